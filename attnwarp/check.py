@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -95,6 +96,10 @@ def instance(value: Any, kind: type, name: str, expected: str) -> None:
         raise TypeError(f"{name}: got {type(value).__name__}, expected {expected}")
 
 
+LARGEST = sys.float_info.max
+"""Beyond it a whole number has no float, which every formula takes."""
+
+
 def number(value: Any, low: float, high: float, name: str, *, whole: bool = False) -> None:
     """Raise ValueError unless ``value`` is a finite number in [low, high], whole if asked.
 
@@ -105,10 +110,14 @@ def number(value: Any, low: float, high: float, name: str, *, whole: bool = Fals
         ValueError: steps: got 2.5, expected a whole number >= 0
     """
     right = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-    if not right or not math.isfinite(value) or not low <= value <= high:
+    # A whole number beyond every float is finite by type, and cannot be asked.
+    beyond = right and abs(value) > LARGEST
+    if not right or beyond or math.isnan(value) or not low <= value <= high:
         kind = "a whole number" if whole else "a number"
         bounds = f">= {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
-        raise ValueError(f"{name}: got {value!r}, expected {kind} {bounds}")
+        text = repr(value)
+        shown = text if len(text) <= 80 else f"{text[:40]}... ({len(text)} characters)"
+        raise ValueError(f"{name}: got {shown}, expected {kind} {bounds}")
 
 
 def seconds(value: Any, name: str) -> None:

@@ -71,11 +71,14 @@ def read_splats(path: Path, kind: Kind | None, antialiased: bool | None) -> Gaus
         if kind is Kind.two:
             raise ValueError(f"--kind: {path} is a .splat, which holds 3DGS alone")
         return replace(read_splat(path), antialiased=bool(antialiased))
-    return read_ply(
+    splats = read_ply(
         path,
         kind=None if kind is None else "2d" if kind is Kind.two else "3d",
         antialiased=antialiased,
     )
+    if antialiased and splats.kind == "2d":
+        raise ValueError(f"--antialiased: {path} holds 2DGS, which has a screen filter instead")
+    return splats
 
 
 def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera]) -> None:

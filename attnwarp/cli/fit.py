@@ -181,6 +181,9 @@ def _fit(
 
     settings = attnwarp.fit.FitSettings.from_dict(changes)
     dataset = read_views(data, reading)
+    # A view without a picture can be neither fitted on nor held out.
+    there = [k for k, path in enumerate(dataset.image_paths) if path is not None]
+    dataset = dataset.select(there) if there else dataset
     train, test = attnwarp.fit.hold_out(dataset, every)
     views = attnwarp.fit.load_views(train, max_size=max_size)
     held_out = attnwarp.fit.load_views(test, max_size=max_size) if test is not None else None

@@ -209,6 +209,12 @@ def fit(
     if len(start) == 0:
         raise ValueError("start: holds no splats")
     check_on_cpu(start)
+    for camera in views.cameras if settings.ssim else ():
+        if min(camera.width, camera.height) < losses.SSIM_WINDOW:
+            raise ValueError(
+                f"views: {camera.name!r} has {camera.width} x {camera.height} px, and SSIM needs"
+                f" {losses.SSIM_WINDOW} on each side; use larger pictures, or set ssim to 0"
+            )
     if max_seconds is not None:
         check.seconds(max_seconds, "max_seconds")
     check.seconds(checkpoint_seconds, "checkpoint_seconds")

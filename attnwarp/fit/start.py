@@ -244,13 +244,15 @@ def random_points(
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     middle = centers.mean(0)
     A = across.sum(0)
-    if np.linalg.eigvalsh(A)[0] > 1e-3 * len(cameras):
-        if _at_one_place(centers):
-            raise ValueError(
-                "cameras: got cameras that all stand at one place and look different ways, so"
-                " nothing says how far the scene is; expected first points (ply_file_path, or"
-                " COLMAP's)"
-            )
+    meet = np.linalg.eigvalsh(A)[0] > 1e-3 * len(cameras)
+    # Axes that are opposite are parallel, too.
+    if _at_one_place(centers) and (meet or (forward @ forward[0]).min() < 0):
+        raise ValueError(
+            "cameras: got cameras that all stand at one place and look different ways, so"
+            " nothing says how far the scene is; expected first points (ply_file_path, or"
+            " COLMAP's)"
+        )
+    if meet:
         focus = middle + np.linalg.solve(A, np.einsum("nij,nj->i", across, centers - middle))
     else:
         focus = middle + extent_of(cameras) * forward.mean(0)

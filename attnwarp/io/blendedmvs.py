@@ -68,6 +68,10 @@ def read_blendedmvs(path: str | os.PathLike[str], *, missing_images: Missing = "
     if missing_images == "none":
         files = [file for file, there in zip(files, available, strict=True) if there]
         images = [image for image, there in zip(images, available, strict=True) if there]
+        if not files:
+            raise FileFormatError(
+                path, f"holds none of the pictures in {IMAGES}, which alone say the cameras' size"
+            )
     elif not all(available):
         first = images[available.index(False)]
         raise FileFormatError(

@@ -81,6 +81,7 @@ class Dataset:
         if self.colors is not None:
             if self.points is None:
                 raise ValueError("colors: given without points")
+            self.colors = np.asarray(self.colors)
             check.shape(self.colors, (len(self.points), 3), "colors")
             if self.colors.dtype != np.uint8:
                 raise ValueError(f"colors: got {self.colors.dtype}, expected uint8")

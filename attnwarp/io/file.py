@@ -194,8 +194,14 @@ def _sweep(folder: Path, process: int) -> None:
 
 @cache
 def _host() -> str:
-    """Eight hexadecimal digits of this machine's name."""
-    return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+    """Eight hexadecimal digits of where a process's number means this process: the machine's name,
+    and on Linux the namespace, as containers may share the name and not the numbers.
+    """
+    try:
+        namespace = str(Path("/proc/self/ns/pid").readlink())
+    except OSError:
+        namespace = ""
+    return hashlib.sha256((platform.node() + namespace).encode()).hexdigest()[:8]
 
 
 def _alive(process: int) -> bool:

@@ -12,6 +12,7 @@ import struct
 import warnings
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -81,14 +82,13 @@ def read_image(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
     path = existing_file(path)
     tiff = _unturned(path)
     rgba: npt.NDArray[Any] | None = _with_pillow(path, _alpha_lost_by_opencv, tiff)
-    _check_png(path)
+    data = path.read_bytes() if tiff is None else tiff
+    _check_png(path, data)
     if rgba is not None:
         return rgba
     flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-    if tiff is None:
-        image = cv2.imread(str(path), flags)
-    else:
-        image = cv2.imdecode(np.frombuffer(tiff, np.uint8), flags)
+    # Never by its path: OpenCV crashes at a name that is no UTF-8.
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     if image is None:
         raise FileFormatError(path, "cannot be read as an image; replace it or leave it out")
     if image.dtype not in (np.uint8, np.uint16):
@@ -190,14 +190,42 @@ def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8 | np.uint16] | Non
     return np.array(image.convert("RGBA")) if tiff or grey else None
 
 
-_ORIENTATION, _BITS = 274, 258
-"""TIFF's tags that ask for a turn, and that hold the bits of each channel."""
+_ORIENTATION, _BITS, _SAMPLES = 274, 258, 277
+"""TIFF's tags that ask for a turn, that hold the bits of each channel, and their number."""
 
 
-def _unturned(path: Path) -> bytes | None:
-    """A TIFF whose tag asks for a turn, with a tag that asks for none: OpenCV and Pillow turn the
-    pixels of this format whatever they are told. None for any other file.
+@dataclass(frozen=True)
+class _Tiff:
+    """A TIFF's bytes, and the tags of its first picture.
+
+    Attributes:
+        data: of the file.
+        order: of its bytes, as ``struct`` has it.
+        places: where the value of each tag begins, or where a pointer to it stands.
     """
+
+    data: bytes
+    order: str
+    places: dict[int, int]
+
+    def short(self, tag: int) -> int | None:
+        """The first number of a tag whose numbers have two bytes and need no pointer."""
+        place = self.places.get(tag)
+        if place is None or place + 2 > len(self.data):
+            return None
+        return int(struct.unpack_from(f"{self.order}H", self.data, place)[0])
+
+    def unturned(self) -> bytes:
+        """The bytes with a tag that asks for no turn, if there is one."""
+        if self.short(_ORIENTATION) in (None, 1):
+            return self.data
+        place = self.places[_ORIENTATION]
+        one = struct.pack(f"{self.order}H", 1)
+        return self.data[:place] + one + self.data[place + 2 :]
+
+
+def _tiff(path: Path) -> _Tiff | None:
+    """A TIFF; None for any other file."""
     with path.open("rb") as stream:
         head = stream.read(4)
         order = {b"II": "<", b"MM": ">"}.get(head[:2])
@@ -210,27 +238,39 @@ def _unturned(path: Path) -> bytes | None:
         data = head + stream.read()
     count_type, offset_type, begin = layout
     entry = struct.Struct(f"{order}HH{offset_type}{offset_type}")  # tag, type, count, value
+    places: dict[int, int] = {}
     try:
         (place,) = struct.unpack_from(f"{order}{offset_type}", data, begin)
         (count,) = struct.unpack_from(f"{order}{count_type}", data, place)
         place += struct.calcsize(count_type)
         for start in range(place, place + count * entry.size, entry.size):
             tag, *_ = entry.unpack_from(data, start)
-            if tag != _ORIENTATION:
-                continue
             # A short stands at the beginning of the field for the value.
-            value = start + entry.size - struct.calcsize(offset_type)
-            if struct.unpack_from(f"{order}H", data, value) == (1,):
-                return None
-            return data[:value] + struct.pack(f"{order}H", 1) + data[value + 2 :]
+            places.setdefault(tag, start + entry.size - struct.calcsize(offset_type))
     except (struct.error, OverflowError):
         pass  # damaged, as the decoders will find
-    return None
+    return _Tiff(data, order, places)
 
 
-def _check_png(path: Path) -> None:
+def _unturned(path: Path) -> bytes | None:
+    """The bytes of a TIFF whose tag, if it asks for a turn, asks for none: OpenCV and Pillow turn
+    the pixels of this format whatever they are told. None for any other file.
+
+    Raises:
+        FileFormatError: grey of 16 bits with alpha, which OpenCV reads as 8 bits without alpha.
+    """
+    tiff = _tiff(path)
+    if tiff is None:
+        return None
+    if tiff.short(_SAMPLES) == 2 and (tiff.short(_BITS) or 0) > 8:
+        raise FileFormatError(
+            path, "grey of 16 bits with alpha, which cannot be read as TIFF; convert it to PNG"
+        )
+    return tiff.unturned()
+
+
+def _check_png(path: Path, data: bytes) -> None:
     """Check the CRC of each chunk of a PNG: not every decoder does, and damage would be pixels."""
-    data = path.read_bytes()
     if not data.startswith(_PNG):
         return
     start = len(_PNG)

@@ -62,7 +62,8 @@ def write_splat(
         32
     """
     g = replace(gaussians.detach().to(device="cpu"))
-    if not (np.isfinite(third_scale) and third_scale > 0):
+    single = np.finfo(np.float32)
+    if not single.tiny <= third_scale <= single.max:
         raise ValueError(
             f"third_scale: got {third_scale}, expected a positive length such as {THIRD_SCALE}"
         )

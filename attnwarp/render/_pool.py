@@ -52,6 +52,8 @@ def _give(raw: np.ndarray) -> None:
     global _held
     if _held + raw.nbytes > MOST:
         clear()
+    if raw.nbytes > MOST:
+        return
     _held += raw.nbytes
     _free.setdefault(raw.nbytes, []).append(raw)
 

@@ -323,6 +323,7 @@ def _prepare(
             raise ValueError(
                 "sh_degree: has no meaning beside features, which replace the spherical harmonics"
             )
+        check.instance(features, Tensor, "features", "a torch.Tensor")
         check.shape(features, (len(gaussians), "C"), "features")
         if features.shape[1] < 1:
             raise ValueError("features: got 0 channels, expected at least 1")

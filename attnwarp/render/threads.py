@@ -18,6 +18,8 @@ from attnwarp.render.dispatch import machine_code
 
 _lock = threading.Lock()
 _pools: dict[int, ThreadPoolExecutor] = {}
+"""By the number of threads that was set: a pool for each number of jobs would keep its own
+threads."""
 
 
 def _forget() -> None:
@@ -57,15 +59,16 @@ def run_jobs(work: Callable[..., None], jobs: Sequence[tuple]) -> None:
     """
     if jobs:
         work = machine_code(work, jobs[0])
-    threads = min(thread_count(), len(jobs))
+    count = thread_count()
+    threads = min(count, len(jobs))
     if threads <= 1:
         for job in jobs:
             work(*job)
         return
     with _lock:
-        pool = _pools.setdefault(
-            threads, ThreadPoolExecutor(threads - 1, thread_name_prefix="attnwarp-render")
-        )
+        if count not in _pools:
+            _pools[count] = ThreadPoolExecutor(count - 1, thread_name_prefix="attnwarp-render")
+        pool = _pools[count]
     pending = list(jobs)[::-1]
 
     def drain() -> None:

@@ -183,6 +183,9 @@ def blend_tokens(
     apart = source.untyped_storage().data_ptr() != new.untyped_storage().data_ptr()
     if in_place and apart and new.is_contiguous():
         _blend(_values(source), _values(new), taps, mask, alpha)
+        # As torch's own operations do: a graph that saved ``new`` must not take it for the same.
+        if not new.is_inference():
+            torch.autograd.graph.increment_version(new)
         return new
     result: Tensor = _BlendTokens.apply(source, new, taps, mask, alpha)
     return new.copy_(result) if in_place else result

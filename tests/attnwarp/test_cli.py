@@ -251,6 +251,17 @@ def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
         assert json.loads((out / "settings.json").read_text())["kind"] == kind
 
 
+def test_views_without_pictures_are_neither_fitted_on_nor_held_out(data, tmp_path):
+    shutil.copytree(data, tmp_path / "data")
+    (tmp_path / "data" / "images" / "0.png").unlink()  # the first by name would be held out
+    done = in_process(
+        "fit", tmp_path / "data", "--out", tmp_path / "out", "--missing-images", "none",
+        "--iterations", "2", "--set", "densify=false",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.stderr
+    assert [path.name for path in (tmp_path / "out" / "held_out").iterdir()] == ["1.png"]
+
+
 def test_the_ply_opens_in_another_reader(data, tmp_path):
     done = in_process("fit", data, "--kind", "3dgs", "--out", tmp_path, "--iterations", 5)
     assert done.exit_code == 0, done.stderr
@@ -324,6 +335,7 @@ def test_a_fit_that_is_stopped_keeps_what_it_has_and_goes_on(data, tmp_path, num
         (["fit", "{data}", "--out", "{out}", "--set", "ssim=2"], "ssim: got 2"),
         (["fit", "{data}", "--out", "{out}", "--set", "kind=3d"], "--kind"),
         (["fit", "{data}", "--out", "{out}", "--hold-out", "1"], "leaves nothing to fit on"),
+        (["fit", "{data}", "--out", "{out}", "--seed", "9" * 400], "9... (400 characters)"),
         (["fit", "{data}", "--out", "{out}", "--kind", "4dgs"], "4dgs"),
         (["render", "nowhere.ply", "{data}", "--out", "{out}"], "nowhere.ply: no such file"),
         (["render", "{data}/images/0.png", "{data}", "--out", "{out}"], "0.png"),

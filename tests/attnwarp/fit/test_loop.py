@@ -403,6 +403,16 @@ def test_splats_that_lie_elsewhere_than_in_main_memory_are_refused(scene):
         fit(start, scene[0], settings)
 
 
+def test_a_view_too_small_for_ssim_is_named_before_the_first_iteration(scene):
+    start, settings = begin(scene, iterations=5, sh_degree=0)
+    small = dataclasses.replace(ring(3)[1].resize(16, 8), name="small.png")
+    views = Views([ring(3)[0], small], [np.zeros((32, 32, 3)), np.zeros((8, 16, 3))])
+    with pytest.raises(ValueError, match=r"views: 'small.png' has 16 x 8 px, and SSIM needs 11"):
+        fit(start, views, settings)
+    without = dataclasses.replace(settings, ssim=0.0)
+    assert fit(start, views, without).iteration == 5
+
+
 def test_views_that_show_nothing_of_the_splats_end_in_a_clear_error(scene):
     start, settings = begin(
         scene,

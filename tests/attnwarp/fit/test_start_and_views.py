@@ -239,6 +239,15 @@ def test_cameras_at_one_place_that_look_different_ways_are_refused():
         random_points(cameras, 10)
 
 
+def test_cameras_at_one_place_that_look_in_opposite_directions_are_refused():
+    view = dict(width=8, height=8, fov_y=40)
+    both = [Camera.look_at((1, 2, 3), (1 + x, 2, 3), **view) for x in (1, -1)]
+    with pytest.raises(ValueError, match="all stand at one place and look different ways"):
+        random_points(both, 50)
+    points, _ = random_points(both[:1] * 2, 50)  # one way alone, where a guess is possible
+    assert np.ptp(points, axis=0).min() > 0
+
+
 @pytest.mark.parametrize(("radius", "place"), [(3e-3, 5e6), (3e-10, 0.0)])
 def test_a_small_ring_of_cameras_far_away_is_no_single_place(radius, place):
     """Millimetres at a map's coordinates, and a world in tiny units."""

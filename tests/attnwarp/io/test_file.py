@@ -79,3 +79,16 @@ def test_a_folder_in_a_files_place_is_named_and_nothing_is_left(tmp_path):
 def test_a_name_as_long_as_the_file_system_takes_can_be_written(tmp_path, name):
     write_atomically(tmp_path / name, lambda stream: stream.write(b"whole"))
     assert (tmp_path / name).read_bytes() == b"whole"
+
+
+def test_a_process_of_another_namespace_is_of_another_place(tmp_path, monkeypatch):
+    """Containers may share the machine's name, but not the numbers of processes."""
+    own = file._host()
+    path = tmp_path / f".a.{own}-{2**22 + 1}-{'0' * 32}.tmp"
+    path.write_bytes(b"")
+    file._host.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setattr(file.Path, "readlink", lambda path: file.Path("pid:[1]"))
+        assert file._host() != own and file.remove_abandoned(tmp_path) == 0
+    file._host.cache_clear()
+    assert file._host() == own and file.remove_abandoned(tmp_path) == 1

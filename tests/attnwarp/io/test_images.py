@@ -1,5 +1,6 @@
 """The one door for pictures: what the file holds comes in, and a damaged file does not."""
 
+import os
 import struct
 import zlib
 
@@ -204,3 +205,30 @@ def test_what_is_not_there_or_empty_is_said(tmp_path):
     (tmp_path / "empty.png").write_bytes(b"")
     with pytest.raises(FileFormatError, match=r"empty\.png: the file is empty"):
         image_size(tmp_path / "empty.png")
+
+
+def test_a_folder_whose_name_is_no_utf8_is_read(tmp_path):
+    """As an old archive leaves it; OpenCV crashes at such a path."""
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    try:
+        folder.mkdir()
+    except OSError:
+        pytest.skip("this file system takes UTF-8 alone")
+    pixels = np.random.default_rng(0).integers(0, 256, (5, 4, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(folder / "a.png")
+    assert np.array_equal(read_image(folder / "a.png"), pixels)
+
+
+def test_a_grey_tiff_of_16_bits_with_alpha_is_refused(tmp_path):
+    """OpenCV halves its depth and drops its alpha."""
+    pixels = np.zeros((8, 8, 2), np.uint16)
+    pixels[..., 0], pixels[:4, :, 1] = 30000, 65535
+    tags = [(256, 3, 1, 8), (257, 3, 1, 8), (258, 3, 2, 16 | 16 << 16), (259, 3, 1, 1),
+            (262, 3, 1, 1), (273, 4, 1, 8), (277, 3, 1, 2), (278, 3, 1, 8),
+            (279, 4, 1, pixels.nbytes), (338, 3, 1, 2)]  # fmt: skip
+    directory = struct.pack("<H", len(tags)) + b"".join(struct.pack("<HHII", *t) for t in tags)
+    data = b"II*\0" + struct.pack("<I", 8 + pixels.nbytes) + pixels.tobytes()
+    (tmp_path / "la.tiff").write_bytes(data + directory + bytes(4))
+    assert cv2.imread(str(tmp_path / "la.tiff"), cv2.IMREAD_UNCHANGED).dtype == np.uint8
+    with pytest.raises(FileFormatError, match="grey of 16 bits with alpha"):
+        read_image(tmp_path / "la.tiff")

@@ -161,5 +161,9 @@ def test_images_that_are_missing_are_named_or_left_out(tmp_path, cameras):
     with pytest.raises(FileFormatError, match=r"1 of 3 images are missing: .*00000001\.jpg"):
         read_dataset(tmp_path / "scene")
     check(read_dataset(tmp_path / "scene", missing_images="none"), cameras[::2], W, H)
+    for path in (tmp_path / "scene" / "blended_images").glob("*.jpg"):
+        path.unlink()
+    with pytest.raises(FileFormatError, match="none of the pictures in blended_images"):
+        read_dataset(tmp_path / "scene", missing_images="none")
     with pytest.raises(ValueError, match="BlendedMVS has one folder of images"):
         read_dataset(tmp_path / "scene", scale=2)

@@ -87,6 +87,8 @@ def test_bad_values_are_refused(tmp_path):
         write_splat(tmp_path / "a.splat", g)
     with pytest.raises(ValueError, match="third_scale"):
         write_splat(tmp_path / "a.splat", model(), third_scale=0.0)
+    with pytest.raises(ValueError, match="third_scale: got 1e-50"):  # 0 in the file's float32
+        write_splat(tmp_path / "a.splat", model(), third_scale=1e-50)
     assert not list(tmp_path.iterdir())
 
 

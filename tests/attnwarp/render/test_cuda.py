@@ -5,6 +5,7 @@ features.
 from __future__ import annotations
 
 import dataclasses
+import types
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ import torch
 from attnwarp import Camera
 from attnwarp.render import api, constants, cuda, reference, render
 from attnwarp.render.interface import Inputs
+from attnwarp.warp import preset, render_surface
 
 
 def prepared(splats, camera, depth: str = "center") -> Inputs:
@@ -125,3 +127,19 @@ def test_it_says_why_it_cannot_run(make_camera, make_splats, monkeypatch) -> Non
 def test_auto_is_the_cpu_for_splats_in_main_memory(make_camera, make_splats) -> None:
     camera = make_camera(3, 8, 8)
     assert render(make_splats(3, "2d", 5, camera), camera).backend == "cpu"
+
+
+def test_a_warp_is_told_that_there_is_no_median_depth(
+    make_camera, make_splats, monkeypatch
+) -> None:
+    """Its mask would be empty, and blame the poses."""
+    camera = square_pixels(make_camera(3, 8, 8))
+    splats = make_splats(3, "3d", 5, camera)
+    made = cuda.composite(prepared(splats, camera), brute_force)
+    made = types.SimpleNamespace(**vars(made), backend="cuda")
+    monkeypatch.setattr("attnwarp.render.render", lambda *_, **__: made)
+    median = preset("corrected", depth="center")
+    with pytest.raises(ValueError, match="got 'median', which backend 'cuda' does not have"):
+        render_surface(splats, camera, median)
+    expected = dataclasses.replace(median, depth_statistic="expected")
+    assert torch.equal(render_surface(splats, camera, expected).alpha, made.alpha)

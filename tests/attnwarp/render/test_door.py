@@ -163,3 +163,9 @@ def test_normals_lie_where_their_depth_does() -> None:
 def test_importing_the_door_loads_neither_numba_nor_gsplat() -> None:
     modules = modules_after("import attnwarp.render")
     assert "attnwarp.render" in modules and not modules & {"numba", "gsplat", "scipy"}
+
+
+@pytest.mark.parametrize("features", [[[1.0], [2.0], [3.0]], np.zeros((3, 1), np.float32)])
+def test_features_that_are_no_tensor_are_refused_by_name(features) -> None:
+    with pytest.raises(TypeError, match=r"features: got \w+, expected a torch.Tensor"):
+        render(gaussians(), camera(), features=features)

@@ -52,3 +52,11 @@ def test_shapes_types_and_small_arrays() -> None:
             array = _pool.zeros(shape, dtype)
             assert array.shape == np.zeros(shape).shape and array.dtype == dtype and not array.any()
             assert array.flags.c_contiguous and array.flags.writeable
+
+
+def test_a_block_beyond_the_bound_is_not_held(monkeypatch) -> None:
+    monkeypatch.setattr(_pool, "MOST", 1 << 20)
+    _pool.clear()
+    del_me = _pool.empty((1 << 21,), np.uint8)
+    del del_me
+    assert _pool._held == 0
