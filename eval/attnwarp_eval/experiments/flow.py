@@ -20,6 +20,7 @@ import numpy.typing as npt
 from attnwarp.camera import Camera
 from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.experiments.overwriting import check_nothing_is_lost
 from attnwarp_eval.files import write_picture
 from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
@@ -124,7 +125,8 @@ def measure(
         progress: told of each row.
 
     Raises:
-        InputError: another scene than :data:`SCENES`; another run is writing to ``out``.
+        InputError: another scene than :data:`SCENES`; another run is writing to ``out``, or rows of
+            its ``flow.json`` would be lost.
     """
     if options.method not in get_args(Method):
         raise InputError(
@@ -133,6 +135,8 @@ def measure(
     for name in scenes:
         if name not in SCENES:
             raise InputError(f"scene {name!r}: expected one of {', '.join(SCENES)}")
+    asked = {(name, str(float(yaw)), options.method) for name in scenes for yaw in yaws}
+    check_nothing_is_lost(out / "flow.json", None, ("scene", "yaw", "method"), asked)
     store = Store(out)
     tasks = (_task(store, name, float(yaw), options) for name in scenes for yaw in yaws)
     yield from results(store, tasks, len(scenes) * len(yaws), progress)

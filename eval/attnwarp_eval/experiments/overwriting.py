@@ -14,7 +14,7 @@ Key = tuple[str, ...]
 
 
 def check_nothing_is_lost(
-    path: Path, table: str, fields: Sequence[str], available: Collection[Key]
+    path: Path, table: str | None, fields: Sequence[str], available: Collection[Key]
 ) -> set[Key]:
     """Check that a table can be overwritten: its folder has cells, and each row will be there.
 
@@ -23,7 +23,7 @@ def check_nothing_is_lost(
 
     Args:
         path: of the table's JSON, in the run's folder; there may be none yet.
-        table: the key of the list of rows.
+        table: the key of the list of rows; None where the list is all there is.
         fields: the keys of a row that name it.
         available: the rows that the call makes or reads from cells.
 
@@ -37,7 +37,8 @@ def check_nothing_is_lost(
         return set()
     remedy = "name another folder with --out, or move the file away"
     try:
-        rows = json.loads(path.read_bytes())[table]
+        content = json.loads(path.read_bytes())
+        rows = content if table is None else content[table]
         stored = {tuple(str(row[field]) for field in fields) for row in rows}
     except (ValueError, LookupError, TypeError, RecursionError, OSError):
         raise InputError(f"{path}: is not a file that this command wrote; {remedy}") from None

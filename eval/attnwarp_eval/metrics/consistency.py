@@ -52,8 +52,8 @@ class Disagreement:
         linear: (H, W, 3) target minus source at the same point, linear RGB; NaN elsewhere.
         srgb: (H, W, 3) the same of sRGB values.
         delta_e: (H, W) CIEDE2000 between the two colours (D65, 2 degree observer); NaN elsewhere.
-        candidates: number of pixels that could have been compared: those to compare that have a
-            position.
+        candidates: number of pixels that were asked about; at exact correspondences those that have
+            a position.
 
     Example:
         >>> import numpy as np
@@ -434,7 +434,7 @@ def _grey(image: Array) -> npt.NDArray[np.uint8]:
 def _flow(
     target_colors: npt.NDArray[np.uint8], source_colors: npt.NDArray[np.uint8], method: FlowMethod
 ) -> Array:
-    """(H, W, 2) displacement of each pixel of ``here`` in ``there``."""
+    """(H, W, 2) displacement of each pixel of the target in the source, in px."""
     import cv2
 
     cv: Any = cv2  # its stubs lack DIS, and None for the flow to start from

@@ -14,6 +14,7 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.metrics.multiview import ABOVE_FLOOR, BELOW_FLOOR
 from attnwarp_eval.statistics.intervals import (
+    ROUNDING,
     ByView,
     Interval,
     agreement,
@@ -243,10 +244,11 @@ def _here(claim: Claim, measured: Measured, scenes: int) -> Here:
 
     ``scenes``: how many the study has. One without values cannot show what is expected.
     """
-    differences = [
-        paired({s: measured.a[s]}, {s: measured.b[s]}) for s in measured.a if s in measured.b
-    ]
-    signs = [one.mean * claim.sign > 0 for one in differences if one.views]
+    shared = common([measured.a, measured.b])
+    values = [abs(x) for table in shared for views in table.values() for x in views.values()]
+    rounding = ROUNDING * max(values, default=0.0)
+    differences = [paired({s: shared[0][s]}, {s: shared[1][s]}) for s in shared[0]]
+    signs = [one.mean * claim.sign > rounding for one in differences]
     if not all(signs):
         return "mixed" if any(signs) else "not seen"
     return "seen" if len(signs) == scenes else "seen where defined"

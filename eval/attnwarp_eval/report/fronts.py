@@ -40,6 +40,9 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
     for index, front in enumerate(results.study.fronts):
         metric = front.metric.format(layer=results.layer)
         shared = results.shared(front.probe, front.variants, metric)
+        if results.finished(front.probe) and not any(map(any, shared.tables.values())):
+            section.text.append(f"{front.title}: no view has a value of `{metric}`.")
+            continue
         points, rows = _points(results, front, shared)
         if not points:
             continue
@@ -75,7 +78,7 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
             ]
         section.tables.append(Table(columns, marked, front.title))
         section.tables += _cheapest(results, shared, points, time)
-    return [section] if section.tables else []
+    return [section] if section.tables or len(section.text) > len(_text(results)) else []
 
 
 def _probabilities(timed: Timed, shared: Shared, names: Sequence[str]) -> dict[str, str]:

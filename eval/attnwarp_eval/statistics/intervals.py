@@ -270,22 +270,24 @@ def _bounds_of_median(values: npt.NDArray[np.float64]) -> tuple[float, float]:
 def agreement(a: ByView, b: ByView, sign: int) -> tuple[int, int]:
     """In how many of the views that both have b - a has the given sign: (those, all).
 
-    It says what was seen on these scenes, without speaking of others.
+    It says what was seen on these scenes, without speaking of others. What is within the rounding
+    of the values (:data:`ROUNDING`) has no sign.
 
     Example:
         >>> a = {"bear": {"yaw010": 1.0, "yaw020": 1.0}}
         >>> agreement(a, {"bear": {"yaw010": 2.0, "yaw020": 0.5}}, sign=1)
         (1, 2)
     """
-    differences = [
-        b[scene][view] - a[scene][view]
+    pairs = [
+        (a[scene][view], b[scene][view])
         for scene in a
         if scene in b
         for view in a[scene]
         if view in b[scene]
     ]
-    defined = [d for d in differences if np.isfinite(d)]
-    return sum(d * sign > 0 for d in defined), len(defined)
+    defined = [pair for pair in pairs if np.isfinite(pair).all()]
+    rounding = ROUNDING * max((abs(value) for pair in defined for value in pair), default=0.0)
+    return sum((after - before) * sign > rounding for before, after in defined), len(defined)
 
 
 def benjamini_hochberg(p: Sequence[float]) -> list[float]:

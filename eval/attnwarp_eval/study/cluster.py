@@ -78,6 +78,10 @@ class Workplace(ABC):
     def receive(self, cell: Cell, result: Any) -> Failure | None:
         """Take what the worker returned; its record is stored after this."""
 
+    @abstractmethod
+    def forget(self, worker: str) -> None:
+        """A worker is gone; another may come under its address."""
+
 
 class _Local(Workplace):
     """Workers on this machine, which write to the run's folder themselves."""
@@ -102,6 +106,9 @@ class _Local(Workplace):
         error: Failure | None = result
         return error
 
+    def forget(self, worker: str) -> None:
+        """Workers of this machine are told nothing that could be forgotten."""
+
 
 class _Remote(Workplace):
     """Workers anywhere: scenes travel to them, records and pictures come back."""
@@ -123,7 +130,14 @@ class _Remote(Workplace):
         )
 
     def receive(self, cell: Cell, result: Parcel | Failure) -> Failure | None:
-        return result if isinstance(result, Failure) else unpack(result, self.store)
+        if isinstance(result, Failure):
+            # It may be of the files themselves: whoever tries the scene next gets them again.
+            self._sent = {sent for sent in self._sent if sent[1] != cell.scene}
+            return result
+        return unpack(result, self.store)
+
+    def forget(self, worker: str) -> None:
+        self._sent = {sent for sent in self._sent if sent[0] != worker}
 
 
 def run_on_workers(
@@ -383,6 +397,7 @@ class _Runner:
         self.refused.pop(worker, None)
         self.asked.pop(worker, None)
         self.accepted.discard(worker)
+        self.place.forget(worker)
         if worker not in self.running:
             return
         future, cell = self.running.pop(worker)

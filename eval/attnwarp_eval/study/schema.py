@@ -37,7 +37,7 @@ class StudyError(InputError):
 class Part(BaseModel):
     """Keys of a study's YAML; an unknown key is an error."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     def part(self, kind: type[P]) -> P:
         """The same object as one of the parts that it was joined from.
@@ -130,7 +130,9 @@ class Study(Part):
     views: list[str] = Field(
         default_factory=list, description="target views by name; all of them if empty"
     )
-    seeds: Annotated[list[int], Field(min_length=1)] = Field(default_factory=lambda: [0])
+    seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)] = Field(
+        default_factory=lambda: [0]
+    )
     spp: Annotated[int, Field(ge=1)] = 16
     feature_sizes: list[int] = Field(
         default_factory=list, description="image size, 1/8 and 1/16 of it if left out"

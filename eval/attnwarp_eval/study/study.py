@@ -62,6 +62,8 @@ class _Joined(Study):
             raise ValueError(f"variants: got none, expected at least one for probes.{judging[0]}")
         self._check_each_variant()
         for name, variants in self.probes.items():
+            if not variants and available[name].judges_variants:
+                raise ValueError(f"probes.{name}: names no variant, expected at least one")
             self.check_variants(variants, f"probes.{name}")
         tabled = [name for name, p in available.items() if p.columns]
         for i, ablation in enumerate(self.ablations):
@@ -103,6 +105,8 @@ def _check_metric(front: Front, front_probe: Probe[Any], key: str) -> None:
     except KeyError:
         near = did_you_mean(front.metric, front_probe.metrics)
         raise ValueError(f"{key}: no metric {front.metric!r}{near}") from None
+    if "{" in front.metric.replace("{layer}", ""):
+        raise ValueError(f"{key}: got {front.metric!r}; braces may hold 'layer' alone")
     if direction != "lower":
         raise ValueError(f"{key}: {front.metric!r} is not one of which less is better")
 
@@ -229,7 +233,8 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         )
     data = _beside(data, path.parent)
     every = data.get("scenes")
-    files = {scene_name(where): where for where in every or () if is_scene_file(where)}
+    named = every if isinstance(every, list) else ()
+    files = {scene_name(where): where for where in named if is_scene_file(where)}
     data.update({k: v for k, v in overrides.items() if v is not None})
     if overrides.get("scenes") is not None:
         # Reports call a scene of the file by its name.

@@ -43,6 +43,16 @@ def test_yaws_that_are_no_degrees_are_one_line(tmp_path, yaws):
     assert not (tmp_path / "out").exists()
 
 
+def test_rows_of_a_published_table_are_not_written_over(tmp_path):
+    table = tmp_path / "flow.json"
+    table.write_text(json.dumps([{"scene": "person", "yaw": 2.0, "method": "dis"}]))
+    before = table.read_bytes()
+    for more in ([], ["--yaws", "2"]):
+        result = run(tmp_path, *more)
+        assert result.exit_code == 2 and "person of 2.0 of dis would be lost" in result.stderr
+    assert table.read_bytes() == before and list(tmp_path.iterdir()) == [table]
+
+
 @pytest.mark.slow
 def test_the_study_tells_views_that_agree_from_views_that_do_not(tmp_path):
     result = run(tmp_path, "--yaws", "5")

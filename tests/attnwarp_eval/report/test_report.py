@@ -737,6 +737,21 @@ def test_an_instrument_that_is_off_is_reported(tmp_path, changes, says):
     assert "not calibrated" in section.text[0]
 
 
+def test_a_front_of_a_figure_that_no_view_has_says_so(tmp_path):
+    title = {"title": "Cost", "variants": ["good", "slipped"]}
+    front = [{**title, "metric": "warp.feature_all_accepted"}]  # without its grid
+    (section,) = fronts(results(CLEAR, fronts=front), Layout(tmp_path))
+    assert section.text[-1] == "Cost: no view has a value of `warp.feature_all_accepted`."
+    assert not section.tables and not section.figures
+
+
+def test_rounding_is_not_seen():
+    """Differences of 5.6e-17 in every scene: the same values, as the p-value says."""
+    table = {"good": [[0.3, 0.3]] * 3, "slipped": [[0.1 + 0.2, 0.1 + 0.2]] * 3}
+    (claim,) = judge(results(table), [SLIP_CLAIM])
+    assert (claim.here, claim.verdict, claim.agreement) == ("not seen", "can't tell", (0, 6))
+
+
 def test_a_front_never_puts_seconds_of_two_kinds_on_one_axis(tmp_path):
     front = [{"title": "Cost", "metric": SLIP, "variants": ["good", "slipped"]}]
     rounds = {"render": [[1.0] * 3] * 2, "pair": [[1.0, 2.0, 4.0], [1.0, 2.0, 4.0]]}

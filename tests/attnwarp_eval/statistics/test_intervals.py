@@ -210,6 +210,9 @@ def test_agreement_counts_the_views_that_show_the_sign():
     b = {"s": {"v": 2.0, "w": 1.0, "x": 1.0}, "t": {"v": 3.0, "y": 1.0}}
     assert agreement(a, b, +1) == (2, 3)
     assert agreement(a, b, -1) == (1, 3)
+    # Sums in another order are no sign.
+    rounded = {"bear": {"v": 0.1 + 0.2, "w": 0.3}}
+    assert agreement({"bear": {"v": 0.3, "w": 0.1 + 0.2}}, rounded, +1) == (0, 2)
 
 
 def test_ratios_taken_in_turn_see_through_a_machine_that_drifts():

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -19,6 +20,7 @@ import attnwarp_eval
 import attnwarp_eval.study.cluster
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import write_report
+from attnwarp_eval.study.record import Failure
 from attnwarp_eval.study.store import Store
 
 ROOT = pathlib.Path(attnwarp.__file__).parents[1]
@@ -268,3 +270,24 @@ def test_workers_that_start_together_start_with_different_probes_and_get_every_c
     rest = [queue.take("b", {"depth"}), queue.take("a", {"warp"})]
     assert [cell.title for cell in rest] == ["b / v / depth", "a / v / warp"]
     assert queue.take("a") is None
+
+
+def test_a_worker_gets_a_scenes_files_again_when_it_comes_back_or_a_cell_of_it_fails(monkeypatch):
+    """A new process under an old address has none; nor has one whose disk was full."""
+    cluster = attnwarp_eval.study.cluster
+    monkeypatch.setattr(cluster, "files_of_scene", lambda scene: "files")
+    cell = cluster.Cell({}, "ball", "v", "warp", 0)
+    place, sent = cluster._Remote(Store("none"), {"ball": None}), []
+    client = SimpleNamespace(submit=lambda do, probe, cell, files, **_: sent.append(files))
+    runner = cluster._Runner(client, [], place, lambda cell: None)
+    for worker in ("tcp://a:1", "tcp://a:1", "tcp://b:1"):
+        place.submit(client, worker, cell)
+    assert sent == ["files", None, "files"]
+    assert list(runner._give_up("tcp://a:1")) == []
+    place.submit(client, "tcp://a:1", cell)
+    place.submit(client, "tcp://b:1", cell)
+    assert sent[3:] == ["files", None]
+    failed = Failure("ball", "v", "warp", "OSError: no space left")
+    assert place.receive(cell, failed) is failed
+    place.submit(client, "tcp://b:1", cell)
+    assert sent[5:] == ["files"]

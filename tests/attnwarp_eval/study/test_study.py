@@ -127,6 +127,15 @@ def test_ids_change_with_the_content_and_not_with_the_names(tmp_path):
             {"variants": {}, "probes": {"warp": []}},
             "variants: got none, expected at least one for probes.warp",
         ),
+        ({"probes": {"warp": []}}, "probes.warp: names no variant, expected at least one"),
+        ({"scenes": 5}, "scenes: got 5, but .*list"),
+        ({"splats": {"position_noise": float("inf")}}, "position_noise: got inf, but .*finite"),
+        ({"fit": {"noise": float("nan")}}, "fit.noise: got nan, but .*finite"),
+        ({"seeds": [0, -1]}, "seeds.*: got -1, but .*greater than or equal to 0"),
+        (
+            {"fronts": [{"title": "t", "metric": "warp.epe_median.{size}", "variants": ["again"]}]},
+            "braces may hold 'layer' alone",
+        ),
     ],
 )
 def test_a_wrong_study_says_where_and_what_to_do(tmp_path, changes, message):

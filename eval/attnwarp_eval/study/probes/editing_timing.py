@@ -81,6 +81,11 @@ class EditingTimingProbe(Probe[Rounds]):
         for name in study.probes.get(self.name, []):
             variant = study.variants[name]
             own = variant.part(editing.VariantPart)
+            if own.method == "true pictures":
+                raise ValueError(
+                    f"probes.editing-timing: {name!r} edits nothing, so there is no time to take;"
+                    " leave it out"
+                )
             if "truth" in (variant.geometry, own.mask):
                 raise ValueError(
                     f"probes.editing-timing: {name!r} warps by the scene's truth, which takes no"

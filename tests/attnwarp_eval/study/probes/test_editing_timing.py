@@ -112,6 +112,14 @@ LIMITED = {"limited": {"method": "by_view", "budget": {"network_rows": 4}}}
             {"editing": {}, "variants": LIMITED, "probes": {"editing-timing": ["limited"]}},
             "'limited' has a budget",
         ),
+        (
+            {
+                "editing": {},
+                "variants": {"ceiling": {"method": "true pictures"}},
+                "probes": {"editing-timing": ["ceiling"]},
+            },
+            "'ceiling' edits nothing",
+        ),
         ({"editing_timing": {"scenes": 0}}, "editing_timing.scenes"),
     ],
 )
