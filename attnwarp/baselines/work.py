@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from attnwarp.baselines.settings import BaselineSettings
-from attnwarp.editing.editor import Editor, guided, shared_noise
+from attnwarp.editing.editor import Editor, guided, shared_noise, side_multiple
 from attnwarp.editing.schedule import steps_as_published
 from attnwarp.gaussians import Gaussians
 from attnwarp.propagate.editing import Guide
@@ -109,7 +109,7 @@ class Work:
     ) -> None:
         self.frozen, self.scene, self.editor = gaussians.detach(), scene, editor
         self.instruction, self.settings, self.backend = instruction, settings, backend
-        multiple = editor.factor * 2 ** (len(editor.unet.config.block_out_channels) - 1)
+        multiple = side_multiple(editor)
         self.sizes: list[Size] = [
             edit_size(camera.height, camera.width, settings.size, multiple)
             for camera in scene.cameras

@@ -326,12 +326,20 @@ class Recording:
         check.one_of(branch, self.plan.keep, "branch")
         value = self._features[(timestep, layer.name)]
         if isinstance(value, Path):
-            from safetensors.torch import load_file
+            from safetensors import safe_open
 
-            value = load_file(value)["features"]
-        views = len(value) // len(self.plan.keep)
+            with safe_open(value, "pt") as stored:
+                # The other branches stay on disk.
+                return self._of_branch(stored.get_slice("features"), branch)
+        return self._of_branch(value, branch)
+
+    def _of_branch(self, value: Any, branch: str) -> Tensor:
+        """The rows of a branch, of a tensor or a slice of a file."""
+        rows = value.shape[0] if isinstance(value, Tensor) else value.get_shape()[0]
+        views = rows // len(self.plan.keep)
         row = self.plan.keep.index(branch) * views
-        return value[row : row + views]
+        part: Tensor = value[row : row + views]
+        return part
 
     def step_of(self, timestep: float) -> int:
         """The number of a timestep among those of the recorded run, from 0.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.editing.attention import CONTROLNET_BRANCHES
-from attnwarp.editing.editor import MOST_GUIDANCE, Guide, Image, Latent, tensor_of
+from attnwarp.editing.editor import MOST_GUIDANCE, Guide, Image, Latent, check_networks, tensor_of
 
 
 def control_image(depth: npt.NDArray[Any]) -> Image:
@@ -66,6 +66,10 @@ class DepthControlNet(Latent):
         negative_prompt: str = "",
     ) -> None:
         super().__init__(unet, vae, text_encoder, tokenizer, scheduler)
+        channels = vae.config.latent_channels
+        plain = "; a ControlNet takes a plain model, not InstructPix2Pix's"
+        check_networks(unet, text_encoder, channels, "unet", plain)
+        check_networks(controlnet, text_encoder, channels, "controlnet")
         check.number(guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "guidance")
         self.controlnet = controlnet.eval().requires_grad_(False)
         self.guidance, self.control_scale = guidance, control_scale
@@ -85,14 +89,14 @@ class DepthControlNet(Latent):
         Raises:
             InputError: files that are missing or of another kind, by name.
         """
-        from attnwarp.editing.folder import load_controlnet, load_parts
+        from attnwarp.editing.folder import load_controlnet, load_parts, named
 
         device, dtype = settings.pop("device", "cpu"), settings.pop("dtype", torch.float32)
         parts = load_parts(folder, device=device, dtype=dtype)
         place = Path(folder) / "controlnet" if controlnet is None else controlnet
-        return cls(
-            **parts, controlnet=load_controlnet(place, device=device, dtype=dtype), **settings
-        )
+        control = load_controlnet(place, device=device, dtype=dtype)
+        with named(folder):
+            return cls(**parts, controlnet=control, **settings)
 
     @property
     def branches(self) -> tuple[str, ...]:

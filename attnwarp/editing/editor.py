@@ -257,6 +257,47 @@ def tensor_of(images: Sequence[npt.NDArray[Any]], name: str, multiple: int) -> T
     return torch.from_numpy(stacked).permute(0, 3, 1, 2).contiguous()
 
 
+def side_multiple(editor: Any) -> int:
+    """Pixels that the sides of a picture are rounded to a multiple of: two halvings of the latents
+    are exact, as many as layers with attention need, and further ones are padded by the UNet.
+    """
+    halvings = len(editor.unet.config.block_out_channels) - 1
+    return int(editor.factor * 2 ** min(2, halvings))
+
+
+def check_networks(
+    network: Any, text_encoder: Any, channels: int, name: str, hint: str = ""
+) -> None:
+    """Refuse networks that do not fit each other, before anything is computed with them.
+
+    Args:
+        network: a UNet or a ControlNet.
+        text_encoder: of the same model.
+        channels: that the network has to take.
+        name: of the network, for the message.
+        hint: what takes so many channels, for the message.
+
+    Raises:
+        ValueError: another number of channels, texts of another size, or a model of SDXL's kind.
+    """
+    if getattr(network.config, "addition_embed_type", None) is not None:
+        raise ValueError(
+            f"{name}: is of Stable Diffusion XL's kind, which takes more than a text; expected"
+            " Stable Diffusion 1 or 2"
+        )
+    takes = network.config.in_channels
+    if takes != channels:
+        raise ValueError(f"{name}: takes {takes} channels, expected {channels}{hint}")
+    wanted = getattr(network.config, "cross_attention_dim", None)
+    has = getattr(text_encoder.config, "hidden_size", None)
+    projected = getattr(network.config, "encoder_hid_dim", None) is not None
+    if isinstance(wanted, int) and has is not None and not projected and wanted != has:
+        raise ValueError(
+            f"{name}: takes texts of {wanted} channels, and the text encoder gives {has}; are both"
+            " of one version of Stable Diffusion?"
+        )
+
+
 class Latent:
     """Pictures to latents and back, and texts to tokens: what both kinds of editor share."""
 
@@ -287,10 +328,17 @@ class Latent:
         return timesteps
 
     def raw_latents(self, pictures: Tensor) -> Tensor:
-        """(B, C, h, w) of (B, 3, H, W) in [0, 1], the mode, not scaled."""
+        """(B, C, h, w) of (B, 3, H, W) in [0, 1], the mode, not scaled.
+
+        Picture by picture: Stable Diffusion's autoencoder takes 0.6 GiB for one of 512 px.
+        """
+        rows = []
         with torch.no_grad():
-            coded = self.vae.encode((2 * pictures - 1).to(self.vae.device, self.vae.dtype))
-        return coded.latent_dist.mode() if hasattr(coded, "latent_dist") else coded.latents
+            for picture in pictures.split(1):
+                coded = self.vae.encode((2 * picture - 1).to(self.vae.device, self.vae.dtype))
+                plain = hasattr(coded, "latent_dist")
+                rows.append(coded.latent_dist.mode() if plain else coded.latents)
+        return torch.cat(rows)
 
     def encode(self, pictures: Sequence[Image]) -> Tensor:
         """(B, C, h, w) scaled latents of (H, W, 3) pictures in [0, 1]."""
@@ -301,10 +349,14 @@ class Latent:
         return self.raw_latents(pixels) * self.vae.config.scaling_factor
 
     def pixels(self, latents: Tensor) -> Tensor:
-        """(B, 3, H, W) of scaled latents as they are decoded: values may leave [0, 1]."""
+        """(B, 3, H, W) of scaled latents as they are decoded: values may leave [0, 1].
+
+        Picture by picture, as :meth:`raw_latents`.
+        """
         with torch.no_grad():
             scaled = latents.to(self.vae.dtype) / self.vae.config.scaling_factor
-            return self.vae.decode(scaled, return_dict=False)[0].float() / 2 + 0.5
+            rows = [self.vae.decode(one, return_dict=False)[0] for one in scaled.split(1)]
+        return torch.cat(rows).float() / 2 + 0.5
 
     def decode(self, latents: Tensor) -> list[Image]:
         """(H, W, 3) float32 pictures in [0, 1] of scaled latents.
@@ -324,9 +376,15 @@ class Latent:
                 )
         return list(pixels.clamp(0, 1).permute(0, 2, 3, 1).cpu().numpy())
 
+    @property
+    def text_limit(self) -> int:
+        """Tokens that the text encoder takes; tokenizers of some folders name no limit."""
+        own = self.tokenizer.model_max_length
+        return int(min(own, getattr(self.text_encoder.config, "max_position_embeddings", own)))
+
     def check_text(self, text: str) -> None:
         """Raise ValueError for a text that is longer than the encoder takes."""
-        limit = self.tokenizer.model_max_length
+        limit = self.text_limit
         length = len(self.tokenizer(text, verbose=False).input_ids)
         if length > limit:
             raise ValueError(
@@ -336,7 +394,7 @@ class Latent:
 
     def embed(self, texts: Sequence[str]) -> Tensor:
         """(N, L, D) embeddings; a text longer than the encoder takes is refused."""
-        limit = self.tokenizer.model_max_length
+        limit = self.text_limit
         for text in texts:
             self.check_text(text)
         codes = self.tokenizer(

@@ -53,6 +53,9 @@ def load_parts(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -
     pair = all((words / name).is_file() for name in ("vocab.json", "merges.txt"))
     if not pair and not (words / "tokenizer.json").is_file():
         missing.append("tokenizer/vocab.json with merges.txt, or tokenizer/tokenizer.json")
+    # What pads a text stands there.
+    if not (words / "tokenizer_config.json").is_file():
+        missing.append("tokenizer/tokenizer_config.json")
     if missing:
         raise InputError(
             f"{folder}: lacks {', '.join(missing)}; fetch the model again in diffusers' format"
@@ -140,6 +143,15 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
             f"{f' and {len(damaged) - 1} more' if len(damaged) > 1 else ''}; fetch the model again"
         )
     return network.to(device)
+
+
+@contextmanager
+def named(folder: str | Path) -> Iterator[None]:
+    """Put a folder's name before what is wrong with the networks in it."""
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(f"{folder}: {error}") from None
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.editing.attention import PIX2PIX_BRANCHES
-from attnwarp.editing.editor import MOST_GUIDANCE, Guide, Latent, tensor_of
+from attnwarp.editing.editor import MOST_GUIDANCE, Guide, Latent, check_networks, tensor_of
 
 
 class InstructPix2Pix(Latent):
@@ -40,6 +40,8 @@ class InstructPix2Pix(Latent):
         image_guidance: float = 1.5,
     ) -> None:
         super().__init__(unet, vae, text_encoder, tokenizer, scheduler)
+        both = ": noisy latents and the picture's; is it an InstructPix2Pix model?"
+        check_networks(unet, text_encoder, 2 * vae.config.latent_channels, "unet", both)
         check.number(text_guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "text_guidance")
         check.number(image_guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "image_guidance")
         self.text_guidance, self.image_guidance = text_guidance, image_guidance
@@ -55,10 +57,12 @@ class InstructPix2Pix(Latent):
         Raises:
             InputError: files that are missing or of another kind, by name.
         """
-        from attnwarp.editing.folder import load_parts
+        from attnwarp.editing.folder import load_parts, named
 
         device, dtype = settings.pop("device", "cpu"), settings.pop("dtype", torch.float32)
-        return cls(**load_parts(folder, device=device, dtype=dtype), **settings)
+        parts = load_parts(folder, device=device, dtype=dtype)
+        with named(folder):
+            return cls(**parts, **settings)
 
     @property
     def branches(self) -> tuple[str, ...]:
@@ -69,12 +73,6 @@ class InstructPix2Pix(Latent):
         """An edit of (H, W, 3) pictures in [0, 1] by one instruction."""
         pictures = tensor_of(guides, "guides", self.factor)
         before = self.raw_latents(pictures)  # not scaled, as the model was trained
-        channels = before.shape[1] + self.vae.config.latent_channels
-        if self.unet.config.in_channels != channels:
-            raise ValueError(
-                f"unet: takes {self.unet.config.in_channels} channels, expected {channels}: noisy"
-                " latents and the picture's; is it an InstructPix2Pix model?"
-            )
         shares = branch_shares(self.text_guidance, self.image_guidance)
         views = len(before)
         texts = self.embed([prompt, ""])

@@ -142,6 +142,11 @@ def read_preprocessing(folder: Path) -> Preprocessing:
     config = read_json(path)
     if path.name == _FILES[1]:
         config = config.get("image_processor") or {}
+        if not isinstance(config, dict):
+            raise InputError(
+                f"{path}: image_processor is {config!r}, expected an object; place the file that"
+                " was published with the weights"
+            )
     family = (
         config.get("image_processor_type")
         or config.get("feature_extractor_type")
@@ -155,11 +160,12 @@ def read_preprocessing(folder: Path) -> Preprocessing:
         raise InputError(
             f"{path}: do_pad is true, which is not supported; encoders that pad are not known here"
         )
-    rescale = (
-        float(config.get("rescale_factor", 1 / 255)) if config.get("do_rescale", True) else 1.0
-    )
     normalise = config.get("do_normalize", True)
     try:
+        factor = config.get("rescale_factor", 1 / 255)
+        if isinstance(factor, bool) or not isinstance(factor, int | float):
+            raise ValueError(f"rescale_factor is {factor!r}, expected a number")
+        rescale = float(factor) if config.get("do_rescale", True) else 1.0
         return Preprocessing(
             resize=_size(config.get("size", 224), edge=True)
             if config.get("do_resize", True)

@@ -121,6 +121,7 @@ def edit_dataset(
         segment = segments_of(by_words, words, [camera.name for camera in views.cameras])
         segments = [segment(k, to_float(image)) for k, image in enumerate(images)]
         say(_coverage(segments, views.cameras))
+        del by_words, segment  # their networks would stay beside the editor's
     by_hand = None
     if source_picture is not None:
         pixels, top = read_over_black(source_picture)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -65,6 +65,7 @@ class Source:
         branches: of the batch while it was edited.
         noise: (h, w) order of the noise that it started from, where noise sticks to the surface.
         estimates: (C, h, w) clean latents that were predicted at each step, where they are warped.
+        decoded: by step, the (3, H, W) picture of an estimate in main memory, once it was needed.
     """
 
     picture: Image
@@ -72,6 +73,7 @@ class Source:
     branches: tuple[str, ...]
     noise: Tensor | None = None
     estimates: Sequence[Tensor] = ()
+    decoded: dict[int, Tensor] = field(default_factory=dict)
 
 
 class ViewEditor:
@@ -103,6 +105,12 @@ class ViewEditor:
     ) -> None:
         self.editor, self.instruction, self.settings = editor, instruction, settings
         self.store, self.announce = store, announce
+        if (
+            settings.latents == "inversion"
+            and settings.source_prompt
+            and hasattr(editor, "check_text")
+        ):
+            editor.check_text(settings.source_prompt)
         if settings.latents == "inversion" and editor.guide != "depth":
             raise ValueError(
                 "latents: 'inversion' is made for a depth ControlNet, got InstructPix2Pix, which"
@@ -365,13 +373,18 @@ class ViewEditor:
             [] if t.sight is None else [t.sight.warp(k, picture=True) for k in range(len(sources))]
             for t in targets
         ]
-        carry = self._carry_picture if s.estimate_in == "picture" else _carry
+        pictures = s.estimate_in == "picture"
+        carry = self._carry_picture if pictures else _carry
 
         def change(number: int, x0: Tensor) -> Tensor:
             weight = s.estimate * (1 - number / max(1, s.estimate_until * s.steps))
             result = x0
             if weight > 0 and sources:
-                maps = [source.estimates[number].to(x0) for source in sources]
+                maps = [
+                    self._decoded(source, number, x0) if pictures
+                    else source.estimates[number].to(x0)
+                    for source in sources
+                ]  # fmt: skip
                 rows = [carry(own, maps, ws, weight) for own, ws in zip(x0, warps, strict=True)]
                 result = torch.stack(rows)
             if store is not None:
@@ -380,11 +393,17 @@ class ViewEditor:
 
         return change
 
+    def _decoded(self, source: Source, number: int, like: Tensor) -> Tensor:
+        """(3, H, W) of a source's estimate at a step, decoded once for all targets."""
+        if number not in source.decoded:
+            latents = source.estimates[number].to(like)
+            source.decoded[number] = self.editor.pixels(latents[None])[0].cpu()
+        return source.decoded[number].to(like.device)
+
     def _carry_picture(
-        self, own: Tensor, maps: Sequence[Tensor], warps: Sequence[SourceWarp], weight: float
+        self, own: Tensor, pictures: Sequence[Tensor], warps: Sequence[SourceWarp], weight: float
     ) -> Tensor:
-        """(C, h, w) latents of a target whose picture takes the sources', warped."""
-        pictures = [self.editor.pixels(map_[None])[0] for map_ in maps]
+        """(C, h, w) latents of a target whose picture takes the sources' (3, H, W), warped."""
         before = self.editor.pixels(own[None])
         after = _carry(before[0], pictures, warps, weight)[None]
         # What an autoencoder loses of a picture is lost in both, so that nothing changes where

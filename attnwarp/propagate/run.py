@@ -19,7 +19,7 @@ from attnwarp import check, losses
 from attnwarp.camera import Camera
 from attnwarp.digest import digest, digest_each
 from attnwarp.editing.attention import Layer, Recording
-from attnwarp.editing.editor import Editor
+from attnwarp.editing.editor import Editor, side_multiple
 from attnwarp.editing.inversion import inversion_steps
 from attnwarp.editing.schedule import FRESH_PROTOCOL, START_PROTOCOL
 from attnwarp.gaussians import Gaussians
@@ -232,7 +232,7 @@ class _Run:
         self.settings, self.backend, self.watch = settings, backend, watch
         self.warps = warps
         self.checkpoint_seconds = checkpoint_seconds
-        multiple = editor.factor * 2 ** (len(editor.unet.config.block_out_channels) - 1)
+        multiple = side_multiple(editor)
         self.sizes = [
             edit_size(camera.height, camera.width, settings.size, multiple)
             for camera in scene.cameras

@@ -146,10 +146,16 @@ def render_picture(gaussians: Gaussians, camera: Camera, near: float, backend: s
 
 
 def editor_digest(editor: Any) -> str:
-    """SHA-256 of an editor's networks, schedule and guidance."""
+    """SHA-256 of an editor's networks, schedule, guidance, and what it makes tokens of."""
     settings = ("text_guidance", "image_guidance", "guidance", "control_scale", "negative_prompt")
     # One list: numbers one after another could be read as others, 1.5 and 12 as 1.51 and 2.
     values = [type(editor).__name__, *(getattr(editor, name, None) for name in settings)]
+    # What spaces the steps, and ends them.
+    config = dict(getattr(getattr(editor, "scheduler", None), "config", {}))
+    values.append(sorted((k, repr(v)) for k, v in config.items() if not k.startswith("_")))
+    values.append(getattr(editor.vae.config, "scaling_factor", None))
+    tokenizer = getattr(editor, "tokenizer", None)
+    values.append(None if tokenizer is None else sorted(tokenizer.get_vocab().items()))
     parts: list[Any] = [values]
     parts += [editor.schedule.prediction, editor.schedule.alphas.cpu().numpy()]
     for name in ("unet", "vae", "text_encoder", "controlnet"):
