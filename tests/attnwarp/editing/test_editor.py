@@ -3,24 +3,27 @@
 import itertools
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from diffusers import DDIMScheduler
-from tiny_editors import controlnet, nearest_steps, pix2pix
+from diffusers import ControlNetModel, DDIMScheduler
+from tiny_editors import controlnet, nearest_steps, pix2pix, unet
 
 from attnwarp.editing.attention import (
     CONTROLNET_BRANCHES,
+    PIX2PIX_BRANCHES,
     RecordingPlan,
+    all_layers,
     choose_layers,
     constant,
     inject,
     record,
 )
 from attnwarp.editing.controlnet import DepthControlNet, control_image
-from attnwarp.editing.editor import edit, shared_noise
+from attnwarp.editing.editor import edit, shared_noise, side_multiple
 from attnwarp.editing.folder import load_parts
 from attnwarp.editing.pix2pix import InstructPix2Pix
 from attnwarp.editing.schedule import (
@@ -382,6 +385,7 @@ def test_a_view_that_sees_nothing_is_drawn_from_a_black_control_picture():
         ("text_encoder/model.safetensors", "lacks text_encoder/model.safetensors"),
         ("scheduler/scheduler_config.json", "lacks scheduler/scheduler_config.json"),
         ("controlnet/config.json", "lacks controlnet/config.json"),
+        ("tokenizer/tokenizer_config.json", "lacks tokenizer/tokenizer_config.json"),
     ],
 )
 def test_a_missing_file_is_named(lost, message, tmp_path):
@@ -389,6 +393,113 @@ def test_a_missing_file_is_named(lost, message, tmp_path):
     (tmp_path / lost).unlink()
     with pytest.raises(InputError, match=re.escape(message)):
         DepthControlNet.from_folder(tmp_path)
+
+
+def test_networks_that_do_not_fit_each_other_are_refused_when_their_folder_is_read(tmp_path):
+    pix2pix().save_pretrained(tmp_path / "instructions")
+    controlnet().save_pretrained(tmp_path / "plain")
+    xl = {
+        "addition_embed_type": "text_time",
+        "addition_time_embed_dim": 8,
+        "projection_class_embeddings_input_dim": 80,
+    }
+
+    def other(name, network, base="plain"):
+        """A copy of a folder of which one network is another."""
+        shutil.copytree(tmp_path / base, tmp_path / name)
+        network.save_pretrained(tmp_path / name / "unet")
+        return str(tmp_path / name)
+
+    control = f"{tmp_path / 'plain' / 'controlnet'}"
+    for place, message in (
+        (str(tmp_path / "plain"), "unet: takes 4 channels, expected 8: noisy"),
+        (f"{tmp_path / 'instructions'},{control}", "unet: takes 8 channels, expected 4; a Contr"),
+        (other("wide", unet(8, cross_attention_dim=48), "instructions"),
+         "unet: takes texts of 48 channels, and the text encoder gives 32; are both of one version"),
+        (other("xl", unet(8, **xl), "instructions"), "unet: is of Stable Diffusion XL's kind"),
+        (other("wide-base", unet(4, cross_attention_dim=48)) + f",{control}", "unet: takes texts"),
+        (other("xl-base", unet(4, **xl)) + f",{control}", "unet: is of Stable Diffusion XL's kind"),
+    ):  # fmt: skip
+        # A folder with a controlnet beside the rest is no InstructPix2Pix: asked for by its class.
+        load = load_editor if "," in place else InstructPix2Pix.from_folder
+        with pytest.raises(InputError, match=message) as caught:
+            load(place)
+        assert place.partition(",")[0] in str(caught.value)
+    wrong = ControlNetModel.from_unet(unet(4, cross_attention_dim=48))
+    wrong.save_pretrained(tmp_path / "wrong")
+    with pytest.raises(InputError, match="controlnet: takes texts of 48 channels"):
+        load_editor(f"{tmp_path / 'plain'},{tmp_path / 'wrong'}")
+
+
+def test_where_a_tokenizer_names_no_limit_the_text_encoders_is_one(tmp_path):
+    pix2pix().save_pretrained(tmp_path)
+    path = tmp_path / "tokenizer" / "tokenizer_config.json"
+    config = json.loads(path.read_text())
+    del config["model_max_length"]
+    path.write_text(json.dumps(config))
+    limitless = InstructPix2Pix.from_folder(tmp_path)
+    assert limitless.tokenizer.model_max_length > 10**9
+    with pytest.raises(ValueError, match="has .* tokens, the text encoder takes 24; shorten it"):
+        limitless.check_text("a bear " * 30)
+    # Padded to the limit, as diffusers pads.
+    assert torch.equal(limitless.embed(["a bear"]), editor_of(pix2pix()).embed(["a bear"]))
+
+
+def test_the_autoencoder_takes_one_picture_at_a_time_and_gives_what_a_batch_gives(monkeypatch):
+    editor = editor_of(pix2pix())
+    pixels = torch.rand(5, 3, H, W, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        coded = editor.vae.encode(2 * pixels - 1).latent_dist.mode()
+        latents = coded * editor.vae.config.scaling_factor
+        decoded = editor.vae.decode(coded).sample / 2 + 0.5
+    taken = []
+    for name in ("encode", "decode"):
+        own = getattr(editor.vae, name)
+        monkeypatch.setattr(
+            editor.vae, name, lambda x, own=own, **more: taken.append(len(x)) or own(x, **more)
+        )
+    assert torch.allclose(editor.raw_latents(pixels), coded, rtol=0, atol=1e-5)
+    assert torch.allclose(editor.pixels(latents), decoded, rtol=0, atol=1e-5)
+    assert taken == [1] * 10
+
+
+DEEP = {
+    "block_out_channels": (16, 16, 16, 16),
+    "down_block_types": ("CrossAttnDownBlock2D",) * 3 + ("DownBlock2D",),
+    "up_block_types": ("UpBlock2D",) + ("CrossAttnUpBlock2D",) * 3,
+}  # as Stable Diffusion's
+
+
+def test_sides_of_two_halvings_are_enough_for_stable_diffusions_three():
+    """Oracle: diffusers' pipeline on latents of 12 x 20, whose last level is padded from 1.5 x 2.5
+    to 2 x 3.
+    """
+    pipe = pix2pix()
+    pipe.register_modules(unet=unet(8, **DEEP))
+    editor = editor_of(pipe)
+    assert side_multiple(editor) == 2 * 4  # its autoencoder halves once
+    assert side_multiple(editor_of(pix2pix())) == 2 * 2
+    guide = np.random.default_rng(3).uniform(size=(24, 40, 3)).astype(np.float32)
+    noise = torch.randn((1, 4, 12, 20), generator=torch.Generator().manual_seed(8))
+    theirs = pipe(
+        "a bear", image=tensor(guide), num_inference_steps=3, guidance_scale=7.5, image_guidance_scale=1.5,
+        latents=noise, output_type="np",
+    ).images[0]  # fmt: skip
+    settings = {"text_guidance": 7.5, "image_guidance": 1.5}
+    plain = edit(editor_of(pipe, **settings), [guide], "a bear", steps=3, noise=noise)
+    assert np.abs(plain.images[0] - theirs).max() < 1e-5
+    # Features of every layer are recorded and injected at such a size, the odd ones among them.
+    layers = all_layers(editor.unet)
+    assert {layer.size((12, 20)) for layer in layers} == {(12, 20), (6, 10), (3, 5), (2, 3)}
+    plan = RecordingPlan(layers, (12, 20), PIX2PIX_BRANCHES, ("text", "image"), 3)
+    with record(pipe.unet, plan) as recording:
+        edit(editor, [guide], "a bear", steps=3, noise=noise)
+    for layer in layers:
+        features = recording.features(editor.timesteps(3)[0], layer, "text")
+        assert features.shape == (1, np.prod(layer.size((12, 20))), 16)
+    with inject(pipe.unet, recording, branches=PIX2PIX_BRANCHES, weight=constant(1.0)):
+        again = edit(editor, [guide], "a bear", steps=3, noise=noise)
+    assert torch.equal(again.latents, edit(editor, [guide], "a bear", steps=3, noise=noise).latents)
 
 
 def test_weights_that_lack_a_tensor_are_refused_and_not_filled_with_random_numbers(tmp_path):

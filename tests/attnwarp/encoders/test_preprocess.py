@@ -144,6 +144,8 @@ def test_the_part_of_a_newer_file_is_found(tmp_path):
         ('{"resample": 9}', "resample 9 is not known"),
         ('{"image_mean": [0.5]}', "not one number for each of three channels"),
         ('{"do_pad": true}', "do_pad is true, which is not supported"),
+        ('{"rescale_factor": "1/255"}', "rescale_factor is '1/255', expected a number"),
+        ('{"rescale_factor": null}', "rescale_factor is None, expected a number"),
     ],
 )
 def test_a_file_that_is_not_understood_is_refused_by_name(tmp_path, said, complaint):
@@ -152,3 +154,11 @@ def test_a_file_that_is_not_understood_is_refused_by_name(tmp_path, said, compla
     with pytest.raises(InputError, match=complaint) as caught:
         read_preprocessing(tmp_path)
     assert str(tmp_path) in str(caught.value)
+
+
+def test_a_part_of_a_newer_file_that_is_no_object_is_refused_by_name(tmp_path):
+    (tmp_path / "processor_config.json").write_text('{"image_processor": "CLIPImageProcessor"}')
+    with pytest.raises(
+        InputError, match="image_processor is 'CLIPImageProcessor', expected an obj"
+    ):
+        read_preprocessing(tmp_path)

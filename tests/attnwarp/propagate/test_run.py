@@ -1172,6 +1172,32 @@ def test_one_more_pass_of_the_network_is_run_for_no_further_source(scene, editor
     assert rows == result.counters["network_rows"] == 5 * 2 * 3
 
 
+def test_an_estimate_of_a_source_is_decoded_once_for_all_that_take_it(scene, editor, monkeypatch):
+    decoded = 0
+    decode = editor.vae.decode
+
+    def count(latents, **more):
+        nonlocal decoded
+        decoded += len(latents)
+        return decode(latents, **more)
+
+    monkeypatch.setattr(editor.vae, "decode", count)
+    settings = replace(
+        QUICK, stages=1, views_per_stage=4, iterations=0, **ALL_IDEAS, estimate_in="picture"
+    )
+    assert (settings.steps, settings.sources, len(scene[1])) == (2, 3, 5)
+    run(scene, editor, settings=settings)
+    steps = sum(1 - k / (settings.estimate_until * settings.steps) > 0 for k in range(2))
+    # Each of three sources once a step, each view but the first once a step, and five pictures.
+    assert decoded == steps * (3 + 4) + 5
+
+
+def test_a_source_prompt_that_is_too_long_is_refused_before_any_work(scene, depth_editor):
+    settings = quick("corrected", latents="inversion", source_prompt="a bear " * 40)
+    with pytest.raises(ValueError, match="tokens, the text encoder takes .*; shorten it"):
+        run(scene, depth_editor, None, settings, watch=lambda step: pytest.fail("work was done"))
+
+
 def test_with_every_idea_a_killed_run_gives_the_same_bytes(extended, scene, editor, tmp_path):
     settings = replace(QUICK, **ALL_IDEAS)
     moment = int(np.random.default_rng(0).integers(5, 60))

@@ -77,3 +77,26 @@ def test_editors_of_other_guidance_have_other_digests_where_their_digits_read_al
         for text, image in ((1.5, 12), (1.51, 2), (15, 12))
     }
     assert len(digests) == 3
+
+
+def test_editors_of_another_schedule_scale_or_vocabulary_have_other_digests(tmp_path):
+    pix2pix().save_pretrained(tmp_path)
+    first = editor_digest(InstructPix2Pix.from_folder(tmp_path))
+    assert editor_digest(InstructPix2Pix.from_folder(tmp_path)) == first
+    for name, change in (
+        ("scheduler/scheduler_config.json", {"timestep_spacing": "trailing"}),
+        ("scheduler/scheduler_config.json", {"steps_offset": 0}),
+        ("vae/config.json", {"scaling_factor": 0.5}),
+    ):
+        path = tmp_path / name
+        before = path.read_text()
+        path.write_text(json.dumps({**json.loads(before), **change}))
+        assert editor_digest(InstructPix2Pix.from_folder(tmp_path)) != first, change
+        path.write_text(before)
+    path = tmp_path / "tokenizer" / "tokenizer.json"
+    words = json.loads(path.read_text())
+    vocabulary = words["model"]["vocab"]
+    one, other = sorted(vocabulary)[:2]
+    vocabulary[one], vocabulary[other] = vocabulary[other], vocabulary[one]
+    path.write_text(json.dumps(words))
+    assert editor_digest(InstructPix2Pix.from_folder(tmp_path)) != first
