@@ -31,6 +31,16 @@ EXTRAS = {
 """The extras of pyproject.toml -> the modules that each brings and the plain package lacks."""
 
 
+def install_command(*extras: str) -> str:
+    """What installs extras. The package is not published, so a checkout is what there is.
+
+    Example:
+        >>> print(install_command("edit", "eval"))
+        in the checkout: pip install -c constraints.txt '.[edit,eval]'
+    """
+    return f"in the checkout: pip install -c constraints.txt '.[{','.join(extras)}]'"
+
+
 class InputError(ValueError):
     """An input that cannot be used. The message names the file, what came, what was expected, and
     the remedy.
@@ -47,8 +57,8 @@ class MissingExtraError(InputError):
 
     def __init__(self, module: str, extra: str) -> None:
         super().__init__(
-            f"needs the package {module}, which comes with the extra {extra!r}:"
-            f" pip install 'attnwarp[{extra}]'"
+            f"needs the package {module}, which comes with the extra {extra!r};"
+            f" {install_command(extra)}"
         )
         self.module = module
         self.extra = extra
@@ -58,8 +68,9 @@ def missing_extra(error: ImportError) -> MissingExtraError | None:
     """The error to show instead of a failed import; None if no extra brings the module.
 
     Example:
-        >>> print(missing_extra(ModuleNotFoundError(name="diffusers")))
-        needs the package diffusers, which comes with the extra 'edit': pip install 'attnwarp[edit]'
+        >>> error = missing_extra(ModuleNotFoundError(name="diffusers"))
+        >>> print(str(error).partition(";")[0])
+        needs the package diffusers, which comes with the extra 'edit'
     """
     module = (error.name or "").partition(".")[0]
     extra = next((extra for extra, modules in EXTRAS.items() if module in modules), None)

@@ -11,6 +11,7 @@ import typer
 
 from attnwarp.cli.options import DataArgument
 from attnwarp.cli.shell import fail
+from attnwarp.errors import install_command
 
 
 def inspect(
@@ -24,7 +25,7 @@ def inspect(
     from importlib.util import find_spec
 
     if find_spec("attnwarp_eval") is None:
-        raise fail("inspect: needs the package attnwarp_eval: pip install 'attnwarp[inspect]'")
+        raise fail(f"inspect: needs the package attnwarp_eval; {install_command('inspect')}")
     # The library does not import the instrument: this process becomes its command.
     command = [sys.executable, "-m", "attnwarp_eval.cli.main", "inspect", str(splats)]
     os.execv(sys.executable, [*command, "--data", str(data), *context.args])

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from attnwarp.encoders._weights import device_of
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, install_command
 
 WEIGHTS = ("diffusion_pytorch_model", "model", "pytorch_model")
 ENDINGS = {None: (".safetensors", ".bin"), "fp16": (".fp16.safetensors",)}
@@ -27,7 +27,7 @@ def require_diffusers() -> None:
         import diffusers  # noqa: F401
     except ImportError:
         raise InputError(
-            "editors need diffusers, which is not installed: pip install 'attnwarp[edit]'"
+            f"editors need diffusers, which is not installed; {install_command('edit')}"
         ) from None
 
 

@@ -27,6 +27,7 @@ import os
 
 import torch
 
+from attnwarp.errors import install_command
 from attnwarp.render import harmonics, reference
 from attnwarp.render.interface import Inputs, Outputs
 
@@ -40,7 +41,7 @@ def reason_not() -> str | None:
     if not torch.cuda.is_available():
         return "needs a GPU that torch can see"
     if importlib.util.find_spec("gsplat") is None:
-        return "needs gsplat (pip install 'attnwarp[gpu]')"
+        return f"needs gsplat; {install_command('gpu')}"
     return None
 
 
@@ -75,7 +76,7 @@ def render(inputs: Inputs) -> Outputs:
     refuse(inputs)
     reason = reason_not()
     if reason is not None:
-        raise RuntimeError(f"backend: 'cuda' {reason}; use backend 'cpu'")
+        raise RuntimeError(f"backend: 'cuda' {reason}; or use backend 'cpu'")
     return composite(inputs, rasterize)
 
 

@@ -18,6 +18,7 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Literal
 
+from attnwarp.errors import EXTRAS, install_command
 from attnwarp.process import core_count
 
 State = Literal["ok", "lack", "broken"]
@@ -89,8 +90,6 @@ LACKS = {
 
 def extras() -> Check:
     """The optional packages."""
-    from attnwarp.errors import EXTRAS
-
     missing = {
         extra: [module for module in modules if util.find_spec(module) is None]
         for extra, modules in EXTRAS.items()
@@ -104,7 +103,7 @@ def extras() -> Check:
         "broken" if "eval" in lacking else "lack",
         f"extras that are not installed: {named}",
         "; ".join(f"{extra}: {LACKS[extra]}" for extra in lacking),
-        f"pip install 'attnwarp[{','.join(lacking)}]'",
+        install_command(*lacking),
     )
 
 
@@ -203,7 +202,7 @@ print("works" if abs(distance - 2) < 1e-5 else f"a distance of {distance}, expec
         "broken",
         "Open3D casts no rays",
         f"no truth, so nothing can be measured: {problem or printed}",
-        "apt install libegl1 libgl1 libx11-6 libgomp1, or install attnwarp[eval] again",
+        f"apt install libegl1 libgl1 libx11-6 libgomp1, or again {install_command('eval')}",
     )
 
 
@@ -226,7 +225,7 @@ def pictures() -> Check:
             "broken",
             f"Mitsuba does not start with {variant}",
             f"no true picture can be made: {problem or printed}",
-            "apt install libatomic1, or install attnwarp[eval] again",
+            f"apt install libatomic1, or again {install_command('eval')}",
         )
     if chosen:
         return Check("true pictures", "ok", f"Mitsuba {version}, {variant} by ATTNWARP_MITSUBA")
@@ -247,7 +246,7 @@ def window() -> Check:
             "lack",
             "PyVista is not installed",
             "attnwarp-eval inspect does not run",
-            "pip install 'attnwarp[inspect]'",
+            install_command("inspect"),
         )
     program = """
 import pyvista
@@ -303,7 +302,7 @@ print(json.dumps([torch.__version__, torch.version.cuda, names]))
             "lack",
             f"{', '.join(names)}, CUDA {cuda}, without gsplat",
             "splats are rendered on the processor; editors use the GPU",
-            "pip install 'attnwarp[gpu]'",
+            install_command("gpu"),
         )
     driver = shutil.which("nvidia-smi") is not None
     return Check(

@@ -115,7 +115,7 @@ def test_it_says_why_it_cannot_run(make_camera, make_splats, monkeypatch) -> Non
     solid = make_splats(3, "3d", 5, camera)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(
-        RuntimeError, match="backend: 'cuda' needs a GPU that torch can see; use backend 'cpu'"
+        RuntimeError, match="backend: 'cuda' needs a GPU that torch can see; or use backend 'cpu'"
     ):
         render(solid, camera, backend="cuda", depth="center")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
