@@ -8,6 +8,7 @@ import torch
 
 from attnwarp.baselines import METHODS, Baseline
 from attnwarp.baselines.settings import BaselineSettings, Budget
+from attnwarp.editing.editor import own_size
 from attnwarp.editing.small import check_instruction, load_editor, thread_count
 from attnwarp.fit import load_views
 from attnwarp.gaussians import Gaussians
@@ -54,7 +55,7 @@ def edit_dataset(
     check_instruction(editor_name, editor, instruction)
     torch.set_num_threads(thread_count(editor, threads))
     if settings.size is None:
-        settings = settings.changed(size=editor.unet.config.sample_size * editor.factor)
+        settings = settings.changed(size=own_size(editor))
     with progress_display(title=out.name) as watch:
         return METHODS[method](
             splats,

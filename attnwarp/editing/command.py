@@ -105,7 +105,7 @@ def edit_image(
     import numpy as np
     import torch
 
-    from attnwarp.editing.editor import edit, side_multiple
+    from attnwarp.editing.editor import edit, own_size, side_multiple
     from attnwarp.editing.segment import load_segmenter
     from attnwarp.editing.small import check_instruction, load_editor, thread_count
 
@@ -114,7 +114,7 @@ def edit_image(
     model = load_editor(editor, device=device, **given)
     check_instruction(editor, model, instruction)
     torch.set_num_threads(thread_count(model, threads))
-    longest = size or model.unet.config.sample_size * model.factor
+    longest = size or own_size(model)
     image = _fit(image, longest, side_multiple(model))
     h, w = image.shape[:2]
     share = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,15 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.editing.attention import CONTROLNET_BRANCHES
-from attnwarp.editing.editor import MOST_GUIDANCE, Guide, Image, Latent, check_networks, tensor_of
+from attnwarp.editing.editor import (
+    LATENT_CHANNELS,
+    MOST_GUIDANCE,
+    Guide,
+    Image,
+    Latent,
+    check_networks,
+    tensor_of,
+)
 
 
 def control_image(depth: npt.NDArray[Any]) -> Image:
@@ -36,6 +44,33 @@ def control_image(depth: npt.NDArray[Any]) -> Image:
         raise ValueError(f"depth: got {depth[defined].min():g}, expected positive numbers")
     near = np.where(defined, 1 / (np.where(defined, depth, 1) + 1e-5), 0)
     return np.repeat((near / near.max())[..., None], 3, axis=2).astype(np.float32)
+
+
+def check_base(
+    unet: Mapping[str, Any], text_encoder: Mapping[str, Any], vae: Mapping[str, Any]
+) -> None:
+    """Refuse configurations that are not of one plain Stable Diffusion.
+
+    Raises:
+        ValueError: see :func:`attnwarp.editing.editor.check_networks`.
+    """
+    hint = (
+        "; a ControlNet goes with a plain model, which takes no picture, mask or depth map besides"
+    )
+    channels = vae.get("latent_channels", LATENT_CHANNELS)
+    check_networks(unet, text_encoder, channels, "unet", hint)
+
+
+def check_controlnet(
+    controlnet: Mapping[str, Any], text_encoder: Mapping[str, Any], vae: Mapping[str, Any]
+) -> None:
+    """Refuse a ControlNet's configuration that does not fit the base model's.
+
+    Raises:
+        ValueError: see :func:`attnwarp.editing.editor.check_networks`.
+    """
+    channels = vae.get("latent_channels", LATENT_CHANNELS)
+    check_networks(controlnet, text_encoder, channels, "controlnet")
 
 
 class DepthControlNet(Latent):
@@ -66,10 +101,9 @@ class DepthControlNet(Latent):
         negative_prompt: str = "",
     ) -> None:
         super().__init__(unet, vae, text_encoder, tokenizer, scheduler)
-        channels = vae.config.latent_channels
-        plain = "; a ControlNet takes a plain model, not InstructPix2Pix's"
-        check_networks(unet, text_encoder, channels, "unet", plain)
-        check_networks(controlnet, text_encoder, channels, "controlnet")
+        words = text_encoder.config.to_dict()
+        check_base(unet.config, words, vae.config)
+        check_controlnet(controlnet.config, words, vae.config)
         check.number(guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "guidance")
         self.controlnet = controlnet.eval().requires_grad_(False)
         self.guidance, self.control_scale = guidance, control_scale
@@ -89,14 +123,19 @@ class DepthControlNet(Latent):
         Raises:
             InputError: files that are missing or of another kind, by name.
         """
-        from attnwarp.editing.folder import load_controlnet, load_parts, named
+        from attnwarp.editing.folder import config_of, load_controlnet, load_parts, named
 
         device, dtype = settings.pop("device", "cpu"), settings.pop("dtype", torch.float32)
-        parts = load_parts(folder, device=device, dtype=dtype)
-        place = Path(folder) / "controlnet" if controlnet is None else controlnet
-        control = load_controlnet(place, device=device, dtype=dtype)
+        place = Path(folder) / "controlnet" if controlnet is None else Path(controlnet)
+        # Before any weights: those of a large model might not fit the memory.
+        words, vae = config_of(folder, "text_encoder"), config_of(folder, "vae")
         with named(folder):
-            return cls(**parts, controlnet=control, **settings)
+            check_base(config_of(folder, "unet"), words, vae)
+        with named(place):
+            check_controlnet(config_of(place.parent, place.name), words, vae)
+        parts = load_parts(folder, device=device, dtype=dtype)
+        control = load_controlnet(place, device=device, dtype=dtype)
+        return cls(**parts, controlnet=control, **settings)
 
     @property
     def branches(self) -> tuple[str, ...]:

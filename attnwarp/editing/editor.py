@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +21,9 @@ Image = npt.NDArray[np.float32]
 Guide = Literal["picture", "depth"]
 
 STEPS = 20
+
+LATENT_CHANNELS = 4
+"""Of Stable Diffusion, where an autoencoder's configuration names none."""
 
 MOST_GUIDANCE = 1000.0
 """Bound of guidance weights; those in use are below 20."""
@@ -265,32 +268,50 @@ def side_multiple(editor: Any) -> int:
     return int(editor.factor * 2 ** min(2, halvings))
 
 
+def own_size(editor: Any) -> int:
+    """Longest side in px of the pictures that an editor was made for; 64 latents where its UNet
+    names none.
+    """
+    size = getattr(editor.unet.config, "sample_size", None) or 64
+    return int((max(size) if isinstance(size, list | tuple) else size) * editor.factor)
+
+
 def check_networks(
-    network: Any, text_encoder: Any, channels: int, name: str, hint: str = ""
+    network: Mapping[str, Any],
+    text_encoder: Mapping[str, Any],
+    channels: int,
+    name: str,
+    hint: str = "",
 ) -> None:
-    """Refuse networks that do not fit each other, before anything is computed with them.
+    """Refuse networks that do not fit each other, by their configurations.
 
     Args:
-        network: a UNet or a ControlNet.
+        network: of a UNet or a ControlNet.
         text_encoder: of the same model.
         channels: that the network has to take.
         name: of the network, for the message.
         hint: what takes so many channels, for the message.
 
     Raises:
-        ValueError: another number of channels, texts of another size, or a model of SDXL's kind.
+        ValueError: another number of channels, texts of another size, or a model that takes more
+            than a text.
     """
-    if getattr(network.config, "addition_embed_type", None) is not None:
+    if network.get("addition_embed_type") is not None:
         raise ValueError(
             f"{name}: is of Stable Diffusion XL's kind, which takes more than a text; expected"
             " Stable Diffusion 1 or 2"
         )
-    takes = network.config.in_channels
+    classes = ("class_embed_type", "num_class_embeds")
+    if any(network.get(key) is not None for key in classes):
+        raise ValueError(
+            f"{name}: takes a class or a picture's embedding beside the text, as unCLIP and"
+            " upscalers do; expected Stable Diffusion 1 or 2"
+        )
+    takes = network.get("in_channels", channels)
     if takes != channels:
         raise ValueError(f"{name}: takes {takes} channels, expected {channels}{hint}")
-    wanted = getattr(network.config, "cross_attention_dim", None)
-    has = getattr(text_encoder.config, "hidden_size", None)
-    projected = getattr(network.config, "encoder_hid_dim", None) is not None
+    wanted, has = network.get("cross_attention_dim"), text_encoder.get("hidden_size")
+    projected = network.get("encoder_hid_dim") is not None
     if isinstance(wanted, int) and has is not None and not projected and wanted != has:
         raise ValueError(
             f"{name}: takes texts of {wanted} channels, and the text encoder gives {has}; are both"

@@ -69,10 +69,7 @@ def load_parts(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -
 
     def model(name: str, *kinds: Any) -> Any:
         place = folder / name
-        with readable(place):
-            wanted = json.loads((place / "config.json").read_text()).get("_class_name", "")
-        kind = next((k for k in kinds if k.__name__ == wanted), kinds[0])
-        return load_network(kind, place, device, dtype)
+        return load_network(class_of(place, *kinds), place, device, dtype)
 
     parts = {
         "unet": model("unet", UNet2DConditionModel, EditUNet),
@@ -102,7 +99,7 @@ def load_controlnet(folder: str | Path, *, device: str = "cpu", dtype: torch.dty
 
     from diffusers import ControlNetModel
 
-    return load_network(ControlNetModel, folder, device, dtype)
+    return load_network(class_of(folder, ControlNetModel), folder, device, dtype)
 
 
 def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> Any:
@@ -143,6 +140,36 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
             f"{f' and {len(damaged) - 1} more' if len(damaged) > 1 else ''}; fetch the model again"
         )
     return network.to(device)
+
+
+def config_of(folder: str | Path, name: str) -> dict[str, Any]:
+    """The configuration of a network in a folder; empty where it is missing, which loading says.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    place = Path(folder) / name
+    path = place / "config.json"
+    if not path.is_file():
+        return {}
+    with readable(place):
+        config = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(config, dict):
+        raise InputError(f"{path}: holds {config!r:.40}, expected an object; fetch the model again")
+    return config
+
+
+def class_of(folder: Path, *kinds: Any) -> Any:
+    """The class of a network in a folder, by its configuration; the first where that names none.
+
+    Raises:
+        InputError: another class.
+    """
+    wanted = config_of(folder.parent, folder.name).get("_class_name")
+    names = [kind.__name__ for kind in kinds]
+    if wanted is not None and wanted not in names:
+        raise InputError(f"{folder}: is of the class {wanted!r}, expected {' or '.join(names)}")
+    return kinds[0] if wanted is None else kinds[names.index(wanted)]
 
 
 @contextmanager

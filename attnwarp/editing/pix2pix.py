@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,27 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.editing.attention import PIX2PIX_BRANCHES
-from attnwarp.editing.editor import MOST_GUIDANCE, Guide, Latent, check_networks, tensor_of
+from attnwarp.editing.editor import (
+    LATENT_CHANNELS,
+    MOST_GUIDANCE,
+    Guide,
+    Latent,
+    check_networks,
+    tensor_of,
+)
+
+
+def check_pix2pix(
+    unet: Mapping[str, Any], text_encoder: Mapping[str, Any], vae: Mapping[str, Any]
+) -> None:
+    """Refuse configurations that are not of one InstructPix2Pix model.
+
+    Raises:
+        ValueError: see :func:`attnwarp.editing.editor.check_networks`.
+    """
+    hint = ": noisy latents and the picture's; is it an InstructPix2Pix model?"
+    channels = 2 * vae.get("latent_channels", LATENT_CHANNELS)
+    check_networks(unet, text_encoder, channels, "unet", hint)
 
 
 class InstructPix2Pix(Latent):
@@ -40,8 +60,7 @@ class InstructPix2Pix(Latent):
         image_guidance: float = 1.5,
     ) -> None:
         super().__init__(unet, vae, text_encoder, tokenizer, scheduler)
-        both = ": noisy latents and the picture's; is it an InstructPix2Pix model?"
-        check_networks(unet, text_encoder, 2 * vae.config.latent_channels, "unet", both)
+        check_pix2pix(unet.config, text_encoder.config.to_dict(), vae.config)
         check.number(text_guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "text_guidance")
         check.number(image_guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "image_guidance")
         self.text_guidance, self.image_guidance = text_guidance, image_guidance
@@ -57,12 +76,13 @@ class InstructPix2Pix(Latent):
         Raises:
             InputError: files that are missing or of another kind, by name.
         """
-        from attnwarp.editing.folder import load_parts, named
+        from attnwarp.editing.folder import config_of, load_parts, named
 
         device, dtype = settings.pop("device", "cpu"), settings.pop("dtype", torch.float32)
-        parts = load_parts(folder, device=device, dtype=dtype)
+        # Before any weights: those of a large model might not fit the memory.
         with named(folder):
-            return cls(**parts, **settings)
+            check_pix2pix(*(config_of(folder, name) for name in ("unet", "text_encoder", "vae")))
+        return cls(**load_parts(folder, device=device, dtype=dtype), **settings)
 
     @property
     def branches(self) -> tuple[str, ...]:

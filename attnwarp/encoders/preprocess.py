@@ -7,6 +7,7 @@ pipelines round to 8 bits before and after it, which would turn differences belo
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -162,10 +163,13 @@ def read_preprocessing(folder: Path) -> Preprocessing:
         )
     normalise = config.get("do_normalize", True)
     try:
-        factor = config.get("rescale_factor", 1 / 255)
-        if isinstance(factor, bool) or not isinstance(factor, int | float):
-            raise ValueError(f"rescale_factor is {factor!r}, expected a number")
-        rescale = float(factor) if config.get("do_rescale", True) else 1.0
+        rescale = 1.0
+        if config.get("do_rescale", True):
+            factor = config.get("rescale_factor", 1 / 255)
+            number = isinstance(factor, int | float) and not isinstance(factor, bool)
+            if not number or not 0 < factor < math.inf:
+                raise ValueError(f"rescale_factor is {factor!r}, expected a number above 0")
+            rescale = float(factor)
         return Preprocessing(
             resize=_size(config.get("size", 224), edge=True)
             if config.get("do_resize", True)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp.camera import Camera
+from attnwarp.editing.editor import own_size
 from attnwarp.editing.segment import load_segmenter, segments_of
 from attnwarp.editing.small import check_instruction, load_editor, thread_count
 from attnwarp.errors import InputError, suggest
@@ -130,7 +131,7 @@ def edit_dataset(
         # Again in the edit, but here before a fit spends its minutes.
         check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
     if settings.size is None:
-        settings = replace(settings, size=editor.unet.config.sample_size * editor.factor)
+        settings = replace(settings, size=own_size(editor))
     if splats is None:
         # So are settings that the editor or the tuning cannot use.
         ViewEditor(editor, instruction, settings)

@@ -35,9 +35,10 @@ FORMAT = 2
 """Raised when a folder's files change meaning; older folders are then refused. 2: records have the
 hash of their picture, and the editor's hash tells all guidance apart."""
 
-PROTOCOL = 2
+PROTOCOL = 3
 """Raised when the same settings come to edit views otherwise, so that no folder mixes both. 2:
-warps and depth have the pictures' near plane, and ``mask=False`` leaves out what has no depth.
+warps and depth have the pictures' near plane, and ``mask=False`` leaves out what has no depth. 3:
+sides of pictures are multiples of two halvings of the latents, 32 px for Stable Diffusion.
 """
 
 MANIFEST = "manifest.json"

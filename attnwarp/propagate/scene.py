@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -150,16 +151,37 @@ def editor_digest(editor: Any) -> str:
     settings = ("text_guidance", "image_guidance", "guidance", "control_scale", "negative_prompt")
     # One list: numbers one after another could be read as others, 1.5 and 12 as 1.51 and 2.
     values = [type(editor).__name__, *(getattr(editor, name, None) for name in settings)]
-    # What spaces the steps, and ends them.
-    config = dict(getattr(getattr(editor, "scheduler", None), "config", {}))
-    values.append(sorted((k, repr(v)) for k, v in config.items() if not k.startswith("_")))
-    values.append(getattr(editor.vae.config, "scaling_factor", None))
-    tokenizer = getattr(editor, "tokenizer", None)
-    values.append(None if tokenizer is None else sorted(tokenizer.get_vocab().items()))
-    parts: list[Any] = [values]
-    parts += [editor.schedule.prediction, editor.schedule.alphas.cpu().numpy()]
+    schedule = editor.schedule
+    # How the model's scheduler spaces its steps shows in a few numbers of them.
+    spacing = [editor.timesteps(n) for n in (1, 2, 7, 20) if n < len(schedule.alphas)]
+    values += [schedule.prediction, schedule.final_alpha, spacing, _tokens(editor)]
+    parts: list[Any] = [values, schedule.alphas.cpu().numpy()]
     for name in ("unet", "vae", "text_encoder", "controlnet"):
         network = getattr(editor, name, None)
+        parts.append(_configuration(network))
         for key, value in sorted(network.state_dict().items()) if network is not None else ():
             parts += [key, value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy()]
     return digest(*parts)
+
+
+def _configuration(network: Any) -> list[tuple[str, str]]:
+    """What a network's configuration says beside where it came from and what wrote it."""
+    config = getattr(network, "config", {})
+    # transformers' configurations have hundreds of defaults, which its versions change.
+    said = config.to_diff_dict() if hasattr(config, "to_diff_dict") else dict(config)
+    about = ("architectures", "dtype", "torch_dtype", "transformers_version")
+    return sorted((k, repr(v)) for k, v in said.items() if k not in about and k[0] != "_")
+
+
+def _tokens(editor: Any) -> Any:
+    """What makes tokens of a text: vocabulary, merges, rules, what pads it, and to which length."""
+    tokenizer = getattr(editor, "tokenizer", None)
+    if tokenizer is None:
+        return None
+    padding = [tokenizer.pad_token_id, getattr(editor, "text_limit", None)]
+    backend = getattr(tokenizer, "backend_tokenizer", None)
+    if backend is None:
+        return [padding, sorted(tokenizer.get_vocab().items())]
+    said = json.loads(backend.to_str())
+    # What its last call padded and cut to stands there too.
+    return [padding, {k: v for k, v in said.items() if k not in ("padding", "truncation")}]

@@ -255,6 +255,7 @@ def _edit(
     import torch
 
     from attnwarp.baselines import Budget
+    from attnwarp.editing.editor import own_size
 
     variant = study.variants[name]
     own = variant.part(editing.VariantPart)
@@ -262,7 +263,7 @@ def _edit(
         editing.settings_of(study, variant, study.seeds[0]), words.source or ""
     )
     if settings.get("size") is None:
-        settings["size"] = editor.unet.config.sample_size * editor.factor
+        settings["size"] = own_size(editor)
     budget = None
     if own.budget is not None:
         limit = own.budget.seconds

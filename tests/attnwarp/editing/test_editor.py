@@ -23,7 +23,7 @@ from attnwarp.editing.attention import (
     record,
 )
 from attnwarp.editing.controlnet import DepthControlNet, control_image
-from attnwarp.editing.editor import edit, shared_noise, side_multiple
+from attnwarp.editing.editor import edit, own_size, shared_noise, side_multiple
 from attnwarp.editing.folder import load_parts
 from attnwarp.editing.pix2pix import InstructPix2Pix
 from attnwarp.editing.schedule import (
@@ -414,6 +414,8 @@ def test_networks_that_do_not_fit_each_other_are_refused_when_their_folder_is_re
     for place, message in (
         (str(tmp_path / "plain"), "unet: takes 4 channels, expected 8: noisy"),
         (f"{tmp_path / 'instructions'},{control}", "unet: takes 8 channels, expected 4; a Contr"),
+        (other("inpainting", unet(9)) + f",{control}", "unet: takes 9 channels, expected 4; a Con"),
+        (other("unclip", unet(4, class_embed_type="timestep")) + f",{control}", "unet: takes a cl"),
         (other("wide", unet(8, cross_attention_dim=48), "instructions"),
          "unet: takes texts of 48 channels, and the text encoder gives 32; are both of one version"),
         (other("xl", unet(8, **xl), "instructions"), "unet: is of Stable Diffusion XL's kind"),
@@ -427,8 +429,34 @@ def test_networks_that_do_not_fit_each_other_are_refused_when_their_folder_is_re
         assert place.partition(",")[0] in str(caught.value)
     wrong = ControlNetModel.from_unet(unet(4, cross_attention_dim=48))
     wrong.save_pretrained(tmp_path / "wrong")
-    with pytest.raises(InputError, match="controlnet: takes texts of 48 channels"):
+    with pytest.raises(InputError, match="wrong: controlnet: takes texts of 48 channels"):
         load_editor(f"{tmp_path / 'plain'},{tmp_path / 'wrong'}")
+
+
+@pytest.mark.parametrize("name", ["unet", "vae", "controlnet"])
+def test_a_network_of_another_class_is_refused_by_its_name(name, tmp_path):
+    controlnet().save_pretrained(tmp_path)
+    path = tmp_path / name / "config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "_class_name": "Another"}))
+    with pytest.raises(InputError, match=f"{name}: is of the class 'Another', expected"):
+        load_editor(str(tmp_path))
+
+
+def test_networks_are_refused_before_their_weights_are_read(tmp_path):
+    pix2pix().save_pretrained(tmp_path)
+    path = tmp_path / "unet" / "config.json"
+    config = {**json.loads(path.read_text()), "addition_embed_type": "text_time"}
+    path.write_text(json.dumps(config))
+    (tmp_path / "unet" / "diffusion_pytorch_model.safetensors").write_bytes(b"none can be read")
+    with pytest.raises(InputError, match="is of Stable Diffusion XL's kind"):
+        InstructPix2Pix.from_folder(tmp_path)
+
+
+@pytest.mark.parametrize(("said", "size"), [(8, 16), ([6, 10], 20), (None, 128)])
+def test_an_editors_own_size_is_that_of_its_longest_side(said, size):
+    editor = editor_of(pix2pix())
+    editor.unet.register_to_config(sample_size=said)
+    assert own_size(editor) == size  # its autoencoder halves once
 
 
 def test_where_a_tokenizer_names_no_limit_the_text_encoders_is_one(tmp_path):
@@ -499,7 +527,12 @@ def test_sides_of_two_halvings_are_enough_for_stable_diffusions_three():
         assert features.shape == (1, np.prod(layer.size((12, 20))), 16)
     with inject(pipe.unet, recording, branches=PIX2PIX_BRANCHES, weight=constant(1.0)):
         again = edit(editor, [guide], "a bear", steps=3, noise=noise)
-    assert torch.equal(again.latents, edit(editor, [guide], "a bear", steps=3, noise=noise).latents)
+    plain = edit(editor, [guide], "a bear", steps=3, noise=noise)
+    assert torch.equal(again.latents, plain.latents)
+    with inject(pipe.unet, recording, branches=PIX2PIX_BRANCHES, weight=constant(1.0)):
+        other = edit(editor, [1 - guide], "a bear", steps=3, noise=noise)
+    alone = edit(editor, [1 - guide], "a bear", steps=3, noise=noise)
+    assert (other.latents - alone.latents).abs().max() > 1e-3
 
 
 def test_weights_that_lack_a_tensor_are_refused_and_not_filled_with_random_numbers(tmp_path):

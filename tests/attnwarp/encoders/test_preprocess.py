@@ -146,6 +146,8 @@ def test_the_part_of_a_newer_file_is_found(tmp_path):
         ('{"do_pad": true}', "do_pad is true, which is not supported"),
         ('{"rescale_factor": "1/255"}', "rescale_factor is '1/255', expected a number"),
         ('{"rescale_factor": null}', "rescale_factor is None, expected a number"),
+        ('{"rescale_factor": NaN}', "rescale_factor is nan, expected a number above 0"),
+        ('{"rescale_factor": 0}', "rescale_factor is 0, expected a number above 0"),
     ],
 )
 def test_a_file_that_is_not_understood_is_refused_by_name(tmp_path, said, complaint):
@@ -154,6 +156,12 @@ def test_a_file_that_is_not_understood_is_refused_by_name(tmp_path, said, compla
     with pytest.raises(InputError, match=complaint) as caught:
         read_preprocessing(tmp_path)
     assert str(tmp_path) in str(caught.value)
+
+
+def test_a_factor_that_is_not_used_is_not_looked_at(tmp_path):
+    said = {"do_rescale": False, "rescale_factor": None}
+    (tmp_path / "preprocessor_config.json").write_text(json.dumps(said))
+    assert read_preprocessing(tmp_path).scale == 255  # of bytes, as they are
 
 
 def test_a_part_of_a_newer_file_that_is_no_object_is_refused_by_name(tmp_path):

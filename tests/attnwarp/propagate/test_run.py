@@ -350,7 +350,7 @@ def test_edit_psnr_counts_the_views_that_the_settings_name(finished, scene, edit
 def test_a_folder_that_was_edited_by_a_former_protocol_is_refused(scene, editor, tmp_path):
     run(scene, editor, tmp_path, replace(QUICK, stages=1, iterations=0))
     without(tmp_path, "protocol")
-    with pytest.raises(InputError, match=r"an edit of other protocol \(null, now 2\)"):
+    with pytest.raises(InputError, match=r"an edit of other protocol \(null, now 3\)"):
         run(scene, editor, tmp_path, replace(QUICK, stages=1, iterations=0))
 
 
@@ -1192,10 +1192,14 @@ def test_an_estimate_of_a_source_is_decoded_once_for_all_that_take_it(scene, edi
     assert decoded == steps * (3 + 4) + 5
 
 
-def test_a_source_prompt_that_is_too_long_is_refused_before_any_work(scene, depth_editor):
+def test_a_source_prompt_that_is_too_long_is_refused_before_any_work(
+    scene, depth_editor, monkeypatch
+):
     settings = quick("corrected", latents="inversion", source_prompt="a bear " * 40)
+    for work in ("task", "raw_latents", "embed"):
+        monkeypatch.setattr(depth_editor, work, lambda *_: pytest.fail("work was done"))
     with pytest.raises(ValueError, match="tokens, the text encoder takes .*; shorten it"):
-        run(scene, depth_editor, None, settings, watch=lambda step: pytest.fail("work was done"))
+        run(scene, depth_editor, None, settings)
 
 
 def test_with_every_idea_a_killed_run_gives_the_same_bytes(extended, scene, editor, tmp_path):

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from tiny_editors import pix2pix
 from tiny_scenes import cameras
 
 from attnwarp import Camera
+from attnwarp.editing.editor import Editor
 from attnwarp.editing.pix2pix import InstructPix2Pix
 from attnwarp.fit import Views
 from attnwarp.propagate.scene import Scene, editor_digest, images_of
@@ -87,12 +89,20 @@ def test_editors_of_another_schedule_scale_or_vocabulary_have_other_digests(tmp_
         ("scheduler/scheduler_config.json", {"timestep_spacing": "trailing"}),
         ("scheduler/scheduler_config.json", {"steps_offset": 0}),
         ("vae/config.json", {"scaling_factor": 0.5}),
+        ("vae/config.json", {"norm_num_groups": 2}),
+        ("unet/config.json", {"attention_head_dim": 8}),
+        ("text_encoder/config.json", {"hidden_act": "gelu"}),
+        ("tokenizer/tokenizer_config.json", {"pad_token": "a</w>"}),
+        ("tokenizer/tokenizer_config.json", {"model_max_length": 20}),
     ):
         path = tmp_path / name
         before = path.read_text()
         path.write_text(json.dumps({**json.loads(before), **change}))
         assert editor_digest(InstructPix2Pix.from_folder(tmp_path)) != first, change
         path.write_text(before)
+    same = tmp_path / "scheduler" / "scheduler_config.json"
+    same.write_text(json.dumps({**json.loads(same.read_text()), "thresholding": False}))
+    assert editor_digest(InstructPix2Pix.from_folder(tmp_path)) == first
     path = tmp_path / "tokenizer" / "tokenizer.json"
     words = json.loads(path.read_text())
     vocabulary = words["model"]["vocab"]
@@ -100,3 +110,15 @@ def test_editors_of_another_schedule_scale_or_vocabulary_have_other_digests(tmp_
     vocabulary[one], vocabulary[other] = vocabulary[other], vocabulary[one]
     path.write_text(json.dumps(words))
     assert editor_digest(InstructPix2Pix.from_folder(tmp_path)) != first
+
+
+def test_a_digest_does_not_change_when_texts_are_embedded_nor_need_more_than_the_protocol():
+    pipe = pix2pix()
+    own = InstructPix2Pix(pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler)
+    first = editor_digest(own)
+    own.embed(["a bear"])  # which leaves its padding in the tokenizer
+    assert editor_digest(own) == first
+    members = {name for name in vars(Editor) if name[0] != "_"} | set(Editor.__annotations__)
+    bare = SimpleNamespace(**{name: getattr(own, name) for name in members})
+    assert len(editor_digest(bare)) == 64
+    assert not hasattr(bare, "vae") and not hasattr(bare, "tokenizer")
