@@ -211,6 +211,14 @@ class ViewEditor:
             for number, (view, (h, w)) in enumerate(sources.items())
         ]
         self.announce(in_words(plans))
+        s = self.settings
+        if s.estimate_in == "picture" and s.estimate > 0:
+            kept = sum(self._estimate_weight(number) > 0 for number in range(s.steps))
+            pixels = sum(h * w for h, w in sources.values())
+            self.announce(
+                f"estimates of {len(sources)} source{'s' * (len(sources) > 1)}, as pictures of"
+                f" {kept} steps: up to {12 * kept * pixels / 2**20:.1f} MiB in main memory"
+            )
 
     def _plan(self, view: int, size: tuple[int, int], *, further: bool) -> RecordingPlan:
         """What is recorded of a source whose latents have (h, w)."""
@@ -377,7 +385,7 @@ class ViewEditor:
         carry = self._carry_picture if pictures else _carry
 
         def change(number: int, x0: Tensor) -> Tensor:
-            weight = s.estimate * (1 - number / max(1, s.estimate_until * s.steps))
+            weight = self._estimate_weight(number)
             result = x0
             if weight > 0 and sources:
                 maps = [
@@ -392,6 +400,11 @@ class ViewEditor:
             return result
 
         return change
+
+    def _estimate_weight(self, number: int) -> float:
+        """Of a source's estimate at a step, from 0; not above 0 where it is not taken."""
+        s = self.settings
+        return s.estimate * (1 - number / max(1, s.estimate_until * s.steps))
 
     def _decoded(self, source: Source, number: int, like: Tensor) -> Tensor:
         """(3, H, W) of a source's estimate at a step, decoded once for all targets."""

@@ -1182,14 +1182,21 @@ def test_an_estimate_of_a_source_is_decoded_once_for_all_that_take_it(scene, edi
         return decode(latents, **more)
 
     monkeypatch.setattr(editor.vae, "decode", count)
+    told = []
     settings = replace(
         QUICK, stages=1, views_per_stage=4, iterations=0, **ALL_IDEAS, estimate_in="picture"
     )
     assert (settings.steps, settings.sources, len(scene[1])) == (2, 3, 5)
-    run(scene, editor, settings=settings)
+    run(scene, editor, settings=settings, announce=told.append)
     steps = sum(1 - k / (settings.estimate_until * settings.steps) > 0 for k in range(2))
     # Each of three sources once a step, each view but the first once a step, and five pictures.
     assert decoded == steps * (3 + 4) + 5
+    # Three sources of 32 x 32 px, three channels in float32.
+    amount = 3 * steps * 32 * 32 * 3 * 4 / 2**20
+    (line,) = [text for text in told if text.startswith("estimates")]
+    assert line == (
+        f"estimates of 3 sources, as pictures of {steps} steps: up to {amount:.1f} MiB in main memory"
+    )
 
 
 def test_a_source_prompt_that_is_too_long_is_refused_before_any_work(
