@@ -201,6 +201,7 @@ class _Run:
                     "splats": work.frozen.digest(),
                     **work.scene.digest(),
                     "editor": editor_digest(work.editor),
+                    **self.fitting.weights,
                 },
             }
         )

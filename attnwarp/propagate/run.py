@@ -272,6 +272,7 @@ class _Run:
                     "splats": gaussians.digest(),
                     **scene.digest(),
                     "editor": editor_digest(editor),
+                    **self.tuning.weights,
                     "source_picture": None if by_hand is None else digest(by_hand),
                     **({} if warps is None else {"warps": self._warps_digest(warps)}),
                 },

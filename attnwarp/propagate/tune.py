@@ -15,7 +15,7 @@ from torch import Tensor
 
 from attnwarp import losses
 from attnwarp.camera import Camera
-from attnwarp.encoders import load_encoder
+from attnwarp.encoders import EncoderInfo, load_encoder
 from attnwarp.fit import FitSettings, extent_of
 from attnwarp.fit.checkpoint import load, save
 from attnwarp.fit.model import Model, check_on_cpu
@@ -31,6 +31,11 @@ SOURCE_EVERY = 10
 
 class PerceptualLoss(Protocol):
     """A perceptual distance with a gradient."""
+
+    @property
+    def about(self) -> EncoderInfo:
+        """Whose weights it has."""
+        ...
 
     def features(self, picture: Tensor) -> list[Tensor]:
         """What is compared of a picture (H, W, 3) in [0, 1]."""
@@ -151,6 +156,7 @@ class Tuning:
         loss: of the last iteration.
         visits: how often each view was tuned on, by its number.
         perceptual: the perceptual distance; None where no iteration takes it.
+        weights: by the loss that has them, the SHA-256 of its network's.
 
     Raises:
         InputError: no such perceptual distance.
@@ -190,6 +196,7 @@ class Tuning:
         # Here and not at its first use: before it, views are edited for hours.
         net = perceptual_net(settings)
         self.perceptual = None if net is None else DistanceToViews(net)
+        self.weights = {} if net is None else {"perceptual": net.about.weights_sha256}
 
     def gaussians(self) -> Gaussians:
         """The splats as they stand, outside autograd."""

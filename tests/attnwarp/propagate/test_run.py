@@ -6,12 +6,14 @@ import json
 import shutil
 import time
 import weakref
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import held_pictures
 import numpy as np
 import pytest
+import tiny_models
 import torch
 from edit_folders import Killed, events, files, without
 from PIL import Image
@@ -488,6 +490,19 @@ def test_a_folder_of_another_edit_is_refused_by_name(
     with pytest.raises(InputError, match=message):
         run(scene, editor, finished[1], replace(QUICK, **settings), words)
     assert files(finished[1]) == before
+
+
+def test_a_folder_that_was_tuned_by_other_weights_is_refused(scene, editor, tmp_path):
+    """The same folder of LPIPS weights, with another network in it."""
+    weights = tmp_path / "lpips"
+    weights.mkdir()
+    (weights / "alex.pth").write_bytes((tiny_models.linear_layers() / "alex.pth").read_bytes())
+    settings = replace(QUICK, stages=1, perceptual_encoder=f"lpips:{weights}")
+    refused = pytest.raises(InputError, match=r"holds an edit of other inputs\.perceptual")
+    for seed, expected in ((0, nullcontext()), (0, nullcontext()), (1, refused)):
+        tiny_models.save_backbone(weights / "alexnet-owt-7be5be79.pth", "alex", seed)
+        with expected:
+            run(scene, editor, tmp_path / "edit", settings)
 
 
 @pytest.mark.parametrize(
