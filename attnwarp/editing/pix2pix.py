@@ -29,8 +29,14 @@ def check_pix2pix(
     """Refuse configurations that are not of one InstructPix2Pix model.
 
     Raises:
-        ValueError: see :func:`attnwarp.editing.editor.check_networks`.
+        ValueError: see :func:`attnwarp.editing.editor.check_networks`; or a tiny autoencoder, whose
+            latents are scaled already, while the network takes those of a picture unscaled.
     """
+    if vae.get("_class_name") == "AutoencoderTiny":
+        raise ValueError(
+            "vae: is an AutoencoderTiny, whose latents of a picture are not those that"
+            " InstructPix2Pix was trained on; expected its own AutoencoderKL"
+        )
     hint = ": noisy latents and the picture's; is it an InstructPix2Pix model?"
     channels = 2 * vae.get("latent_channels", LATENT_CHANNELS)
     check_networks(unet, text_encoder, channels, "unet", hint)

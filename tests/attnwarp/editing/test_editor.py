@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from diffusers import ControlNetModel, DDIMScheduler
+from diffusers import AutoencoderTiny, ControlNetModel, DDIMScheduler
 from tiny_editors import controlnet, nearest_steps, pix2pix, unet
 
 from attnwarp.editing.attention import (
@@ -440,6 +440,26 @@ def test_a_network_of_another_class_is_refused_by_its_name(name, tmp_path):
     path.write_text(json.dumps({**json.loads(path.read_text()), "_class_name": "Another"}))
     with pytest.raises(InputError, match=f"{name}: is of the class 'Another', expected"):
         load_editor(str(tmp_path))
+
+
+def test_a_tiny_autoencoder_is_refused_by_pix2pix_and_taken_beside_a_controlnet(tmp_path):
+    tiny = AutoencoderTiny(
+        encoder_block_out_channels=(8, 8),
+        decoder_block_out_channels=(8, 8),
+        num_encoder_blocks=(1, 1),
+        num_decoder_blocks=(1, 1),
+    )
+    for name, pipe in (("pix2pix", pix2pix()), ("plain", controlnet())):
+        pipe.save_pretrained(tmp_path / name)
+        shutil.rmtree(tmp_path / name / "vae")
+        tiny.save_pretrained(tmp_path / name / "vae")
+    with pytest.raises(InputError, match="pix2pix: vae: is an AutoencoderTiny"):
+        load_editor(str(tmp_path / "pix2pix"))
+    editor = load_editor(str(tmp_path / "plain"))
+    latents = torch.randn(2, 4, 4, 4, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        expected = tiny.decode(latents).sample / 2 + 0.5
+    assert torch.allclose(editor.pixels(latents), expected, rtol=0, atol=1e-6)
 
 
 def test_networks_are_refused_before_their_weights_are_read(tmp_path):
