@@ -29,6 +29,13 @@ EditorOption = Annotated[
         help="A bundled editor, or a folder or two in diffusers' format.",
     ),
 ]
+PictureEditorOption = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME|FOLDER",
+        help="A bundled editor that takes pictures, or a folder in diffusers' format.",
+    ),
+]
 DeviceOption = Annotated[str, typer.Option(help="Of the editor: cpu or cuda.")]
 WhereOption = Annotated[
     str | None,
@@ -52,7 +59,7 @@ def edit_image(
     picture: Annotated[Path, typer.Argument(help="A PNG or JPEG file.")],
     instruction: InstructionOption,
     out: Annotated[Path, typer.Option(help="PNG file for the result.")],
-    editor: EditorOption = "small-plain",
+    editor: PictureEditorOption = "small-plain",
     seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 0,
     steps: Annotated[int, typer.Option(min=1, max=1000, help="Of denoising.")] = 20,
     size: Annotated[
