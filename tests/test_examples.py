@@ -117,7 +117,7 @@ def folder(tmp_path, monkeypatch):
     colors = np.full((60, 3), 128, np.uint8)
     data = Dataset(cameras, paths, points=splats.means.numpy(), colors=colors)
     write_transforms(tmp_path / "transforms.json", data)
-    for name in ("my_capture", "my-capture", "DATA"):
+    for name in ("my_capture", "my-capture", "DATA", "capture"):
         (tmp_path / name).symlink_to(tmp_path, target_is_directory=True)
     monkeypatch.chdir(tmp_path)
     return tmp_path
