@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import os
 import struct
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ import numpy.typing as npt
 
 from attnwarp import check
 from attnwarp.camera import Camera
+from attnwarp.errors import InputWarning
 from attnwarp.io.dataset import Dataset, Distorted, Missing, with_images
 from attnwarp.io.file import FileFormatError, existing_file
 from attnwarp.io.lens import Lens
@@ -107,6 +109,9 @@ def read_colmap(
         scale: 4 for the folder ``images_4`` in place of ``images``, where ``images`` is left out;
             the cameras are resized to its pictures.
 
+    Warns:
+        InputWarning: another model beside ``sparse/0`` has more images.
+
     Raises:
         FileNotFoundError: no model there.
         FileFormatError: a camera with lens distortion, a damaged or truncated file, missing images.
@@ -156,6 +161,8 @@ def read_colmap(
         cameras.append(camera)
         lenses.append(lens)
     folder = _image_folder(path, model, images, "images" if scale == 1 else f"images_{scale}")
+    if model != path:
+        _warn_of_larger(model, len(poses), folder)
     cameras, paths = with_images(
         source,
         cameras,
@@ -189,6 +196,36 @@ class _Pose:
     translation: tuple[float, ...]
     camera: int
     name: str
+
+
+def _warn_of_larger(model: Path, count: int, images: Path) -> None:
+    """Where photographs do not hang together COLMAP leaves several models, numbered in the order in
+    which it began them: the first need not be the best.
+    """
+    others = {
+        other: _image_count(other)
+        for other in model.parent.iterdir()
+        if other.name.isdecimal() and other != model
+    }
+    largest = max(others, key=lambda other: (others[other], other.name), default=model)
+    if others.get(largest, 0) > count:
+        warnings.warn(
+            f"{model}: is read, with {count} images; {largest} has {others[largest]}, and may be"
+            f" the better model: name it, with {images} as the folder of its images (--images)",
+            InputWarning,
+            stacklevel=3,
+        )
+
+
+def _image_count(model: Path) -> int:
+    """Registered images of a model; 0 where it cannot be read."""
+    try:
+        if (model / "images.bin").is_file():
+            with (model / "images.bin").open("rb") as stream:
+                return int(struct.unpack("<Q", stream.read(8))[0])
+        return len(_text_images(model / "images.txt"))
+    except (OSError, struct.error, FileFormatError):
+        return 0
 
 
 def _image_folder(

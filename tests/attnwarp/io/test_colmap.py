@@ -1,10 +1,12 @@
 import struct
+import warnings
 
 import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from attnwarp.errors import InputWarning
 from attnwarp.io import FileFormatError, read_colmap, read_dataset
 
 IDS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 6}
@@ -372,3 +374,26 @@ def test_a_camera_that_stands_twice_is_refused(tmp_path, write):
     write(tmp_path, cameras=[*CAMERAS, CAMERAS[0]])
     with pytest.raises(FileFormatError, match="camera 7 stands twice"):
         read_dataset(tmp_path, missing_images="none")
+
+
+@pytest.mark.parametrize("write", [write_binary, write_text])
+def test_a_model_with_more_images_beside_the_one_that_is_read_is_named(tmp_path, write):
+    for number, count in ((0, 2), (1, 3), (2, 1)):
+        write(tmp_path / "sparse" / str(number), images=poses(count))
+    pictures(tmp_path / "images")
+    (tmp_path / "sparse" / "10").mkdir()  # without a model
+    (tmp_path / "sparse" / "notes").mkdir()
+    larger = (
+        r"0: is read, with 2 images; .*1 has 3, and may be the better model: name it, with .*images"
+    )
+    with pytest.warns(InputWarning, match=larger):
+        assert len(read_dataset(tmp_path).cameras) == 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        named = read_dataset(tmp_path / "sparse" / "1", images=tmp_path / "images")
+        assert len(named.cameras) == 3
+        read_dataset(tmp_path / "sparse" / "0")  # named: it is meant
+        (
+            tmp_path / "sparse" / "1" / f"images{'.bin' if write is write_binary else '.txt'}"
+        ).unlink()
+        assert len(read_dataset(tmp_path).cameras) == 2
