@@ -77,7 +77,7 @@ def read_blendedmvs(path: str | os.PathLike[str], *, missing_images: Missing = "
         raise FileFormatError(
             path,
             f"{available.count(False)} of {len(images)} images are missing: {first}; put them"
-            " there, or do without: missing_images='none', or --missing-images none",
+            " there, or do without: missing_images='none' (--missing-images none)",
         )
     cameras = [_camera(file, image) for file, image in zip(files, images, strict=True)]
     cameras, paths = with_images(

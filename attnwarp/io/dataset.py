@@ -177,7 +177,7 @@ def with_images(
         raise FileFormatError(
             source,
             f"{len(absent)} of {len(paths)} images are missing: {first}{more}; "
-            "put them there, or do without: missing_images='none', or --missing-images none",
+            "put them there, or do without: missing_images='none' (--missing-images none)",
         )
     missing = set(absent)
     available: list[Path | None] = [None if path in missing else path for path in paths]
