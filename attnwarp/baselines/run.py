@@ -12,9 +12,7 @@ edited.ply  result.json  times.json  the edited splats; counters; seconds by par
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -32,7 +30,7 @@ from attnwarp.editing.editor import Editor
 from attnwarp.editing.schedule import START_PROTOCOL
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
-from attnwarp.propagate.folder import Folder
+from attnwarp.propagate.folder import Folder, results_in
 from attnwarp.propagate.pictures import Bytes, enlarged, full_size, resized, to_bytes
 from attnwarp.propagate.progress import Step
 from attnwarp.propagate.scene import (
@@ -58,9 +56,10 @@ class Options(TypedDict, total=False):
     """What every baseline takes by name.
 
     Args:
-        folder: of all results, created if need be. A killed run resumes from it. All files but
-            ``times.json`` then get the bytes of an uninterrupted run, on one machine, with the same
-            number of threads and without a budget in seconds.
+        folder: of all results, created if need be; one that another run writes to is refused. A
+            killed run resumes from it. All files but ``times.json`` then get the bytes of an
+            uninterrupted run, on one machine, with the same number of threads and without a budget
+            in seconds.
         budget: limits of the run, :class:`Budget`; None for a whole run.
         segments: what is edited: (H, W) bool masks of the views, or a function of a view's number
             and picture. The original stays outside.
@@ -155,8 +154,8 @@ def run(
     scene = Scene.checked(cameras, images, options.get("segments"))
     work = Work(gaussians, scene, editor, instruction, chosen, backend)
     method = kind.make(work, chosen)
-    with nullcontext(folder) if folder else tempfile.TemporaryDirectory() as place:
-        return _Run(kind.name, method, work, Path(str(place)), options).go()
+    with results_in(folder) as place:
+        return _Run(kind.name, method, work, place, options).go()
 
 
 class _Run:

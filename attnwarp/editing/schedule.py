@@ -103,8 +103,9 @@ class Schedule:
         x0, noise = self.split(output, x, now)
         if change is not None:
             changed = change(x0)
-            if changed is not x0:
-                x0, noise = changed, (before - now.sqrt() * changed) / (1 - now).sqrt()
+            # By the difference, so that what is unchanged keeps the bits of its noise.
+            noise = noise - (now / (1 - now)).sqrt() * (changed - x0)
+            x0 = changed
         return (then.sqrt() * x0 + (1 - then).sqrt() * noise).to(x.dtype)
 
     def sigma(self, timestep: int, following: int | None) -> Tensor:

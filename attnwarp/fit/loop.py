@@ -6,6 +6,7 @@ import math
 import os
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from attnwarp.fit.start import extent_of
 from attnwarp.fit.views import Views
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError, write_ply
+from attnwarp.io.lock import alone_in
 from attnwarp.render import Render, render
 
 Tensor = torch.Tensor
@@ -178,6 +180,7 @@ def fit(
             the folder holds a fit of other views, settings or first splats, or a number is out of
             range.
         FileFormatError: the folder's checkpoint is damaged.
+        InputError: another run writes to the folder.
         RuntimeError: the loss or a held-out view is no longer finite, or no splat is left; the
             message says what to try. The last checkpoint stays.
 
@@ -221,10 +224,10 @@ def fit(
     if third_scale is not None and settings.kind != "2d":
         raise ValueError(f"third_scale: got {third_scale} for kind '3d', expected None")
     run = _Run(start, views, settings, held_out, backend, measure, third_scale)
-    if folder is not None:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        run.resume(Path(folder))
-    return run.go(max_seconds, checkpoint_seconds, watch, stop)
+    with nullcontext() if folder is None else alone_in(folder):
+        if folder is not None:
+            run.resume(Path(folder))
+        return run.go(max_seconds, checkpoint_seconds, watch, stop)
 
 
 class _Run:

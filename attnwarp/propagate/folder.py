@@ -15,8 +15,10 @@ times.json               seconds by part, over all sittings
 from __future__ import annotations
 
 import json
+import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from attnwarp.digest import digest
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.io.file import FileFormatError, write_atomically
 from attnwarp.io.images import encode_png, read_image
+from attnwarp.io.lock import alone_in
 from attnwarp.io.names import file_stems
 from attnwarp.io.ply import read_ply
 
@@ -50,6 +53,21 @@ RESULTS = ("source.json", "source.png", "features.png", "edited.ply", VIEWER_PLY
 """Files beside the manifest."""
 
 FOLDERS = ("views", "masks", "features", "stages", "renders/before", "renders/after")
+
+
+@contextmanager
+def results_in(folder: Path | str | None) -> Iterator[Path]:
+    """Where a run writes: a folder that no other run writes to meanwhile, or a temporary one.
+
+    Raises:
+        InputError: another run writes to it.
+    """
+    if folder:
+        with alone_in(folder):
+            yield Path(folder)
+    else:
+        with tempfile.TemporaryDirectory() as place:
+            yield Path(place)
 
 
 class Folder:

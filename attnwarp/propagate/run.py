@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -25,7 +23,7 @@ from attnwarp.editing.schedule import FRESH_PROTOCOL, START_PROTOCOL
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
 from attnwarp.propagate.editing import Guide, Source, Store, Target, ViewEditor
-from attnwarp.propagate.folder import MANIFEST, SEGMENTS_FOLDER, Folder, record_of
+from attnwarp.propagate.folder import MANIFEST, SEGMENTS_FOLDER, Folder, record_of, results_in
 from attnwarp.propagate.pictures import (
     Bytes,
     Image,
@@ -160,7 +158,8 @@ def propagate(
 
     Raises:
         ValueError: an argument of another size or type; the message names it.
-        InputError: the folder holds an edit of other settings or inputs; the message names them.
+        InputError: the folder holds an edit of other settings or inputs, which the message names;
+            or another run writes to it.
         RuntimeError: tuning diverged; the last checkpoint stays.
 
     Example:
@@ -200,10 +199,10 @@ def propagate(
                 "source_picture: got one with latents 'inversion', but its own noise is replayed;"
                 " leave it out, or set latents to 'random'"
             )
-    with nullcontext(folder) if folder else tempfile.TemporaryDirectory() as place:
+    with results_in(folder) as place:
         run = _Run(
             gaussians, scene, editor, instruction, settings, source, by_hand, warps,
-            Path(str(place)), store, checkpoint_seconds, backend, watch, announce,
+            place, store, checkpoint_seconds, backend, watch, announce,
         )  # fmt: skip
         return run.go()
 

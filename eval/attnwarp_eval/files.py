@@ -1,10 +1,8 @@
-"""Files that the harness writes: atomically, pictures, and locks."""
+"""Files that the harness writes: atomically, and pictures."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -50,26 +48,3 @@ def write_picture(path: Path, image: npt.ArrayLike, **jpeg: Any) -> Path:
     """
     write_atomic(path, encode_picture(image, path.suffix, **jpeg))
     return path
-
-
-@contextmanager
-def locked(path: Path, *, wait: bool) -> Iterator[None]:
-    """Hold a lock file, which is made; the end of a process lets go of it too.
-
-    Args:
-        path: of the file, in a folder that exists.
-        wait: until whoever holds it lets go.
-
-    Raises:
-        BlockingIOError: another holds it, and ``wait`` is False.
-        OSError: it is a symbolic link (``errno.ELOOP``), or cannot be written.
-    """
-    import fcntl  # not on Windows
-
-    # Neither followed nor emptied: in a folder from elsewhere it may link to any file.
-    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(file)

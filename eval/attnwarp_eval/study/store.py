@@ -20,8 +20,8 @@ from typing import Any, TypeVar
 
 from attnwarp.errors import InputError
 from attnwarp.io.file import remove_abandoned
+from attnwarp.io.lock import locked
 from attnwarp_eval.canonical_json import digest, write_json
-from attnwarp_eval.files import locked
 
 FORMAT = 1
 """Version of the layout of a cell's file; a reader refuses others."""

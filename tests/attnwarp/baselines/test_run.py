@@ -282,6 +282,19 @@ def test_a_folder_of_another_method_or_budget_is_refused_by_name(run, tmp_path):
         run("by_view", ByViewSettings(**none), folder=tmp_path, budget=Budget(seconds=5))
 
 
+def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(run, tmp_path):
+    refusals = []
+
+    def again(step):
+        with pytest.raises(InputError, match="another run writes to this folder") as caught:
+            run("by_view", settings, folder=tmp_path)
+        refusals.append(caught)
+
+    settings = ByViewSettings(steps=2, iterations=0)
+    run("by_view", settings, folder=tmp_path, watch=again)
+    assert refusals
+
+
 def test_a_folder_whose_start_was_a_step_of_the_editors_schedule_is_refused(run, tmp_path):
     noised = IGS2GSSettings(steps=1, iterations=0)
     run("igs2gs", noised, folder=tmp_path)

@@ -70,9 +70,12 @@ SCHEDULES = {
 @pytest.mark.parametrize("schedule", SCHEDULES)
 @pytest.mark.parametrize(("text", "image"), [(7.5, 1.5), (1.5, 1.0)])
 def test_the_loop_gives_what_diffusers_instruct_pix2pix_gives(schedule, text, image):
-    pipe = pix2pix()
+    # In double precision: guidance amplifies what vector units of processors round differently.
+    pipe = pix2pix().to(torch.float64)
     pipe.scheduler = DDIMScheduler.from_config(pipe.scheduler.config, **SCHEDULES[schedule])
-    noise = torch.randn((1, 4, H // 2, W // 2), generator=torch.Generator().manual_seed(8))
+    noise = torch.randn(
+        (1, 4, H // 2, W // 2), generator=torch.Generator().manual_seed(8), dtype=torch.float64
+    )
     theirs = pipe(
         "a bear", image=tensor(picture()), num_inference_steps=5, guidance_scale=text, image_guidance_scale=image,
         latents=noise, output_type="np",
@@ -84,7 +87,7 @@ def test_the_loop_gives_what_diffusers_instruct_pix2pix_gives(schedule, text, im
         steps=5,
         noise=noise,
     )
-    assert np.abs(ours.images[0] - theirs).max() < 1e-5
+    assert np.abs(ours.images[0] - theirs).max() < 1e-6
     assert theirs.std() > 0.01
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from attnwarp import Camera, Gaussians
+from attnwarp.errors import InputError
 from attnwarp.fit import FitSettings, Views, checkpoint, fit, from_points
 from attnwarp.fit.loop import CHECKPOINT, SPLATS
 from attnwarp.io import read_ply
@@ -354,6 +355,21 @@ def test_a_measure_of_the_callers_own_is_part_of_the_curve(scene, tmp_path):
     # Finished: taking it up again computes nothing and returns the same.
     again = fit(start, scene[0], settings, folder=tmp_path)
     assert again.history == result.history and same_bits(again.gaussians, result.gaussians)
+
+
+def test_a_second_fit_into_a_folder_is_refused_while_the_first_goes_on(scene, tmp_path):
+    start, settings = begin(scene, iterations=2, sh_degree=0)
+    refusals = []
+
+    def again(state):
+        with pytest.raises(InputError, match="another run writes to this folder") as caught:
+            fit(start, scene[0], settings, folder=tmp_path)
+        refusals.append(caught)
+
+    result = fit(start, scene[0], settings, folder=tmp_path, watch=again)
+    assert refusals
+    after = fit(start, scene[0], settings, folder=tmp_path)
+    assert same_bits(after.gaussians, result.gaussians)
 
 
 def test_a_checkpoint_of_other_settings_or_views_is_refused_by_name(scene, tmp_path):

@@ -492,6 +492,20 @@ def test_a_folder_of_another_edit_is_refused_by_name(
     assert files(finished[1]) == before
 
 
+def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(scene, editor, tmp_path):
+    refusals = []
+
+    def again(step):
+        with pytest.raises(InputError, match="another run writes to this folder") as caught:
+            run(scene, editor, tmp_path)
+        refusals.append(caught)
+
+    result = run(scene, editor, tmp_path, watch=again)
+    assert refusals
+    # Nothing of the first is lost, and the folder is free again.
+    assert run(scene, editor, tmp_path).edited.keys() == result.edited.keys()
+
+
 def test_a_folder_that_was_tuned_by_other_weights_is_refused(scene, editor, tmp_path):
     """The same folder of LPIPS weights, with another network in it."""
     weights = tmp_path / "lpips"

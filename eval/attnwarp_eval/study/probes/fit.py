@@ -14,13 +14,13 @@ from pydantic import Field
 
 import attnwarp.fit
 from attnwarp.fit import FitSettings
+from attnwarp.io.lock import locked
 from attnwarp.warp import WarpSettings, render_surface
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import canonical_json, digest
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number
-from attnwarp_eval.files import locked
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats import export, fitted
 from attnwarp_eval.statistics.intervals import Interval, interval
