@@ -171,6 +171,8 @@ def run_on_workers(
         "distributed.nanny.pre-spawn-environ.MKL_NUM_THREADS": threads,
     }
     with contextlib.ExitStack() as stack:
+        # First, so that it ends last: a cluster that closes lets dask speak of broken connections.
+        stack.enter_context(_silent())
         stack.enter_context(dask.config.set(settings))
         with _signals_wait(), _errors_of_dask("the worker processes could not be started"):
             # No memory limit: near one dask pauses a worker for good, since a world's caches are
