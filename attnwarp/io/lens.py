@@ -33,6 +33,10 @@ FOLD_GRID = 200
 """Points along each axis at which an undistorted picture is searched for folds: milliseconds."""
 
 
+RADII = 4097
+"""Radii of the table that the inversion of radial distortion begins with."""
+
+
 @dataclass(frozen=True)
 class Lens:
     """Distortion of a lens, as a function of normalised image coordinates.
@@ -93,8 +97,8 @@ class Lens:
             with np.errstate(invalid="ignore", divide="ignore"):
                 factor = np.where(r > 0, self._angle(np.arctan(r)) / r, 1.0)
             return xy * factor[..., None]
-        k1, k2, p1, p2, k3, k4, k5, k6 = self.coefficients
-        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        _, _, p1, p2, *_ = self.coefficients
+        radial = self._radial(r2)
         return np.stack(
             [
                 x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
@@ -124,8 +128,9 @@ class Lens:
             with np.errstate(invalid="ignore", divide="ignore"):
                 factor = np.where(r > 0, np.tan(theta) / r, 1.0)
             return target * factor[..., None]
-        # Newton's method.
-        point = target.copy()
+        # Newton's method, begun where the radial terms alone are inverted before their first fold:
+        # begun at the target it may end beyond a fold.
+        point = self._unrolled(target)
         for _ in range(50):
             here, dx, dy, det = self._linear(point)
             error = here - target
@@ -163,6 +168,23 @@ class Lens:
         """
         folded: npt.NDArray[np.bool_] = ~(self._linear(np.asarray(xy, dtype=np.float64))[3] > 0)
         return folded
+
+    def _radial(self, r2: Array) -> Array:
+        """Stretch of a point at this squared distance from the axis."""
+        k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
+        return (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+
+    def _unrolled(self, target: Array) -> Array:
+        """The inverse of the radial terms, by a table as far as their first fold."""
+        r = np.linspace(0, np.tan(STEEPEST), RADII)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            shown = r * self._radial(r * r)
+            rising = np.diff(shown) > 0
+        end = RADII if rising.all() else 1 + int(np.argmin(rising))
+        length = np.linalg.norm(target, axis=-1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            factor = np.where(length > 0, np.interp(length, shown[:end], r[:end]) / length, 1.0)
+        return target * factor[..., None]
 
     def _angle(self, theta: Array) -> Array:
         k1, k2, k3, k4 = self.coefficients

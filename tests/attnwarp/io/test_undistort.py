@@ -133,6 +133,27 @@ def test_the_colour_of_transparent_pixels_does_not_bleed_into_their_neighbours(d
     np.testing.assert_allclose(shown, expected, atol=1)
 
 
+@pytest.mark.parametrize(
+    ("k1", "k2", "k3"),
+    [(0.435, 0.253, -0.199), (0.427, 0.374, -0.194), (0.302, 0.339, -0.094), (0.094, 0.279, -0.142)],
+)
+@pytest.mark.parametrize("tangential", [(0.0, 0.0), (0.002, -0.001)])
+def test_points_before_a_fold_are_found_however_far_the_lens_moves_them(k1, k2, k3, tangential):
+    """Newton's method from where they are shown ends beyond the fold, or at the opposite side."""
+    r = np.linspace(0, 2, 20001)
+    shown = r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)
+    fold = r[np.argmax(np.diff(shown) < 0)]
+    assert 1 < fold < 2
+    radii, angles = np.meshgrid(np.linspace(0, 0.9 * fold, 50), np.linspace(0, 6, 25))
+    points = np.stack([radii * np.cos(angles), radii * np.sin(angles)], -1)
+    lens = Lens("brown", (k1, k2, *tangential, k3))
+    np.testing.assert_allclose(lens.undistort(lens.distort(points)), points, atol=1e-9)
+    # A picture that reaches to nine tenths of the fold.
+    focal = 32 / lens.distort([0.9 * fold, 0.0])[0]
+    K = np.array([[focal, 0, 32], [0, focal, 4], [0, 0, 1]])
+    assert undistorted_camera(Camera(K, np.eye(4), 64, 8), lens).width < 64
+
+
 def test_coefficients_that_fold_the_picture_over_are_refused():
     with pytest.raises(ValueError, match=r"lens: .* fold the picture of camera 'a.png' over"):
         undistorted_camera(camera_of("OPENCV"), Lens("brown", (-3.0, 0.0)))
