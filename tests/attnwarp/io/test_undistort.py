@@ -135,7 +135,12 @@ def test_the_colour_of_transparent_pixels_does_not_bleed_into_their_neighbours(d
 
 @pytest.mark.parametrize(
     ("k1", "k2", "k3"),
-    [(0.435, 0.253, -0.199), (0.427, 0.374, -0.194), (0.302, 0.339, -0.094), (0.094, 0.279, -0.142)],
+    [
+        (0.435, 0.253, -0.199),
+        (0.427, 0.374, -0.194),
+        (0.302, 0.339, -0.094),
+        (0.094, 0.279, -0.142),
+    ],
 )
 @pytest.mark.parametrize("tangential", [(0.0, 0.0), (0.002, -0.001)])
 def test_points_before_a_fold_are_found_however_far_the_lens_moves_them(k1, k2, k3, tangential):
