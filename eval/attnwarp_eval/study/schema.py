@@ -130,7 +130,7 @@ class Study(Part):
     views: list[str] = Field(
         default_factory=list, description="target views by name; all of them if empty"
     )
-    seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)] = Field(
+    seeds: Annotated[list[Annotated[int, Field(ge=0, lt=2**32)]], Field(min_length=1)] = Field(
         default_factory=lambda: [0]
     )
     spp: Annotated[int, Field(ge=1)] = 16

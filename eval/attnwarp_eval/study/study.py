@@ -23,6 +23,7 @@ from attnwarp_eval.study.schema import (
     Study,
     StudyError,
     Variant,
+    check_distinct,
     did_you_mean,
 )
 
@@ -65,14 +66,17 @@ class _Joined(Study):
             if not variants and available[name].judges_variants:
                 raise ValueError(f"probes.{name}: names no variant, expected at least one")
             self.check_variants(variants, f"probes.{name}")
+            check_distinct(variants, f"probes.{name}")
         tabled = [name for name, p in available.items() if p.columns]
         for i, ablation in enumerate(self.ablations):
             _check_probe(ablation.probe, tabled, f"ablations[{i}].probe")
             names = [ablation.baseline, *ablation.variants]
             self.check_variants(names, f"ablations[{i}]", ablation.probe)
+            check_distinct(ablation.variants, f"ablations[{i}].variants")
         for i, front in enumerate(self.fronts):
             _check_probe(front.probe, tabled, f"fronts[{i}].probe")
             self.check_variants(front.variants, f"fronts[{i}]", front.probe)
+            check_distinct(front.variants, f"fronts[{i}].variants")
             _check_metric(front, available[front.probe], f"fronts[{i}].metric")
         self.check_variants(self.pictures.variants, "pictures.variants")
         for p in available.values():

@@ -91,6 +91,16 @@ def test_ids_change_with_the_content_and_not_with_the_names(tmp_path):
         ),
         ({"variants": {"corrected": {"splats": {"number": 3}}}}, "number"),
         ({"seeds": [0, 0]}, "named twice"),
+        ({"seeds": [2**32]}, "seeds.*: got 4294967296, but .*less than 4294967296"),
+        ({"probes": {"warp": ["again", "again"]}}, r"probes.warp: .*named twice in \['again'"),
+        (
+            {"ablations": [{"title": "t", "baseline": "again", "variants": ["corrected"] * 2}]},
+            r"ablations\[0\].variants: .*named twice",
+        ),
+        (
+            {"fronts": [{"title": "t", "metric": "warp.epe_median", "variants": ["again"] * 2}]},
+            r"fronts\[0\].variants: .*named twice",
+        ),
         ({"name": "../escape"}, "name: .*pattern"),
         ({"feature_sizes": [128]}, "expected 1 to 64, the image size"),
         (
