@@ -4,6 +4,7 @@ on.
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import resource
 import statistics
@@ -21,6 +22,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+import attnwarp
 from attnwarp.process import core_count
 
 T = TypeVar("T")
@@ -205,7 +207,22 @@ def environment() -> dict[str, Any]:
             "cores": core_count(),
         },
         "git": _git(Path(__file__).resolve().parent),
+        "source": source_hash(),
     }
+
+
+@cache
+def source_hash() -> str:
+    """SHA-256 of every source file of both packages.
+
+    A revision would not do: an installed copy has none, and files of a checkout change without one.
+    """
+    total = hashlib.sha256()
+    for package in (Path(attnwarp.__file__).parent, Path(__file__).parent):
+        for path in sorted(package.rglob("*.py")):
+            total.update(f"{package.name}/{path.relative_to(package).as_posix()}\n".encode())
+            total.update(hashlib.sha256(path.read_bytes()).digest())
+    return total.hexdigest()
 
 
 def _git(folder: Path) -> dict[str, Any]:

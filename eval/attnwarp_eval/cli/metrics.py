@@ -72,12 +72,18 @@ def metrics(
     from rich.console import Console
 
     with clear_errors():
+        from attnwarp.errors import InputError
         from attnwarp_eval.study.store import Store
         from attnwarp_eval.user_images import measure, write
 
         inputs = measure.Inputs(
             renders, edited, originals, source_edit, prompt, source_prompt, mask, _color(background)
         )
+        if (out / "study.json").exists():
+            raise InputError(
+                f"--out: {out} is the run of a study, to which these figures would be strange;"
+                " name another folder"
+            )
         kinds: dict[Any, str | None] = {"clip": clip, "dino": dino, "perceptual": perceptual}
         with progress() as show, resumable(lambda: "finished batches of views are kept"):
             measured = measure.measure(inputs, kinds, Store(out), device=device, progress=show)

@@ -444,6 +444,7 @@ def studies() -> None:
     """List the studies that ship with the package."""
     from attnwarp_eval.study.study import load_study, shipped_studies
 
-    names = list(shipped_studies())
-    for name in names:
-        typer.echo(f"{name:{max(map(len, names))}}  {load_study(name).title}")
+    with clear_errors():
+        names = list(shipped_studies())
+        for name in names:
+            typer.echo(f"{name:{max(map(len, names))}}  {load_study(name).title}")

@@ -49,10 +49,15 @@ def check_not_of_run(out: Path, run: Path) -> None:
         run: folder that the command reads.
 
     Raises:
-        InputError: the file says what the run is, or is its report.
+        InputError: the file says what the run is, or is its report; or it would lie among its cells
+            or pictures.
     """
+    from attnwarp.errors import InputError
     from attnwarp.io.file import check_other
 
+    for name in ("cells", "failed", "pictures"):
+        if out.resolve().is_relative_to((run / name).resolve()):
+            raise InputError(f"{out}: lies among the {name} of the run {run}; choose another place")
     for name in ("study.json", "results.jsonl", "report.md", "report.html"):
         check_other(out, run / name, f"a file of the run {run}")
 

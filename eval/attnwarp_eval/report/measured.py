@@ -75,6 +75,8 @@ def _environments(records: list[Record[Any]]) -> list[str]:
         code = f"revision `{revision[:12]}`" if revision else "an installed copy"
         if environment.dirty:
             code += " with local changes"
+        if environment.source and (environment.dirty or not revision):
+            code += f" (source `{environment.source[:12]}`)"
         versions = ", ".join(f"{name} {version}" for name, version in environment.versions.items())
         machine = environment.machine
         computer = f"{machine['system']} {machine['arch']}, {machine['cores']} cores"

@@ -10,6 +10,7 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.report.claims import JudgedClaim, judge, load_claims
 from attnwarp_eval.statistics.planning import MOST_SCENES, effect_interval, scenes_needed
+from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.probes.variant_splats import is_fitted
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
@@ -103,7 +104,8 @@ def _hours_a_scene(results: Results) -> float:
     """
     scenes: dict[str, list[Record[Any] | None]] = {}
     for cell in results.cells:
-        scenes.setdefault(cell.scene, []).append(cell.record)
+        if probe(cell.probe).needs_scenes:  # hard cases are none
+            scenes.setdefault(cell.scene, []).append(cell.record)
     done = [
         [record for record in records if record is not None]
         for records in scenes.values()

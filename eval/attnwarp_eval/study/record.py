@@ -135,12 +135,14 @@ class Environment:
         machine: ``system``, ``arch`` and ``cores``.
         revision: of the source; None for an installed copy.
         dirty: whether the source had local changes.
+        source: SHA-256 of the source; None in records of former code.
     """
 
     versions: Mapping[str, str]
     machine: Mapping[str, Any]
     revision: str | None
     dirty: bool | None
+    source: str | None = None
 
     def to_json(self) -> Json:
         """As a record's file has it, and as :func:`attnwarp_eval.cost.environment` gives it."""
@@ -148,26 +150,33 @@ class Environment:
             "versions": dict(self.versions),
             "machine": dict(self.machine),
             "git": {"sha": self.revision, "dirty": self.dirty},
+            **({} if self.source is None else {"source": self.source}),
         }
 
     @classmethod
     def from_json(cls, data: Json) -> Environment:
         """From :meth:`to_json`; one object for all records of the same environment."""
         versions, machine, git = data["versions"], data["machine"], data["git"]
-        key = (cls, *versions.items(), *machine.items(), git["sha"], git["dirty"])
+        code = (git["sha"], git["dirty"], data.get("source"))
+        key = (cls, *versions.items(), *machine.items(), *code)
         if key not in _environments:
-            _environments[key] = cls(versions, machine, git["sha"], git["dirty"])
+            _environments[key] = cls(versions, machine, *code)
         return _environments[key]
 
     def same_code(self, other: Environment) -> bool:
         """Whether both were computed by the same state of the source and the same packages.
 
-        Packages that only one of them names do not count: former code recorded fewer.
+        Packages that only one of them names do not count: former code recorded fewer. It recorded
+        no hash of the source either, and then two states with local changes count as different.
         """
         shared = self.versions.keys() & other.versions.keys()
-        return (self.revision, self.dirty) == (other.revision, other.dirty) and all(
-            self.versions[name] == other.versions[name] for name in shared
-        )
+        if any(self.versions[name] != other.versions[name] for name in shared):
+            return False
+        if (self.revision, self.dirty) != (other.revision, other.dirty):
+            return False
+        if self.source is None or other.source is None:
+            return not self.dirty
+        return self.source == other.source
 
 
 @dataclass(frozen=True)

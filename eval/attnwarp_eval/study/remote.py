@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import hashlib
 import os
 import shutil
 import sys
@@ -12,8 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import attnwarp
-from attnwarp_eval.cost import environment
+from attnwarp_eval.cost import environment, source_hash
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import MeshSpec
@@ -56,21 +53,7 @@ def this_code() -> Code:
     """The code of this process."""
     versions = dict(environment()["versions"])
     versions["python"] = "{}.{}".format(*sys.version_info[:2])
-    return Code(_source(), versions)
-
-
-@functools.cache
-def _source() -> str:
-    """SHA-256 of every source file of both packages.
-
-    A revision would not do: an installed copy has none, and files of a checkout change without one.
-    """
-    total = hashlib.sha256()
-    for package in (Path(attnwarp.__file__).parent, Path(__file__).parents[1]):
-        for path in sorted(package.rglob("*.py")):
-            total.update(f"{package.name}/{path.relative_to(package).as_posix()}\n".encode())
-            total.update(hashlib.sha256(path.read_bytes()).digest())
-    return total.hexdigest()
+    return Code(source_hash(), versions)
 
 
 def code_of_worker(request: int = 0) -> Code:
@@ -183,6 +166,7 @@ def unpack(parcel: Parcel, store: Store) -> Failure | None:
             raise ValueError(f"a worker sent a picture outside the run's pictures: {name!r}")
         write_atomic(store.root / path, content)
     # The worker's source is this one's, byte for byte; its copy need not know the revision.
-    own = {**parcel.record["environment"], "git": environment()["git"]}
+    here = environment()
+    own = {**parcel.record["environment"], "git": here["git"], "source": here["source"]}
     store.write({**parcel.record, "environment": own})
     return None

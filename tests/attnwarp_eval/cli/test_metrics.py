@@ -211,6 +211,16 @@ def test_what_is_left_out_costs_its_figures_and_the_reason_is_said(data, models,
     )  # Edit PSNR has two rows
 
 
+def test_the_folder_of_a_study_is_refused(data):
+    folder, _ = data
+    (folder / "run").mkdir()
+    (folder / "run" / "study.json").write_text("{}")
+    done = call("metrics", "--renders", folder / "renders", "--edited", folder / "edited",
+                "--out", folder / "run")  # fmt: skip
+    assert done.exit_code == 2 and "is the run of a study" in done.stderr
+    assert [path.name for path in (folder / "run").iterdir()] == ["study.json"]
+
+
 def test_pixels_alone_need_no_encoder(data):
     folder, _ = data
     off = ("--clip=none", "--dino=none", "--perceptual=none")

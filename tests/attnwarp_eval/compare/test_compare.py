@@ -280,6 +280,8 @@ def test_what_is_written_never_replaces_the_baseline_or_each_other(stored, run, 
         (("--markdown", path), "is the baseline"),
         (("--json", run / "study.json"), f"is a file of the run {run}"),
         (("--html", run / "report.html"), f"is a file of the run {run}"),
+        (("--json", run / "cells" / "ab" / "x.json"), f"lies among the cells of the run {run}"),
+        (("--html", run / "pictures" / "x.html"), f"lies among the pictures of the run {run}"),
         (("--json", other, "--html", other), "is that of --json too"),
         (("--update", "--markdown", other), "--markdown: --update compares nothing"),
     ):

@@ -301,6 +301,11 @@ def test_hours_to_settle_a_claim_are_those_of_the_studys_cells_without_what_othe
     (section,) = settling(written_runs.results(study(), cells))
     assert "1.00 a scene, as here" in section.text[1]
     assert "hours" not in settling(written_runs.results(study(), cells), False)[0].text[1].lower()
+    # Hard cases are no scenes: however many there are, a scene takes as long.
+    case = timed("thin_disc", 0.1, "good", {"truth": 1.0})
+    cells.append(dataclasses.replace(case, probe="stability"))
+    (section,) = settling(written_runs.results(study(), cells))
+    assert "1.00 a scene, as here" in section.text[1]
 
 
 def test_hours_are_not_said_where_splats_were_fitted():
@@ -682,13 +687,19 @@ def test_the_means_beside_a_claims_difference_are_over_the_views_that_both_sides
 
 
 def test_cells_of_more_than_one_state_of_the_code_are_told_apart(tmp_path):
-    other = {**written_runs.ENVIRONMENT, "git": {"sha": "b" * 40, "dirty": True}}
-    changed = written_runs.outcome("warp", "one", ["good"], record([0.1], other))
-    mixed = results(CLEAR, [changed], ablations=[])
-    text = markdown(build(mixed, tmp_path))
+    changed = {**written_runs.ENVIRONMENT, "git": {"sha": "b" * 40, "dirty": True}}
+    cells = [
+        written_runs.outcome("warp", "one", ["good"], record([0.1], {**changed, **more}))
+        for more in ({}, {"source": "c" * 64}, {"source": "d" * 64})
+    ]
+    text = markdown(build(results(CLEAR, cells, ablations=[]), tmp_path))
     assert "more than one state of code" in text
     assert "6 cells with revision `aaaaaaaaaaaa`" in text
-    assert "; 1 cell with revision `bbbbbbbbbbbb` with local changes" in text
+    # Two states with changes to one revision are two.
+    local = "; 1 cell with revision `bbbbbbbbbbbb` with local changes"
+    assert text.count(local) == 3
+    assert f"{local} (source `cccccccccccc`)" in text
+    assert f"{local} (source `dddddddddddd`)" in text
 
 
 def test_a_study_of_one_scene_says_at_its_top_that_no_verdict_is_possible(tmp_path):

@@ -335,3 +335,21 @@ def test_another_version_of_what_decides_an_edit_is_other_code():
     # Records of former code name fewer packages.
     fewer = {k: v for k, v in here["versions"].items() if k not in ("diffusers", "scipy")}
     assert this.same_code(Environment.from_json({**here, "versions": fewer}))
+
+
+def test_two_states_of_files_that_are_not_committed_are_other_code():
+    here = {**environment(), "git": {"sha": "a" * 40, "dirty": True}}
+    this = Environment.from_json(here)
+    assert this.same_code(Environment.from_json(this.to_json()))
+    assert not this.same_code(Environment.from_json({**here, "source": "0" * 64}))
+    # Former code recorded no hash: the changes may be any.
+    former = {name: value for name, value in here.items() if name != "source"}
+    assert not this.same_code(Environment.from_json(former))
+    committed = {**former, "git": {"sha": "a" * 40, "dirty": False}}
+    assert Environment.from_json(committed).same_code(
+        Environment.from_json({**here, "git": committed["git"]})
+    )
+    # Nor does an installed copy have a revision.
+    installed = {**here, "git": {"sha": None, "dirty": None}}
+    other = Environment.from_json({**installed, "source": "0" * 64})
+    assert not Environment.from_json(installed).same_code(other)
