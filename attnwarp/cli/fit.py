@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from attnwarp.cli.files import check_seen, read_splats, read_views, write_image
+from attnwarp.cli.files import (
+    check_inputs_stay,
+    check_seen,
+    read_splats,
+    read_views,
+    write_image,
+)
 from attnwarp.cli.options import (
     DataArgument,
     Kind,
@@ -28,6 +35,10 @@ if TYPE_CHECKING:
 OWN_OPTIONS = {
     name: f"--{name.replace('_', '-')}" for name in ("kind", "seed", "iterations", "max_splats")
 }
+
+
+RESULTS = ("splats.ply", "checkpoint.pt", "history.jsonl", "settings.json")
+"""Files of a fit beside ``held_out``."""
 
 
 @reading_options()
@@ -178,6 +189,7 @@ def _fit(
     from attnwarp.fit.loop import CHECKPOINT
     from attnwarp.fit.progress import more_points, progress_display
     from attnwarp.fit.start import FIRST_POINTS
+    from attnwarp.io.names import file_stems
 
     settings = attnwarp.fit.FitSettings.from_dict(changes)
     dataset = read_views(data, reading)
@@ -185,6 +197,8 @@ def _fit(
     there = [k for k, path in enumerate(dataset.image_paths) if path is not None]
     dataset = dataset.select(there) if there else dataset
     train, test = attnwarp.fit.hold_out(dataset, every)
+    shown = [] if test is None else [f"held_out/{stem}.png" for stem in file_stems(test.cameras)]
+    check_inputs_stay((out / name for name in (*RESULTS, *shown)), dataset.image_paths)
     views = attnwarp.fit.load_views(train, max_size=max_size)
     held_out = attnwarp.fit.load_views(test, max_size=max_size) if test is not None else None
     if first is not None and start is not None:
@@ -195,16 +209,14 @@ def _fit(
             dataset, views.cameras, settings, echo, random=points or FIRST_POINTS
         )
     out.mkdir(parents=True, exist_ok=True)
-    if restart:
-        (out / CHECKPOINT).unlink(missing_ok=True)
     if settings.max_splats is not None and len(first) > settings.max_splats:
         echo(more_points(len(first), settings.max_splats))
     try:
         with asked_to_stop(echo) as stop, progress_display(title=out.name) as watch:
             result = attnwarp.fit.fit(
-                first, views, settings, held_out=held_out, folder=out, max_seconds=max_seconds,
-                checkpoint_seconds=checkpoint_seconds, third_scale=third_scale, watch=watch,
-                stop=stop,
+                first, views, settings, held_out=held_out, folder=out, restart=restart,
+                max_seconds=max_seconds, checkpoint_seconds=checkpoint_seconds,
+                third_scale=third_scale, watch=watch, stop=stop,
             )  # fmt: skip
     except ValueError as error:
         if str(out / CHECKPOINT) not in str(error):
@@ -223,7 +235,12 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
     from attnwarp.io.file import write_atomically
     from attnwarp.io.names import file_stems
 
-    lines = "".join(json.dumps(asdict(record)) + "\n" for record in result.history)
+    # A held-out picture that is met exactly has an infinite PSNR, which JSON has not.
+    rows = [
+        {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+        for row in map(asdict, result.history)
+    ]
+    lines = "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows)
     settings = json.dumps(
         {**result.settings.to_dict(), "extent": result.extent, "stopped": result.stopped}, indent=2
     )

@@ -249,9 +249,11 @@ def tensor_of(images: Sequence[npt.NDArray[Any]], name: str, multiple: int) -> T
             )
     h, w = images[0].shape[:2]
     if h % multiple or w % multiple:
+        width, height = (max(multiple, side - side % multiple) for side in (w, h))
+        how = "resize or crop" if width <= w and height <= h else "resize"
         raise ValueError(
-            f"{name}: got {w} x {h} px, expected sides that are multiples of {multiple}; resize or"
-            f" crop to {w - w % multiple} x {h - h % multiple}"
+            f"{name}: got {w} x {h} px, expected sides that are multiples of {multiple}; {how} to"
+            f" {width} x {height}"
         )
     stacked = np.stack([np.asarray(image, dtype=np.float32) for image in images])
     check.finite(stacked, name)

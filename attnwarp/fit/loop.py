@@ -142,6 +142,7 @@ def fit(
     *,
     held_out: Views | None = None,
     folder: str | os.PathLike[str] | None = None,
+    restart: bool = False,
     max_seconds: float | None = None,
     checkpoint_seconds: float = 30.0,
     third_scale: float | None = None,
@@ -164,6 +165,7 @@ def fit(
         settings: the default ones for ``start.kind`` if left out.
         held_out: pictures to evaluate on, never fitted on.
         folder: made if need be.
+        restart: begin again, without the folder's checkpoint.
         max_seconds: stop after so many seconds of iterations, over all sittings. The learning rates
             follow ``settings.iterations`` all the same.
         checkpoint_seconds: see above.
@@ -226,6 +228,8 @@ def fit(
     run = _Run(start, views, settings, held_out, backend, measure, third_scale)
     with nullcontext() if folder is None else alone_in(folder):
         if folder is not None:
+            if restart:
+                (Path(folder) / CHECKPOINT).unlink(missing_ok=True)
             run.resume(Path(folder))
         return run.go(max_seconds, checkpoint_seconds, watch, stop)
 

@@ -33,6 +33,9 @@ FOLD_GRID = 200
 """Points along each axis at which an undistorted picture is searched for folds: milliseconds."""
 
 
+INVERTED = 1e-9
+"""Largest distance, in focal lengths, between a point and its undistorted point distorted again."""
+
 RADII = 4097
 """Radii of the table that the inversion of radial distortion begins with."""
 
@@ -110,6 +113,8 @@ class Lens:
     def undistort(self, xy: npt.ArrayLike) -> Array:
         """The inverse of :meth:`distort`, by iteration; NaN where the iteration finds none.
 
+        The one before the first fold is found where there is one; :meth:`folds` tells the others.
+
         Args:
             xy: (..., 2) distorted normalised coordinates.
 
@@ -127,7 +132,12 @@ class Lens:
                 theta = np.clip(theta - (self._angle(theta) - r) / slope, 0, STEEPEST)
             with np.errstate(invalid="ignore", divide="ignore"):
                 factor = np.where(r > 0, np.tan(theta) / r, 1.0)
-            return target * factor[..., None]
+            left = np.abs(self._angle(theta) - r)
+            # Cut at the steepest ray where the angle still rises there, and only then.
+            ends = self._angle(np.array([STEEPEST - 1e-6, STEEPEST]))
+            cut = (r > ends[1]) & bool(ends[1] > ends[0]) & (theta >= STEEPEST)
+            found = (left <= INVERTED * (1 + r)) | cut
+            return np.where(found[..., None], target * factor[..., None], np.nan)
         # Newton's method, begun where the radial terms alone are inverted before their first fold:
         # begun at the target it may end beyond a fold.
         point = self._unrolled(target)
@@ -142,7 +152,10 @@ class Lens:
                     ],
                     axis=-1,
                 )
-        return point
+        with np.errstate(invalid="ignore", over="ignore"):
+            left = np.abs(self.distort(point) - target).max(axis=-1)
+        found = left <= INVERTED * (1 + np.abs(target).max(axis=-1))
+        return np.where(found[..., None], point, np.nan)
 
     def _linear(self, point: Array) -> tuple[Array, Array, Array, Array]:
         """:meth:`distort`, its slopes in x and in y by differences, and their determinant."""

@@ -7,13 +7,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
+import numpy as np
+
+from attnwarp.camera import Camera
 from attnwarp.errors import InputError
 from attnwarp.io.dataset import Dataset
 from attnwarp.io.file import is_file, write_atomically
 from attnwarp.io.images import encode_png, read_image
 from attnwarp.io.lens import undistorted_camera, undistorted_image
 from attnwarp.io.names import numbered
-from attnwarp.io.transforms import write_transforms
+from attnwarp.io.transforms import read_transforms, write_transforms
 
 
 def undistort(
@@ -66,6 +69,7 @@ def undistort(
     names = numbered([_name(camera.name, i) for i, camera in enumerate(dataset.cameras)])
     paths: list[Path | None] = [folder / "images" / name for name in names]
     _check_apart(folder, paths, dataset.image_paths)
+    _check_own(folder, cameras, names)
     for i, (camera, lens, target, source, path) in enumerate(
         zip(dataset.cameras, dataset.lenses, cameras, dataset.image_paths, paths, strict=True)
     ):
@@ -104,6 +108,29 @@ def _check_apart(folder: Path, written: list[Path | None], read: list[Path | Non
             raise InputError(
                 f"{path}: is a picture to undistort; name another folder for the result"
             )
+
+
+def _check_own(folder: Path, cameras: list[Camera], names: list[str]) -> None:
+    """Refuse to write over a transforms.json that is no earlier result of the same cameras."""
+    path = folder / "transforms.json"
+    if not is_file(path):
+        return
+    try:
+        there = read_transforms(path, missing_images="none", points=False)
+        same = len(there.cameras) == len(cameras) and all(
+            (image is None or image.resolve() == (folder / "images" / name).resolve())
+            and np.allclose(old.world_to_camera, new.world_to_camera)
+            for old, image, new, name in zip(
+                there.cameras, there.image_paths, cameras, names, strict=True
+            )
+        )
+    except (InputError, OSError, ValueError):
+        same = False
+    if not same:
+        raise InputError(
+            f"{path}: is of other pictures than these; name another folder for the result, or"
+            " remove it if it is an earlier result"
+        )
 
 
 def _name(name: str, index: int) -> str:

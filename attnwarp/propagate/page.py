@@ -100,7 +100,8 @@ def write_page(folder: Folder, images: Sequence[npt.NDArray[Any]]) -> Path:
         + "\n</body></html>\n"
     )
     path = folder.path / PAGE
-    write_atomically(path, lambda stream: stream.write(page.encode()))
+    # The name of a view may be no UTF-8.
+    write_atomically(path, lambda stream: stream.write(page.encode("utf-8", "replace")))
     return path
 
 

@@ -316,7 +316,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "estimate_until": (0, math.inf),
     "estimate_margin": (0, 1),
     "a0": (0, 1),
-    "composite_blur": (0, math.inf),
+    "composite_blur": (0, 1000),
     "iterations": (0, math.inf),
     "l1": (0, math.inf),
     "perceptual": (0, math.inf),

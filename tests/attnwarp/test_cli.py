@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 from attnwarp import Camera, Gaussians, baselines, progress
 from attnwarp.cli import baseline
 from attnwarp.cli.main import app
-from attnwarp.io import Dataset, read_ply, write_ply, write_transforms
+from attnwarp.io import Dataset, read_dataset, read_ply, write_ply, write_transforms
 from attnwarp.render import render
 from attnwarp.render.threads import set_thread_count
 
@@ -211,6 +211,53 @@ def test_a_fit_of_other_settings_names_the_options_that_begin_again(data, tmp_pa
     (tmp_path / "checkpoint.pt").write_bytes(b"damaged")
     assert "--restart" in in_process(*arguments, "--iterations", 2).stderr
     assert in_process(*arguments, "--iterations", 2, "--restart").exit_code == 0
+
+
+def test_a_fit_writes_over_no_picture_that_it_reads(data, tmp_path):
+    shutil.copytree(data, tmp_path / "data")
+    (tmp_path / "data" / "images").rename(tmp_path / "data" / "held_out")
+    path = tmp_path / "data" / "transforms.json"
+    path.write_text(path.read_text().replace("images/", "held_out/"))
+    before = {p: p.read_bytes() for p in (tmp_path / "data").rglob("*.*")}
+    done = in_process("fit", tmp_path / "data", "--out", tmp_path / "data", "--iterations", 1)
+    assert done.exit_code == 2 and "held_out/0.png: is read, and a result" in done.stderr
+    assert {p: p.read_bytes() for p in (tmp_path / "data").rglob("*.*")} == before
+
+
+def test_a_restart_that_is_refused_leaves_the_checkpoint(tmp_path):
+    view = Camera.look_at([3, 0, 0.5], [0, 0, 0], width=60, height=30, fov_y=40, name="a")
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((30, 60, 3), 128, np.uint8))
+    write_transforms(tmp_path, Dataset([view], [tmp_path / "a.png"]))
+    out = tmp_path / "fit"
+    arguments = ("fit", tmp_path, "--out", out, "--hold-out", 0, "--iterations", 1)
+    assert in_process(*arguments).exit_code == 0
+    before = (out / "checkpoint.pt").read_bytes()
+    done = in_process(*arguments, "--restart", "--max-size", 16)  # 16 x 8 px
+    assert done.exit_code == 2 and "SSIM needs" in done.stderr
+    assert (out / "checkpoint.pt").read_bytes() == before
+
+
+def test_an_infinite_psnr_is_null_in_the_history(data, tmp_path):
+    """A view that looks away, of a black picture, is met exactly."""
+    shutil.copytree(data, tmp_path / "data")
+    there = read_dataset(tmp_path / "data")
+    away = Camera.look_at([0, 0, 50], [0, 0, 99], width=32, height=32, fov_y=40, up=(1, 0, 0))
+    first = replace(away, name=there.cameras[0].name)
+    cv2.imwrite(str(there.image_paths[0]), np.zeros((32, 32, 3), np.uint8))
+    cameras = [first, *there.cameras[1:]]
+    write_transforms(
+        tmp_path / "data", Dataset(cameras, there.image_paths, there.points, there.colors)
+    )
+    done = in_process(
+        "fit", tmp_path / "data", "--out", tmp_path / "fit", "--iterations", 1, "--hold-out", 9
+    )
+    assert done.exit_code == 0, done.output
+
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    lines = (tmp_path / "fit" / "history.jsonl").read_text().splitlines()
+    assert [json.loads(line, parse_constant=refuse)["psnr"] for line in lines][-1] is None
 
 
 def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):

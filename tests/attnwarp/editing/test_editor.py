@@ -279,6 +279,8 @@ def test_what_does_not_fit_is_refused_by_name():
         match="guides: got 23 x 16 px, expected sides that are multiples of 2; resize or crop to 22 x 16",
     ):
         edit(editor, [picture()[:, :-1]], "a bear")
+    with pytest.raises(ValueError, match="got 16 x 1 px, .*multiples of 2; resize to 16 x 2"):
+        edit(editor, [picture()[:1, :16]], "a bear")
     with pytest.raises(ValueError, match="guides: got none"):
         edit(editor, [], "a bear")
     with pytest.raises(ValueError, match="guides: got values to 255"):

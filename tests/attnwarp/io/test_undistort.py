@@ -259,6 +259,44 @@ def test_every_view_has_a_picture_of_its_own(tmp_path, names, files):
     assert [str(p.relative_to(tmp_path / "out/images")) for p in back.image_paths] == files
 
 
+def test_another_capture_is_not_written_over_and_an_earlier_result_is(tmp_path):
+    data = constant_pictures(tmp_path / "in", ["a.png", "b.png", "c.png"])
+    undistort(data, tmp_path / "out")
+    before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")}
+    undistort(data, tmp_path / "out")
+    assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")} == before
+    shift = np.zeros((4, 4))
+    shift[0, 3] = 0.5
+    moved = [
+        dataclasses.replace(camera, world_to_camera=camera.world_to_camera + shift)
+        for camera in data.cameras
+    ]
+    others = (
+        constant_pictures(tmp_path / "named", ["a.png", "b.png", "x.png"]),
+        data.select([0, 1]),
+        Dataset(moved, data.image_paths, lenses=data.lenses),
+    )
+    for other in others:
+        with pytest.raises(InputError, match=r"transforms.json: is of other pictures than these"):
+            undistort(other, tmp_path / "out")
+    (tmp_path / "out" / "transforms.json").write_text("{")
+    with pytest.raises(InputError, match="is of other pictures"):
+        undistort(data, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("lens", "shown"),
+    # r - 0.3 r^3 rises up to 0.703, t - 0.5 t^3 to 0.544.
+    [(Lens("brown", (-0.3,)), 0.703), (Lens("fisheye", (-0.5,)), 0.544)],
+)
+def test_what_is_found_is_an_inverse_and_all_else_is_undefined(lens, shown):
+    points = np.stack([np.linspace(0, 1.5, 151), np.linspace(0, 0.1, 151)], -1)
+    back = lens.undistort(points)
+    found = np.isfinite(back).all(-1)
+    assert found[np.linalg.norm(points, axis=-1) < shown - 0.01].all()
+    np.testing.assert_allclose(lens.distort(back[found]), points[found], atol=1e-8)
+
+
 @pytest.mark.parametrize("link", [False, True])
 def test_no_picture_that_is_read_is_written_over(tmp_path, link):
     # The second of three is written to the place of the third.

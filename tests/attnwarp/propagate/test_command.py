@@ -140,6 +140,22 @@ def test_it_leaves_an_edited_ply_and_a_page_that_needs_no_other_file(place, tmp_
     assert "<p>1 of 2; the folder has all.</p>" in rest and len(Page(rest).pictures) == 2
 
 
+def test_the_page_is_written_where_the_name_of_a_view_is_no_utf_8(place, tmp_path):
+    shutil.copytree(place, tmp_path / "place")
+    data, name = tmp_path / "place" / "data", "f\udcfcr.png"  # Latin-1, as Python hands it on
+    try:
+        (data / "images" / "v0.png").rename(data / "images" / name)
+    except OSError:
+        pytest.skip("this file system takes UTF-8 names alone")
+    scene = json.loads((data / "transforms.json").read_text())
+    for frame in scene["frames"]:
+        frame["file_path"] = frame["file_path"].replace("v0.png", name)
+    (data / "transforms.json").write_text(json.dumps(scene))
+    result = run(tmp_path / "place", tmp_path / "edit", "--ply", place / "splats.ply")
+    assert result.exit_code == 0, result.output
+    assert "f?r" in (tmp_path / "edit" / "index.html").read_text(encoding="utf-8")
+
+
 def test_the_page_shows_the_further_sources_in_their_order(place, tmp_path):
     more = ("--ply", place / "splats.ply", "--set", "sources=3")
     assert run(place, tmp_path, *more).exit_code == 0
