@@ -36,6 +36,8 @@ from attnwarp.propagate.progress import Step
 from attnwarp.propagate.scene import (
     Scene,
     Segments,
+    check_cameras,
+    check_loaded,
     editor_digest,
     near_of,
     render_picture,
@@ -143,8 +145,11 @@ def run(
         raise ValueError(
             f"settings: {kind.name} takes {kind.settings.__name__}, got {type(chosen).__name__}"
         )
-    if not cameras:
-        raise ValueError("cameras: got none, expected at least one")
+    check.instance(gaussians, Gaussians, "gaussians", "attnwarp.Gaussians")
+    check_loaded(editor)
+    cameras = check_cameras(cameras)
+    if options.get("budget") is not None:
+        check.instance(options["budget"], Budget, "budget", "attnwarp.baselines.Budget")
     if not instruction.strip():
         raise ValueError("instruction: is empty, expected words such as 'make it red'")
     backend, folder = options.get("backend", "auto"), options.get("folder")

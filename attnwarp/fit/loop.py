@@ -199,6 +199,12 @@ def fit(
         >>> fit(start, grey, FitSettings(kind="3d", iterations=2, sh_degree=0)).iteration
         2
     """
+    check.instance(start, Gaussians, "start", "attnwarp.Gaussians")
+    check.instance(views, Views, "views", "attnwarp.fit.Views")
+    if held_out is not None:
+        check.instance(held_out, Views, "held_out", "attnwarp.fit.Views")
+    if settings is not None:
+        check.instance(settings, FitSettings, "settings", "attnwarp.fit.FitSettings")
     settings = (
         FitSettings(kind=start.kind, sh_degree=start.sh_degree) if settings is None else settings
     )

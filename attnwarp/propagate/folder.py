@@ -189,11 +189,25 @@ class Folder:
             InputError: it is another one.
         """
         record = record_of(picture)
-        if self.has(record) and self.read_json(record).get("sha256") != digest(pixels):
+        if self.has(record) and self.read_record(picture)["sha256"] != digest(pixels):
             raise InputError(
                 f"{self.path}: the edit is not the one that {picture} was; go on with the same"
                 " device, number of threads and versions, or name another folder"
             )
+
+    def read_record(self, picture: str, *keys: str) -> dict[str, Any]:
+        """What the edit of a picture was.
+
+        Raises:
+            FileFormatError: the record is damaged, or lacks one of the keys.
+        """
+        record: dict[str, Any] = self.read_json(record_of(picture))
+        for key in ("sha256", *keys):
+            if key not in record:
+                raise FileFormatError(
+                    self.path / record_of(picture), f"lacks {key!r}; remove it, it is made anew"
+                )
+        return record
 
     def edited(self, picture: str, *further: str) -> bool:
         """Whether a view is edited: beside its picture stands a record, NAME.json.
@@ -205,6 +219,9 @@ class Folder:
             picture: of the edit.
             further: pictures that were written with it.
 
+        Raises:
+            FileFormatError: the record is damaged.
+
         Warns:
             InputWarning: a view is edited again; once for each.
         """
@@ -213,9 +230,8 @@ class Folder:
             return False
         damaged = next((name for name in (picture, *further) if not self.has_picture(name)), None)
         what = "missing or damaged"
-        if damaged is None and self.read_json(record).get("sha256") != digest(
-            self.read_picture(picture)
-        ):
+        stored = self.read_record(picture)["sha256"]
+        if damaged is None and stored != digest(self.read_picture(picture)):
             damaged, what = picture, "not the picture that the edit made"
         if damaged is not None:
             self._again.add(picture)

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from numbers import Integral
 from pathlib import Path
 from typing import Any, Literal
 
@@ -43,6 +44,8 @@ from attnwarp.propagate.progress import Step
 from attnwarp.propagate.scene import (
     Scene,
     Segments,
+    check_cameras,
+    check_loaded,
     checked_image,
     editor_digest,
     near_of,
@@ -157,7 +160,8 @@ def propagate(
             recordings together before the first is made.
 
     Raises:
-        ValueError: an argument of another size or type; the message names it.
+        ValueError: an argument of another size or of values that cannot be; the message names it.
+        TypeError: an argument of another type, such as the name of an editor.
         InputError: the folder holds an edit of other settings or inputs, which the message names;
             or another run writes to it.
         RuntimeError: tuning diverged; the last checkpoint stays.
@@ -176,8 +180,11 @@ def propagate(
         >>> result.plan.stages, result.edited[1].shape
         (((1,),), (32, 32, 3))
     """
-    if not cameras:
-        raise ValueError("cameras: got none, expected at least one")
+    check.instance(gaussians, Gaussians, "gaussians", "attnwarp.Gaussians")
+    check.instance(settings, PropagateSettings, "settings", "PropagateSettings, as of preset()")
+    check_loaded(editor)
+    cameras = check_cameras(cameras)
+    check.instance(source, Integral, "source", "a number of a view")
     if not 0 <= source < len(cameras):
         raise ValueError(f"source: got {source}, expected a number of a view below {len(cameras)}")
     check.one_of(store, ("device", "cpu", "disk"), "store")
@@ -720,7 +727,8 @@ class _Run:
         source = self.folder.read_json("source.json")
         targets = self.plan.targets
         shares = [
-            self.folder.read_json(f"views/{self.names[view]}.json")["injected"] for view in targets
+            self.folder.read_record(f"views/{self.names[view]}.png", "injected")["injected"]
+            for view in targets
         ]
         sources = len(self.plan.sources)
         # An edit made by hand is inverted before it is replayed.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -126,6 +127,32 @@ def images_of(views: Views) -> list[npt.NDArray[Any]]:
         image if image.shape[2] == 3 else views.target(k, black).numpy()
         for k, image in enumerate(views.images)
     ]
+
+
+def check_cameras(cameras: Any) -> list[Camera]:
+    """The cameras as a list.
+
+    Raises:
+        TypeError: something else than cameras one after another.
+        ValueError: there are none.
+    """
+    if isinstance(cameras, Camera) or not isinstance(cameras, Iterable):
+        raise TypeError(f"cameras: got {type(cameras).__name__}, expected a list of cameras")
+    listed = list(cameras)
+    if not listed:
+        raise ValueError("cameras: got none, expected at least one")
+    for camera in listed:
+        check.instance(camera, Camera, "cameras", "attnwarp.Camera")
+    return listed
+
+
+def check_loaded(editor: Any) -> None:
+    """Raise TypeError if an editor is a name or a path."""
+    if isinstance(editor, str | Path):
+        raise TypeError(
+            f"editor: got {str(editor)!r}, expected an editor; load it with"
+            f" attnwarp.editing.small.load_editor({str(editor)!r})"
+        )
 
 
 def near_of(cameras: Sequence[Camera], gaussians: Gaussians) -> float:

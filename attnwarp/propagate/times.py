@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from attnwarp.io.file import FileFormatError
 from attnwarp.propagate.folder import Folder
 
 FILE = "times.json"
@@ -20,7 +21,14 @@ class Times:
 
     def __init__(self, folder: Folder) -> None:
         self.folder = folder
-        self._ended: dict[str, float] = dict(folder.read_json(FILE)) if folder.has(FILE) else {}
+        stored = folder.read_json(FILE) if folder.has(FILE) else {}
+        for name, value in stored.items():
+            if not isinstance(value, int | float):
+                raise FileFormatError(
+                    folder.path / FILE,
+                    f"got {value!r}, expected seconds; remove it, it is made anew", field=name,
+                )  # fmt: skip
+        self._ended: dict[str, float] = dict(stored)
         self._part, self._since = "", 0.0
 
     @contextmanager

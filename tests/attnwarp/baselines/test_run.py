@@ -282,6 +282,11 @@ def test_a_folder_of_another_method_or_budget_is_refused_by_name(run, tmp_path):
         run("by_view", ByViewSettings(**none), folder=tmp_path, budget=Budget(seconds=5))
 
 
+def test_a_budget_of_another_type_is_named(run):
+    with pytest.raises(TypeError, match=r"budget: got dict, expected attnwarp.baselines.Budget"):
+        run("by_view", budget={"seconds": 3})
+
+
 def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(run, tmp_path):
     refusals = []
 

@@ -357,6 +357,22 @@ def test_a_measure_of_the_callers_own_is_part_of_the_curve(scene, tmp_path):
     assert again.history == result.history and same_bits(again.gaussians, result.gaussians)
 
 
+@pytest.mark.parametrize(
+    ("position", "value", "message"),
+    [
+        (0, "a.ply", "start: got str, expected attnwarp.Gaussians"),
+        (1, [], "views: got list, expected attnwarp.fit.Views"),
+        (2, {}, "settings: got dict, expected attnwarp.fit.FitSettings"),
+    ],
+)
+def test_an_argument_of_another_type_is_named(scene, position, value, message):
+    start, settings = begin(scene, iterations=1)
+    arguments = [start, scene[0], settings]
+    arguments[position] = value
+    with pytest.raises(TypeError, match=message):
+        fit(*arguments)
+
+
 def test_a_second_fit_into_a_folder_is_refused_while_the_first_goes_on(scene, tmp_path):
     start, settings = begin(scene, iterations=2, sh_degree=0)
     refusals = []

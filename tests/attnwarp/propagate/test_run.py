@@ -3,6 +3,7 @@
 import copy
 import hashlib
 import json
+import re
 import shutil
 import time
 import weakref
@@ -517,6 +518,50 @@ def test_a_folder_that_was_tuned_by_other_weights_is_refused(scene, editor, tmp_
         tiny_models.save_backbone(weights / "alexnet-owt-7be5be79.pth", "alex", seed)
         with expected:
             run(scene, editor, tmp_path / "edit", settings)
+
+
+@pytest.mark.parametrize(
+    ("record", "key"), [("source", "sha256"), ("views/{}", "sha256"), ("views/{}", "injected")]
+)
+def test_a_record_that_lacks_something_is_named_and_made_anew_once_it_is_gone(
+    finished, scene, editor, tmp_path, record, key
+):
+    folder = finished[1]
+    name = record.format(min((folder / "views").glob("*.png")).stem)
+    shutil.copytree(folder, tmp_path / "edit")
+    path = tmp_path / "edit" / f"{name}.json"
+    path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != key}))
+    lacks = f"{re.escape(str(path))}: lacks '{key}'; remove it"
+    with pytest.raises(FileFormatError, match=lacks):
+        run(scene, editor, tmp_path / "edit")
+    path.unlink()
+    run(scene, editor, tmp_path / "edit")
+    assert files(tmp_path / "edit") == files(folder)
+
+
+def test_seconds_that_are_none_are_named(finished, scene, editor, tmp_path):
+    shutil.copytree(finished[1], tmp_path / "edit")
+    (tmp_path / "edit" / "times.json").write_text('{"edit": "x"}')
+    with pytest.raises(FileFormatError, match="times.json: edit: got 'x', expected seconds"):
+        run(scene, editor, tmp_path / "edit")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"gaussians": "a.ply"}, "gaussians: got str, expected attnwarp.Gaussians"),
+        ({"cameras": cameras()[0]}, "cameras: got Camera, expected a list of cameras"),
+        ({"cameras": ["a"]}, "cameras: got str, expected attnwarp.Camera"),
+        ({"editor": "small"}, r"editor: got 'small', .*load_editor\('small'\)"),
+        ({"settings": "corrected"}, "settings: got str, expected PropagateSettings"),
+        ({"source": "0"}, "source: got str, expected a number"),
+    ],
+)
+def test_an_argument_of_another_type_is_named(scene, editor, changes, message):
+    model, views, images = scene
+    given = {"gaussians": model, "cameras": views, "images": images, "editor": editor}
+    with pytest.raises(TypeError, match=message):
+        propagate(**{**given, "instruction": "a bear", "settings": QUICK, **changes})
 
 
 @pytest.mark.parametrize(
