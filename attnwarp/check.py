@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -100,24 +101,65 @@ LARGEST = sys.float_info.max
 """Beyond it a whole number has no float, which every formula takes."""
 
 
-def number(value: Any, low: float, high: float, name: str, *, whole: bool = False) -> None:
-    """Raise ValueError unless ``value`` is a finite number in [low, high], whole if asked.
+def is_number(value: Any, *, whole: bool = False) -> bool:
+    """Whether ``value`` is a number of Python or numpy, of a whole type if asked; no bool is.
 
     Example:
         >>> from attnwarp import check
+        >>> check.is_number(True), check.is_number(2.0), check.is_number(2.0, whole=True)
+        (False, True, False)
+    """
+    kind = numbers.Integral if whole else numbers.Real
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
+def number(value: Any, low: float, high: float, name: str, *, whole: bool = False) -> float:
+    """``value`` as Python's own number, if it is finite and in [low, high], and whole if asked.
+
+    Numbers of numpy are taken too. A whole number stays an int, so that settings keep their JSON.
+
+    Raises:
+        ValueError: it is not.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import check
+        >>> check.number(np.int64(2), 0, 5, "steps", whole=True)
+        2
         >>> check.number(2.5, 0, float("inf"), "steps", whole=True)
         Traceback (most recent call last):
         ValueError: steps: got 2.5, expected a whole number >= 0
     """
-    right = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+    right = is_number(value, whole=whole)
+    # As Python's own before it is compared: the largest float has no float32.
+    plain = (int(value) if isinstance(value, numbers.Integral) else float(value)) if right else 0
     # A whole number beyond every float is finite by type, and cannot be asked.
-    beyond = right and abs(value) > LARGEST
-    if not right or beyond or math.isnan(value) or not low <= value <= high:
+    beyond = abs(plain) > LARGEST
+    if not right or beyond or math.isnan(plain) or not low <= plain <= high:
         kind = "a whole number" if whole else "a number"
         bounds = f">= {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
         text = repr(value)
         shown = text if len(text) <= 80 else f"{text[:40]}... ({len(text)} characters)"
         raise ValueError(f"{name}: got {shown}, expected {kind} {bounds}")
+    return plain
+
+
+def size(value: Any, name: str) -> tuple[int, int]:
+    """``value`` as a (height, width) of whole numbers from 1.
+
+    Raises:
+        ValueError: it is not.
+
+    Example:
+        >>> from attnwarp import check
+        >>> check.size((8, 2.5), "size")
+        Traceback (most recent call last):
+        ValueError: size: got (8, 2.5), expected (height, width) of whole numbers from 1
+    """
+    sides = tuple(value) if isinstance(value, Sequence | np.ndarray) else ()
+    if len(sides) != 2 or not all(is_number(side, whole=True) and side >= 1 for side in sides):
+        raise ValueError(f"{name}: got {value!r}, expected (height, width) of whole numbers from 1")
+    return int(sides[0]), int(sides[1])
 
 
 def seconds(value: Any, name: str) -> None:
@@ -129,8 +171,7 @@ def seconds(value: Any, name: str) -> None:
         Traceback (most recent call last):
         ValueError: checkpoint_seconds: got None, expected seconds >= 0
     """
-    right = isinstance(value, int | float) and not isinstance(value, bool)
-    if not right or not value >= 0:
+    if not is_number(value) or not value >= 0:
         raise ValueError(f"{name}: got {value!r}, expected seconds >= 0")
 
 

@@ -8,6 +8,7 @@ not depend on the image's size.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cache
 from typing import Any, Literal
 
@@ -16,6 +17,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp import check
+from attnwarp.camera import Camera
 from attnwarp.render import Render
 
 Tensor = torch.Tensor
@@ -148,6 +150,31 @@ def ssim_terms(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     _windowed(image, target)
     _, _, a1, a2, b1, b2 = _moments(image.detach(), target.detach())
     return a1 / b1, a2 / b2
+
+
+def check_sizes(cameras: Sequence[Camera], smallest: int, loss: str, setting: str) -> None:
+    """Raise ValueError that names the first view that is too small for a loss.
+
+    Args:
+        cameras: of the views.
+        smallest: side in px that the loss takes.
+        loss: for the message.
+        setting: the loss's weight.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera, losses
+        >>> camera = Camera(np.eye(3), np.eye(4), width=16, height=8, name="a.png")
+        >>> losses.check_sizes([camera], losses.SSIM_WINDOW, "SSIM", "ssim")
+        Traceback (most recent call last):
+        ValueError: views: 'a.png' has 16 x 8 px, SSIM needs 11 a side; enlarge it, or set ssim to 0
+    """
+    for camera in cameras:
+        if min(camera.width, camera.height) < smallest:
+            raise ValueError(
+                f"views: {camera.name!r} has {camera.width} x {camera.height} px, {loss} needs"
+                f" {smallest} a side; enlarge it, or set {setting} to 0"
+            )
 
 
 def _windowed(image: Tensor, target: Tensor) -> None:

@@ -8,6 +8,11 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 extras=${1:-dev}
+if [[ $extras == -* ]]; then
+    sed -n '2,/^set /{s/^# \{0,1\}//p}' scripts/venv.sh
+    [[ $extras == -h || $extras == --help ]] && exit 0
+    exit 2
+fi
 venv=.venv
 hash=$(cat pyproject.toml constraints.txt scripts/venv.sh | sha256sum | cut -d' ' -f1)
 stamp=$venv/.installed-$extras
@@ -104,7 +109,9 @@ install_libraries
 [ -x "$venv/bin/python" ] && "$venv/bin/python" -m pip --version >/dev/null 2>&1 || make_venv
 say "attnwarp: installing the tested versions into $venv, with the extras $extras (a few minutes the first time)"
 # Python compiles a module when it is first imported; pip would compile all 20,000, of which most are never used.
-install() { "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt "$@"; }
+install() { PYTHONWARNINGS=ignore "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt "$@"; }
+# The pip that Debian's Python brings takes half a minute longer; without a newer one it goes on with that.
+install pip==26.3 2>/dev/null || say "attnwarp: could not fetch pip 26.3; going on with this one"
 # torch first and by its exact version: a range could bring the newest build with several GB of CUDA.
 install torch==2.13.0
 install -e ".[$extras]"

@@ -29,7 +29,7 @@ class Budget:
             beyond does not begin, and the round's tuning is the last.
 
     Raises:
-        ValueError: a negative number, or one that is not finite.
+        ValueError: no number, a negative one, or one that is not finite; rows that are not whole.
 
     Example:
         >>> from attnwarp.baselines import Budget
@@ -41,10 +41,11 @@ class Budget:
     network_rows: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("seconds", "network_rows"):
+        for name, whole in (("seconds", False), ("network_rows", True)):
             value = getattr(self, name)
-            if value is not None and not 0 <= value < math.inf:
-                raise ValueError(f"{name}: got {value!r}, expected None or a finite number >= 0")
+            if value is not None:
+                value = check.number(value, 0, math.inf, name, whole=whole)
+                object.__setattr__(self, name, value)
 
 
 @dataclass(frozen=True)
@@ -110,11 +111,12 @@ class BaselineSettings:
             if field.name in _CHOICES:
                 check.one_of(value, get_args(_CHOICES[field.name]), field.name)
             elif field.name in _NUMBERS:
-                _check_number(field.name, value)
+                object.__setattr__(self, field.name, _checked_number(field.name, value))
             elif field.name in _TEXTS and not (value is None and field.name in _OPTIONAL):
                 check.text(value, field.name)
             elif field.name in ("start", "starts"):
-                _check_timesteps(field.name, getattr(self, field.name))
+                steps = _checked_timesteps(field.name, getattr(self, field.name))
+                object.__setattr__(self, field.name, steps)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values in the order of the fields."""
@@ -287,22 +289,18 @@ _OPTIONAL = {
 }  # fmt: skip
 
 
-def _check_number(name: str, value: Any) -> None:
+def _checked_number(name: str, value: Any) -> float | None:
     kind, low, high = _NUMBERS[name]
     if value is None and name in _OPTIONAL:
-        return
-    right = isinstance(value, int if kind is int else (int, float)) and not isinstance(value, bool)
-    if not right or not math.isfinite(value) or not low <= value <= high:
-        word = "a whole number" if kind is int else "a number"
-        bounds = f">= {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
-        raise ValueError(f"{name}: got {value!r}, expected {word} {bounds}")
+        return None
+    return check.number(value, low, high, name, whole=kind is int)
 
 
-def _check_timesteps(name: str, value: Any) -> None:
+def _checked_timesteps(name: str, value: Any) -> tuple[int, ...] | None:
     if value is None and name == "start":
-        return
+        return None
     right = isinstance(value, tuple) and all(
-        isinstance(t, int) and 0 <= t < PUBLISHED_STEPS for t in value
+        check.is_number(t, whole=True) and 0 <= t < PUBLISHED_STEPS for t in value
     )
     limits = f"of Stable Diffusion, in [0, {PUBLISHED_STEPS - 1}]"
     if name == "start":
@@ -310,6 +308,7 @@ def _check_timesteps(name: str, value: Any) -> None:
             raise ValueError(f"start: got {value!r}, expected (lowest, highest) timestep {limits}")
     elif not right or not value:
         raise ValueError(f"starts: got {value!r}, expected timesteps {limits}, at least one")
+    return tuple(int(t) for t in value)
 
 
 _STABLE_DIFFUSION: dict[str, Any] = {

@@ -85,7 +85,7 @@ def fit(
     ] = 30.0,
     threads: RenderThreadsOption = None,
     restart: Annotated[
-        bool, typer.Option("--restart", help="Begin again without the checkpoint.")
+        bool, typer.Option("--restart", help="Begin again, over the fit in --out.")
     ] = False,
     third_scale: Annotated[
         float | None,
@@ -186,7 +186,7 @@ def _fit(
         )
 
     import attnwarp.fit
-    from attnwarp.fit.loop import CHECKPOINT
+    from attnwarp.fit.loop import CHECKPOINT, SPLATS
     from attnwarp.fit.progress import more_points, progress_display
     from attnwarp.fit.start import FIRST_POINTS
     from attnwarp.io.names import file_stems
@@ -219,7 +219,7 @@ def _fit(
                 third_scale=third_scale, watch=watch, stop=stop,
             )  # fmt: skip
     except ValueError as error:
-        if str(out / CHECKPOINT) not in str(error):
+        if not any(str(out / name) in str(error) for name in (CHECKPOINT, SPLATS)):
             raise
         raise ValueError(
             f"{error} (--restart does so; --start SPLATS.ply goes on from splats in another folder)"

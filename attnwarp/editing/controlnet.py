@@ -104,7 +104,7 @@ class DepthControlNet(Latent):
         words = text_encoder.config.to_dict()
         check_base(unet.config, words, vae.config)
         check_controlnet(controlnet.config, words, vae.config)
-        check.number(guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "guidance")
+        guidance = check.number(guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "guidance")
         self.controlnet = controlnet.eval().requires_grad_(False)
         self.guidance, self.control_scale = guidance, control_scale
         self.negative_prompt = negative_prompt

@@ -67,9 +67,9 @@ class InstructPix2Pix(Latent):
     ) -> None:
         super().__init__(unet, vae, text_encoder, tokenizer, scheduler)
         check_pix2pix(unet.config, text_encoder.config.to_dict(), vae.config)
-        check.number(text_guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "text_guidance")
-        check.number(image_guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "image_guidance")
-        self.text_guidance, self.image_guidance = text_guidance, image_guidance
+        most = MOST_GUIDANCE
+        self.text_guidance = check.number(text_guidance, -most, most, "text_guidance")
+        self.image_guidance = check.number(image_guidance, -most, most, "image_guidance")
 
     @classmethod
     def from_folder(cls, folder: str | Path, **settings: Any) -> InstructPix2Pix:

@@ -220,7 +220,13 @@ class BundledDino(_OfSquares):
 
 
 class BundledPerceptual:
-    """perceptual-small: a :class:`~attnwarp.encoders.base.PerceptualDistance`."""
+    """perceptual-small: a :class:`~attnwarp.encoders.base.PerceptualDistance`.
+
+    Attributes:
+        smallest: shortest side in px of a picture that it takes.
+    """
+
+    smallest = 1
 
     def __init__(self, name: str, folder: Path) -> None:
         self.net = PerceptualSmall()

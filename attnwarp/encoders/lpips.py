@@ -143,6 +143,9 @@ class Lpips:
         weights: the linear layers, one (channels,) tensor a stage.
         about: identity, stored with results.
         device: of the computation.
+
+    Attributes:
+        smallest: shortest side in px of a picture that it takes.
     """
 
     def __init__(
@@ -154,6 +157,7 @@ class Lpips:
         device: torch.device | str = "cpu",
     ) -> None:
         self.about = about
+        self.smallest = backbone.smallest
         self._backbone = backbone
         self._device = torch.device(device)
         self._network = network.to(self._device, torch.float32).eval().requires_grad_(False)
@@ -167,10 +171,10 @@ class Lpips:
         """
         pairs = checked_pairs(a, b)
         for i, (first, _) in enumerate(pairs):
-            if min(first.shape[:2]) < self._backbone.smallest:
+            if min(first.shape[:2]) < self.smallest:
                 raise ValueError(
                     f"a[{i}]: got {first.shape[1]} x {first.shape[0]} px, expected sides of at"
-                    f" least {self._backbone.smallest} px for LPIPS with {self._backbone.name}"
+                    f" least {self.smallest} px for LPIPS with {self._backbone.name}"
                 )
         # Pair by pair: VGG's first stage holds 64 floats a pixel, 134 MB for one pair of 512 x 512.
         return np.array([self._pair(first, second) for first, second in pairs], dtype=np.float64)

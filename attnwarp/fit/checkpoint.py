@@ -22,7 +22,7 @@ FORMAT = 2
 misread.
 """
 
-REMEDY = "remove it to begin again"
+REMEDY = "remove it and splats.ply to begin again"
 
 _MAGIC = b"attnwarp checkpoint"
 

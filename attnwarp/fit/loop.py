@@ -165,7 +165,7 @@ def fit(
         settings: the default ones for ``start.kind`` if left out.
         held_out: pictures to evaluate on, never fitted on.
         folder: made if need be.
-        restart: begin again, without the folder's checkpoint.
+        restart: begin again, without the folder's checkpoint, and write over its splats.
         max_seconds: stop after so many seconds of iterations, over all sittings. The learning rates
             follow ``settings.iterations`` all the same.
         checkpoint_seconds: see above.
@@ -179,8 +179,8 @@ def fit(
 
     Raises:
         ValueError: ``start`` is of another kind or degree than the settings say or lies on a GPU,
-            the folder holds a fit of other views, settings or first splats, or a number is out of
-            range.
+            the folder holds a fit of other views, settings or first splats, or ``splats.ply``
+            without a checkpoint, or a number is out of range.
         FileFormatError: the folder's checkpoint is damaged.
         InputError: another run writes to the folder.
         RuntimeError: the loss or a held-out view is no longer finite, or no splat is left; the
@@ -220,12 +220,8 @@ def fit(
     if len(start) == 0:
         raise ValueError("start: holds no splats")
     check_on_cpu(start)
-    for camera in views.cameras if settings.ssim else ():
-        if min(camera.width, camera.height) < losses.SSIM_WINDOW:
-            raise ValueError(
-                f"views: {camera.name!r} has {camera.width} x {camera.height} px, and SSIM needs"
-                f" {losses.SSIM_WINDOW} on each side; use larger pictures, or set ssim to 0"
-            )
+    if settings.ssim:
+        losses.check_sizes(views.cameras, losses.SSIM_WINDOW, "SSIM", "ssim")
     if max_seconds is not None:
         check.seconds(max_seconds, "max_seconds")
     check.seconds(checkpoint_seconds, "checkpoint_seconds")
@@ -234,9 +230,7 @@ def fit(
     run = _Run(start, views, settings, held_out, backend, measure, third_scale)
     with nullcontext() if folder is None else alone_in(folder):
         if folder is not None:
-            if restart:
-                (Path(folder) / CHECKPOINT).unlink(missing_ok=True)
-            run.resume(Path(folder))
+            run.resume(Path(folder), restart=restart)
         return run.go(max_seconds, checkpoint_seconds, watch, stop)
 
 
@@ -280,10 +274,19 @@ class _Run:
             "origin": [float(v) for v in self.model.origin],
         }
 
-    def resume(self, folder: Path) -> None:
+    def resume(self, folder: Path, *, restart: bool) -> None:
         self.folder = folder
         path = folder / CHECKPOINT
+        if restart:
+            path.unlink(missing_ok=True)
+            return
         if not path.exists():
+            splats = folder / SPLATS
+            if splats.exists():
+                raise ValueError(
+                    f"folder: {splats} is there without {CHECKPOINT}, and a fit would write over"
+                    " it; name another folder, or remove it to begin again"
+                )
             return
         state = checkpoint.load(path)
         # Checkpoints from before they named the first splats can't be held to them.
@@ -301,7 +304,7 @@ class _Run:
                 name = f"settings ({'; '.join(differ)})"
             raise ValueError(
                 f"folder: {folder} holds a fit of other {NAMED.get(name, name)}; go on with the"
-                f" same ones, or name another folder, or remove {path} to begin again"
+                f" same ones, or name another folder, or remove {path} and {SPLATS} to begin again"
             )
         try:
             self.model.restore(state["model"])
@@ -320,7 +323,7 @@ class _Run:
     def save(self) -> None:
         if self.folder is None:
             return
-        write_ply(self.folder / SPLATS, self.model.gaussians(), third_scale=self.third_scale)
+        # The checkpoint first: splats without one are taken for somebody's own.
         checkpoint.save(
             self.folder / CHECKPOINT,
             {
@@ -337,6 +340,7 @@ class _Run:
                 "history": [asdict(record) for record in self.history],
             },
         )
+        write_ply(self.folder / SPLATS, self.model.gaussians(), third_scale=self.third_scale)
 
     def go(
         self,

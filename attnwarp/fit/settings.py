@@ -135,9 +135,8 @@ class FitSettings:
             if value is None and name in _OPTIONAL:
                 continue
             whole = name in _WHOLE
-            check.number(value, low, high, name, whole=whole)
-            if not whole:
-                object.__setattr__(self, name, float(value))
+            value = check.number(value, low, high, name, whole=whole)
+            object.__setattr__(self, name, value if whole else float(value))
 
     @property
     def normal_weight(self) -> float:

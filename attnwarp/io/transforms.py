@@ -508,7 +508,8 @@ def _splits(
                 )
             result[i] = each
     without = [name for name, each in zip(names, result, strict=True) if each is None]
-    if lists and without:
+    # Programs write empty lists where nothing is split.
+    if without and any(data[f"{each}_filenames"] for each in lists):
         warnings.warn(
             f"{path}: {len(without)} of {len(names)} frames are in no split and not used by a"
             f" fit: {', '.join(map(brief, without[:3]))}",

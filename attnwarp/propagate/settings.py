@@ -206,9 +206,10 @@ class PropagateSettings:
         for name, (low, high) in _LIMITS.items():
             value = getattr(self, name)
             if value is not None or name not in _OPTIONAL:
-                check.number(value, low, high, name, whole=name in _WHOLE)
-        _check_start(self.start)
-        _check_feature_steps(self.feature_steps)
+                value = check.number(value, low, high, name, whole=name in _WHOLE)
+                object.__setattr__(self, name, value)
+        object.__setattr__(self, "start", _checked_start(self.start))
+        object.__setattr__(self, "feature_steps", _checked_shares(self.feature_steps))
         if not self.feature_range():
             raise ValueError(
                 f"feature_steps: got {list(self.feature_steps)}, in which none of {self.steps}"
@@ -327,24 +328,28 @@ _LIMITS: dict[str, tuple[float, float]] = {
 }
 
 
-def _check_start(start: tuple[int, int] | None) -> None:
+def _checked_start(start: tuple[int, int] | None) -> tuple[int, int] | None:
     if start is None:
-        return
-    right = len(start) == 2 and all(isinstance(t, int) and 0 <= t < PUBLISHED_STEPS for t in start)
-    if not right or start[0] > start[1]:
+        return None
+    last = PUBLISHED_STEPS - 1
+    right = len(start) == 2 and all(check.is_number(t, whole=True) for t in start)
+    if not right or not 0 <= start[0] <= start[1] <= last:
         raise ValueError(
             f"start: got {list(start)}, expected [lowest, highest] timestep of Stable Diffusion, in"
-            f" [0, {PUBLISHED_STEPS - 1}]"
+            f" [0, {last}]"
         )
+    return int(start[0]), int(start[1])
 
 
-def _check_feature_steps(shares: tuple[float, float]) -> None:
-    right = len(shares) == 2 and all(type(share) in (int, float) for share in shares)
+def _checked_shares(shares: tuple[float, float]) -> tuple[float, float]:
+    right = len(shares) == 2 and all(check.is_number(share) for share in shares)
     if not right or not 0 <= shares[0] < shares[1] <= 1:
         raise ValueError(
             f"feature_steps: got {list(shares)}, expected [from, until] shares of the steps, with"
             " 0 <= from < until <= 1"
         )
+    first, last = (check.number(share, 0, 1, "feature_steps") for share in shares)
+    return first, last
 
 
 _RELEASED = PropagateSettings(

@@ -22,7 +22,7 @@ from attnwarp.fit.model import Model, check_on_cpu
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError
 from attnwarp.propagate.pictures import Image
-from attnwarp.propagate.settings import PropagateSettings
+from attnwarp.propagate.settings import Detail, PropagateSettings
 from attnwarp.render import Render, render
 
 SOURCE_EVERY = 10
@@ -35,6 +35,11 @@ class PerceptualLoss(Protocol):
     @property
     def about(self) -> EncoderInfo:
         """Whose weights it has."""
+        ...
+
+    @property
+    def smallest(self) -> int:
+        """Shortest side of a picture that it takes, px."""
         ...
 
     def features(self, picture: Tensor) -> list[Tensor]:
@@ -70,6 +75,17 @@ class TrainingView:
     number: int
     camera: Camera
     picture: Image
+
+
+def training_cameras(
+    cameras: Sequence[Camera], sizes: Sequence[tuple[int, int]], detail: Detail
+) -> list[Camera]:
+    """The cameras of the pictures to tune on: the views' own where an edit's change is put onto
+    them, else of the size (h, w) px of each view's edit.
+    """
+    if detail == "change":
+        return list(cameras)
+    return [camera.resize(w, h) for camera, (h, w) in zip(cameras, sizes, strict=True)]
 
 
 HELD_BYTES = 2**31
@@ -146,7 +162,8 @@ class Tuning:
 
     Args:
         start: the splats before the edit.
-        cameras: of all views; they decide the extent.
+        cameras: of all views, of the sizes that are tuned on (:func:`training_cameras`); they
+            decide the extent.
         settings: losses, iterations, rates.
         stages: number of stages, over which the centres' learning rate falls.
         backend: of the renderer.
@@ -160,7 +177,8 @@ class Tuning:
 
     Raises:
         InputError: no such perceptual distance.
-        ValueError: the splats lie on a GPU.
+        ValueError: the splats lie on a GPU, or the perceptual distance takes no picture as small as
+            a view's.
     """
 
     def __init__(
@@ -195,6 +213,10 @@ class Tuning:
         self.visits: dict[int, int] = {}
         # Here and not at its first use: before it, views are edited for hours.
         net = perceptual_net(settings)
+        if net is not None:
+            losses.check_sizes(
+                cameras, net.smallest, f"the perceptual distance {net.about.name}", "perceptual"
+            )
         self.perceptual = None if net is None else DistanceToViews(net)
         self.weights = {} if net is None else {"perceptual": net.about.weights_sha256}
 

@@ -183,6 +183,10 @@ def correspond_at(
         source_size: (h, w) of the source's; by default the source image scaled as the target's is.
         interpolation, spread: as in :func:`resize_depth`.
 
+    Raises:
+        ValueError: as :func:`correspond`, :func:`layer_size`, and a size that is no pair of whole
+            numbers from 1.
+
     Example:
         >>> import numpy as np
         >>> from attnwarp import Camera
@@ -195,8 +199,11 @@ def correspond_at(
         >>> c.xy[0, 0].tolist()  # half as many pixels
         [1.5, 0.5]
     """
+    size = check.size(size, "size")
     if source_size is None:
         source_size = layer_size(source, target, size)
+    else:
+        source_size = check.size(source_size, "source_size")
     depth = resize_depth(target_depth, size, interpolation=interpolation, spread=spread)
     return correspond(
         source.resize(source_size[1], source_size[0]),
@@ -212,7 +219,8 @@ def layer_size(source: Camera, target: Camera, size: tuple[int, int]) -> tuple[i
     the image.
 
     Raises:
-        ValueError: the fraction does not give whole numbers.
+        ValueError: a size that is no pair of whole numbers from 1, or that does not give whole
+            numbers.
 
     Example:
         >>> import numpy as np
@@ -222,6 +230,7 @@ def layer_size(source: Camera, target: Camera, size: tuple[int, int]) -> tuple[i
         >>> layer_size(wide, square, (8, 8))
         (8, 16)
     """
+    size = check.size(size, "size")
     h, w = size[0] * source.height / target.height, size[1] * source.width / target.width
     if h != round(h) or w != round(w):
         raise ValueError(

@@ -48,7 +48,8 @@ def resize_depth(
         (h, w) float64, NaN where a tap that counts is undefined or where the taps were rejected.
 
     Raises:
-        ValueError: a depth of another shape or type, or a size below 1 x 1.
+        ValueError: a depth of another shape or type, or a size that is no pair of whole numbers
+            from 1.
 
     Example:
         >>> import torch
@@ -58,9 +59,7 @@ def resize_depth(
         [[1.0, nan]]
     """
     source = valid_depth(depth, "depth")
-    h, w = size
-    if h < 1 or w < 1:
-        raise ValueError(f"size: got {size}, expected (h, w) of at least 1 x 1")
+    h, w = check.size(size, "size")
     H, W = source.shape
     x = (torch.arange(w, dtype=torch.float64) + 0.5) * (W / w)
     y = (torch.arange(h, dtype=torch.float64) + 0.5) * (H / h)

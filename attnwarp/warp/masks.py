@@ -26,7 +26,8 @@ def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize = "area") 
         (h, w) bool.
 
     Raises:
-        ValueError: a mask of another shape or type, or another mode.
+        ValueError: a mask of another shape or type, a size that is no pair of whole numbers from
+            1, or another mode.
 
     Example:
         >>> import torch
@@ -38,8 +39,9 @@ def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize = "area") 
     if mask.dtype != torch.bool:
         raise ValueError(f"mask: got {mask.dtype}, expected bool")
     check.shape(mask, ("H", "W"), "mask")
-    rows = axis_weights(size[0], mask.shape[0], mode)
-    columns = axis_weights(size[1], mask.shape[1], mode)
+    h, w = check.size(size, "size")
+    rows = axis_weights(h, mask.shape[0], mode)
+    columns = axis_weights(w, mask.shape[1], mode)
     share = rows @ mask.double().cpu() @ columns.T
     # Half of a pixel is not more than half, whatever the last bit of the sum says.
     return (share > 0.5 + 1e-9).to(mask.device)

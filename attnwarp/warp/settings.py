@@ -122,7 +122,7 @@ class WarpSettings:
             value = getattr(self, name)
             if value is None and name in ("opaque", "photometric", "depth_spread"):
                 continue
-            check.number(value, 0, limits.get(name, float("inf")), name)
+            value = check.number(value, 0, limits.get(name, float("inf")), name)
             object.__setattr__(self, name, float(value))
 
     def to_dict(self) -> dict[str, Any]:

@@ -94,13 +94,14 @@ class WarpedView:
             source_size: (h, w) of the source's; by default at the same fraction of its image.
 
         Raises:
-            ValueError: a size that is no pair, or below 1.
+            ValueError: a size that is no pair of whole numbers from 1.
         """
-        for name, value in (("size", size), ("source_size", source_size)):
-            if value is not None and (not hasattr(value, "__len__") or len(value) != 2):
-                raise ValueError(f"{name}: got {value!r}, expected (height, width)")
+        size = check.size(size, "size")
         source, target = self.correspondence.source, self.correspondence.target
-        source_size = layer_size(source, target, size) if source_size is None else source_size
+        if source_size is None:
+            source_size = layer_size(source, target, size)
+        else:
+            source_size = check.size(source_size, "source_size")
         key = (*size, *source_size)
         if key == (target.height, target.width, source.height, source.width):
             self._at.setdefault(key, FeatureWarp(self.correspondence, self.mask, self.backend))

@@ -51,6 +51,7 @@ class Figure:
         count: answers.
         chance: value of guessing; None if that says nothing.
         asked: the required share; None if none is required.
+        at_most: the share that is not to be exceeded; None if there is none.
     """
 
     what: str
@@ -60,6 +61,14 @@ class Figure:
     count: int
     chance: float | None = None
     asked: float | None = None
+    at_most: float | None = None
+
+    @property
+    def short(self) -> bool:
+        """Whether it misses what was asked for."""
+        return (self.asked is not None and self.value < self.asked) or (
+            self.at_most is not None and self.value > self.at_most
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""

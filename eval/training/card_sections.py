@@ -28,14 +28,21 @@ def with_section(card: str, section: str) -> str:
 
 
 def short_of(figures: Sequence[Figure]) -> list[str]:
-    """Lines that name the figures below what was asked for; none where all reach it."""
-    short = [f.what for f in figures if f.asked is not None and f.value < f.asked]
+    """Lines that name the figures that miss what was asked for; none where all meet it."""
+    short = [f.what for f in figures if f.short]
     return ["", "Short of what was asked for: " + "; ".join(short) + "."] if short else []
 
 
 def percent(f: Figure) -> str:
     """A figure with its interval, for a table."""
     return f"**{100 * f.value:.0f} %** ({100 * f.low:.0f} to {100 * f.high:.0f})"
+
+
+def asked_for(f: Figure) -> str:
+    """What was asked of a figure, for a table."""
+    if f.at_most is not None:
+        return f"at most {100 * f.at_most:.0f} %"
+    return "" if f.asked is None else f"{100 * f.asked:.0f} %"
 
 
 class Kept:

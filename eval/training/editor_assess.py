@@ -13,7 +13,7 @@ import torch
 
 from attnwarp.editing.editor import Image, edit
 from training.assess import Figure, figure
-from training.card_sections import percent, short_of, with_section
+from training.card_sections import asked_for, percent, short_of, with_section
 from training.editing_pairs import (
     AMBIGUOUS,
     GROUPS,
@@ -191,9 +191,8 @@ def editor_card(
     ]  # fmt: skip
     for own, other in zip(figures, control, strict=True):
         chance = "" if own.chance is None else f"{100 * own.chance:.0f} %"
-        asked = "" if own.asked is None else f"{100 * own.asked:.0f} %"
         lines.append(
-            f"| {own.what} | {percent(own)} | {100 * other.value:.0f} % | {chance} | {asked} | {own.count} |"
+            f"| {own.what} | {percent(own)} | {100 * other.value:.0f} % | {chance} | {asked_for(own)} | {own.count} |"
         )
     lines += short_of(figures)
     card = "\n".join([*lines, ""])
@@ -209,9 +208,8 @@ def _scenes_section(scenes: Sequence[Figure]) -> str:
         "", "| question | share | chance | asked for | answers |", "|---|---|---|---|---|",
     ]  # fmt: skip
     for f in scenes:
-        asked = "" if f.asked is None else f"{100 * f.asked:.0f} %"
         lines.append(
-            f"| {f.what} | {percent(f)} | {100 * (f.chance or 0):.0f} % | {asked} | {f.count} |"
+            f"| {f.what} | {percent(f)} | {100 * (f.chance or 0):.0f} % | {asked_for(f)} | {f.count} |"
         )
     return "\n".join(lines + short_of(scenes))
 

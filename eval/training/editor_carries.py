@@ -30,7 +30,7 @@ from attnwarp.editing.attention import (
 from attnwarp.editing.editor import Image, edit
 from attnwarp.warp import EXACT_DEPTH_TOLERANCE, Surface, WarpSettings, warp_surfaces
 from training.assess import Figure, figure
-from training.card_sections import Kept, percent, short_of
+from training.card_sections import Kept, asked_for, percent, short_of
 from training.editing_pairs import GROUPS, SIZE, VIEWS, Worlds
 from training.editor_assess import SEED
 from training.editor_judge import nearest
@@ -153,12 +153,12 @@ class Swap:
             return self.run(guides, noise)
 
 
-QUESTIONS = {
-    "same": ("features of the same picture make it their colour", 0.8),
-    "held": (f"... with a constant weight of {CONSTANT:g}", None),
-    "follows": ("injected in the left half, that half follows", 0.75),
-    "keeps": ("... and the other half keeps its own", 0.75),
-    "other": ("features of another picture make it their colour (at most 15 % asked)", None),
+QUESTIONS: dict[str, tuple[str, dict[str, float]]] = {
+    "same": ("features of the same picture make it their colour", {"asked": 0.8}),
+    "held": (f"... with a constant weight of {CONSTANT:g}", {}),
+    "follows": ("injected in the left half, that half follows", {"asked": 0.75}),
+    "keeps": ("... and the other half keeps its own", {"asked": 0.75}),
+    "other": ("features of another picture make it their colour", {"at_most": 0.15}),
 }
 
 Marks = dict[str, list[tuple[bool, int]]]
@@ -193,7 +193,7 @@ def swap_figures(
                 marks[key] += values
         number += 1
     return [
-        figure(what, [r for r, _ in marks[key]], [w for _, w in marks[key]], asked=asked)
+        figure(what, [r for r, _ in marks[key]], [w for _, w in marks[key]], **asked)
         for key, (what, asked) in QUESTIONS.items()
         if marks[key]
     ]
@@ -369,6 +369,5 @@ def carried_section(carried: Sequence[Figure], pairs: int) -> str:
         "| question | share | asked for | answers |", "|---|---|---|---|",
     ]  # fmt: skip
     for f in carried:
-        asked = "" if f.asked is None else f"{100 * f.asked:.0f} %"
-        lines.append(f"| {f.what} | {percent(f)} | {asked} | {f.count} |")
+        lines.append(f"| {f.what} | {percent(f)} | {asked_for(f)} | {f.count} |")
     return "\n".join(lines + short_of(carried))

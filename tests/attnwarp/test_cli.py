@@ -211,6 +211,11 @@ def test_a_fit_of_other_settings_names_the_options_that_begin_again(data, tmp_pa
     (tmp_path / "checkpoint.pt").write_bytes(b"damaged")
     assert "--restart" in in_process(*arguments, "--iterations", 2).stderr
     assert in_process(*arguments, "--iterations", 2, "--restart").exit_code == 0
+    (tmp_path / "checkpoint.pt").unlink()
+    before = (tmp_path / "splats.ply").read_bytes()
+    result = in_process(*arguments, "--iterations", 2)
+    assert result.exit_code == 2 and "--restart" in result.stderr
+    assert (tmp_path / "splats.ply").read_bytes() == before
 
 
 def test_a_fit_writes_over_no_picture_that_it_reads(data, tmp_path):
@@ -233,7 +238,7 @@ def test_a_restart_that_is_refused_leaves_the_checkpoint(tmp_path):
     assert in_process(*arguments).exit_code == 0
     before = (out / "checkpoint.pt").read_bytes()
     done = in_process(*arguments, "--restart", "--max-size", 16)  # 16 x 8 px
-    assert done.exit_code == 2 and "SSIM needs" in done.stderr
+    assert done.exit_code == 2 and "SSIM needs 11 a side" in done.stderr
     assert (out / "checkpoint.pt").read_bytes() == before
 
 
@@ -335,7 +340,7 @@ def start_and_wait_for_a_checkpoint(arguments, out):
         [*ATTNWARP, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
     end = time.monotonic() + 100
-    while not (out / "checkpoint.pt").exists():
+    while not (out / "splats.ply").exists():  # written after the checkpoint
         assert process.poll() is None and time.monotonic() < end, process.communicate()
         time.sleep(0.05)
     return process

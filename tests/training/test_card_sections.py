@@ -1,6 +1,7 @@
 """Oracles: cards written out."""
 
-from training.card_sections import with_section
+from training.assess import Figure
+from training.card_sections import asked_for, short_of, with_section
 
 
 def test_a_section_replaces_the_one_of_its_heading_and_leaves_the_others():
@@ -12,3 +13,17 @@ def test_a_section_replaces_the_one_of_its_heading_and_leaves_the_others():
     # A heading that another one begins with is another section.
     assert with_section(card, "## Fir\n\nNew.") == card + "\n## Fir\n\nNew.\n"
     assert with_section(added, "## Third\n\nNew.") == added
+
+
+def test_figures_below_what_is_asked_or_above_what_is_allowed_are_named():
+    figures = [
+        Figure("low", 0.79, 0.7, 0.9, 100, asked=0.8),
+        Figure("reached", 0.8, 0.7, 0.9, 100, asked=0.8),
+        Figure("high", 0.16, 0.1, 0.2, 100, at_most=0.15),
+        Figure("allowed", 0.15, 0.1, 0.2, 100, at_most=0.15),
+        Figure("free", 0.0, 0.0, 0.1, 100),
+    ]
+    assert short_of(figures) == ["", "Short of what was asked for: low; high."]
+    assert short_of(figures[1::2]) == []
+    asked = [asked_for(figure) for figure in figures]
+    assert asked == ["80 %", "80 %", "at most 15 %", "at most 15 %", ""]

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib import resources
 from statistics import fmean
 from typing import Any, Literal
 
-import yaml
-
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.metrics.multiview import ABOVE_FLOOR, BELOW_FLOOR
+from attnwarp_eval.scene.yaml import read_yaml
 from attnwarp_eval.statistics.intervals import (
     ROUNDING,
     ByView,
@@ -159,12 +159,13 @@ def of_comparisons(judged: Iterable[JudgedClaim]) -> dict[Comparison, float]:
     }
 
 
-def load_claims() -> list[Claim]:
+@cache
+def load_claims() -> tuple[Claim, ...]:
     """The claims that ship with the package."""
     text = (resources.files("attnwarp_eval.report") / "claims.yaml").read_text()
-    return [
-        Claim(**_tuples(one)) for entry in yaml.safe_load(text) for one in _of_each_metric(entry)
-    ]
+    return tuple(
+        Claim(**_tuples(one)) for entry in read_yaml(text)[1] for one in _of_each_metric(entry)
+    )
 
 
 def _of_each_metric(entry: dict[str, Any]) -> list[dict[str, Any]]:
@@ -196,7 +197,7 @@ def _tuples(entry: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def judge(results: Results, claims: list[Claim]) -> list[JudgedClaim]:
+def judge(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
     """Every claim that the run has measurements for, with its verdict.
 
     p-values are adjusted over the claims (Benjamini-Hochberg). A claim about the editor's working

@@ -55,7 +55,7 @@ class Splats(Part):
     """Gaussians sampled on the scene's surfaces."""
 
     kind: Literal["2d", "3d"] = "2d"
-    count: Annotated[int, Field(ge=1, le=5_000_000)] = 40_000
+    count: Annotated[int, Field(strict=True, ge=1, le=5_000_000)] = 40_000
     position_noise: Annotated[float, Field(ge=0)] = 0.0
     normal_noise: Annotated[float, Field(ge=0, le=90)] = 0.0
 
@@ -125,20 +125,20 @@ class Study(Part):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
     title: str = ""
     description: str = ""
-    size: Annotated[int, Field(ge=16, le=4096)] = 512
+    size: Annotated[int, Field(strict=True, ge=16, le=4096)] = 512
     scenes: list[str] = Field(default_factory=list)
     views: list[str] = Field(
         default_factory=list, description="target views by name; all of them if empty"
     )
-    seeds: Annotated[list[Annotated[int, Field(ge=0, lt=2**32)]], Field(min_length=1)] = Field(
-        default_factory=lambda: [0]
-    )
-    spp: Annotated[int, Field(ge=1)] = 16
-    feature_sizes: list[int] = Field(
+    seeds: Annotated[
+        list[Annotated[int, Field(strict=True, ge=0, lt=2**32)]], Field(min_length=1)
+    ] = Field(default_factory=lambda: [0])
+    spp: Annotated[int, Field(strict=True, ge=1)] = 16
+    feature_sizes: list[Annotated[int, Field(strict=True)]] = Field(
         default_factory=list, description="image size, 1/8 and 1/16 of it if left out"
     )
-    feature_channels: Annotated[int, Field(ge=1, le=4096)] = 8
-    timing_rounds: Annotated[int, Field(ge=3)] = 15
+    feature_channels: Annotated[int, Field(strict=True, ge=1, le=4096)] = 8
+    timing_rounds: Annotated[int, Field(strict=True, ge=3)] = 15
     splats: Splats = Splats()
     variants: dict[str, Variant] = Field(default_factory=dict)
     probes: Annotated[dict[str, list[str]], Field(min_length=1)]

@@ -226,12 +226,18 @@ def test_arguments_that_do_not_fit_are_named(run, scene, editor, depth_editor, t
         run("by_view", progress=print)
     with pytest.raises(ValueError, match="image_guidance: this editor has none"):
         run("gaussctrl", GaussCtrlSettings(image_guidance=1.5))
+    small = [views[0], *(view.resize(8, 8) for view in views[1:])]
+    with pytest.raises(ValueError, match=f"views: '{views[1].name}' has 8 x 8 px, SSIM needs 11"):
+        # Before the first round's edits.
+        igs2gs(model, small, None, editor, "a bear", replace(QUICK["igs2gs"], ssim=0.2), folder=tmp_path / "ssim")  # fmt: skip
     wide = [*views[:2], Camera.look_at((0, 0, 3), (0, 0, 0), width=64, height=32, fov_y=40, up=(0, 1, 0))]  # fmt: skip
     with pytest.raises(ValueError, match="cameras: dge edits views together, got edits of 32 x 32 and 64 x 32"):  # fmt: skip
         dge(model, wide, None, editor, "a bear", QUICK["dge"])
-    for seconds in (-1, np.inf, np.nan):
-        with pytest.raises(ValueError, match=f"seconds: got {seconds}, expected None or a finite"):
+    for seconds in (-1, np.inf, np.nan, "10"):
+        with pytest.raises(ValueError, match=f"seconds: got {seconds!r}, expected a number >= 0"):
             Budget(seconds=seconds)
+    with pytest.raises(ValueError, match="network_rows: got 2.5, expected a whole number >= 0"):
+        Budget(network_rows=2.5)
     for field in ("suffix", "negative_prompt", "source_prompt", "perceptual_encoder"):
         with pytest.raises(ValueError, match=f"{field}: got 2024, expected a string"):
             preset("gaussctrl", **{field: 2024})

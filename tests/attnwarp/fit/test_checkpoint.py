@@ -23,7 +23,7 @@ def state():
     }
 
 
-def refused(path, part="remove it to begin again"):
+def refused(path, part="remove it and splats.ply to begin again"):
     with pytest.raises(FileFormatError) as caught:
         checkpoint.load(path)
     assert str(path) in str(caught.value) and part in str(caught.value)
@@ -58,7 +58,9 @@ def test_every_flipped_bit_and_every_end_is_refused(tmp_path):
 def test_what_is_no_checkpoint_is_refused_by_a_fit_by_path(scene, tmp_path, content):
     (tmp_path / CHECKPOINT).write_bytes(content)
     start = from_points(scene[2], scene[3], kind="2d", sh_degree=0)
-    with pytest.raises(FileFormatError, match=r"checkpoint\.pt: .*remove it to begin again"):
+    with pytest.raises(
+        FileFormatError, match=r"checkpoint\.pt: .*remove it and splats.ply to begin"
+    ):
         fit(start, scene[0], FitSettings(iterations=5, sh_degree=0), folder=tmp_path)
 
 

@@ -394,13 +394,27 @@ def test_a_checkpoint_of_other_settings_or_views_is_refused_by_name(scene, tmp_p
     with pytest.raises(ValueError, match=r"other settings \(ssim: 0.2, now 0.3\)") as caught:
         fit(start, scene[0], dataclasses.replace(settings, ssim=0.3), folder=tmp_path)
     # The library names the file; options are the command line's to advise.
-    assert f"remove {tmp_path / CHECKPOINT} to begin again" in str(caught.value)
+    assert f"remove {tmp_path / CHECKPOINT} and {SPLATS} to begin again" in str(caught.value)
     assert "--" not in str(caught.value)
     with pytest.raises(ValueError, match="other views"):
         fit(start, scene[1], settings, folder=tmp_path)
     moved = dataclasses.replace(start, means=start.means + 0.01)
     with pytest.raises(ValueError, match="other first splats"):
         fit(moved, scene[0], settings, folder=tmp_path)
+
+
+def test_splats_without_a_checkpoint_stay(scene, tmp_path):
+    """A fit whose checkpoint was removed, or splats of another program."""
+    start, settings = begin(scene, iterations=2, sh_degree=0)
+    fit(start, scene[0], settings, folder=tmp_path)
+    whole = (tmp_path / SPLATS).read_bytes()
+    (tmp_path / CHECKPOINT).unlink()
+    (tmp_path / SPLATS).write_bytes(b"somebody's own")
+    with pytest.raises(ValueError, match=f"{SPLATS} is there without {CHECKPOINT}"):
+        fit(start, scene[0], settings, folder=tmp_path)
+    assert (tmp_path / SPLATS).read_bytes() == b"somebody's own"
+    fit(start, scene[0], settings, folder=tmp_path, restart=True)
+    assert (tmp_path / SPLATS).read_bytes() == whole
 
 
 def test_a_checkpoint_that_names_no_first_splats_is_resumed(scene, tmp_path):
@@ -439,7 +453,7 @@ def test_a_view_too_small_for_ssim_is_named_before_the_first_iteration(scene):
     start, settings = begin(scene, iterations=5, sh_degree=0)
     small = dataclasses.replace(ring(3)[1].resize(16, 8), name="small.png")
     views = Views([ring(3)[0], small], [np.zeros((32, 32, 3)), np.zeros((8, 16, 3))])
-    with pytest.raises(ValueError, match=r"views: 'small.png' has 16 x 8 px, and SSIM needs 11"):
+    with pytest.raises(ValueError, match=r"views: 'small.png' has 16 x 8 px, SSIM needs 11"):
         fit(start, views, settings)
     without = dataclasses.replace(settings, ssim=0.0)
     assert fit(start, views, without).iteration == 5

@@ -577,6 +577,13 @@ def test_frames_in_no_split_are_counted(tmp_path):
     assert data.splits == ["train", "test", None]
 
 
+def test_empty_lists_split_nothing_and_are_no_reason_to_warn(tmp_path, recwarn):
+    lists = {key: [] for key in split_names(tmp_path, lambda name: name)}
+    data = read_transforms(folder_of(tmp_path, **lists))
+    assert data.splits == [None] * 3
+    assert not recwarn.list
+
+
 @pytest.mark.parametrize("held_out", ["test", "val"])
 def test_nerfstudio_finds_all_three_splits_in_what_we_write(tmp_path, held_out):
     """Its dataparser: with any of the lists there, each of the three must be, and is looked up."""

@@ -518,6 +518,12 @@ def test_a_folder_that_was_tuned_by_other_weights_is_refused(scene, editor, tmp_
         tiny_models.save_backbone(weights / "alexnet-owt-7be5be79.pth", "alex", seed)
         with expected:
             run(scene, editor, tmp_path / "edit", settings)
+    # A view too small for it is named before any is edited.
+    model, views, _ = scene
+    small = [views[0], *(view.resize(16, 24) for view in views[1:])]
+    named = f"views: '{views[1].name}' has 16 x 24 px, the perceptual distance lpips:.* needs 31"
+    with pytest.raises(ValueError, match=named):
+        propagate(model, small, None, editor, "a bear", settings)
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,23 @@
 """YAML from people: what cannot be meant is refused in one line, with its place, at once."""
 
+from pathlib import Path
+
 import pytest
+import yaml
 from damage_files import mutate_bytes, mutate_text, survey
 
+import attnwarp_eval
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import SceneError
-from attnwarp_eval.scene.yaml import DEEPEST, MOST_VALUES, YamlError, read_yaml
+from attnwarp_eval.scene.yaml import (
+    DEEPEST,
+    EXACT,
+    FAST,
+    MOST_VALUES,
+    YamlError,
+    _read,
+    read_yaml,
+)
 
 BOMB = "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + "".join(
     f"{name}: &{name} [{', '.join(['*' + above] * 9)}]\n"
@@ -130,3 +142,23 @@ def test_damaged_scenes_are_refused_in_one_line_or_are_scenes(tmp_path):
 @pytest.mark.slow
 def test_many_damaged_scenes_are_refused_in_one_line_or_are_scenes(tmp_path):
     assert len(survey_scenes(tmp_path, 320)) == 400
+
+
+@pytest.mark.skipif(FAST is None, reason="PyYAML without libyaml")
+def test_libyaml_and_pythons_parser_read_every_shipped_file_alike():
+    root = Path(attnwarp_eval.__file__).parents[2]
+    files = [*root.glob("eval/**/*.yaml"), *root.glob("scenes/**/*.yaml")]
+    assert len(files) > 20
+
+    def lines(node):
+        if isinstance(node, yaml.MappingNode):
+            return [(key.value, key.start_mark.line, lines(value)) for key, value in node.value]
+        if isinstance(node, yaml.SequenceNode):
+            return [(item.start_mark.line, lines(item)) for item in node.value]
+        return node.value
+
+    for path in files:
+        text = path.read_text(encoding="utf-8")
+        (fast, values), (exact, same) = _read(text, FAST), _read(text, EXACT)
+        assert values == same == yaml.safe_load(text), path
+        assert lines(fast) == lines(exact), path
