@@ -28,7 +28,6 @@ LONGEST = [
     "attnwarp_eval/scene/test_suite.py",
     "attnwarp_eval/effects/test_proof.py",
     "attnwarp/encoders/test_bundled.py",
-    "attnwarp_eval/study/test_signals.py",
     "attnwarp_eval/truth/test_mitsuba.py",
     "attnwarp/test_cli.py",
     "attnwarp_eval/truth/test_edits.py",

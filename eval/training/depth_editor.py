@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-import yaml
 from tokenizers import Tokenizer
 
 from attnwarp.editing.controlnet import control_image
 from attnwarp.editing.latents import BLOCK, CHANNELS
+from attnwarp_eval.scene.yaml import read_yaml
 from training.clip import true_of
 from training.editing_pairs import LOOKS, PAIRS_PROTOCOL, SIZE, VIEWS, Worlds, load_pairs
 from training.editor import tokenizer_of, weights_of
@@ -137,7 +137,7 @@ def reserved_prompts() -> frozenset[str]:
     edits = [
         edit
         for path in sorted(folder.glob("*.yaml"))
-        for edit in yaml.safe_load(path.read_text()).get("edits", ())
+        for edit in read_yaml(path.read_text())[1].get("edits", ())
     ]
     answers = [answer for edit in edits for answer in edit.get("answers", ())]
     texts = [one[key] for one in (*edits, *answers) for key in ("source", "target") if key in one]

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from attnwarp.io.file import write_atomically
+from attnwarp_eval.scene.yaml import read_yaml
 from training.assemblies import (
     KINDS,
     PART_NOUNS,
@@ -294,7 +294,7 @@ def reserved() -> frozenset[str]:
     import attnwarp_eval
 
     folder = (Path(attnwarp_eval.__file__).parent / "scenes").resolve()
-    texts = [yaml.safe_load(path.read_text()) for path in sorted(folder.glob("*.yaml"))]
+    texts = [read_yaml(path.read_text())[1] for path in sorted(folder.glob("*.yaml"))]
     return frozenset(e["instruction"].lower() for t in texts for e in t.get("edits", ()))
 
 

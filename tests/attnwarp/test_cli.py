@@ -350,7 +350,7 @@ def start_and_wait_for_a_checkpoint(arguments, out):
     ("number", "code"),
     [
         (signal.SIGINT, 130),
-        (signal.SIGKILL, -9),
+        pytest.param(signal.SIGKILL, -9, marks=pytest.mark.slow),
         pytest.param(signal.SIGTERM, 130, marks=pytest.mark.slow),
     ],
 )

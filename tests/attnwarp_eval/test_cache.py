@@ -134,6 +134,7 @@ def _write(folder, value):
         cache.write_arrays("kind", "key", {"x": np.full(20_000, value)})
 
 
+@pytest.mark.slow
 def test_two_processes_that_write_at_once_leave_one_whole_file(tmp_path, monkeypatch):
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
     context = multiprocessing.get_context("spawn")

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 import attnwarp_eval
 from attnwarp_eval.scene.bodies import BodySpec
+from attnwarp_eval.scene.yaml import read_yaml
 from training.assemblies import (
     KINDS,
     PART_NOUNS,
@@ -154,7 +154,7 @@ def shapes_and_palettes():
     folder = (Path(attnwarp_eval.__file__).parent / "scenes").resolve()
     shapes, palettes = set(), set()
     for path in folder.glob("*.yaml"):
-        for thing in yaml.safe_load(path.read_text())["objects"]:
+        for thing in read_yaml(path.read_text())[1]["objects"]:
             shapes |= {shape_of(part) for part in thing["shape"].get("parts", ())}
             palettes.add(str(thing.get("texture", {}).get("colors")))
     assert len(shapes) > 50

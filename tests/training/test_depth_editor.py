@@ -87,6 +87,7 @@ def prepare(folder, tokenizer):
     torch.save({"average": {**net.state_dict(), "n_averaged": 0}}, folder / "first.pt")
 
 
+@pytest.mark.slow
 def test_a_stopped_training_goes_on_to_the_same_weights(trained, tokenizer, tmp_path):
     prepare(tmp_path, tokenizer)
     half = dataclasses.replace(TINY, steps=1)

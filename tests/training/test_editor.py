@@ -1,12 +1,12 @@
 """Oracles: the scenes' own files, orthogonality, exact geometry, diffusers' own pipeline, a run that was not stopped."""
 
 import dataclasses
+import functools
 import types
 
 import numpy as np
 import pytest
 import torch
-import yaml
 from diffusers import StableDiffusionInstructPix2PixPipeline
 from picked_answers import picked
 from typer.testing import CliRunner
@@ -16,6 +16,7 @@ from attnwarp.editing.editor import edit
 from attnwarp.editing.latents import HaarLatents, haar_basis
 from attnwarp.editing.small import load_editor
 from attnwarp.errors import InputError
+from attnwarp_eval.scene.yaml import read_yaml
 from training import editing_pairs, editor, editor_draws, editor_injection, editor_net, steps
 from training.data import SPLITS
 from training.edit import app
@@ -65,7 +66,7 @@ def scene_instructions():
     return {
         e["instruction"].lower()
         for p in folder.glob("*.yaml")
-        for e in yaml.safe_load(p.read_text()).get("edits", ())
+        for e in read_yaml(p.read_text())[1].get("edits", ())
     }
 
 
@@ -89,11 +90,9 @@ def test_no_instruction_of_the_scenes_is_ever_drawn():
     assert refused & theirs  # without the check some would have been
 
 
-LOOKS_OF: dict = {}
-
-
+@functools.cache
 def cached_looks(index):
-    return LOOKS_OF.setdefault(index, edit_looks(index, PAIR_SPLITS["edit-train"]))
+    return edit_looks(index, PAIR_SPLITS["edit-train"])
 
 
 def test_worlds_of_training_and_tests_do_not_meet():

@@ -9,6 +9,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 from numba import njit
 
 from attnwarp.render._kernels.compilation import by_one_process
@@ -28,6 +29,7 @@ print(json.dumps([order, *counts]))
 """
 
 
+@pytest.mark.slow
 def test_of_processes_that_begin_together_one_compiles_and_the_others_read(tmp_path):
     """Oracle: numba's own counts of what was compiled, and of what came from disk."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}

@@ -418,6 +418,7 @@ def samples(seed, first_seed, scenes=10, shift=0.0, noise=0.1):
     return Snapshot("noise", "", tuple(cells))
 
 
+@pytest.mark.slow
 def test_200_runs_of_equal_code_with_other_seeds_fail_at_most_at_the_stated_rate():
     baselines = (samples(1000 + i, 0) for i in range(200))
     results = [compare(before, samples(5000 + i, 3)) for i, before in enumerate(baselines)]

@@ -154,7 +154,14 @@ def test_less_light_is_darker_and_no_negative_brightness(light, word):
     assert said and f"{float(said[1]):.0f} {said[2]}" == word, words
 
 
-@pytest.mark.parametrize("kind", ["normal", "skewed", "sky"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param("normal", marks=pytest.mark.slow),
+        "skewed",
+        pytest.param("sky", marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize(
     ("alpha", "range_"),
     [

@@ -69,6 +69,7 @@ def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, 
     assert made[3:] == ["glass"] and (tmp_path / "mirror.jpg").read_bytes() == picture
 
 
+@pytest.mark.slow
 def test_a_table_that_was_interrupted_goes_on_with_the_same_entries(small, monkeypatch, tmp_path):
     real, made = effects.measure_entry, []
 

@@ -184,7 +184,7 @@ def test_the_same_seed_gives_the_same_splats_and_another_seed_others(scene, geom
     assert not torch.equal(a.means, c.means)
 
 
-@pytest.mark.parametrize("name", ["bear", "fence"])
+@pytest.mark.parametrize("name", [pytest.param("bear", marks=pytest.mark.slow), "fence"])
 def test_colours_are_those_of_rendered_views_that_see_the_splats(name):
     # Splats have the colours of direct light.
     scene = direct(name).with_size(128, 128)

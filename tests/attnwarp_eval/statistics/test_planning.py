@@ -45,7 +45,15 @@ def test_what_no_number_of_scenes_tells_and_what_two_do():
             scenes_needed(*bad)
 
 
-@pytest.mark.parametrize(("effect", "scenes"), [(0.0, 6), (0.3, 3), (1.0, 6), (3.0, 2)])
+@pytest.mark.parametrize(
+    ("effect", "scenes"),
+    [
+        pytest.param(0.0, 6, marks=pytest.mark.slow),
+        (0.3, 3),
+        pytest.param(1.0, 6, marks=pytest.mark.slow),
+        pytest.param(3.0, 2, marks=pytest.mark.slow),
+    ],
+)
 def test_four_of_five_intervals_of_an_effect_have_it(effect, scenes):
     """Oracle: the effect of which 1,000 studies were drawn; sqrt(0.8 * 0.2 / 1000) is 0.013."""
     drawn = np.random.default_rng(4).normal(effect, 1.0, (1000, scenes))

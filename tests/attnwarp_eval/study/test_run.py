@@ -285,6 +285,7 @@ def test_the_instrument_is_calibrated_in_every_run(finished):
     assert cell["views"][0]["metrics"]["occlusion.f1.exact"] == 1
 
 
+@pytest.mark.slow
 def test_a_run_killed_half_way_goes_on_and_gives_the_same_bytes(undisturbed, folder):
     run = folder / "killed"
     process = start("run", "study.yaml", "--out", run, stderr=subprocess.DEVNULL)
@@ -316,6 +317,7 @@ def test_a_run_that_takes_the_place_of_anothers_report_says_so(finished, folder)
     assert len(Store(run).done()) == 2 * CELLS
 
 
+@pytest.mark.slow
 def test_two_workers_give_the_same_numbers_as_one_process(undisturbed, folder):
     run = folder / "parallel"
     done = call("run", "study.yaml", "--out", run, "--jobs", "2")

@@ -71,7 +71,7 @@ def finish(folder, run):
 @pytest.mark.parametrize(
     ("moment", "send"),
     [
-        ("a cell is written", os.kill),
+        pytest.param("a cell is written", os.kill, marks=pytest.mark.slow),
         pytest.param("workers start", os.kill, marks=pytest.mark.slow),
         # As a batch system does: to the command and to its workers.
         pytest.param("a cell is written", os.killpg, marks=pytest.mark.slow),

@@ -48,7 +48,7 @@ SUN = {"type": "sun", "elevation": 30, "azimuth": 50, "irradiance": 2.0, "color"
 SKY = {"type": "sky", "horizon": "#c0d0e0", "zenith": "#c0d0e0", "radiance": 0.7}
 
 
-@pytest.mark.parametrize("name", ["spheres", "bear", "fence"])
+@pytest.mark.parametrize("name", ["spheres", pytest.param("bear", marks=pytest.mark.slow), "fence"])
 def test_mitsuba_and_the_exact_geometry_hit_the_same_objects_at_the_same_places(name):
     scene = load_scene(name).with_size(128, 96)
     geometry = Geometry(scene)
@@ -120,7 +120,7 @@ def test_a_missed_pixel_shows_the_sky():
     assert np.abs(appearance(scene, up, spp=4) / expected - 1).max() < 1e-3
 
 
-@pytest.mark.parametrize("name", ["spheres", "bear", "fence"])
+@pytest.mark.parametrize("name", ["spheres", pytest.param("bear", marks=pytest.mark.slow), "fence"])
 def test_pictures_converge_to_albedo_times_the_light_that_ray_casting_finds(name):
     # Catches textures that are flipped or turned in one of the two, shadows that fall elsewhere,
     # light counted twice.
