@@ -57,7 +57,9 @@ def test_a_closed_pipe_is_no_regression(buffered):
     assert (done.returncode, done.stderr) == (141, "")
 
 
-@pytest.mark.parametrize(("reader", "expected"), [("listens", 1), ("is gone", 141)])
+@pytest.mark.parametrize(
+    ("reader", "expected"), [pytest.param("listens", 1, marks=pytest.mark.slow), ("is gone", 141)]
+)
 def test_a_regression_is_told_from_a_closed_pipe(reader, expected, tmp_path):
     from attnwarp_eval.compare import Snapshot, read_snapshot, write_baseline
     from attnwarp_eval.study import Store, parse_study, run

@@ -256,6 +256,7 @@ def test_the_suites_time_is_that_of_an_empty_cache_and_leaves_the_cache_alone(
     assert total == pytest.approx(2 * first.wall["geometry"])
 
 
+@pytest.mark.slow
 def test_panels_that_are_finished_are_read_and_not_measured_again(tmp_path, monkeypatch):
     asked = []
 

@@ -131,6 +131,7 @@ def test_a_damaged_or_unwritable_cache_costs_time_and_nothing_else(monkeypatch, 
     assert np.array_equal(mesh_body(BALL, 0.0, 16).vertices, first.vertices)
 
 
+@pytest.mark.slow
 def test_two_processes_that_write_the_same_entry_never_show_half_of_one(monkeypatch, tmp_path):
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
     context = multiprocessing.get_context("spawn")

@@ -306,6 +306,7 @@ def test_a_run_killed_half_way_goes_on_and_gives_the_same_bytes(undisturbed, fol
     assert without_timings(run) == undisturbed
 
 
+@pytest.mark.slow
 def test_a_run_that_takes_the_place_of_anothers_report_says_so(finished, folder):
     run = folder / "reused"
     shutil.copytree(finished, run)
