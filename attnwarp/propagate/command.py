@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any
@@ -14,7 +14,7 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import own_size
-from attnwarp.editing.segment import load_segmenter, segments_of
+from attnwarp.editing.segment import load_segmenter
 from attnwarp.editing.small import check_instruction, load_editor, thread_count
 from attnwarp.errors import InputError, suggest
 from attnwarp.fit import FitSettings, Views, first_splats, fit, load_views, progress
@@ -23,14 +23,15 @@ from attnwarp.io import THIRD_SCALE, Dataset, read_image, write_ply
 from attnwarp.io.names import file_stems
 from attnwarp.process import asked_to_stop
 from attnwarp.propagate.editing import ViewEditor
-from attnwarp.propagate.folder import SEGMENTS_FOLDER, VIEWER_PLY, Folder
+from attnwarp.propagate.folder import VIEWER_PLY, Folder
 from attnwarp.propagate.page import write_page
 from attnwarp.propagate.pictures import check_view_aspect
 from attnwarp.propagate.progress import progress_display
 from attnwarp.propagate.run import Propagation, propagate
-from attnwarp.propagate.scene import images_of, to_float
+from attnwarp.propagate.scene import images_of
 from attnwarp.propagate.settings import PropagateSettings
 from attnwarp.propagate.tune import perceptual_net
+from attnwarp.propagate.words import WORDS_FOLDER, masks_by_words
 
 FIT_FOLDER = "fit"
 
@@ -117,12 +118,7 @@ def edit_dataset(
     editor = load_editor(editor_name, device=device)
     check_instruction(editor_name, editor, instruction)
     if words is not None:
-        by_words = load_segmenter(segmenter, device=device)
-        say(f"masks of {words!r} by {segmenter}: {out / SEGMENTS_FOLDER}")
-        segment = segments_of(by_words, words, [camera.name for camera in views.cameras])
-        segments = [segment(k, to_float(image)) for k, image in enumerate(images)]
-        say(_coverage(segments, views.cameras))
-        del by_words, segment  # their networks would stay beside the editor's
+        segments = _by_words(words, segmenter, device, views.cameras, images, out, say)
     by_hand = None
     if source_picture is not None:
         pixels, top = read_over_black(source_picture)
@@ -158,6 +154,26 @@ def edit_dataset(
         # Other programs take no splats of two scales.
         write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
     return result, write_page(Folder(out, views.cameras), images)
+
+
+def _by_words(
+    words: str,
+    name: str,
+    device: str,
+    cameras: Sequence[Camera],
+    images: Sequence[npt.NDArray[Any]],
+    out: Path,
+    say: Callable[[str], None],
+) -> list[npt.NDArray[np.bool_]]:
+    """Masks by a segmenter, whose networks do not stay beside the editor's."""
+    segmenter = load_segmenter(name, device=device)
+    say(f"masks of {words!r} by {name}: {out / WORDS_FOLDER}")
+    with progress_display(title="masks") as watch:
+        masks, kept = masks_by_words(segmenter, words, cameras, images, out, watch)
+    if kept:
+        say(f"{kept} of {len(masks)} masks are those of an earlier run")
+    say(_coverage(masks, cameras))
+    return masks
 
 
 def _fitted(

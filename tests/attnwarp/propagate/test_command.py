@@ -26,12 +26,16 @@ from typer.testing import CliRunner
 from attnwarp import Camera, propagate
 from attnwarp.cli import edit
 from attnwarp.cli.main import app
+from attnwarp.editing.segment import load_segmenter, segmenter_digest
 from attnwarp.errors import InputError
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp.io.images import encode_png
 from attnwarp.propagate import page as page_of_edits
+from attnwarp.propagate import words
 from attnwarp.propagate.command import mask_files, read_mask, read_over_black
 from attnwarp.propagate.folder import Folder
+from attnwarp.propagate.scene import to_float
+from attnwarp.propagate.words import masks_by_words
 
 runner = CliRunner()
 QUICK = (
@@ -240,6 +244,10 @@ def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
     segmenter = ("--segmenter", f"{tmp_path / 'dino'},{tmp_path / 'sam'}")
     result = run(place, tmp_path / "words", *ply, "--where", "bear", *segmenter)
     assert result.exit_code == 0, result.output
+    assert "masks are those of an earlier run" not in result.stderr
+    again = run(place, tmp_path / "words", *ply, "--where", "bear", *segmenter)
+    assert again.exit_code == 0, again.output
+    assert f"{len(cameras())} of {len(cameras())} masks are those of an earlier run" in again.stderr
     files = sorted((tmp_path / "words" / "segments").iterdir())
     assert [path.name for path in files] == [camera.name for camera in cameras()]
     shares = [(read_image(path) > 127).mean() for path in files]
@@ -426,6 +434,63 @@ def test_an_edit_whose_targets_got_no_features_says_so(place, tmp_path):
     result = run(place, tmp_path / "all", *ply)
     assert result.exit_code == 0 and "edited alone" not in result.stderr
     assert "in place of" not in result.stderr
+
+
+class Counted:
+    """A segmenter that notes what it is shown, and may be stopped before a view."""
+
+    def __init__(self, segmenter, stop_at=None):
+        self.segmenter, self.stop_at, self.shown = segmenter, stop_at, 0
+
+    def segment(self, image, words):
+        if self.shown == self.stop_at:
+            raise KeyboardInterrupt
+        self.shown += 1
+        return self.segmenter.segment(image, words)
+
+
+def test_masks_by_words_are_made_once(place, tmp_path, monkeypatch):
+    """Stopped before the third view, begun anew, then with other words, damage, and other weights."""
+    save_dino(tmp_path / "dino")
+    save_sam(tmp_path / "sam", seed=2)
+    name = f"{tmp_path / 'dino'},{tmp_path / 'sam'}"
+    monkeypatch.setattr(
+        words, "segmenter_digest", lambda counted: segmenter_digest(counted.segmenter)
+    )
+    views, folder = cameras(), tmp_path / "edit"
+    images = [read_image(place / "data" / "images" / camera.name) for camera in views]
+
+    def masks(text="bear", stop_at=None, thresholds=None):
+        segmenter = load_segmenter(name)
+        for key, value in (thresholds or {}).items():
+            object.__setattr__(segmenter, key, value)
+        counted = Counted(segmenter, stop_at)
+        steps = []
+        try:
+            made, kept = masks_by_words(counted, text, views, images, folder, steps.append)
+        except KeyboardInterrupt:
+            return counted.shown
+        assert [(step.done, step.total) for step in steps] == [
+            (k + 1, len(views)) for k in range(len(views))
+        ]
+        alone = [segmenter.segment(to_float(image), text) for image in images]
+        assert all(map(np.array_equal, made, alone))
+        assert kept == len(views) - counted.shown
+        return counted.shown
+
+    assert masks(stop_at=2) == 2
+    assert masks() == len(views) - 2
+    assert masks() == 0
+    path = folder / "words" / "v1.png"
+    path.write_bytes(path.read_bytes()[:-20])
+    (folder / "words" / "v2.json").write_text("{")
+    assert masks() == 2
+    assert masks(thresholds={"box_threshold": 0.3}) == len(views)
+    assert masks() == len(views)
+    assert masks("a bear") == len(views)
+    (folder / "words" / "v1.json").unlink()
+    with pytest.raises(InputError, match="words/v1.png: is there without words/v1.json"):
+        masks("a bear")
 
 
 def test_words_that_a_view_does_not_show_are_one_clear_line_with_the_view(place, tmp_path):
