@@ -6,6 +6,7 @@ import math
 import numbers
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -131,11 +132,13 @@ def number(value: Any, low: float, high: float, name: str, *, whole: bool = Fals
         ValueError: steps: got 2.5, expected a whole number >= 0
     """
     right = is_number(value, whole=whole)
-    # As Python's own before it is compared: the largest float has no float32.
-    plain = (int(value) if isinstance(value, numbers.Integral) else float(value)) if right else 0
-    # A whole number beyond every float is finite by type, and cannot be asked.
-    beyond = abs(plain) > LARGEST
-    if not right or beyond or math.isnan(plain) or not low <= plain <= high:
+    # As Python's own before it is compared: the largest float has no float32. A whole number beyond
+    # every float can't be asked whether it is NaN, so its size is looked at first.
+    plain: float = math.nan
+    if right:
+        with suppress(OverflowError):
+            plain = int(value) if isinstance(value, numbers.Integral) else float(value)
+    if not right or abs(plain) > LARGEST or math.isnan(plain) or not low <= plain <= high:
         kind = "a whole number" if whole else "a number"
         bounds = f">= {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
         text = repr(value)
@@ -156,7 +159,8 @@ def size(value: Any, name: str) -> tuple[int, int]:
         Traceback (most recent call last):
         ValueError: size: got (8, 2.5), expected (height, width) of whole numbers from 1
     """
-    sides = tuple(value) if isinstance(value, Sequence | np.ndarray) else ()
+    pair = isinstance(value, Sequence) and not isinstance(value, str | bytes)
+    sides = tuple(value) if pair or (isinstance(value, np.ndarray) and value.ndim == 1) else ()
     if len(sides) != 2 or not all(is_number(side, whole=True) and side >= 1 for side in sides):
         raise ValueError(f"{name}: got {value!r}, expected (height, width) of whole numbers from 1")
     return int(sides[0]), int(sides[1])

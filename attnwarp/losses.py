@@ -152,7 +152,14 @@ def ssim_terms(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     return a1 / b1, a2 / b2
 
 
-def check_sizes(cameras: Sequence[Camera], smallest: int, loss: str, setting: str) -> None:
+def check_sizes(
+    cameras: Sequence[Camera],
+    smallest: int,
+    loss: str,
+    setting: str,
+    *,
+    edited: Sequence[tuple[int, int]] | None = None,
+) -> None:
     """Raise ValueError that names the first view that is too small for a loss.
 
     Args:
@@ -160,6 +167,7 @@ def check_sizes(cameras: Sequence[Camera], smallest: int, loss: str, setting: st
         smallest: side in px that the loss takes.
         loss: for the message.
         setting: the loss's weight.
+        edited: (h, w) px of the views' edits, where these are what is compared.
 
     Example:
         >>> import numpy as np
@@ -169,11 +177,13 @@ def check_sizes(cameras: Sequence[Camera], smallest: int, loss: str, setting: st
         Traceback (most recent call last):
         ValueError: views: 'a.png' has 16 x 8 px, SSIM needs 11 a side; enlarge it, or set ssim to 0
     """
-    for camera in cameras:
-        if min(camera.width, camera.height) < smallest:
+    sizes = [(each.height, each.width) for each in cameras] if edited is None else edited
+    has, remedy = ("has", "enlarge it") if edited is None else ("is edited at", "raise size")
+    for camera, (h, w) in zip(cameras, sizes, strict=True):
+        if min(h, w) < smallest:
             raise ValueError(
-                f"views: {camera.name!r} has {camera.width} x {camera.height} px, {loss} needs"
-                f" {smallest} a side; enlarge it, or set {setting} to 0"
+                f"views: {camera.name!r} {has} {w} x {h} px, {loss} needs {smallest} a side;"
+                f" {remedy}, or set {setting} to 0"
             )
 
 

@@ -24,12 +24,9 @@ class Fitting(Tuning):
 
     Args:
         start: the splats before the edit.
-        cameras: of all views, of the sizes that are tuned on; they decide the extent.
+        cameras: of all views; they decide the extent.
         settings: losses, iterations, rates.
         backend: of the renderer.
-
-    Raises:
-        ValueError: also for views that are too small for SSIM.
     """
 
     def __init__(
@@ -55,7 +52,7 @@ class Fitting(Tuning):
         super().__init__(start, cameras, shared, stages=1, backend=backend)
         self.ssim = settings.ssim
         if self.ssim and settings.iterations:
-            losses.check_sizes(cameras, losses.SSIM_WINDOW, "SSIM", "ssim")
+            self.smallest.append(("SSIM", losses.SSIM_WINDOW, "ssim"))
 
     def loss_of(self, picture: Render, view: TrainingView) -> Tensor:
         """The weighted sum of the losses; see :class:`attnwarp.propagate.tune.Tuning`."""

@@ -43,7 +43,7 @@ from attnwarp.propagate.scene import (
     render_picture,
 )
 from attnwarp.propagate.times import Times
-from attnwarp.propagate.tune import DrawnViews, TrainingView, training_cameras
+from attnwarp.propagate.tune import DrawnViews, TrainingView
 
 FOLDERS = ("rounds", "views", "renders/before", "renders/after")
 
@@ -178,8 +178,12 @@ class _Run:
         folders = (*FOLDERS, *(f"rounds/{number}" for number in rounds))
         self.folder = Folder(folder, work.scene.cameras, folders)
         self.names = self.folder.names
-        sizes = training_cameras(work.scene.cameras, work.sizes, work.settings.detail)
-        self.fitting = Fitting(work.frozen, sizes, work.settings, work.backend)
+        self.fitting = Fitting(work.frozen, work.scene.cameras, work.settings, work.backend)
+        tuned = sorted({view for part in method.rounds for view in part.training})
+        self.fitting.check_sizes(
+            [work.scene.cameras[view] for view in tuned],
+            None if work.settings.detail == "change" else [work.sizes[view] for view in tuned],
+        )
         self.times = Times(self.folder)
         self.done, self.rows, self.edits = 0, 0, 0
         self.latest: dict[int, int] = {}

@@ -28,6 +28,9 @@ Mask = npt.NDArray[np.bool_]
 WORKING_SIDE = 256
 """Larger pictures are cut at this short side in px."""
 
+MASK_PROTOCOL = 1
+"""Raised when the same settings come to cut pictures otherwise, so that no edit mixes both."""
+
 LONGEST_SIDE = 1024
 """In px, of what is rated and cut: a panorama would take memory without bound. Pictures up to 4:1
 stay below it."""
@@ -144,12 +147,13 @@ def segmenter_digest(segmenter: Segmenter) -> str:
         about: EncoderInfo | None = getattr(s.encoder, "about", None)
         if about is not None:
             limits = [list(s.sides), s.likely, s.background, s.sure, s.detection]
-            return digest(["clip", about.weights_sha256, limits])
+            sides = [WORKING_SIDE, LONGEST_SIDE]
+            return digest(["clip", MASK_PROTOCOL, about.weights_sha256, limits, sides])
     if not isinstance(segmenter, GroundedSam):
         raise InputError(f"segmenter: {type(segmenter).__name__} does not say whose weights it has")
     g = segmenter
     tokens = g.detector_processor.tokenizer.backend_tokenizer.to_str()
-    parts: list[Any] = ["grounded", g.box_threshold, g.text_threshold, tokens]
+    parts: list[Any] = ["grounded", MASK_PROTOCOL, g.box_threshold, g.text_threshold, tokens]
     for network, processor in ((g.detector, g.detector_processor), (g.sam, g.sam_processor)):
         parts += [network.config.to_diff_dict(), processor.image_processor.to_dict()]
         for key, value in sorted(network.state_dict().items()):

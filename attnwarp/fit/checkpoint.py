@@ -22,7 +22,7 @@ FORMAT = 2
 misread.
 """
 
-REMEDY = "remove it and splats.ply to begin again"
+REMEDY = "remove it to begin again"
 
 _MAGIC = b"attnwarp checkpoint"
 
@@ -39,8 +39,12 @@ def save(path: str | os.PathLike[str], state: dict[str, Any]) -> None:
     write_atomically(path, lambda stream: stream.write(head + data))
 
 
-def load(path: str | os.PathLike[str]) -> dict[str, Any]:
+def load(path: str | os.PathLike[str], remedy: str = REMEDY) -> dict[str, Any]:
     """What :func:`save` wrote. Only tensors and plain values are read; a file cannot run code.
+
+    Args:
+        path: of the file.
+        remedy: the end of a message.
 
     Raises:
         FileFormatError: it is damaged in any bit, of another format, or something else altogether.
@@ -49,16 +53,16 @@ def load(path: str | os.PathLike[str]) -> dict[str, Any]:
     head, _, data = path.read_bytes().partition(b"\n")
     words = head.split()
     if words[:2] != _MAGIC.split() or len(words) != 4:
-        raise FileFormatError(path, f"not a checkpoint of this version; {REMEDY}")
+        raise FileFormatError(path, f"not a checkpoint of this version; {remedy}")
     if words[2] != str(FORMAT).encode():
         raise FileFormatError(
             path,
             f"got a checkpoint of format {words[2].decode('ascii', 'replace')}, expected {FORMAT};"
-            f" {REMEDY}",
+            f" {remedy}",
             field="format",
         )
     if words[3] != hashlib.sha256(data).hexdigest().encode():
-        raise FileFormatError(path, f"its checksum does not match, so it is damaged; {REMEDY}")
+        raise FileFormatError(path, f"its checksum does not match, so it is damaged; {remedy}")
     try:
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     # A checksum that matches leaves a file made on purpose. torch's message advises to load it all
@@ -67,8 +71,8 @@ def load(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise FileFormatError(
             path,
             f"holds something other than tensors and plain values ({type(error).__name__}); do not"
-            f" use it, {REMEDY}",
+            f" use it, {remedy}",
         ) from None
     if not isinstance(state, dict):
-        raise FileFormatError(path, f"holds {type(state).__name__}, expected a dict; {REMEDY}")
+        raise FileFormatError(path, f"holds {type(state).__name__}, expected a dict; {remedy}")
     return state

@@ -278,8 +278,7 @@ class _Run:
         self.folder = folder
         path = folder / CHECKPOINT
         if restart:
-            path.unlink(missing_ok=True)
-            return
+            return  # What is there stays until the first save replaces it.
         if not path.exists():
             splats = folder / SPLATS
             if splats.exists():
@@ -288,7 +287,8 @@ class _Run:
                     " it; name another folder, or remove it to begin again"
                 )
             return
-        state = checkpoint.load(path)
+        remedy = f"remove it and {SPLATS} to begin again"
+        state = checkpoint.load(path, remedy)
         # Checkpoints from before they named the first splats can't be held to them.
         stored_of = {"start": self.start, **state}
         for name, expected in self.identity().items():
@@ -317,7 +317,7 @@ class _Run:
             self.history = [Record(**record) for record in state["history"]]
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise FileFormatError(
-                path, f"lacks something or is damaged: {error}; {checkpoint.REMEDY}"
+                path, f"lacks something or is damaged: {error}; {remedy}"
             ) from error
 
     def save(self) -> None:

@@ -31,7 +31,7 @@ from attnwarp.propagate.run import Propagation, propagate
 from attnwarp.propagate.scene import images_of
 from attnwarp.propagate.settings import PropagateSettings
 from attnwarp.propagate.tune import perceptual_net
-from attnwarp.propagate.words import WORDS_FOLDER, masks_by_words
+from attnwarp.propagate.words import masks_by_words, words_folder
 
 FIT_FOLDER = "fit"
 
@@ -167,9 +167,10 @@ def _by_words(
 ) -> list[npt.NDArray[np.bool_]]:
     """Masks by a segmenter, whose networks do not stay beside the editor's."""
     segmenter = load_segmenter(name, device=device)
-    say(f"masks of {words!r} by {name}: {out / WORDS_FOLDER}")
+    folder = words_folder(out, segmenter, words)
+    say(f"masks of {words!r} by {name}: {folder}")
     with progress_display(title="masks") as watch:
-        masks, kept = masks_by_words(segmenter, words, cameras, images, out, watch)
+        masks, kept = masks_by_words(segmenter, words, cameras, images, folder, watch)
     if kept:
         say(f"{kept} of {len(masks)} masks are those of an earlier run")
     say(_coverage(masks, cameras))

@@ -4,6 +4,7 @@ manifest.json            settings, plan, hashes of the inputs
 source.png  source.json  the source's edit; features.png: its recorded features as colours
 views/NAME.png  .json    each edited view, and what its edit was
 segments/                what is edited of each view, where segments are given
+words/                   masks by words as they are made (attnwarp edit)
 masks/  features/        where features were injected, and the warped features as colours
 stages/1.ply  1.pt       the splats after each stage, and the state of their optimiser
 renders/before/  after/  the scene from every view

@@ -56,7 +56,7 @@ from attnwarp.propagate.settings import PRESETS, PropagateSettings
 from attnwarp.propagate.sight import Sight
 from attnwarp.propagate.stages import Plan, choose_chain
 from attnwarp.propagate.times import Times
-from attnwarp.propagate.tune import DrawnViews, TrainingView, Tuning, training_cameras
+from attnwarp.propagate.tune import DrawnViews, TrainingView, Tuning
 from attnwarp.warp import Surface, WarpedView, render_surface, warp_view
 
 RECORDING = ".recording"
@@ -258,11 +258,12 @@ class _Run:
         if announce is not None:
             self._announce_changes(announce, source, multiple)
         self.tuning = Tuning(
-            gaussians,
-            training_cameras(scene.cameras, self.sizes, settings.detail),
-            settings,
-            len(self.plan.stages),
-            backend=backend,
+            gaussians, scene.cameras, settings, len(self.plan.stages), backend=backend
+        )
+        tuned = sorted({source, *self.plan.sources, *self.plan.edited})
+        self.tuning.check_sizes(
+            [scene.cameras[view] for view in tuned],
+            None if settings.detail == "change" else [self.sizes[view] for view in tuned],
         )
         self.done = 0
         self.total = (

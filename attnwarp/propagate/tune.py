@@ -22,7 +22,7 @@ from attnwarp.fit.model import Model, check_on_cpu
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError
 from attnwarp.propagate.pictures import Image
-from attnwarp.propagate.settings import Detail, PropagateSettings
+from attnwarp.propagate.settings import PropagateSettings
 from attnwarp.render import Render, render
 
 SOURCE_EVERY = 10
@@ -75,17 +75,6 @@ class TrainingView:
     number: int
     camera: Camera
     picture: Image
-
-
-def training_cameras(
-    cameras: Sequence[Camera], sizes: Sequence[tuple[int, int]], detail: Detail
-) -> list[Camera]:
-    """The cameras of the pictures to tune on: the views' own where an edit's change is put onto
-    them, else of the size (h, w) px of each view's edit.
-    """
-    if detail == "change":
-        return list(cameras)
-    return [camera.resize(w, h) for camera, (h, w) in zip(cameras, sizes, strict=True)]
 
 
 HELD_BYTES = 2**31
@@ -162,8 +151,7 @@ class Tuning:
 
     Args:
         start: the splats before the edit.
-        cameras: of all views, of the sizes that are tuned on (:func:`training_cameras`); they
-            decide the extent.
+        cameras: of all views; they decide the extent.
         settings: losses, iterations, rates.
         stages: number of stages, over which the centres' learning rate falls.
         backend: of the renderer.
@@ -174,11 +162,12 @@ class Tuning:
         visits: how often each view was tuned on, by its number.
         perceptual: the perceptual distance; None where no iteration takes it.
         weights: by the loss that has them, the SHA-256 of its network's.
+        smallest: each loss that takes no small pictures, the side in px that it takes, and the
+            setting that is its weight.
 
     Raises:
         InputError: no such perceptual distance.
-        ValueError: the splats lie on a GPU, or the perceptual distance takes no picture as small as
-            a view's.
+        ValueError: the splats lie on a GPU.
     """
 
     def __init__(
@@ -213,12 +202,25 @@ class Tuning:
         self.visits: dict[int, int] = {}
         # Here and not at its first use: before it, views are edited for hours.
         net = perceptual_net(settings)
+        self.smallest: list[tuple[str, int, str]] = []
         if net is not None:
-            losses.check_sizes(
-                cameras, net.smallest, f"the perceptual distance {net.about.name}", "perceptual"
-            )
+            name = f"the perceptual distance {net.about.name}"
+            self.smallest.append((name, net.smallest, "perceptual"))
         self.perceptual = None if net is None else DistanceToViews(net)
         self.weights = {} if net is None else {"perceptual": net.about.weights_sha256}
+
+    def check_sizes(
+        self, cameras: Sequence[Camera], edited: Sequence[tuple[int, int]] | None
+    ) -> None:
+        """Raise ValueError that names a view whose picture is too small for a loss.
+
+        Args:
+            cameras: of the views that are tuned on.
+            edited: (h, w) px of their edits where these are tuned on as they are; None where an
+                edit's change is put onto a picture of the camera's size.
+        """
+        for loss, smallest, setting in self.smallest:
+            losses.check_sizes(cameras, smallest, loss, setting, edited=edited)
 
     def gaussians(self) -> Gaussians:
         """The splats as they stand, outside autograd."""

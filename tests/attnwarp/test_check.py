@@ -1,6 +1,7 @@
 """What doors take for numbers and sizes, against Python's own values."""
 
 import json
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -47,7 +48,9 @@ def test_a_budget_takes_them_too():
     assert repr(budget) == "Budget(seconds=2.0, network_rows=600)"
 
 
-@pytest.mark.parametrize("size", [(8, 2.5), (0, 8), (8,), 8, "88", (True, 8), np.ones((2, 2))])
+@pytest.mark.parametrize(
+    "size", [(8, 2.5), (0, 8), (8,), 8, "88", (True, 8), np.ones((2, 2)), np.array(5), b"ab"]
+)
 def test_a_size_that_is_no_pair_of_whole_numbers_is_named(size):
     camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
     depth = np.full((8, 8), 2.0)
@@ -72,3 +75,11 @@ def test_a_size_of_numpy_or_torch_is_one_of_whole_numbers():
     for size in (np.array([4, 6]), torch.zeros(4, 6).shape, [np.int64(4), 6]):
         assert check.size(size, "size") == (4, 6)
         assert all(type(side) is int for side in check.size(size, "size"))
+
+
+@pytest.mark.parametrize(
+    "value", [10**400, Fraction(10**400), np.longdouble("1e4000"), np.nan, True]
+)
+def test_a_number_that_no_float_holds_is_named(value):
+    with pytest.raises(ValueError, match=r"a0: got .*, expected a number in \[0, 1\]"):
+        check.number(value, 0, 1, "a0")

@@ -39,7 +39,7 @@ def read_yaml(text: str) -> tuple[yaml.Node, Any]:
     """
     if len(text) > LONGEST:
         raise YamlError(f"has {len(text):,} characters, more than {LONGEST:,}")
-    if FAST is not None:
+    if FAST is not None and not DISPUTED.intersection(text):
         try:
             return _read(text, FAST)
         except YamlError:
@@ -80,7 +80,9 @@ class _Values(yaml.constructor.SafeConstructor):
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         try:
             return super().construct_object(node, deep)
-        except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+        except (
+            ValueError, TypeError, LookupError, AttributeError, OverflowError,
+        ) as error:  # fmt: skip
             if isinstance(error, YamlError):
                 raise
             kind = node.tag.removeprefix("tag:yaml.org,2002:")
@@ -95,6 +97,10 @@ class _Exact(_Values, yaml.SafeLoader):
 EXACT: type[Any] = _Exact
 FAST: type[Any] | None = None
 """libyaml's parser where PyYAML has it: 15 times as fast."""
+
+DISPUTED = frozenset("\t!\ufeff")
+"""Characters that libyaml and PyYAML's own parser read otherwise in places: ``title: !``, a tab
+after a colon, a byte order mark on a later line."""
 
 if yaml.__with_libyaml__:
 

@@ -8,7 +8,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    field_validator,
+    model_validator,
+)
 
 from attnwarp import check
 from attnwarp.errors import InputError, suggest
@@ -34,6 +42,16 @@ class StudyError(InputError):
     """
 
 
+def _no_truth(value: Any) -> Any:
+    # pydantic counts true as 1.
+    if isinstance(value, bool):
+        raise ValueError(f"got {value}, expected a whole number")
+    return value
+
+
+Whole = Annotated[int, BeforeValidator(_no_truth)]
+
+
 class Part(BaseModel):
     """Keys of a study's YAML; an unknown key is an error."""
 
@@ -55,7 +73,7 @@ class Splats(Part):
     """Gaussians sampled on the scene's surfaces."""
 
     kind: Literal["2d", "3d"] = "2d"
-    count: Annotated[int, Field(strict=True, ge=1, le=5_000_000)] = 40_000
+    count: Annotated[Whole, Field(ge=1, le=5_000_000)] = 40_000
     position_noise: Annotated[float, Field(ge=0)] = 0.0
     normal_noise: Annotated[float, Field(ge=0, le=90)] = 0.0
 
@@ -125,20 +143,20 @@ class Study(Part):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
     title: str = ""
     description: str = ""
-    size: Annotated[int, Field(strict=True, ge=16, le=4096)] = 512
+    size: Annotated[Whole, Field(ge=16, le=4096)] = 512
     scenes: list[str] = Field(default_factory=list)
     views: list[str] = Field(
         default_factory=list, description="target views by name; all of them if empty"
     )
-    seeds: Annotated[
-        list[Annotated[int, Field(strict=True, ge=0, lt=2**32)]], Field(min_length=1)
-    ] = Field(default_factory=lambda: [0])
-    spp: Annotated[int, Field(strict=True, ge=1)] = 16
-    feature_sizes: list[Annotated[int, Field(strict=True)]] = Field(
+    seeds: Annotated[list[Annotated[Whole, Field(ge=0, lt=2**32)]], Field(min_length=1)] = Field(
+        default_factory=lambda: [0]
+    )
+    spp: Annotated[Whole, Field(ge=1)] = 16
+    feature_sizes: list[Whole] = Field(
         default_factory=list, description="image size, 1/8 and 1/16 of it if left out"
     )
-    feature_channels: Annotated[int, Field(strict=True, ge=1, le=4096)] = 8
-    timing_rounds: Annotated[int, Field(strict=True, ge=3)] = 15
+    feature_channels: Annotated[Whole, Field(ge=1, le=4096)] = 8
+    timing_rounds: Annotated[Whole, Field(ge=3)] = 15
     splats: Splats = Splats()
     variants: dict[str, Variant] = Field(default_factory=dict)
     probes: Annotated[dict[str, list[str]], Field(min_length=1)]

@@ -23,7 +23,7 @@ def state():
     }
 
 
-def refused(path, part="remove it and splats.ply to begin again"):
+def refused(path, part="remove it to begin again"):
     with pytest.raises(FileFormatError) as caught:
         checkpoint.load(path)
     assert str(path) in str(caught.value) and part in str(caught.value)

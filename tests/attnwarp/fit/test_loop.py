@@ -417,6 +417,20 @@ def test_splats_without_a_checkpoint_stay(scene, tmp_path):
     assert (tmp_path / SPLATS).read_bytes() == whole
 
 
+def test_a_restart_that_is_stopped_before_its_first_save_loses_nothing(scene, tmp_path):
+    start, settings = begin(scene, iterations=2, sh_degree=0)
+    fit(start, scene[0], settings, folder=tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def stop(state):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(start, scene[0], settings, folder=tmp_path, restart=True, watch=stop)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert fit(start, scene[0], settings, folder=tmp_path).iteration == 2
+
+
 def test_a_checkpoint_that_names_no_first_splats_is_resumed(scene, tmp_path):
     """As those were that were written before."""
     start, settings = begin(scene, iterations=5, sh_degree=0)

@@ -26,16 +26,16 @@ from typer.testing import CliRunner
 from attnwarp import Camera, propagate
 from attnwarp.cli import edit
 from attnwarp.cli.main import app
-from attnwarp.editing.segment import load_segmenter, segmenter_digest
+from attnwarp.editing.segment import GroundedSam, load_segmenter
 from attnwarp.errors import InputError
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp.io.images import encode_png
+from attnwarp.io.lock import alone_in
 from attnwarp.propagate import page as page_of_edits
-from attnwarp.propagate import words
 from attnwarp.propagate.command import mask_files, read_mask, read_over_black
 from attnwarp.propagate.folder import Folder
 from attnwarp.propagate.scene import to_float
-from attnwarp.propagate.words import masks_by_words
+from attnwarp.propagate.words import masks_by_words, words_folder
 
 runner = CliRunner()
 QUICK = (
@@ -449,48 +449,76 @@ class Counted:
         return self.segmenter.segment(image, words)
 
 
-def test_masks_by_words_are_made_once(place, tmp_path, monkeypatch):
-    """Stopped before the third view, begun anew, then with other words, damage, and other weights."""
-    save_dino(tmp_path / "dino")
-    save_sam(tmp_path / "sam", seed=2)
-    name = f"{tmp_path / 'dino'},{tmp_path / 'sam'}"
-    monkeypatch.setattr(
-        words, "segmenter_digest", lambda counted: segmenter_digest(counted.segmenter)
-    )
-    views, folder = cameras(), tmp_path / "edit"
+def test_masks_by_words_are_made_once(place, tmp_path):
+    """Stopped before the third view, begun anew, then damaged, and repainted."""
+    views = cameras()
     images = [read_image(place / "data" / "images" / camera.name) for camera in views]
+    segmenter, text = tiny_segmenter(tmp_path), "bear"
+    folder = words_folder(tmp_path / "edit", segmenter, text)
+    alone = [segmenter.segment(to_float(image), text) for image in images]
 
-    def masks(text="bear", stop_at=None, thresholds=None):
-        segmenter = load_segmenter(name)
-        for key, value in (thresholds or {}).items():
-            object.__setattr__(segmenter, key, value)
-        counted = Counted(segmenter, stop_at)
-        steps = []
+    def made(stop_at=None, views=views, images=images):
+        counted, steps = Counted(segmenter, stop_at), []
         try:
-            made, kept = masks_by_words(counted, text, views, images, folder, steps.append)
+            masks, kept = masks_by_words(counted, text, views, images, folder, steps.append)
         except KeyboardInterrupt:
             return counted.shown
-        assert [(step.done, step.total) for step in steps] == [
+        assert [(s.done, s.total) for s in steps] == [
             (k + 1, len(views)) for k in range(len(views))
         ]
-        alone = [segmenter.segment(to_float(image), text) for image in images]
-        assert all(map(np.array_equal, made, alone))
         assert kept == len(views) - counted.shown
+        if images is not flipped:
+            assert all(map(np.array_equal, masks, alone))
         return counted.shown
 
-    assert masks(stop_at=2) == 2
-    assert masks() == len(views) - 2
-    assert masks() == 0
-    path = folder / "words" / "v1.png"
+    flipped = [image[:, ::-1].copy() for image in images]
+    assert made(stop_at=2) == 2
+    assert made() == len(views) - 2
+    assert made() == 0
+    path = folder / "v1.png"
     path.write_bytes(path.read_bytes()[:-20])
-    (folder / "words" / "v2.json").write_text("{")
-    assert masks() == 2
-    assert masks(thresholds={"box_threshold": 0.3}) == len(views)
-    assert masks() == len(views)
-    assert masks("a bear") == len(views)
-    (folder / "words" / "v1.json").unlink()
-    with pytest.raises(InputError, match="words/v1.png: is there without words/v1.json"):
-        masks("a bear")
+    (folder / "v2.json").write_text("{")
+    assert made() == 2
+    assert made(images=flipped) == len(views)
+    assert made() == len(views)
+    path.write_bytes(encode_png(255 - read_image(path)))
+    painted = path.read_bytes()
+    with pytest.raises(InputError, match=r"v1.png: is not the mask that was made; .*--masks"):
+        made()
+    (folder / "v1.json").unlink()
+    with pytest.raises(InputError, match="v1.png: is there without v1.json"):
+        made()
+    assert path.read_bytes() == painted
+    with alone_in(folder), pytest.raises(InputError, match="another run writes to this folder"):
+        made()
+
+
+def test_masks_of_other_words_or_segmenters_write_over_none(place, tmp_path):
+    views = cameras()[:2]
+    images = [read_image(place / "data" / "images" / camera.name) for camera in views]
+    files = {}
+    segmenters = [
+        tiny_segmenter(tmp_path), tiny_segmenter(tmp_path, box_threshold=0.3),
+        tiny_segmenter(tmp_path, sam_seed=3), load_segmenter("clip-parts"),
+    ]  # fmt: skip
+    for segmenter in segmenters:
+        for text in ("bear", "Bear", "a bear / b"):
+            folder = words_folder(tmp_path / "edit", segmenter, text)
+            assert folder not in files
+            files[folder] = segmenter, text
+    assert len({folder.parent for folder in files}) == 1
+    for folder, (segmenter, text) in list(files.items())[:4]:
+        _, kept = masks_by_words(segmenter, text, views, images, folder, lambda step: None)
+        assert kept == 0
+    for folder, (segmenter, text) in list(files.items())[:4]:
+        _, kept = masks_by_words(segmenter, text, views, images, folder, lambda step: None)
+        assert kept == len(views)
+
+
+def tiny_segmenter(folder, *, sam_seed=2, **thresholds):
+    save_dino(folder / "dino")
+    save_sam(folder / f"sam{sam_seed}", seed=sam_seed)
+    return GroundedSam.from_folders(folder / "dino", folder / f"sam{sam_seed}", **thresholds)
 
 
 def test_words_that_a_view_does_not_show_are_one_clear_line_with_the_view(place, tmp_path):

@@ -518,12 +518,24 @@ def test_a_folder_that_was_tuned_by_other_weights_is_refused(scene, editor, tmp_
         tiny_models.save_backbone(weights / "alexnet-owt-7be5be79.pth", "alex", seed)
         with expected:
             run(scene, editor, tmp_path / "edit", settings)
-    # A view too small for it is named before any is edited.
+    # A view too small for it is named before any is edited, if it is one to tune on.
     model, views, _ = scene
-    small = [views[0], *(view.resize(16, 24) for view in views[1:])]
-    named = f"views: '{views[1].name}' has 16 x 24 px, the perceptual distance lpips:.* needs 31"
+    edited = set(run(scene, editor, None, settings).edited)
+    assert 0 in edited and len(edited) < len(views)
+    tuned, other = max(edited), min(set(range(len(views))) - edited)
+    named = f"views: '{views[tuned].name}' has 16 x 24 px, the perceptual distance lpips:.* needs"
+    for small, expected in (
+        (other, nullcontext()),
+        (tuned, pytest.raises(ValueError, match=named)),
+    ):
+        cameras = [view.resize(16, 24) if k == small else view for k, view in enumerate(views)]
+        with expected:
+            propagate(model, cameras, None, editor, "a bear", settings)
+    named = (
+        "is edited at 16 x 16 px, the perceptual distance lpips:.*; raise size, or set perceptual"
+    )
     with pytest.raises(ValueError, match=named):
-        propagate(model, small, None, editor, "a bear", settings)
+        run(scene, editor, None, replace(settings, size=16, detail="none"))
 
 
 @pytest.mark.parametrize(

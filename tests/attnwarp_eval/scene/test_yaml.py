@@ -162,3 +162,18 @@ def test_libyaml_and_pythons_parser_read_shipped_files_alike():
         (fast, values), (exact, same) = _read(text, FAST), _read(text, EXACT)
         assert values == same, path
         assert lines(fast) == lines(exact), path
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["title: !\n", "\n\ufeffname: a\n", "name:\ta\n", "a: !!int ''\n", "a: 1\t\n", "a: 'b!'\n"],
+)
+def test_what_the_two_parsers_would_read_otherwise_is_read_by_pythons_alone(text):
+    def outcome(read):
+        try:
+            return read()
+        except YamlError as error:
+            return str(error), error.line
+
+    exact = outcome(lambda: _read(text, EXACT)[1])
+    assert outcome(lambda: read_yaml(text)[1]) == exact
