@@ -162,7 +162,10 @@ def load_views(dataset: Dataset, *, max_size: int | None = None) -> Views:
         cameras.append(camera)
         images.append(image)
     if not cameras:
-        raise ValueError("dataset: none of its cameras has an image")
+        raise ValueError(
+            "dataset: none of its cameras has an image that is there; put the images where the data"
+            " set names them"
+        )
     return Views(cameras, images)
 
 

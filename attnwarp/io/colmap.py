@@ -169,6 +169,7 @@ def read_colmap(
         [folder / pose.name for pose in poses],
         missing_images=missing_images,
         resize_cameras=resize_cameras or scale > 1,
+        elsewhere="images=FOLDER (--images FOLDER)",
     )
     cloud = model / f"points3D{suffix}"
     if not points or not cloud.is_file():

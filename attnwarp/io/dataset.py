@@ -13,7 +13,7 @@ import numpy.typing as npt
 from attnwarp import check
 from attnwarp.camera import EXACT_ROTATION, Camera, nearest_orthonormal
 from attnwarp.io.file import FileFormatError, is_file
-from attnwarp.io.images import image_size
+from attnwarp.io.images import IMAGE_SUFFIXES, image_size, is_turned
 from attnwarp.io.lens import Lens
 
 Array = npt.NDArray[np.float64]
@@ -162,8 +162,15 @@ def with_images(
     *,
     missing_images: Missing,
     resize_cameras: bool,
+    elsewhere: str = "",
 ) -> tuple[list[Camera], list[Path | None]]:
     """Check that each camera's image exists and has the camera's size.
+
+    Args:
+        source: of the cameras, for messages.
+        cameras, paths: one path for each camera.
+        missing_images, resize_cameras: see :func:`attnwarp.io.read_dataset`.
+        elsewhere: how a person names the images' folder, where that can be.
 
     Returns:
         the cameras (resized to their images where ``resize_cameras`` says so), and the paths, None
@@ -174,10 +181,13 @@ def with_images(
     if absent and missing_images == "error":
         first = ", ".join(str(path) for path in absent[:3])
         more = f" and {len(absent) - 3} more" if len(absent) > 3 else ""
+        near = _of_another_suffix(absent[0])
+        there = f"; {near.name} is there" if near is not None else ""
+        folder = f", or name their folder: {elsewhere}" if elsewhere else ""
         raise FileFormatError(
             source,
-            f"{len(absent)} of {len(paths)} images are missing: {first}{more}; "
-            "put them there, or do without: missing_images='none' (--missing-images none)",
+            f"{len(absent)} of {len(paths)} images are missing: {first}{more}{there}; put them"
+            f" there{folder}, or do without: missing_images='none' (--missing-images none)",
         )
     missing = set(absent)
     available: list[Path | None] = [None if path in missing else path for path in paths]
@@ -188,6 +198,13 @@ def with_images(
         camera, (width, height) = cameras[i], image_size(path)
         if (width, height) == (camera.width, camera.height):
             continue
+        if (width > height) != (camera.width > camera.height) and is_turned(path):
+            raise FileFormatError(
+                source,
+                f"{path} is stored as {width} x {height} with an EXIF tag that asks for a turn,"
+                f" which is not followed; its camera is {camera.width} x {camera.height}: write the"
+                " pictures out turned, without the tag",
+            )
         if not resize_cameras:
             raise FileFormatError(
                 source,
@@ -202,3 +219,10 @@ def with_images(
             raise FileFormatError(source, str(error)) from None
         cameras[i] = camera.resize(width, height)
     return cameras, available
+
+
+def _of_another_suffix(path: Path) -> Path | None:
+    """An image of the same name with another suffix."""
+    stem = path.with_suffix("")
+    each = (Path(f"{stem}{suffix}") for suffix in IMAGE_SUFFIXES)
+    return next((image for image in each if image != path and is_file(image)), None)

@@ -21,6 +21,20 @@ import numpy.typing as npt
 
 from attnwarp.io.file import FileFormatError, existing_file
 
+IMAGE_SUFFIXES = (
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".PNG",
+    ".JPG",
+    ".JPEG",
+    ".webp",
+    ".tif",
+    ".tiff",
+    ".exr",
+)
+"""Of images, in the order in which they are looked for."""
+
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -51,6 +65,22 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
         height, width = read_image(path).shape[:2]
         return width, height
     return size
+
+
+def is_turned(path: str | os.PathLike[str]) -> bool:
+    """Whether a picture has an EXIF tag that asks for a quarter turn, which no reader here follows.
+
+    Example:
+        >>> from PIL import Image
+        >>> picture = Image.new("RGB", (4, 3))
+        >>> exif = picture.getexif()
+        >>> exif[274] = 6
+        >>> picture.save("turned.jpg", exif=exif)
+        >>> is_turned("turned.jpg"), image_size("turned.jpg")
+        (True, (4, 3))
+    """
+    asked = _with_pillow(Path(path), lambda image: image.getexif().get(_ORIENTATION, 1))
+    return asked in (5, 6, 7, 8)
 
 
 def read_image(path: str | os.PathLike[str]) -> npt.NDArray[Any]:

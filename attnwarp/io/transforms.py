@@ -26,25 +26,13 @@ from attnwarp.camera import Camera
 from attnwarp.errors import InputWarning, suggest
 from attnwarp.io.dataset import Dataset, Distorted, Missing, nearest_rotation, with_images
 from attnwarp.io.file import FileFormatError, existing_file, is_file, write_atomically
-from attnwarp.io.images import image_size
+from attnwarp.io.images import IMAGE_SUFFIXES, image_size
 from attnwarp.io.lens import Lens
 from attnwarp.io.ply import read_points, write_points
 
 Array = npt.NDArray[np.float64]
 
 SPLITS = ("train", "val", "test")
-IMAGE_SUFFIXES = (
-    ".png",
-    ".jpg",
-    ".jpeg",
-    ".PNG",
-    ".JPG",
-    ".JPEG",
-    ".webp",
-    ".tif",
-    ".tiff",
-    ".exr",
-)
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Keys of the distortion coefficients, in the order of OpenCV's vector."""
 

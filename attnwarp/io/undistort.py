@@ -60,7 +60,10 @@ def undistort(
     folder = Path(folder)
     dataset = dataset.select([i for i, path in enumerate(dataset.image_paths) if path is not None])
     if not len(dataset):
-        raise ValueError("dataset: none of its cameras has an image")
+        raise ValueError(
+            "dataset: none of its cameras has an image that is there; put the images where the data"
+            " set names them"
+        )
     # Before the first picture is written: a lens that cannot be undone costs no work.
     cameras = [
         camera if lens is None else undistorted_camera(camera, lens)

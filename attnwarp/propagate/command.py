@@ -114,18 +114,18 @@ def edit_dataset(
     views = load_views(dataset, max_size=max_size)
     index = _view_of(views.cameras, source)
     images = images_of(views)
-    segments = None if masks is None else _masks(masks, views.cameras, say)
-    editor = load_editor(editor_name, device=device)
-    check_instruction(editor_name, editor, instruction)
-    if words is not None:
-        segments = _by_words(words, segmenter, device, views.cameras, images, out, say)
     by_hand = None
     if source_picture is not None:
         pixels, top = read_over_black(source_picture)
         by_hand = (pixels / top).astype(np.float32)
         h, w, _ = by_hand.shape
-        # Again in the edit, but here before a fit spends its minutes.
+        # Again in the edit, but here before an editor is loaded and a fit spends its minutes.
         check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
+    segments = None if masks is None else _masks(masks, views.cameras, say)
+    editor = load_editor(editor_name, device=device)
+    check_instruction(editor_name, editor, instruction)
+    if words is not None:
+        segments = _by_words(words, segmenter, device, views.cameras, images, out, say)
     if settings.size is None:
         settings = replace(settings, size=own_size(editor))
     if splats is None:
@@ -225,6 +225,8 @@ def _view_of(cameras: Any, name: str | None) -> int:
 
 def _masks(folder: Path, cameras: Any, say: Callable[[str], None]) -> list[npt.NDArray[np.bool_]]:
     """(H, W) bool of each view from NAME.png: white is edited."""
+    if not folder.is_dir():
+        raise InputError(f"--masks: {folder} is no folder; name one with a PNG for each view")
     paths = mask_files(folder, cameras)
     masks = [read_mask(path, camera) for path, camera in zip(paths, cameras, strict=True)]
     black = [camera.name for mask, camera in zip(masks, cameras, strict=True) if not mask.any()]
@@ -288,6 +290,11 @@ def read_mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:
     if np.ptp(pixels, axis=-1).max() > COLORED * top:
         raise InputError(
             f"--masks: {path} is coloured, expected a grey picture: white is edited, black is not"
+        )
+    if pixels.max() == 1:
+        raise InputError(
+            f"--masks: {path} has no value above 1 of {top}, so all of it is black; multiply its"
+            f" values by {top}"
         )
     bright = pixels.mean(axis=-1) / top
     size = (camera.width, camera.height)

@@ -255,8 +255,6 @@ class _Run:
         self.plan = Plan.draw(len(scene.cameras), source, settings, self._chain(source))
         editing = [number for number, stage in enumerate(self.plan.stages) if stage]
         self.view_editor.check_batches(editing, further=bool(self.plan.chain))
-        if announce is not None:
-            self._announce_changes(announce, source, multiple)
         self.tuning = Tuning(
             gaussians, scene.cameras, settings, len(self.plan.stages), backend=backend
         )
@@ -289,6 +287,9 @@ class _Run:
                 },
             }
         )
+        # After the claim: in the folder of another edit nothing of this one is true.
+        if announce is not None:
+            self._announce_changes(announce, source, multiple)
 
     def _announce_changes(
         self, announce: Callable[[str], None], source: int, multiple: int

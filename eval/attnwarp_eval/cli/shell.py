@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from attnwarp.cli.shell import STOPPED, USAGE, closed_pipe
-from attnwarp.progress import Pace
+from attnwarp.progress import LINE_SECONDS, Pace
 
 if TYPE_CHECKING:
     import rich.progress
@@ -121,7 +122,8 @@ def names(text: str | None) -> list[str] | None:
 
 
 class Progress:
-    """Progress of one command on stderr: a bar on a terminal, else lines if they are asked for.
+    """Progress of one command on stderr: a bar on a terminal, else lines, now and then or for every
+    call.
 
     Attributes:
         console: stderr.
@@ -133,8 +135,9 @@ class Progress:
         self.console = console
         self._bar = bar
         self._task = task
-        self._lines = lines and not console.is_terminal
+        self._lines = lines
         self._pace = Pace()
+        self._told = time.monotonic()
 
     def __call__(self, done: int, total: int, step: str) -> None:
         """Show how far the work is.
@@ -145,13 +148,23 @@ class Progress:
             step: what is at work, or has just ended.
         """
         self._bar.update(self._task, description=step, completed=done, total=total or None)
-        if self._lines:
+        if not self.console.is_terminal and (self._lines or self._due()):
             left = self._pace.left(done, total)
             self.line(f"[{done}/{total}] {step}{left}" if total else step)
 
     def step(self, text: str) -> None:
         """Name what is at work, without a count."""
         self._bar.update(self._task, description=text)
+        if not self.console.is_terminal and self._due():
+            self.line(text)
+
+    def _due(self) -> bool:
+        """Whether a log file has had no line for a while."""
+        now = time.monotonic()
+        if now - self._told < LINE_SECONDS:
+            return False
+        self._told = now
+        return True
 
     def line(self, text: str) -> None:
         """Print a line above the bar; a log file gets it whole, so that it can be searched."""
@@ -165,26 +178,38 @@ def progress(total: int = 0, *, done: int = 0, lines: bool = False) -> Iterator[
     Args:
         total: number of steps; 0 while it is unknown.
         done: steps finished before.
-        lines: without a terminal, print a line for every call.
+        lines: without a terminal, print a line for every call, not every ten seconds alone.
     """
     import rich.progress
-    from rich.console import Console
+    from rich.console import Console, RenderableType
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
+        ProgressColumn,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
+    from rich.text import Text
+
+    class Known(ProgressColumn):
+        """A column for work whose steps are counted; empty for any other."""
+
+        def __init__(self, inner: ProgressColumn) -> None:
+            super().__init__()
+            self.inner = inner
+
+        def render(self, task: rich.progress.Task) -> RenderableType:
+            return Text() if task.total is None else self.inner(task)
 
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
+        BarColumn(bar_width=20),
+        Known(MofNCompleteColumn()),
         TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
+        Known(TextColumn("left")),
+        Known(TimeRemainingColumn()),
     )
     with rich.progress.Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         yield Progress(

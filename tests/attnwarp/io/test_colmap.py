@@ -303,6 +303,12 @@ def test_missing_images_are_listed(tmp_path):
         FileFormatError, match=r"3 of 3 images are missing: .*a\.png.*c\.png; put them there"
     ):
         read_colmap(tmp_path)
+    # Two ways out: where they are, and what they are called.
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (8, 6)).save(tmp_path / "images" / "a.jpg")
+    message = r"c\.png; a\.jpg is there; put them there, or name their folder: .*--images FOLDER"
+    with pytest.raises(FileFormatError, match=message):
+        read_colmap(tmp_path)
 
 
 def test_smaller_images_in_another_folder_resize_the_cameras_when_asked(tmp_path):

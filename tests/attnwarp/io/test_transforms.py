@@ -288,6 +288,28 @@ def test_an_image_of_another_size_is_refused_or_resizes_its_camera(tmp_path):
     assert cameras[1].K.tolist() == [[5, 0, 1.75], [0, 5.5, 1.625], [0, 0, 1]]
 
 
+@pytest.mark.parametrize(("orientation", "turned"), [(1, False), (3, False), (6, True), (8, True)])
+def test_a_picture_whose_tag_asks_for_a_turn_is_told_from_one_of_another_size(
+    tmp_path, orientation, turned
+):
+    frames = [{"file_path": "images/a.jpg", "transform_matrix": pose()}]
+    path = write(tmp_path, frames, **{**LENS, "w": 6, "h": 8})
+    picture = Image.new("RGB", (8, 6))
+    exif = picture.getexif()
+    exif[274] = orientation
+    (tmp_path / "images").mkdir()
+    picture.save(tmp_path / "images/a.jpg", exif=exif)
+    message = (
+        "stored as 8 x 6 with an EXIF tag .* camera is 6 x 8" if turned else "is 8 x 6, but its"
+    )
+    for resize in (False, True) if turned else (False,):
+        with pytest.raises(FileFormatError, match=message):
+            read_transforms(path, resize_cameras=resize)
+    # Where sides fit as stored, the tag is nobody's business.
+    upright = write(tmp_path, frames, **LENS)
+    assert len(read_transforms(upright).cameras) == 1
+
+
 def test_no_camera_is_resized_to_a_picture_of_another_shape(tmp_path):
     # No resampling turns 4:3 into 3:4; a side may be rounded: 8 x 6 by 0.4 is 3.2 x 2.4.
     path = folder_of(tmp_path)

@@ -70,9 +70,11 @@ def place(tmp_path_factory):
     )
     write_ply(folder / "splats.ply", model)
     pix2pix().save_pretrained(folder / "editor")
-    (folder / "black").mkdir()
-    for camera in views:
-        (folder / "black" / camera.name).write_bytes(encode_png(np.zeros((32, 32, 3), np.uint8)))
+    for name, value in (("black", 0), ("ones", 1)):
+        (folder / name).mkdir()
+        for camera in views:
+            grey = np.full((32, 32, 3), value, np.uint8)
+            (folder / name / camera.name).write_bytes(encode_png(grey))
     (folder / "wide.png").write_bytes(encode_png(np.zeros((32, 48, 3), np.uint8)))
     return folder
 
@@ -344,7 +346,12 @@ def test_transparent_pixels_of_a_mask_or_a_picture_by_hand_are_black(tmp_path):
         (("--set", "opaqe=1"), "setting: got 'opaqe', expected one of"),
         (("--set", "steps=3"), "--set: steps has an option of its own, --steps"),
         (("--set", "a0=3"), "a0: got 3, expected a number in [0, 1]"),
-        (("--masks", "nowhere"), "--masks: nowhere/v0.png is missing"),
+        (("--masks", "nowhere"), "--masks: nowhere is no folder"),
+        (("--masks", "editor"), "--masks: editor/v0.png is missing"),
+        (
+            ("--masks", "ones"),
+            "v0.png has no value above 1 of 255, so all of it is black; multiply",
+        ),
         (("--masks", ".", "--where", "bear"), "--where: got --masks too, expected one of the two"),
         (("--masks", "data/images"), "v0.png is coloured, expected a grey picture"),
         (("--where", " "), "--where: got ' ', expected words such as 'bear'"),
