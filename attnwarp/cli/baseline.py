@@ -65,7 +65,9 @@ def baseline(
     reading: Reading,
 ) -> None:
     """Edit a scene by another method, for comparison with attnwarp edit."""
-    with clear_errors(f"stopped; what {out} holds is whole, and the same command goes on from it"):
+    with clear_errors(
+        f"stopped; what {out} holds is whole, and the same command goes on from it", out
+    ):
         changes = assignments(change or [], {})
         check_out(out)
         check_inputs_stay([out / "edited.ply"], [ply])

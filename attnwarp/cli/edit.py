@@ -106,7 +106,9 @@ def edit(
     reading: Reading,
 ) -> None:
     """Edit a scene: one view by an instruction, the others along with it, the splats on all."""
-    with clear_errors(f"stopped; what {out} holds is whole, and the same command goes on from it"):
+    with clear_errors(
+        f"stopped; what {out} holds is whole, and the same command goes on from it", out
+    ):
         options: dict[str, Any] = {
             "stages": stages, "views_per_stage": views_per_stage, "steps": steps,
             "iterations": iterations, "size": size, "seed": seed,

@@ -96,7 +96,7 @@ def fit(
 ) -> None:
     """Fit splats to posed pictures. Stopped half-way and started again, it goes on where it was."""
     with clear_errors(
-        f"stopped; what {out} holds is whole, and the same command goes on from its checkpoint"
+        f"stopped; what {out} holds is whole, and the same command goes on from its checkpoint", out
     ):
         # What needs nothing heavy is read first: a typing error is answered at once.
         changes = assignments(change or [], OWN_OPTIONS)

@@ -40,12 +40,17 @@ def echo(text: str) -> None:
     typer.echo(text, err=True)
 
 
+NOTHING = "stopped; nothing was written"
+
+
 @contextmanager
-def clear_errors(stopped: str = "stopped; nothing was written") -> Iterator[None]:
+def clear_errors(stopped: str = NOTHING, out: Path | None = None) -> Iterator[None]:
     """Turn errors about a person's input into one clear line and exit code 2.
 
     Args:
         stopped: what is said after Ctrl-C or a polite kill.
+        out: folder of the results that it speaks of, if it does; nothing was written while it is
+            not there.
     """
     printed: set[str] = set()
 
@@ -66,7 +71,8 @@ def clear_errors(stopped: str = "stopped; nothing was written") -> Iterator[None
     except typer.Exit:  # a RuntimeError too
         raise
     except KeyboardInterrupt:
-        typer.echo(f"attnwarp: {stopped}", err=True)
+        said = stopped if out is None or out.exists() else NOTHING
+        typer.echo(f"attnwarp: {said}", err=True)
         raise typer.Exit(STOPPED) from None
     except BrokenPipeError:
         raise closed_pipe() from None

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import typer
 from imported_modules import modules_after
 from plyfile import PlyData
 from typer.testing import CliRunner
@@ -23,6 +24,7 @@ from typer.testing import CliRunner
 from attnwarp import Camera, Gaussians, baselines, progress
 from attnwarp.cli import baseline
 from attnwarp.cli.main import app
+from attnwarp.cli.shell import clear_errors
 from attnwarp.io import Dataset, read_dataset, read_ply, write_ply, write_transforms
 from attnwarp.render import render
 from attnwarp.render.threads import set_thread_count
@@ -778,3 +780,17 @@ def test_half_a_jpeg_is_refused_by_name(data, tmp_path):
     done = in_process("fit", folder, "--out", tmp_path / "out", "--iterations", 1)
     assert done.exit_code == 2
     assert f"{folder / 'images/4.jpg'}: the picture is damaged" in done.stderr
+
+
+def test_a_command_that_is_stopped_before_it_made_its_folder_says_so(tmp_path, capsys):
+    for there, expected in (
+        (False, "stopped; nothing was written"),
+        (True, "what it holds is whole"),
+    ):
+        out = tmp_path / "out"
+        if there:
+            out.mkdir()
+        with pytest.raises(typer.Exit) as caught, clear_errors("what it holds is whole", out):
+            raise KeyboardInterrupt
+        assert caught.value.exit_code == 130
+        assert capsys.readouterr().err == f"attnwarp: {expected}\n"
