@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from attnwarp.editing.small import check_words, guide_of
+from attnwarp.errors import InputWarning
 
 if TYPE_CHECKING:
     from attnwarp.editing.editor import Image
@@ -17,6 +20,9 @@ TILE_COLUMNS = 5
 
 MOST_PIXELS = 4096
 """Longest side that an edit works at; more is a typing error that would take all the memory."""
+
+MOST_STRETCH = 0.03
+"""Change of a picture's shape that is not worth a word."""
 
 SEGMENTER = "clip-parts"
 """What ``--where`` asks if ``--segmenter`` is left out."""
@@ -122,8 +128,9 @@ def edit_image(
     check_instruction(editor, model, instruction)
     torch.set_num_threads(thread_count(model, threads))
     longest = size or own_size(model)
-    image = _fit(image, longest, side_multiple(model))
+    before, image = image.shape, _fit(image, longest, side_multiple(model))
     h, w = image.shape[:2]
+    _tell_stretch(before, image.shape, side_multiple(model))
     share = None
     if words is not None:
         mask = load_segmenter(segmenter or SEGMENTER, device=device).segment(image, words)
@@ -208,6 +215,22 @@ def _fit(image: Image, longest: int, multiple: int) -> Image:
         return image
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     return np.clip(cv2.resize(image, (width, height), interpolation=how), 0, 1)
+
+
+def _tell_stretch(before: Sequence[int], after: Sequence[int], multiple: int) -> None:
+    """Warn of a picture whose shape is clearly another once its sides are multiples."""
+    import warnings
+
+    h, w = before[:2]
+    stretch = (after[1] / after[0]) / (w / h)
+    if abs(math.log(stretch)) > math.log(1 + MOST_STRETCH):
+        warnings.warn(
+            f"{w} x {h} px is edited as {after[1]} x {after[0]}, sides that the editor takes"
+            f" (multiples of {multiple}): {max(stretch, 1 / stretch) - 1:.0%} too"
+            f" {'wide' if stretch > 1 else 'high'}; another --size may fit better",
+            InputWarning,
+            stacklevel=1,
+        )
 
 
 def _sheet(tiles: list[Image]) -> Image:

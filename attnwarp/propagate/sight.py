@@ -85,7 +85,8 @@ def near_edges(depth: Array, margin: int) -> Tensor:
 
     A picture's pixels there mix near and far. Inverse depth is affine in the pixel on a plane, so a
     step of it beyond its neighbours' is an edge: a plane at a grazing angle has none. Undefined
-    depth counts as infinite.
+    depth counts as infinite. Pixels of the outermost rows and columns have one neighbour, so the
+    margin reaches them from their neighbour alone.
 
     Args:
         depth: (H, W), undefined where it is NaN, zero, negative or infinite.

@@ -42,6 +42,7 @@ def test_it_writes_what_the_library_gives_and_a_sheet_of_the_steps(folder, photo
         path, "--instruction", "a bear", "--editor", folder, "--out", out, "--sheet", sheet, "--steps", 3, "--size", 64, "--seed", 4,
     )  # fmt: skip
     assert result.exit_code == 0, result.output
+    assert "warning" not in result.output
     expected = edit(
         load_editor(str(folder)), [pixels.astype(np.float32) / 255], "a bear", steps=3, seed=4
     ).images[0]
@@ -71,6 +72,7 @@ def test_the_picture_is_worked_on_at_the_size_asked_for(folder, photo, tmp_path)
     )
     assert result.exit_code == 0, result.output
     assert cv2.imread(str(out)).shape == (32, 48, 3)  # 30 px rounded to a multiple of 8
+    assert "edited as 48 x 32" in result.output and "7% too high" in result.output  # 1.6 to 1.5
 
 
 def test_transparent_pixels_are_laid_over_black(folder, photo, tmp_path):
@@ -137,6 +139,7 @@ def test_words_that_the_picture_does_not_show_are_one_clear_line(folder, tmp_pat
     cv2.imwrite(str(tmp_path / "photo.png"), np.full((40, 64, 3), 128, np.uint8))
     result = run(
         tmp_path / "photo.png", "--instruction", "a bear", "--editor", folder, "--out", tmp_path / "a.png", "--where", "snowman",
+        "--size", 64,
     )  # fmt: skip
     assert result.exit_code == 2
     assert "no 'snowman' was detected in the picture" in result.output
