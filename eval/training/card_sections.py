@@ -50,10 +50,12 @@ class Kept:
 
     Args:
         path: of the JSON; it names whatever the results depend on, such as the weights' checksum.
+        say: shows the name of each result as it is computed; those that are read back are not told.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, say: Callable[[str], object] = lambda name: None) -> None:
         self.path = path
+        self.say = say
         self.results: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
 
     def get(self, name: str, compute: Callable[[], Any]) -> Any:
@@ -63,4 +65,5 @@ class Kept:
             text = json.dumps(self.results)
             self.path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(self.path, lambda stream: stream.write(text.encode()))
+            self.say(name)
         return self.results[name]

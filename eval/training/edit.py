@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -149,7 +150,8 @@ def judged(name: str, weights: Path, command: str, guide: str = "picture") -> tu
         raise typer.BadParameter(message, param_hint="NAME")
     editor, size = exported(name, weights)
     sums = hashlib.sha256((weights / name / SUMS).read_bytes()).hexdigest()
-    return editor, size, Kept(CACHE / "judged" / f"{name}-{sums[:12]}-{command}.json")
+    path = CACHE / "judged" / f"{name}-{sums[:12]}-{command}.json"
+    return editor, size, Kept(path, say=partial(typer.echo, err=True))
 
 
 def add_section(name: str, weights: Path, section: str) -> None:

@@ -73,7 +73,10 @@ def test_each_noise_is_counted_once_also_where_the_count_was_stopped(
     with pytest.raises(KeyboardInterrupt):
         answered(editor, question, 50, Kept(tmp_path / "new" / "a.json"))
     seen.append(-1)
-    counts = answered(editor, question, 50, Kept(tmp_path / "new" / "a.json"))
+    said = []
+    kept = Kept(tmp_path / "new" / "a.json", said.append)
+    counts = answered(editor, question, 50, kept)
+    assert 0 < len(said) < len(kept.results)  # what was kept is not told again
     assert sorted(seen) == list(range(-1, 50))
     others = dict.fromkeys(set(question.answers) - {"green"}, 10)
     assert counts == Counter({"green": 20, NONE: 10, **others})
