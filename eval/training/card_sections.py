@@ -34,8 +34,13 @@ def short_of(figures: Sequence[Figure]) -> list[str]:
 
 
 def percent(f: Figure) -> str:
-    """A figure with its interval, for a table."""
-    return f"**{100 * f.value:.0f} %** ({100 * f.low:.0f} to {100 * f.high:.0f})"
+    """A figure with its interval, for a table; with decimals where a miss would look like the limit itself."""
+    limit, digits = f.asked if f.at_most is None else f.at_most, 0
+    while (
+        f.short and limit is not None and digits < 3 and round(100 * (f.value - limit), digits) == 0
+    ):
+        digits += 1
+    return f"**{100 * f.value:.{digits}f} %** ({100 * f.low:.0f} to {100 * f.high:.0f})"
 
 
 def asked_for(f: Figure) -> str:

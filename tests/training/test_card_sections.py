@@ -1,7 +1,7 @@
 """Oracles: cards written out."""
 
 from training.assess import Figure
-from training.card_sections import asked_for, short_of, with_section
+from training.card_sections import asked_for, percent, short_of, with_section
 
 
 def test_a_section_replaces_the_one_of_its_heading_and_leaves_the_others():
@@ -27,3 +27,15 @@ def test_figures_below_what_is_asked_or_above_what_is_allowed_are_named():
     assert short_of(figures[1::2]) == []
     asked = [asked_for(figure) for figure in figures]
     assert asked == ["80 %", "80 %", "at most 15 %", "at most 15 %", ""]
+
+
+def test_a_miss_that_rounds_to_its_limit_shows_more_digits():
+    shown = [
+        percent(Figure("high", 41 / 272, 0.1, 0.2, 272, at_most=0.15)),
+        percent(Figure("low", 0.8463, 0.7, 0.9, 1000, asked=0.85)),
+        percent(Figure("clearly low", 0.79, 0.7, 0.9, 100, asked=0.85)),
+        percent(Figure("reached", 0.852, 0.7, 0.9, 100, asked=0.85)),
+    ]
+    assert shown == [
+        "**15.1 %** (10 to 20)", "**84.6 %** (70 to 90)", "**79 %** (70 to 90)", "**85 %** (70 to 90)",
+    ]  # fmt: skip
