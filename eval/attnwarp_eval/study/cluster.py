@@ -12,6 +12,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -292,24 +293,30 @@ def _errors_of_dask(what: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _signals_wait() -> Iterator[None]:
-    """Worker processes that start inside ignore Ctrl-C: this process receives it and ends them.
+    """Worker processes that start inside never see Ctrl-C: this process receives it and ends them.
 
-    A polite kill waits until they run: dask cannot end a cluster that has started by half, and
-    would leave its workers behind.
+    Ctrl-C and a polite kill wait until they run: dask cannot end a cluster that has started by
+    half, and would leave its workers behind.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    killed: list[int] = []
-    interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    terminate = signal.signal(signal.SIGTERM, lambda number, frame: killed.append(number))
+    # Threads and processes inherit what is blocked. multiprocessing's tracker, started by the first
+    # process, would unblock it.
+    resource_tracker.ensure_running()
+    received: list[int] = []
+    former = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    for number in former:
+        signal.signal(number, lambda number, frame: received.append(number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, interrupt)
-        signal.signal(signal.SIGTERM, terminate)
-        if killed:  # in place of dask's error where the workers received the signal too
-            signal.raise_signal(signal.SIGTERM)
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)  # one that waited comes here
+        for number, handler in former.items():
+            signal.signal(number, handler)
+        if received:  # in place of dask's error where the workers received the signal too
+            signal.raise_signal(received[0])
 
 
 class _Runner:

@@ -1,4 +1,4 @@
-"""A polite kill of a run on worker processes. Oracles: the process table, a run that was never
+"""Ctrl-C and a polite kill of a run on worker processes. Oracles: the process table, a run that was never
 disturbed."""
 
 import os
@@ -6,6 +6,7 @@ import pathlib
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -13,6 +14,7 @@ import yaml
 
 from attnwarp_eval.report.results import lines, read_results
 from attnwarp_eval.study import load_study
+from attnwarp_eval.study.cluster import _signals_wait
 from attnwarp_eval.study.run import execute, plan
 from attnwarp_eval.study.store import Store
 
@@ -68,17 +70,37 @@ def finish(folder, run):
     return list(lines(read_results(store), timings=False))
 
 
+KILLS_ITSELF = "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
+
+
+def test_ctrl_c_waits_while_workers_start_and_none_of_them_sees_it():
+    done = []
+    with pytest.raises(KeyboardInterrupt), _signals_wait():
+        os.kill(os.getpid(), signal.SIGINT)
+        # A worker's process is started by a thread of dask's.
+        thread = threading.Thread(
+            target=lambda: done.append(subprocess.run([sys.executable, "-c", KILLS_ITSELF]))
+        )
+        thread.start()
+        thread.join()
+    assert done[0].returncode == 0
+    assert subprocess.run([sys.executable, "-c", KILLS_ITSELF]).returncode != 0
+
+
 @pytest.mark.parametrize(
-    ("moment", "send"),
+    ("moment", "send", "number"),
     [
-        pytest.param("a cell is written", os.kill, marks=pytest.mark.slow),
-        pytest.param("workers start", os.kill, marks=pytest.mark.slow),
+        pytest.param("a cell is written", os.kill, signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param("workers start", os.kill, signal.SIGTERM, marks=pytest.mark.slow),
         # As a batch system does: to the command and to its workers.
-        pytest.param("a cell is written", os.killpg, marks=pytest.mark.slow),
+        pytest.param("a cell is written", os.killpg, signal.SIGTERM, marks=pytest.mark.slow),
+        # As a terminal does.
+        pytest.param("a cell is written", os.killpg, signal.SIGINT, marks=pytest.mark.slow),
+        pytest.param("workers start", os.killpg, signal.SIGINT, marks=pytest.mark.slow),
     ],
 )
-def test_a_polite_kill_of_a_run_on_workers_says_what_is_kept_and_leaves_none_of_them(
-    tmp_path, moment, send
+def test_a_stop_of_a_run_on_workers_says_what_is_kept_and_leaves_none_of_them(
+    tmp_path, moment, send, number
 ):
     (tmp_path / "study.yaml").write_text(yaml.safe_dump(STUDY))
     run = tmp_path / "killed"
@@ -93,7 +115,7 @@ def test_a_polite_kill_of_a_run_on_workers_says_what_is_kept_and_leaves_none_of_
         if started and (moment == "workers start" or list((run / "cells").rglob("*.json"))):
             break
         time.sleep(0.01)
-    send(process.pid, signal.SIGTERM)
+    send(process.pid, number)
     message = process.communicate(timeout=120)[1]
     assert process.returncode == 130
     kept = {path.name: path.stat().st_mtime_ns for path in (run / "cells").rglob("*.json")}
