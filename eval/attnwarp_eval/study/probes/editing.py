@@ -554,8 +554,11 @@ class _Measure:
         self.before, self.after, self.encoders = before, result.gaussians, encoders
         self.source = names[0]
         if not result.edited:
+            method = f"method {work.spec['method']!r}"
             raise StudyError(
-                f"budget: it ended method {work.spec['method']!r} before its first edit; give more"
+                f"{method} gave no edited view, expected at least one"
+                if result.cut is None
+                else f"budget: it ended {method} before its first edit; give more"
             )
         edited = {names[k]: _full(truth.originals[names[k]], v) for k, v in result.edited.items()}
         self.pictures = {"edit": edited, "render": self._renders(result.gaussians)}

@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from edited_run import write_run
 from PIL import Image
 from torch_threads import on_one_thread
 
+import attnwarp_eval
 from attnwarp.baselines import Budget
 from attnwarp.encoders.bundled import WEIGHTS
 from attnwarp_eval import metrics
@@ -133,6 +135,22 @@ def test_an_answer_for_each_view_is_seen_as_it_was_planned(folder, tmp_path, mon
     assert abs(above[1]) < 0.3
     # No view has another neighbour of its own answer but none here: red-green, green-red, blue-green.
     assert min(v for v in figure(record, "multiview.delta_e_above.edit_next") if v == v) > 20
+
+
+def test_the_documents_method_edits_each_view_as_the_control_does(folder, tmp_path, monkeypatch):
+    monkeypatch.setitem(EDITING_METHODS, "mine", planned([]))  # taken back afterwards
+    text = (Path(attnwarp_eval.__file__).parents[2] / "docs" / "extending.md").read_text()
+    exec(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1], {})
+
+    def pictures(**variant):
+        record = record_of(folder, tmp_path, variants={"one": variant}, probes={"editing": ["one"]})
+        return figure(record, "fidelity.mse.edit")
+
+    control = pictures(options={"method": "each view alone"})
+    assert pictures(method="mine") == pytest.approx(control, rel=1e-3)
+    monkeypatch.setitem(EDITING_METHODS, "mine", planned([]))
+    with pytest.raises(StudyError, match="^method 'mine' gave no edited view"):
+        pictures(method="mine")
 
 
 @pytest.mark.parametrize("more", [0, 1])
