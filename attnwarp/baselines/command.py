@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -10,7 +11,7 @@ from attnwarp.baselines import METHODS, Baseline
 from attnwarp.baselines.settings import BaselineSettings, Budget
 from attnwarp.editing.editor import own_size
 from attnwarp.editing.small import check_instruction, load_editor, thread_count
-from attnwarp.fit import load_views
+from attnwarp.fit import compile_kernels, load_views
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import Dataset
 from attnwarp.propagate.progress import progress_display
@@ -30,6 +31,7 @@ def edit_dataset(
     max_size: int | None,
     device: str,
     threads: int | None,
+    say: Callable[[str], None],
 ) -> Baseline:
     """Run a method on the views of a data set.
 
@@ -45,6 +47,7 @@ def edit_dataset(
         max_size: larger pictures are averaged down to it.
         device: of the editor.
         threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
+        say: shows a line to the user.
 
     Raises:
         InputError: no such editor; a folder of another run.
@@ -56,6 +59,7 @@ def edit_dataset(
     torch.set_num_threads(thread_count(editor, threads))
     if settings.size is None:
         settings = settings.changed(size=own_size(editor))
+    compile_kernels(splats.kind, say)
     with progress_display(title=out.name) as watch:
         return METHODS[method](
             splats,

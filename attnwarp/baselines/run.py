@@ -28,6 +28,7 @@ from attnwarp.baselines.work import Method, Work
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor
 from attnwarp.editing.schedule import START_PROTOCOL
+from attnwarp.fit import compile_kernels
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
 from attnwarp.propagate.folder import Folder, results_in
@@ -216,6 +217,8 @@ class _Run:
         )
 
     def go(self) -> Baseline:
+        if self.work.backend in ("auto", "cpu"):
+            compile_kernels(self.work.frozen.kind)
         for number in range(len(self.method.rounds)):
             if self._ended_before(number):
                 break

@@ -15,7 +15,7 @@ from attnwarp.cli.options import (
     Reading,
     reading_options,
 )
-from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
+from attnwarp.cli.shell import assignments, check_out, clear_errors, echo, use_threads
 from attnwarp.editing.command import DeviceOption, EditorOption, InstructionOption, ThreadsOption
 from attnwarp.editing.small import check_words, guide_of
 
@@ -89,6 +89,7 @@ def baseline(
         result = edit_dataset(
             method.value, dataset, splats, editor, instruction, settings, out,
             budget=budget, max_size=max_size, device=device, threads=threads,
+            say=echo,
         )  # fmt: skip
         ended = f", cut short by its {result.cut.replace('_', ' ')}" if result.cut else ""
         typer.echo(

@@ -211,6 +211,7 @@ def _fit(
     out.mkdir(parents=True, exist_ok=True)
     if settings.max_splats is not None and len(first) > settings.max_splats:
         echo(more_points(len(first), settings.max_splats))
+    attnwarp.fit.compile_kernels(settings.kind, echo)
     try:
         with asked_to_stop(echo) as stop, progress_display(title=out.name) as watch:
             result = attnwarp.fit.fit(

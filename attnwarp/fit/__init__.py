@@ -6,6 +6,7 @@ from attnwarp.fit.loop import Fit, Record, Step, fit
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.start import extent_of, first_splats, from_points, random_points
 from attnwarp.fit.views import Views, hold_out, load_views
+from attnwarp.fit.warm import compile_kernels
 
 __all__ = [
     "Fit",
@@ -13,6 +14,7 @@ __all__ = [
     "Record",
     "Step",
     "Views",
+    "compile_kernels",
     "extent_of",
     "first_splats",
     "fit",

@@ -21,6 +21,7 @@ from attnwarp.fit.model import Model, check_on_cpu
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.start import extent_of
 from attnwarp.fit.views import Views
+from attnwarp.fit.warm import compile_kernels
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError, write_ply
 from attnwarp.io.lock import alone_in
@@ -166,8 +167,8 @@ def fit(
         held_out: pictures to evaluate on, never fitted on.
         folder: made if need be.
         restart: begin again, without the folder's checkpoint, and write over its splats.
-        max_seconds: stop after so many seconds of iterations, over all sittings. The learning rates
-            follow ``settings.iterations`` all the same.
+        max_seconds: stop after so many seconds of iterations, over all sittings; compiling kernels
+            is none of them. The learning rates follow ``settings.iterations`` all the same.
         checkpoint_seconds: see above.
         third_scale: of 2D splats in ``splats.ply``, for viewers of 3D ones; see
             :func:`attnwarp.io.write_ply`.
@@ -350,6 +351,8 @@ class _Run:
         stop: Callable[[], bool] | None,
     ) -> Fit:
         s = self.settings
+        if self.backend in ("auto", "cpu"):
+            compile_kernels(s.kind)
         written = time.perf_counter()
         if not self.history:
             self.evaluate()

@@ -158,6 +158,36 @@ def from_points(
     )
 
 
+FAR = 100
+"""Points beyond so many times the usual distance begin no splat. Their first discs would be as
+large, and a few of them outweigh all else in the depth distortion of 2DGS."""
+
+
+def within_reach(points: Array, cameras: Sequence[Camera]) -> npt.NDArray[np.bool_]:
+    """(P,) bool: points that are at most 100 times as far from the cameras as is usual.
+
+    Usual is the points' median distance, or the scene's extent where that is larger. What is not
+    finite stays, for others to refuse.
+
+    Args:
+        points: (P, 3) world coordinates.
+        cameras: that see them, at least one.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.fit.start import within_reach
+        >>> camera = Camera.look_at((0, -3, 0), (0, 0, 0), width=64, height=48, fov_y=40)
+        >>> within_reach(np.array([[0, 0, 0], [1, 0, 0], [0, 0, 9e3]]), [camera]).tolist()
+        [True, True, False]
+    """
+    middle = np.stack([camera.position for camera in cameras]).mean(0)
+    with np.errstate(over="ignore"):
+        away = np.linalg.norm(points - middle, axis=1)
+        usual = max(float(np.median(away)), extent_of(cameras, points))
+    return ~(away > FAR * usual)
+
+
 FIRST_POINTS = 10_000
 """Random first points, where a data set has none."""
 
@@ -176,7 +206,8 @@ def first_splats(
         dataset: whose points and colours are taken.
         cameras: of the views that are fitted on.
         settings: kind, degree and seed of the splats.
-        say: told where random points are taken.
+        say: told where random points are taken, and of points that lie too far away
+            (:func:`within_reach`).
         random: their number.
 
     Example:
@@ -195,6 +226,14 @@ def first_splats(
     if points is None or not len(points):
         say(f"the data has no points: beginning with {random} random ones")
         points, colors = random_points(cameras, random, seed=settings.seed)
+    else:
+        near = within_reach(np.asarray(points, np.float64), cameras)
+        if not near.all():
+            say(
+                f"{(~near).sum()} of {len(near)} points are left out: they lie over {FAR} times as"
+                " far from the cameras as the others do"
+            )
+            points, colors = points[near], None if colors is None else colors[near]
     return from_points(
         points,
         colors,

@@ -17,7 +17,15 @@ from attnwarp.editing.editor import own_size
 from attnwarp.editing.segment import load_segmenter
 from attnwarp.editing.small import check_instruction, load_editor, thread_count
 from attnwarp.errors import InputError, suggest
-from attnwarp.fit import FitSettings, Views, first_splats, fit, load_views, progress
+from attnwarp.fit import (
+    FitSettings,
+    Views,
+    compile_kernels,
+    first_splats,
+    fit,
+    load_views,
+    progress,
+)
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import THIRD_SCALE, Dataset, read_image, write_ply
 from attnwarp.io.names import file_stems
@@ -134,6 +142,7 @@ def edit_dataset(
         perceptual_net(settings)
         splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, say)
     torch.set_num_threads(thread_count(editor, threads))
+    compile_kernels(splats.kind, say)
     with progress_display(title=out.name) as watch:
         result = propagate(
             splats,
@@ -199,6 +208,7 @@ def _fitted(
     if len(start) > plan.max_splats:
         say(progress.more_points(len(start), plan.max_splats))
     folder.mkdir(parents=True, exist_ok=True)
+    compile_kernels(settings.kind, say)
     with asked_to_stop(say) as stop, progress.progress_display(title="fit") as watch:
         result = fit(start, views, settings, folder=folder, watch=watch, stop=stop)
     if result.stopped == "asked":

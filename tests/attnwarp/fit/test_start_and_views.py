@@ -7,8 +7,10 @@ from PIL import Image
 
 from attnwarp import Camera
 from attnwarp.fit import (
+    FitSettings,
     Views,
     extent_of,
+    first_splats,
     from_points,
     hold_out,
     load_views,
@@ -273,3 +275,24 @@ def test_cameras_at_one_place_are_told_by_rounding_alone(place):
     assert extent_of(cameras) == 1
     with pytest.raises(ValueError, match="cameras that all stand at one place"):
         random_points(cameras, 10)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
+def test_points_far_astray_begin_no_splats_and_are_told(unit):
+    # Cameras 3 units from the middle; 100 points about it, so that 100 * 3.3 is the reach.
+    points = unit * np.random.default_rng(0).normal(0, 0.1, (100, 3))
+    points[3], points[7], points[9] = [300 * unit, 0, 0], [0, 400 * unit, 0], [0, 0, -1e200]
+    colors = np.arange(300).reshape(100, 3).astype(np.uint8)
+    cameras = [
+        Camera.look_at(unit * np.array([x, 0.01, 0]), (0, 0, 0), width=8, height=8, fov_y=40)
+        for x in (-3.0, 3.0)
+    ]
+    data = Dataset(cameras, ["a.png", "b.png"], points=points, colors=colors)
+    said = []
+    splats = first_splats(data, cameras, FitSettings(sh_degree=0), said.append)
+    (line,) = said
+    assert line.startswith("2 of 100 points are left out: they lie over 100 times as far")
+    expected = from_points(
+        np.delete(points, (7, 9), 0), np.delete(colors, (7, 9), 0), kind="2d", sh_degree=0
+    )
+    assert splats.digest() == expected.digest()

@@ -25,7 +25,7 @@ from pydantic import Field
 from attnwarp import Camera, Gaussians, check
 from attnwarp.editing.schedule import FRESH_PROTOCOL, START_PROTOCOL
 from attnwarp.errors import InputError
-from attnwarp.render import render
+from attnwarp.fit import compile_kernels
 from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
@@ -518,13 +518,12 @@ def source_by_hand(work: Work, truth: EditTruth, source: str) -> Image | None:
 @cache
 def _compile(kind: Literal["2d", "3d"]) -> None:
     """Compile what renders, tunes and warps, so that a first edit's seconds do not hold it."""
+    compile_kernels(kind)
     splats = Gaussians(
         kind, torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 2 + (kind == "3d")),
         torch.ones(1), torch.zeros(1, 1, 3),
     )  # fmt: skip
     camera = Camera.look_at((0, 0, 3), (0, 0, 0), width=16, height=16, fov_y=40, up=(0, 1, 0))
-    means = splats.means.clone().requires_grad_()
-    render(replace(splats, means=means), camera).color.sum().backward()
     warp_view(splats, camera, camera).at((4, 4)).warp_tokens(torch.zeros(1, 16, 4))
 
 
