@@ -227,7 +227,11 @@ class _Run:
             if number in self.latest.values():
                 self._tune_round(number)
         result = self._finish()
-        self._tell("done", done=self.total)
+        cut = self.cut
+        if cut is None:
+            self._tell("done", done=self.total)
+        else:
+            self._tell(f"cut short by its {cut['limit'].replace('_', ' ')}")
         return result
 
     # --- budget

@@ -91,6 +91,9 @@ class Reading:
     images: Annotated[Path | None, typer.Option(help="Folder of the images of a COLMAP model.")] = (
         None
     )
+    scale: Annotated[
+        int, typer.Option(help="2, 4 or 8: images_N in place of images; cameras are resized.")
+    ] = 1
     missing_images: Annotated[
         MissingImages, typer.Option(help="none: leave out cameras whose image is not there.")
     ] = MissingImages.error

@@ -69,9 +69,8 @@ class NoDetectionError(InputError):
 
     def __init__(self, words: str, view: str | None = None) -> None:
         place = "the picture" if view is None else f"view {view}"
-        super().__init__(
-            f"no {words!r} was detected in {place}; use other words, or give a mask instead"
-        )
+        instead = "" if view is None else ", or give masks instead (--masks)"
+        super().__init__(f"no {words!r} was detected in {place}; use other words{instead}")
         self.words = words
         self.view = view
 

@@ -374,7 +374,7 @@ def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
             message = f"{error.message} in row {row} of {count}; the row is damaged"
         raise FileFormatError(path, message, field=prop, row=row) from error
     except UnicodeDecodeError as error:
-        raise FileFormatError(path, "not a PLY file: its header is not ASCII text") from error
+        raise FileFormatError(path, _not_ascii(path.read_bytes())) from error
     except (ValueError, OverflowError, MemoryError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise FileFormatError(path, f"cannot be read as a PLY file: {first}") from error
@@ -675,3 +675,16 @@ def _logit(opacities: npt.NDArray[np.floating[Any]]) -> Array:
     with np.errstate(divide="ignore"):
         logit = np.log(o) - np.log1p(-o)
     return np.where(o == 0, LOGIT_OF_ZERO, np.where(o == 1, LOGIT_OF_ONE, logit))
+
+
+def _not_ascii(content: bytes) -> str:
+    """What is wrong with a file whose header is not ASCII text."""
+    lines = content.partition(b"end_header")[0].splitlines()
+    if lines and lines[0].strip() == b"ply":
+        for number, line in enumerate(lines, 1):
+            if line.startswith((b"comment", b"obj_info")) and not line.isascii():
+                return (
+                    f"line {number} of its header, a comment, is not ASCII text as PLY's must be;"
+                    " take the line out"
+                )
+    return "not a PLY file: its header is not ASCII text"

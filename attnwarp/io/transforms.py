@@ -706,7 +706,7 @@ def _matrix(path: Path, key: str, row: int | None, value: Any) -> Array:
     rows = value if isinstance(value, list) else []
     if len(rows) not in (3, 4) or not all(isinstance(r, list) and len(r) == 4 for r in rows):
         raise FileFormatError(
-            path, f"got {brief(value)}, expected a 4 x 4 matrix of numbers", field=key, row=row
+            path, f"got {brief(value)}, expected 4 x 4 or 3 x 4 numbers", field=key, row=row
         )
     # Strings and booleans, which numpy would take for numbers, are none.
     entries = [number(entry) for entries in rows for entry in entries]

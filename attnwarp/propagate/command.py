@@ -120,7 +120,7 @@ def edit_dataset(
         raise InputError(f"--where: got {words!r}, expected words such as 'bear'")
     Folder(out, dataset.cameras).check_unclaimed()  # again in the edit, but here before a fit
     views = load_views(dataset, max_size=max_size)
-    index = _view_of(views.cameras, source)
+    index = _view_of(views.cameras, source, dataset)
     images = images_of(views)
     by_hand = None
     if source_picture is not None:
@@ -216,21 +216,29 @@ def _fitted(
     return result.gaussians
 
 
-def _view_of(cameras: Any, name: str | None) -> int:
+def _view_of(cameras: Any, name: str | None, dataset: Dataset) -> int:
     """The number of a view by its name, its file's name with or without suffix, or its number."""
     if name is None:
         return 0
     names = [camera.name for camera in cameras]
-    files, stems = ([getattr(Path(each), part) for each in names] for part in ("name", "stem"))
-    for candidates in (names, files, stems):
+    for candidates in _spellings(names):
         if candidates.count(name) == 1:
             return candidates.index(name)
     if name.isdecimal() and int(name) < len(names):
         return int(name)
+    pairs = zip(dataset.cameras, dataset.image_paths, strict=True)
+    left_out = [camera.name for camera, image in pairs if image is None]
+    if any(name in candidates for candidates in _spellings(left_out)):
+        raise InputError(f"--source: the picture of {name!r} is missing; name another view")
     raise InputError(
         f"--source: got {name!r}, expected a view's name or a number below {len(names)}"
         f"{suggest(name, names)}"
     )
+
+
+def _spellings(names: list[str]) -> list[list[str]]:
+    """The names, their files' names with suffix, and without."""
+    return [names, [Path(name).name for name in names], [Path(name).stem for name in names]]
 
 
 def _masks(folder: Path, cameras: Any, say: Callable[[str], None]) -> list[npt.NDArray[np.bool_]]:

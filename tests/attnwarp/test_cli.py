@@ -582,6 +582,22 @@ def test_a_folder_of_both_formats_and_images_of_another_size_have_their_flags(da
     assert done.exit_code == 0, done.stderr
 
 
+def test_smaller_copies_of_the_images_are_taken_by_their_scale(data, tmp_path):
+    write_ply(tmp_path / "m.ply", one_splat())
+    small = tmp_path / "data"
+    shutil.copytree(data, small)
+    (small / "images_2").mkdir()
+    for path in (small / "images").iterdir():
+        image = cv2.imread(str(path))
+        half = (image.shape[1] // 2, image.shape[0] // 2)
+        cv2.imwrite(str(small / "images_2" / path.name), cv2.resize(image, half))
+    done = in_process("render", tmp_path / "m.ply", small, "--scale", 2, "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.stderr
+    assert cv2.imread(str(next((tmp_path / "out").iterdir()))).shape[:2] == half[::-1]
+    done = in_process("render", tmp_path / "m.ply", small, "--scale", 3, "--out", tmp_path / "out")
+    assert done.exit_code == 2 and "scale: got 3, expected one of 1, 2, 4, 8" in done.stderr
+
+
 def test_masks_are_not_passed_over_silently(data, tmp_path):
     text = json.loads((data / "transforms.json").read_text())
     text["frames"][2]["mask_path"] = "masks/2.png"

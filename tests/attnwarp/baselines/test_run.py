@@ -122,7 +122,11 @@ def test_no_more_rows_go_through_the_network_than_the_budget_has(
     network = (depth_editor if name == "gaussctrl" else editor).unet
     folder, all_rows, full = whole(name)
     limited = Budget(network_rows=sum(all_rows) - 1)
-    rows, result = rows_of(network, lambda: run(name, folder=tmp_path, budget=limited))
+    steps = []
+    rows, result = rows_of(
+        network, lambda: run(name, folder=tmp_path, budget=limited, watch=steps.append)
+    )
+    assert steps[-1].text == "cut short by its network rows" and steps[-1].done < steps[-1].total
     assert sum(rows) == result.counters["network_rows"] < sum(all_rows)
     assert result.cut == "network_rows"
     # The last batch of edits is missing, and those before are the whole run's.

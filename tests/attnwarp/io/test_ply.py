@@ -509,7 +509,7 @@ def test_a_header_that_promises_too_much_does_not_eat_the_memory(tmp_path):
                 b"ply\nformat ascii 1.0\ncomment \xff\nelement vertex 1\nproperty float"
                 b" x\nend_header\n1\n"
             ),
-            "not ASCII",
+            "line 3 of its header, a comment, is not ASCII",
         ),
         (
             (

@@ -375,6 +375,15 @@ def test_what_cannot_be_used_is_one_clear_line(more, message, place, tmp_path, m
     assert len(result.output.strip().splitlines()) == 1
 
 
+def test_a_source_whose_picture_is_missing_is_said_to_be(place, tmp_path):
+    shutil.copytree(place, tmp_path / "copy")
+    (tmp_path / "copy/data/images/v2.png").unlink()
+    more = ("--ply", place / "splats.ply", "--missing-images", "none", "--source", "v2")
+    result = run(tmp_path / "copy", tmp_path / "out", *more)
+    assert result.exit_code == 2
+    assert "--source: the picture of 'v2' is missing; name another view" in result.output
+
+
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
