@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progress, resumable
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progress, resumable, warn
 
 if TYPE_CHECKING:
     from attnwarp_eval.study.cell import Cell
@@ -203,10 +203,18 @@ def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
     Console().print(terminal(table))
     scenes = f"scenes {', '.join(loaded.scene_names)}; " if loaded.scenes else ""
     _name_untabulated(loaded)
+    _name_notices(planned)
     typer.echo(
         f"study {loaded.name}: {scenes}seeds {', '.join(map(str, loaded.seeds))};"
         f" {len(planned.cells)} cells, {planned.reused} done in {store.root}"
     )
+
+
+def _name_notices(planned: Plan) -> None:
+    """Say what a person should know of the scenes; their report has it too."""
+    for scene, lines in planned.notices.items():
+        for line in lines:
+            warn(f"scene {scene}: {line}")
 
 
 def _name_untabulated(study: Study) -> None:
@@ -275,6 +283,7 @@ def run_study(
         _name_untabulated(loaded)
         with resumable(lambda: f"{len(store.done())} cells are kept"):
             planned = plan(loaded, store)
+            _name_notices(planned)
             with store.lock():
                 if planned.other_code:
                     typer.echo(

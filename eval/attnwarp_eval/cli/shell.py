@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -63,13 +64,37 @@ def check_not_of_run(out: Path, run: Path) -> None:
         check_other(out, run / name, f"a file of the run {run}")
 
 
+_printed: set[str] = set()
+"""What was said of scenes by this process: they are built more than once."""
+
+
+def warn(text: str) -> None:
+    """Print a warning on stderr, once a process."""
+    if text not in _printed:
+        _printed.add(text)
+        typer.echo(f"attnwarp-eval: warning: {text}", err=True)
+
+
 @contextmanager
 def clear_errors() -> Iterator[None]:
-    """Turn errors about a person's input into one clear line and exit code 2."""
+    """Turn errors about a person's input into one clear line and exit code 2, and what a scene's
+    meshes give notice of into one line each.
+    """
     from attnwarp.errors import InputError
 
+    show_others = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+        # By name: the class is imported with all that reads scenes.
+        if any(base.__name__ == "SceneNotice" for base in category.__mro__):
+            warn(str(message))
+        else:
+            show_others(message, category, *rest, **more)
+
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.showwarning = show
+            yield
     except InputError as error:
         raise fail(str(error)) from None
     except KeyboardInterrupt:

@@ -211,7 +211,8 @@ def of_run(
     from attnwarp_eval.study.run import stored_study
     from attnwarp_eval.world import world
 
-    study, listed = stored_study(Store(folder))
+    stored = stored_study(Store(folder))
+    study = stored.study
     if not study.scenes:
         raise InputError(f"{folder}: the study {study.name!r} has no scenes; name a scene instead")
     files = dict(zip(study.scene_names, study.scenes, strict=True))
@@ -229,7 +230,7 @@ def of_run(
         )
     size = size or study.size
     views = world(files[name], size)
-    records = measured(folder, listed, name, seed, views.source.name)
+    records = measured(folder, stored.cells, name, seed, views.source.name)
     for own in records.values():
         if own.scene != views.content_hash:
             raise InputError(

@@ -59,6 +59,8 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
                 '**One scene gives no verdict in general: every test says "can\'t tell". Name more'
                 " scenes for one.**"
             )
+    for scene, lines in results.notices.items():
+        lead += [f"**Scene {scene}**: {line}." for line in lines]
     layout = Layout(root, timings)
     of_probes: dict[Place, list[Section]] = {place: [] for place in Place}
     for probe in probes():

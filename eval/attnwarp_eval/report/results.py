@@ -30,13 +30,13 @@ def read_results(store: Store) -> Results:
         >>> [(outcome.probe, outcome.record) for outcome in read_results(store).cells]
         [('calibration', None), ('depth', None)]
     """
-    study, listed = stored_study(store)
+    stored = stored_study(store)
     done = store.done()
     # The folder may hold failures of cells that the study had before its content changed.
-    ids = {cell["id"] for cell in listed}
+    ids = {cell["id"] for cell in stored.cells}
     failures = [Failure.from_json(f) for f in store.failures() if f["id"] in ids]
     cells = []
-    for cell in listed:
+    for cell in stored.cells:
         record: Record[Any] | None = None
         if cell["id"] in done:
             try:
@@ -63,7 +63,7 @@ def read_results(store: Store) -> Results:
                 record,
             )
         )
-    return Results(study, cells, failures)
+    return Results(stored.study, cells, failures, stored.notices)
 
 
 def lines(results: Results, timings: bool = True) -> Iterable[str]:

@@ -23,6 +23,10 @@ FARTHEST = 1e9
 products of much larger ones overflow the float32 of what renders them."""
 
 
+class SceneNotice(UserWarning):
+    """What a person should know of a scene that can be used all the same."""
+
+
 def _no_truth(value: Any) -> Any:
     if isinstance(value, bool):
         raise ValueError(f"got {str(value).lower()}, expected a number")

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from attnwarp_eval.scene.base import SceneNotice
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.shapes import Array, Box, Mesh, Rectangle, Shape, Sphere
 
@@ -18,7 +19,7 @@ SHRINK = 2.0
 """Leaving out that share may make the extent at most this many times smaller without a warning."""
 
 
-class ExtentNotice(UserWarning):
+class ExtentNotice(SceneNotice):
     """A tiny part of a scene makes its extent."""
 
 

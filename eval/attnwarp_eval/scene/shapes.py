@@ -11,6 +11,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp_eval.scene.base import SceneNotice
+
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
@@ -20,7 +22,7 @@ dropped.
 """
 
 
-class MeshNotice(UserWarning):
+class MeshNotice(SceneNotice):
     """Something in a mesh was repaired or left out."""
 
 

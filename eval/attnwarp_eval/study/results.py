@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -93,11 +93,13 @@ class Results:
         study: the resolved study.
         cells: one entry an expected cell, in the study's order.
         failures: the table of failed cells.
+        notices: by scene, what a person should know of it.
     """
 
     study: Study
     cells: list[Outcome]
     failures: list[Failure]
+    notices: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @property
     def layer(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+import warnings
 from collections.abc import Callable, Generator
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -13,7 +14,9 @@ from pydantic import ValidationError
 from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cost import environment
+from attnwarp_eval.scene.base import SceneNotice
 from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.scene.notices import notices
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
@@ -36,6 +39,7 @@ class Plan:
         study, scenes, cells: what a complete run has.
         todo: cells without a record.
         other_code: how many records were computed by other code than this.
+        notices: by scene, what a person should know of it; scenes without any are left out.
     """
 
     study: Study
@@ -43,6 +47,7 @@ class Plan:
     cells: list[Cell]
     todo: list[Cell]
     other_code: int = 0
+    notices: dict[str, list[str]] = field(default_factory=dict)
 
     @property
     def reused(self) -> int:
@@ -87,13 +92,16 @@ def plan(study: Study, store: Store) -> Plan:
         else:
             other_code += not record.environment.same_code(this)
     named = dict(zip(study.scene_names, scenes.values(), strict=True))
-    return Plan(study, named, cells, todo, other_code)
+    said = {name: lines for name, scene in named.items() if (lines := notices(scene))}
+    return Plan(study, named, cells, todo, other_code, said)
 
 
 def _scenes(study: Study) -> dict[str, Scene]:
     scenes: dict[str, Scene] = {}
     for name in study.scenes:
-        scenes[name] = load_scene(name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SceneNotice)  # the plan has them
+            scenes[name] = load_scene(name)
         for other, scene in scenes.items():
             if other != name and scene.content_hash == scenes[name].content_hash:
                 raise StudyError(f"scenes: {other!r} and {name!r} are the same scene; name it once")
@@ -157,8 +165,23 @@ def verify(store: Store) -> Problems:
     return problems
 
 
-def stored_study(store: Store) -> tuple[Study, list[dict[str, Any]]]:
-    """The study of a run, and its expected cells as ``study.json`` lists them.
+@dataclass(frozen=True)
+class Stored:
+    """What ``study.json`` says of a run.
+
+    Attributes:
+        study: resolved.
+        cells: those that a complete run has.
+        notices: as in :class:`Plan`.
+    """
+
+    study: Study
+    cells: list[dict[str, Any]]
+    notices: dict[str, list[str]]
+
+
+def stored_study(store: Store) -> Stored:
+    """The study of a run, and its expected cells, as ``study.json`` has them.
 
     Raises:
         StoreError: the folder is no run, its study cannot be read, or a cell of an unsealed run has
@@ -170,7 +193,7 @@ def stored_study(store: Store) -> tuple[Study, list[dict[str, Any]]]:
         >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
         >>> store = Store("run")
         >>> store.write_study(expected(plan(study, store)))
-        >>> [cell["title"] for cell in stored_study(store)[1]]
+        >>> [cell["title"] for cell in stored_study(store).cells]
         ['spheres / calibration / calibration', 'spheres / a / depth']
     """
     stored = store.read_study()
@@ -192,7 +215,9 @@ def stored_study(store: Store) -> tuple[Study, list[dict[str, Any]]]:
             )
     if "sha256" not in stored:
         _check_labels(store, stored, study)
-    return study, stored["cells"]
+    scenes = stored.get("scenes", {}).items()
+    said = {name: entry["notices"] for name, entry in scenes if entry.get("notices")}
+    return Stored(study, stored["cells"], said)
 
 
 def _by_name(stored: dict[str, Any], study: Study) -> dict[str, Any]:
@@ -317,7 +342,12 @@ def expected(plan: Plan) -> dict[str, Any]:
     return {
         "study": plan.study.model_dump(mode="json"),
         "scenes": {
-            name: {"hash": s.content_hash, "title": s.title} for name, s in plan.scenes.items()
+            name: {
+                "hash": scene.content_hash,
+                "title": scene.title,
+                **({"notices": plan.notices[name]} if name in plan.notices else {}),
+            }
+            for name, scene in plan.scenes.items()
         },
         "cells": [_entry(cell) for cell in plan.cells],
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import traceback
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 from attnwarp.process import core_count
 from attnwarp.render.threads import set_thread_count, thread_count
 from attnwarp_eval.cost import Meter, environment, peak_memory_mb, reset_peak_memory
+from attnwarp_eval.scene.base import SceneNotice
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.plugins import load_plugins
 from attnwarp_eval.study.probes.base import Probe, Work
@@ -39,13 +41,15 @@ def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = Non
     meter = Meter()
     reset_peak_memory()
     scene_world = None
-    if probe.needs_scenes:
-        with meter.stage("setup"):
-            scene_world = world(cell.scene_file, cell.spec["size"])
-        if scene_world.content_hash != cell.spec["scene"]:
-            raise changed(f"scene {cell.scene!r}")
-    work = Work(cell, root, scene_world, meter)
-    extra = probe.compute(work)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SceneNotice)  # the run's plan has said them
+        if probe.needs_scenes:
+            with meter.stage("setup"):
+                scene_world = world(cell.scene_file, cell.spec["size"])
+            if scene_world.content_hash != cell.spec["scene"]:
+                raise changed(f"scene {cell.scene!r}")
+        work = Work(cell, root, scene_world, meter)
+        extra = probe.compute(work)
     _check_metrics(probe, work)
     return Record(
         cell.id,

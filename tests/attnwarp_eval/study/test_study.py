@@ -310,5 +310,5 @@ def test_a_scene_of_a_file_has_its_name_in_cells_and_its_file_beside_it(tmp_path
     file = written["study"]["scenes"][0]
     written["cells"] = [{**cell, "scene": file} for cell in written["cells"]]
     store.write_study(written)
-    assert {cell["scene"] for cell in stored_study(store)[1]} == {"room"}
+    assert {cell["scene"] for cell in stored_study(store).cells} == {"room"}
     assert not verify(store).damaged

@@ -7,7 +7,6 @@ import functools
 import math
 import sys
 import tempfile
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from attnwarp_eval.cache import content_key
 from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.extent import warn_of_strays
 from attnwarp_eval.scene.materials import (
-    TEXTURED,
     GlassMaterial,
     InteriorSpec,
     MetalMaterial,
@@ -30,8 +28,9 @@ from attnwarp_eval.scene.materials import (
     PointSpec,
     SpotSpec,
 )
+from attnwarp_eval.scene.notices import warn_of_lost_texture
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.scene.shapes import Box, Mesh, MeshNotice, Rectangle, Shape, Sphere
+from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Shape, Sphere
 from attnwarp_eval.scene.spec import MeshSpec, ObjectSpec, SkySpec, SunSpec
 from attnwarp_eval.scene.textures import Plain, albedo
 from attnwarp_eval.truth.llvm import SCALAR, variant
@@ -404,39 +403,12 @@ def _shapes(
         else:
             file = folder / f"{index}.ply"
             if isinstance(item.shape, MeshSpec):
-                _warn_of_lost_texture(item, shape)
+                warn_of_lost_texture(item, shape)
             color = albedo(texture, shape.vertices) * (1.0 if shape.tint is None else shape.tint)
             _write_ply(file, shape, center, color)
             form = {"type": "ply", "filename": str(file), "face_normals": shape.normals is None}
             reflectance = {"type": "mesh_attribute", "name": "vertex_color"}
         yield f"shape_{index:06d}", form | {"bsdf": _bsdf(item, reflectance)}
-
-
-LOST = 0.02
-"""Albedo by which the texture between the vertices of a mesh may differ from its vertices' own, on
-average, without a warning."""
-
-
-def _warn_of_lost_texture(item: ObjectSpec, mesh: Mesh) -> None:
-    """A :class:`MeshNotice` where triangles are too large for a texture baked into vertices."""
-    if not isinstance(item.material, TEXTURED) or item.emission:
-        return
-    corners = mesh.vertices[mesh.faces]
-    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    dice, area = np.random.default_rng(0), np.cumsum(np.linalg.norm(sides, axis=1))
-    drawn = np.searchsorted(area, dice.random(2000) * area[-1])
-    shares, corners = dice.dirichlet((1, 1, 1), len(drawn)), corners[drawn]
-    baked = albedo(item.texture, corners.reshape(-1, 3)).reshape(corners.shape)
-    true = albedo(item.texture, np.einsum("ij,ijk->ik", shares, corners))
-    mean = float(np.abs(np.einsum("ij,ijk->ik", shares, baked) - true).mean())
-    if mean > LOST:
-        warnings.warn(
-            f"object {item.name!r}: its pictures miss the texture by an albedo of {mean:.2g} on"
-            f" average, since meshes have it at their vertices alone ({len(mesh.faces)} triangles);"
-            " subdivide the mesh, or make the texture coarser",
-            MeshNotice,
-            stacklevel=2,
-        )
 
 
 def _bsdf(item: ObjectSpec, reflectance: dict[str, Any]) -> dict[str, Any]:

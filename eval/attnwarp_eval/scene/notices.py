@@ -1,0 +1,76 @@
+"""What a person should know of the meshes in a scene before its figures are read."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from attnwarp_eval.scene.base import SceneNotice
+from attnwarp_eval.scene.extent import warn_of_strays
+from attnwarp_eval.scene.materials import TEXTURED
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.scene.shapes import Mesh, MeshNotice
+from attnwarp_eval.scene.spec import MeshSpec, ObjectSpec
+from attnwarp_eval.scene.textures import albedo
+
+LOST = 0.02
+"""Albedo by which the texture between the vertices of a mesh may differ from its vertices' own, on
+average, without a warning."""
+
+
+def notices(scene: Scene) -> list[str]:
+    """A line for each thing that was left out of a scene's mesh files, or that spoils its pictures.
+
+    Everything that building the scene later warns of as well. A scene without mesh files has none.
+
+    Raises:
+        SceneError: the scene cannot be built.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> notices(load_scene("spheres"))
+        []
+    """
+    objects = scene.spec.objects
+    if not any(isinstance(item.shape, MeshSpec) for item in objects):
+        return []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        shapes = scene.shapes()
+        warn_of_strays(scene, shapes)
+        for shape in shapes:
+            item = objects[shape.object_id]
+            if isinstance(shape, Mesh) and isinstance(item.shape, MeshSpec):
+                warn_of_lost_texture(item, shape)
+    texts = []
+    for each in caught:
+        if issubclass(each.category, SceneNotice):
+            texts.append(str(each.message))
+        else:
+            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    return list(dict.fromkeys(texts))
+
+
+def warn_of_lost_texture(item: ObjectSpec, mesh: Mesh) -> None:
+    """A :class:`~attnwarp_eval.scene.shapes.MeshNotice` where triangles are too large for a texture
+    baked into vertices.
+    """
+    if not isinstance(item.material, TEXTURED) or item.emission:
+        return
+    corners = mesh.vertices[mesh.faces]
+    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    dice, area = np.random.default_rng(0), np.cumsum(np.linalg.norm(sides, axis=1))
+    drawn = np.searchsorted(area, dice.random(2000) * area[-1])
+    shares, corners = dice.dirichlet((1, 1, 1), len(drawn)), corners[drawn]
+    baked = albedo(item.texture, corners.reshape(-1, 3)).reshape(corners.shape)
+    true = albedo(item.texture, np.einsum("ij,ijk->ik", shares, corners))
+    mean = float(np.abs(np.einsum("ij,ijk->ik", shares, baked) - true).mean())
+    if mean > LOST:
+        warnings.warn(
+            f"object {item.name!r}: its pictures miss the texture by an albedo of {mean:.2g} on"
+            f" average, since meshes have it at their vertices alone ({len(mesh.faces)} triangles);"
+            " subdivide the mesh, or make the texture coarser",
+            MeshNotice,
+            stacklevel=2,
+        )
