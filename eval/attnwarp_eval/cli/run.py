@@ -280,6 +280,7 @@ def run_study(
         limit_bytes()  # a limit that is no number would make every cell fail
         loaded = load()
         store = Store(out or Path("runs") / loaded.name)
+        store.refuse_strangers()
         _name_untabulated(loaded)
         with resumable(lambda: f"{len(store.done())} cells are kept"):
             planned = plan(loaded, store)
@@ -415,12 +416,16 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
     """Check that a run is whole and undamaged.
 
     The hashes of its cells and pictures are computed again, and the expected cells listed again.
+    results.jsonl is held against the cells.
     """
+    from attnwarp_eval.report import wrong_results
     from attnwarp_eval.study.run import verify
     from attnwarp_eval.study.store import Store
 
     with clear_errors():
         problems = verify(Store(run))
+        if problems.ok:
+            problems.damaged += wrong_results(Store(run))
     for what, items in (
         ("damaged", problems.damaged),
         ("failed", problems.failed),
@@ -433,8 +438,7 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
         bad = len(problems.damaged) + len(problems.failed) + len(problems.missing)
         raise fail(
             f"{run}: {bad} problem{'s' * (bad != 1)} in {problems.checked}"
-            f" cell{'s' * (problems.checked != 1)}; run the study again to recompute"
-            " them",
+            f" cell{'s' * (problems.checked != 1)}; run the study again to mend them",
             TOO_LITTLE,
         )
     if not problems.sealed:

@@ -48,8 +48,29 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
         _check_pictures(results, store)
     report = build(results, store.root, timings=timings, pictures=pictures)
     path = store.root / "results.jsonl"
-    write_atomic(path, "".join(f"{line}\n" for line in lines(results, timings)).encode())
+    write_atomic(path, _content(results, timings))
     return [path, *write_files(report, store.root, "report")]
+
+
+def wrong_results(store: Store) -> list[str]:
+    """What is wrong with the ``results.jsonl`` of a whole run, one line; it may not be there yet.
+
+    Args:
+        store: the run.
+    """
+    path = store.root / "results.jsonl"
+    if not path.is_file():
+        return []
+    results, there = read_results(store), path.read_bytes()
+    if any(there == _content(results, timings) for timings in (True, False)):
+        return []
+    return [
+        f"{path.name}: is not what the cells give; attnwarp-eval report {store.root} writes it anew"
+    ]
+
+
+def _content(results: Results, timings: bool) -> bytes:
+    return "".join(f"{line}\n" for line in lines(results, timings)).encode()
 
 
 def _check_pictures(results: Results, store: Store) -> None:

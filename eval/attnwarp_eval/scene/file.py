@@ -218,7 +218,8 @@ def _check(scene: Scene, root: yaml.Node) -> None:
                     *key,
                 )
             if not path.is_file():
-                there = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+                beside = path.parent.iterdir() if path.parent.is_dir() else ()
+                there = [p.name for p in beside if p.suffix.lower() in MESH_SUFFIXES]
                 refuse(
                     f"objects[{k}].shape.file: there is no file {path}{suggest(path.name, there)}; "
                     "the path counts from the folder of the scene file",

@@ -36,6 +36,11 @@ def load_plugins() -> None:
             ) from error
 
 
+def plugin_modules() -> list[str]:
+    """Modules of the plugins that are named here, sorted."""
+    return sorted({module for module, _ in _named()})
+
+
 def _named() -> Iterator[tuple[str, str]]:
     """Module names, each with what names it."""
     for entry in entry_points(group=GROUP):

@@ -20,6 +20,7 @@ from attnwarp_eval.scene.notices import notices
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
+from attnwarp_eval.study.plugins import VARIABLE, load_plugins, plugin_modules
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.record import Environment, Failure
 from attnwarp_eval.study.schema import Study, StudyError, did_you_mean
@@ -147,6 +148,7 @@ def verify(store: Store) -> Problems:
         InputError: the folder is no run.
     """
     stored = store.read_study()
+    _check_plugins(store, stored)
     problems = store.verify()
     try:
         study = parse_study(stored["study"])
@@ -197,6 +199,7 @@ def stored_study(store: Store) -> Stored:
         ['spheres / calibration / calibration', 'spheres / a / depth']
     """
     stored = store.read_study()
+    _check_plugins(store, stored)
     path, remedy = store.root / "study.json", _remedy(store)
     try:
         study = parse_study(stored["study"])
@@ -230,6 +233,30 @@ def _by_name(stored: dict[str, Any], study: Study) -> dict[str, Any]:
             {**cell, "scene": names.get(cell["scene"], cell["scene"])} for cell in stored["cells"]
         ],
     }
+
+
+def _check_plugins(store: Store, stored: dict[str, Any]) -> None:
+    """Import the plugins; where the run's are not here, say so before anything fails of it.
+
+    Raises:
+        StoreError: some are not named here, and the study cannot be read without them.
+        InputError: one cannot be imported.
+    """
+    load_plugins()
+    missing = sorted(set(stored.get("plugins", ())) - set(plugin_modules()))
+    if not missing:
+        return
+    try:
+        parse_study(stored["study"])
+        known = {each.name for each in probes()}
+        readable = all(cell["probe"] in known for cell in stored["cells"])
+    except (InputError, ValidationError):
+        readable = False
+    if not readable:
+        raise StoreError(
+            f"{store.root}: was made with the plugins {', '.join(missing)}, which are not named"
+            f" here; install their packages, or set {VARIABLE}={','.join(missing)}"
+        )
 
 
 def _remedy(store: Store) -> str:
@@ -349,6 +376,7 @@ def expected(plan: Plan) -> dict[str, Any]:
             }
             for name, scene in plan.scenes.items()
         },
+        **({"plugins": modules} if (modules := plugin_modules()) else {}),
         "cells": [_entry(cell) for cell in plan.cells],
     }
 

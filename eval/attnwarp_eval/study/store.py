@@ -72,7 +72,11 @@ class Store:
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the folder against a second run that would write to it."""
+        """Hold the folder against a second run that would write to it.
+
+        Raises:
+            StoreError: another run holds it, or it cannot be a run's.
+        """
         if self.root.exists() and not self.root.is_dir():
             raise StoreError(
                 f"{self.root}: is a file, expected a run's folder (made if need be); choose another"
@@ -97,6 +101,28 @@ class Store:
                 ) from None
             self._sweep()
             yield
+
+    def refuse_strangers(self) -> None:
+        """Check that a run writes over nothing that no run wrote.
+
+        Raises:
+            StoreError: the folder has files of a run's names and no study.json, or is the current
+                folder with other things in it, as an empty path is.
+        """
+        if (self.root / "study.json").exists():
+            return
+        own = ("report.md", "report.html", "results.jsonl")
+        there = [self.root / name for name in own if (self.root / name).exists()]
+        if there:
+            raise StoreError(
+                f"{there[0]}: is there without a study.json, and a run would write over it; name"
+                " another folder with --out, or move it away"
+            )
+        if self.root == Path() and any(self.root.iterdir()):
+            raise StoreError(
+                "--out: is the current folder (or empty), which holds other things and no run; name"
+                " a folder of its own"
+            )
 
     def refuse_links(self) -> None:
         """Check that what is written to the run's folder stays inside it.
@@ -364,7 +390,7 @@ _LABELS: dict[str, type] = {
 }
 """What ``study.json`` holds of each expected cell."""
 
-_STUDY_KEYS = {"study", "scenes", "cells", "sha256"}
+_STUDY_KEYS = {"study", "scenes", "cells", "sha256", "plugins"}
 """Of ``study.json``. Another one is what damage made of these; if it was the checksum's, the file
 would pass for one of former code, which wrote none.
 """
@@ -385,6 +411,10 @@ def _study_problem(study: dict[str, Any]) -> str | None:
     for scene in scenes.values() if isinstance(scenes, dict) else [scenes]:
         if not isinstance(scene, dict) or not isinstance(scene.get("hash"), str):
             return "damaged (scenes: expected the hash of each)"
+        if not _are_texts(scene.get("notices", [])):
+            return "damaged (scenes: expected notices as texts)"
+    if not _are_texts(study.get("plugins", [])):
+        return "damaged (plugins: expected names)"
     for index, cell in enumerate(cells):
         entry = cell if isinstance(cell, dict) else {}
         for key, kind in _LABELS.items():
@@ -393,6 +423,10 @@ def _study_problem(study: dict[str, Any]) -> str | None:
         if not entry["variants"] or not all(isinstance(name, str) for name in entry["variants"]):
             return f"damaged (cells[{index}].variants: expected names)"
     return None
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(text, str) for text in value)
 
 
 def _digest(value: Any) -> str | None:

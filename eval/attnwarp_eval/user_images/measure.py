@@ -607,7 +607,8 @@ def _edit_rows(errors: Mapping[str, tuple[float, float]], done: Measured) -> Non
         )
     if psnr.undefined:
         done.notes.append(
-            f"{psnr.undefined} masks are black all over: nothing of those views counts"
+            f"{psnr.undefined} mask{'s' * (psnr.undefined > 1)} with nothing brighter than half of"
+            f" white: nothing of {'those views' if psnr.undefined > 1 else 'that view'} counts"
         )
 
 

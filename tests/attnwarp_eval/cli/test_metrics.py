@@ -384,7 +384,7 @@ def test_a_figure_undefined_everywhere_is_too_little(data, models):
         folder / "out",
     )
     assert done.exit_code == 3 and "every figure is undefined on these pictures" in done.stderr
-    assert "3 masks are black all over" in done.stderr
+    assert "3 masks with nothing brighter than half of white" in done.stderr
 
 
 def test_a_mask_leaves_out_what_is_black_and_divides_by_the_rest(data):
@@ -461,7 +461,7 @@ def test_a_mask_acts_on_the_perceptual_distance_too(data, models):
     }
     assert row["value"] == pytest.approx((part + whole) / 2)
     assert (row["n"], row["undefined"]) == (2, ["view10"])
-    assert "1 masks are black all over" in done.stderr
+    assert "1 mask with nothing brighter than half of white" in done.stderr
     for view in VIEWS:
         write(folder / "masks" / f"{view}.png", np.zeros_like(inside))
     done = everything(folder, models, f"--mask={folder / 'masks'}")

@@ -284,6 +284,12 @@ def test_a_part_of_a_file_is_never_a_mesh(tmp_path, suffix, share):
             read_mesh(path)
 
 
+def test_an_obj_may_begin_with_a_byte_order_mark(tmp_path):
+    text = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    (tmp_path / "a.obj").write_bytes(b"\xef\xbb\xbf" + text)
+    assert read_mesh(tmp_path / "a.obj").vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+
+
 def test_an_obj_whose_last_line_does_not_end_is_told(tmp_path):
     with pytest.warns(MeshNotice, match="its last line has no end, so that its end may be missing"):
         read_text(tmp_path, "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3")

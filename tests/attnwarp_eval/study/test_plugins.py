@@ -12,8 +12,9 @@ import yaml
 
 from attnwarp.errors import InputError
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.study import editing_methods, plugins
+from attnwarp_eval.study import Store, editing_methods, parse_study, plugins
 from attnwarp_eval.study.probes import probe, unregister
+from attnwarp_eval.study.run import expected, plan, stored_study, verify
 
 HELPERS = Path(__file__).parents[2] / "helpers"
 PLUGIN = """\
@@ -69,6 +70,36 @@ def test_a_plugin_of_the_environment_has_its_probe_and_method_in_every_worker(tm
     (height,) = {t.height for t in cameras.targets if t.yaw - cameras.source.yaw == 90}
     chord = math.hypot(math.sqrt(2) * cameras.radius, height - cameras.source.height)
     assert length == {"plain": pytest.approx(chord), "double": pytest.approx(2 * chord)}
+    without = {key: value for key, value in environment.items() if key != "ATTNWARP_PLUGINS"}
+    for name in ("report", "verify"):
+        command = [sys.executable, "-m", "attnwarp_eval.cli.main", name, "run"]
+        done = subprocess.run(command, cwd=tmp_path, env=without, capture_output=True, text=True)
+        assert done.returncode == 2 and "set ATTNWARP_PLUGINS=my_plugin" in done.stderr
+
+
+def test_a_run_with_a_plugin_that_is_not_here_names_it(tmp_path):
+    store = Store(tmp_path / "run")
+    content = {"name": "own", "scenes": ["spheres"], "variants": {"a": {}}}
+    stored = expected(plan(parse_study(content | {"probes": {"depth": ["a"]}}), store))
+    assert "plugins" not in stored
+    store.write_study(stored | {"plugins": ["my_plugin"]})
+    assert verify(store).missing  # what needs no plugin is read without it
+    stored["study"]["probes"] = {"chord": ["a"]}
+    store.write_study(stored | {"plugins": ["my_plugin"]})
+    for read in (verify, stored_study):
+        with pytest.raises(InputError, match="plugins my_plugin, which are not named here; .*set"):
+            read(store)
+
+
+def test_a_plugin_that_cannot_be_imported_is_no_damage_of_a_run(tmp_path):
+    store = Store(tmp_path / "run")
+    content = {"name": "own", "scenes": ["spheres"], "variants": {"a": {}}}
+    store.write_study(expected(plan(parse_study(content | {"probes": {"depth": ["a"]}}), store)))
+    done = subprocess.run(
+        [sys.executable, "-m", "attnwarp_eval.cli.main", "verify", "run"], cwd=tmp_path,
+        env={**os.environ, "ATTNWARP_PLUGINS": "nope"}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2 and "the plugin 'nope' cannot be imported" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,22 @@ def test_a_folder_of_cells_that_is_a_link_is_refused(tmp_path):
         pass
 
 
+def test_a_folder_of_others_results_or_the_current_one_with_other_things_is_refused(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "report.md").write_text("mine")
+    with pytest.raises(StoreError, match=r"report.md: is there without a study.json, and a run"):
+        Store(tmp_path).refuse_strangers()
+    (tmp_path / "study.json").write_text("{}")
+    Store(tmp_path).refuse_strangers()
+    (tmp_path / "new").mkdir()
+    monkeypatch.chdir(tmp_path / "new")
+    Store("").refuse_strangers()  # as in a folder made for it
+    (tmp_path / "new" / "study.yaml").write_text("name: mine")
+    with pytest.raises(StoreError, match=r"--out: is the current folder \(or empty\), which holds"):
+        Store("").refuse_strangers()
+
+
 def test_a_file_in_place_of_a_runs_folder_is_named_and_left_alone(tmp_path):
     path = tmp_path / "study.yaml"
     path.write_text("name: mine")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections import Counter
 
@@ -71,6 +72,7 @@ def read_obj(data: bytes) -> Surface:
     """
     if data[:2] in (b"\xfe\xff", b"\xff\xfe"):
         raise ValueError("is text in UTF-16, expected ASCII or UTF-8; save it as UTF-8")
+    data = data.removeprefix(codecs.BOM_UTF8)  # editors of Windows write it
     vertices: list[list[float]] = []
     colors: list[list[float]] = []
     faces: list[list[int]] = []
