@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Sequence
-from typing import Any, get_args, get_origin
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
@@ -78,6 +79,8 @@ def _follow(loc: Sequence[int | str], model: type[BaseModel]) -> tuple[str, type
         if tagged:
             annotation = tagged[0]
             continue
+        if not models and get_origin(annotation) in (Union, UnionType):
+            continue  # pydantic's own name of a member, such as constrained-int
         place += f".{step}" if place else step
         if get_origin(annotation) is dict:
             annotation = get_args(annotation)[1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import yaml
@@ -62,12 +63,25 @@ def _read(text: str, loader: type[Any]) -> tuple[yaml.Node, Any]:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         raise YamlError(
-            f"not valid YAML: {_line(error.problem or error)}; check indentation and quotes",
+            f"not valid YAML: {_line(error.problem or error)}; check indentation and quotes"
+            f"{_bare_color(text)}",
             mark.line + 1 if mark else None,
         ) from error
     except yaml.YAMLError as error:
         raise YamlError(f"not valid YAML: {_line(error)}") from error
     return root, data
+
+
+BARE_COLOR = re.compile(r"[:\[,]\s+#[0-9a-fA-F]{6}\b")
+"""A colour that YAML takes for a comment."""
+
+
+def _bare_color(text: str) -> str:
+    """What to add to an error where the text has a colour without quotes."""
+    for number, line in enumerate(text.splitlines(), 1):
+        if BARE_COLOR.search(line):
+            return f"; line {number} has a colour without quotes, which YAML takes for a comment"
+    return ""
 
 
 def _line(error: object) -> str:

@@ -29,7 +29,7 @@ def load_plugins() -> None:
     for module, named_by in _named():
         try:
             importlib.import_module(module)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise InputError(
                 f"{named_by}: the plugin {module!r} cannot be imported:"
                 f" {type(error).__name__}: {' '.join(str(error).split())}"

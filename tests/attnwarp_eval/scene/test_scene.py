@@ -97,6 +97,12 @@ MISTAKES = [
         11,
         r"objects\[1\].shape.radius: got -1, but input should be greater than 0",
     ),
+    (
+        "lights:\n",
+        "appearance: {bounces: 65}\nlights:\n",
+        13,
+        r"appearance.bounces: got 65, but input should be less than or equal to 64",
+    ),
     ("radius: 0.5", "radius: .nan", 11, r"objects\[1\].shape.radius: got nan, but .*finite"),
     ("radius: 0.5", "radius: big", 11, r"objects\[1\].shape.radius: got 'big', but .*valid number"),
     ("      radius: 0.5\n", "", 8, r"objects\[1\].shape.radius: is missing"),
@@ -107,7 +113,12 @@ MISTAKES = [
         r"objects\[1\].shape.type: got 'spere'; did you mean 'sphere'\?",
     ),
     ("type: sphere", "kind: sphere", 8, r"objects\[1\].shape: says no type"),
-    ("color: '#c04020'", "color: #c04020", None, "not valid YAML"),
+    (
+        "color: '#c04020'",
+        "color: #c04020",
+        None,
+        "not valid YAML.*; line 12 has a colour without quotes, which YAML takes for a comment",
+    ),
     (
         "color: '#c04020'",
         "color:",

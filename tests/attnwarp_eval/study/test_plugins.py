@@ -107,6 +107,7 @@ def test_a_plugin_that_cannot_be_imported_is_no_damage_of_a_run(tmp_path):
     [
         (None, "ATTNWARP_PLUGINS: the plugin 'my_broken' cannot be imported: ModuleNotFoundError"),
         ("1 / 0", "the plugin 'my_broken' cannot be imported: ZeroDivisionError: division by zero"),
+        ("raise SystemExit(1)", "the plugin 'my_broken' cannot be imported: SystemExit: 1"),
     ],
 )
 def test_a_plugin_that_cannot_be_imported_is_named(tmp_path, monkeypatch, text, says):
