@@ -217,8 +217,6 @@ class _Run:
         )
 
     def go(self) -> Baseline:
-        if self.work.backend in ("auto", "cpu"):
-            compile_kernels(self.work.frozen.kind)
         for number in range(len(self.method.rounds)):
             if self._ended_before(number):
                 break
@@ -326,6 +324,8 @@ class _Run:
         over = cut is not None and cut["limit"] == "seconds"
         if not training or over or (self.folder.has(state) and self.fitting.iteration >= end):
             return
+        if self.work.backend in ("auto", "cpu"):
+            compile_kernels(self.work.frozen.kind)  # not within the budget's seconds
         views = DrawnViews([partial(self._training, view, self._edited(view)) for view in training])
         text = f"round {number + 1} of {len(self.method.rounds)}: tuning"
         with self.times.part("tune"):

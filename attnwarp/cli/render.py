@@ -64,7 +64,9 @@ def render(
 
         use_threads(threads)
         splats = read_splats(model, kind, antialiased)
-        dataset = read_views(cameras, reading, missing_images="none", points=False)
+        # Cameras are resized to their images, so those must be there.
+        missing = "error" if reading.scale > 1 else "none"
+        dataset = read_views(cameras, reading, missing_images=missing, points=False)
         views = dataset.cameras
         check_inputs_stay((out / f"{name}.png" for name in file_stems(views)), dataset.image_paths)
         out.mkdir(parents=True, exist_ok=True)

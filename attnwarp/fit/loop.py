@@ -351,7 +351,7 @@ class _Run:
         stop: Callable[[], bool] | None,
     ) -> Fit:
         s = self.settings
-        if self.backend in ("auto", "cpu"):
+        if self.backend in ("auto", "cpu") and self.iteration < s.iterations:
             compile_kernels(s.kind)
         written = time.perf_counter()
         if not self.history:

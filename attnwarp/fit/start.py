@@ -185,7 +185,7 @@ def within_reach(points: Array, cameras: Sequence[Camera]) -> npt.NDArray[np.boo
     with np.errstate(over="ignore"):
         away = np.linalg.norm(points - middle, axis=1)
         usual = max(float(np.median(away)), extent_of(cameras, points))
-    return ~(away > FAR * usual)
+    return ~(away > FAR * usual) | ~np.isfinite(points).all(1)
 
 
 FIRST_POINTS = 10_000
@@ -229,9 +229,11 @@ def first_splats(
     else:
         near = within_reach(np.asarray(points, np.float64), cameras)
         if not near.all():
+            count = int((~near).sum())
+            verb = "is" if count == 1 else "are"
             say(
-                f"{(~near).sum()} of {len(near)} points are left out: they lie over {FAR} times as"
-                " far from the cameras as the others do"
+                f"{count} of {len(near)} points {verb} left out, over {FAR} times as far from the"
+                " cameras as the others"
             )
             points, colors = points[near], None if colors is None else colors[near]
     return from_points(

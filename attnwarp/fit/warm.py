@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 
@@ -13,8 +12,8 @@ from attnwarp.gaussians import Gaussians, Kind
 from attnwarp.losses import normal_consistency
 from attnwarp.render import render
 
-SILENT_SECONDS = 2.0
-"""A person is told of a compilation that takes longer."""
+SILENT_SECONDS = 5.0
+"""A person is told of what takes longer. Loading what is compiled takes about one."""
 
 _ready: set[Kind] = set()
 
@@ -39,20 +38,31 @@ def compile_kernels(kind: Kind, say: Callable[[str], object] | None = None) -> N
     """
     if kind in _ready:
         return
-    text = "compiling the renderer, once after an installation: about a minute"
+    text = "waiting for the renderer, which is compiled once after an installation: about a minute"
     timer = threading.Timer(SILENT_SECONDS, say or _nobody, [text])
     timer.daemon = True
     timer.start()
     try:
-        disc = Gaussians(
-            kind, torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-            torch.ones(1, 2 if kind == "2d" else 3), torch.ones(1), torch.zeros(1, 1, 3),
-        )  # fmt: skip
-        camera = Camera.look_at((0, 0, 3), (0, 0, 0), width=16, height=16, fov_y=40, up=(0, 1, 0))
-        view = render(
-            replace(disc, means=disc.means.clone().requires_grad_()), camera, backend="cpu"
-        )
-        (view.color.sum() + normal_consistency(view)).backward()
+        # A caller may have switched gradients off.
+        with torch.inference_mode(False), torch.enable_grad():
+            _call_all(kind)
     finally:
         timer.cancel()
     _ready.add(kind)
+
+
+def _call_all(kind: Kind) -> None:
+    """Render one splat, and its loss's gradients. Fits are in float32, whatever torch's default."""
+    single = torch.float32
+    means = torch.zeros(1, 3, requires_grad=True, dtype=single)
+    disc = Gaussians(
+        kind,
+        means,
+        torch.tensor([[1, 0, 0, 0]], dtype=single),
+        torch.ones(1, 2 if kind == "2d" else 3, dtype=single),
+        torch.ones(1, dtype=single),
+        torch.zeros(1, 1, 3, dtype=single),
+    )
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), width=16, height=16, fov_y=40, up=(0, 1, 0))
+    view = render(disc, camera, backend="cpu")
+    (view.color.sum() + normal_consistency(view)).backward()

@@ -74,7 +74,9 @@ def read_dataset(
     if format is not None:
         check.one_of(format, ("transforms", "colmap", "blendedmvs"), "format")
     if scale not in SCALES:
-        raise ValueError(f"scale: got {scale!r}, expected one of {', '.join(map(str, SCALES))}")
+        raise ValueError(
+            f"scale (--scale): got {scale!r}, expected one of {', '.join(map(str, SCALES))}"
+        )
     if scale > 1 and images is not None:
         raise ValueError("scale: given with images (--images); name the folder or the scale")
     if not path.exists():

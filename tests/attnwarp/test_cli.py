@@ -595,7 +595,9 @@ def test_smaller_copies_of_the_images_are_taken_by_their_scale(data, tmp_path):
     assert done.exit_code == 0, done.stderr
     assert cv2.imread(str(next((tmp_path / "out").iterdir()))).shape[:2] == half[::-1]
     done = in_process("render", tmp_path / "m.ply", small, "--scale", 3, "--out", tmp_path / "out")
-    assert done.exit_code == 2 and "scale: got 3, expected one of 1, 2, 4, 8" in done.stderr
+    assert done.exit_code == 2 and "(--scale): got 3, expected one of 1, 2, 4, 8" in done.stderr
+    done = in_process("render", tmp_path / "m.ply", small, "--scale", 4, "--out", tmp_path / "out")
+    assert done.exit_code == 2 and "images_4" in done.stderr
 
 
 def test_masks_are_not_passed_over_silently(data, tmp_path):

@@ -3,6 +3,7 @@ KeyboardInterrupt.
 """
 
 import os
+import signal
 import subprocess
 import sys
 import tomllib
@@ -12,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 import attnwarp.cli.main
-from attnwarp.process import core_count
+from attnwarp.process import asked_to_stop, core_count
 
 
 def test_nothing_is_left_to_search_as_the_process_ends():
@@ -75,3 +76,16 @@ def test_the_command_tells_its_version():
     version = tomllib.loads((root / "pyproject.toml").read_text())["project"]["version"]
     done = CliRunner().invoke(attnwarp.cli.main.app, ["--version"])
     assert (done.exit_code, done.output) == (0, f"attnwarp {version}\n")
+
+
+def test_a_signal_that_a_shell_has_a_background_job_ignore_stays_ignored():
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with asked_to_stop(print) as asked:
+            signal.raise_signal(signal.SIGINT)
+            assert not asked()
+            signal.raise_signal(signal.SIGTERM)
+            assert asked()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, handler)

@@ -191,6 +191,7 @@ def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
     with clear_errors():
         loaded = load()
         store = Store(out or Path("runs") / loaded.name)
+        store.refuse_strangers()
         planned = plan(loaded, store)
     todo = {cell.id for cell in planned.todo}
     rows: dict[tuple[str, str], list[bool]] = {}
@@ -416,7 +417,7 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
     """Check that a run is whole and undamaged.
 
     The hashes of its cells and pictures are computed again, and the expected cells listed again.
-    results.jsonl is held against the cells.
+    results.jsonl is held against its checksum.
     """
     from attnwarp_eval.report import wrong_results
     from attnwarp_eval.study.run import verify
@@ -424,8 +425,7 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
 
     with clear_errors():
         problems = verify(Store(run))
-        if problems.ok:
-            problems.damaged += wrong_results(Store(run))
+        problems.damaged += wrong_results(Store(run))
     for what, items in (
         ("damaged", problems.damaged),
         ("failed", problems.failed),
@@ -438,7 +438,8 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
         bad = len(problems.damaged) + len(problems.failed) + len(problems.missing)
         raise fail(
             f"{run}: {bad} problem{'s' * (bad != 1)} in {problems.checked}"
-            f" cell{'s' * (problems.checked != 1)}; run the study again to mend them",
+            f" cell{'s' * (problems.checked != 1)}; run the study again to mend"
+            f" {'it' if bad == 1 else 'them'}",
             TOO_LITTLE,
         )
     if not problems.sealed:

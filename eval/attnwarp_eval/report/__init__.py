@@ -4,6 +4,7 @@ alone.
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 from attnwarp_eval.document.write import write_files
@@ -48,29 +49,36 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
         _check_pictures(results, store)
     report = build(results, store.root, timings=timings, pictures=pictures)
     path = store.root / "results.jsonl"
-    write_atomic(path, _content(results, timings))
+    content = "".join(f"{line}\n" for line in lines(results, timings)).encode()
+    write_atomic(path, content)
+    write_atomic(_sum_of(path), _sum_line(path, content))
     return [path, *write_files(report, store.root, "report")]
 
 
 def wrong_results(store: Store) -> list[str]:
-    """What is wrong with the ``results.jsonl`` of a whole run, one line; it may not be there yet.
+    """What is wrong with a run's ``results.jsonl``, one line. It may not be there yet, and former
+    code wrote no checksum of it.
 
     Args:
         store: the run.
     """
     path = store.root / "results.jsonl"
-    if not path.is_file():
+    if not _sum_of(path).is_file():
         return []
-    results, there = read_results(store), path.read_bytes()
-    if any(there == _content(results, timings) for timings in (True, False)):
+    if path.is_file() and _sum_of(path).read_bytes() == _sum_line(path, path.read_bytes()):
         return []
     return [
-        f"{path.name}: is not what the cells give; attnwarp-eval report {store.root} writes it anew"
+        f"{path.name}: is not what was written; attnwarp-eval report {store.root} writes it anew"
     ]
 
 
-def _content(results: Results, timings: bool) -> bytes:
-    return "".join(f"{line}\n" for line in lines(results, timings)).encode()
+def _sum_of(path: Path) -> Path:
+    return path.with_name(f"{path.name}.sha256")
+
+
+def _sum_line(path: Path, content: bytes) -> bytes:
+    """As sha256sum writes it, which can check it too."""
+    return f"{hashlib.sha256(content).hexdigest()}  {path.name}\n".encode()
 
 
 def _check_pictures(results: Results, store: Store) -> None:

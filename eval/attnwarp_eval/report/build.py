@@ -60,7 +60,8 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
                 " scenes for one.**"
             )
     for scene, lines in results.notices.items():
-        lead += [f"**Scene {scene}**: {line}." for line in lines]
+        # As code: names of files may have asterisks.
+        lead += ["**Scene {}**: `{}`".format(scene, line.replace("`", "'")) for line in lines]
     layout = Layout(root, timings)
     of_probes: dict[Place, list[Section]] = {place: [] for place in Place}
     for probe in probes():

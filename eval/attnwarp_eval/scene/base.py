@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Annotated, Any
 
 import numpy as np
@@ -25,6 +26,17 @@ products of much larger ones overflow the float32 of what renders them."""
 
 class SceneNotice(UserWarning):
     """What a person should know of a scene that can be used all the same."""
+
+
+def silence_notices() -> None:
+    """Let this process warn of no :class:`SceneNotice` any more, where something else says them.
+
+    The filter is set once: each change of it has Python print every other warning anew.
+    """
+    if not any(
+        action == "ignore" and kind is SceneNotice for action, _, kind, *_ in warnings.filters
+    ):
+        warnings.simplefilter("ignore", SceneNotice)
 
 
 def _no_truth(value: Any) -> Any:

@@ -72,7 +72,9 @@ def _read(text: str, loader: type[Any]) -> tuple[yaml.Node, Any]:
     return root, data
 
 
-BARE_COLOR = re.compile(r"[:\[,]\s+#[0-9a-fA-F]{6}\b")
+BARE_COLOR = re.compile(
+    r"""^(?:[^#'"]|'[^']*'|"[^"]*")*?(?:[:,]\s+|\[\s*|^\s*-\s+)#[0-9a-fA-F]{6}\b"""
+)
 """A colour that YAML takes for a comment."""
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-import warnings
 from collections.abc import Callable, Generator
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -14,7 +13,7 @@ from pydantic import ValidationError
 from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cost import environment
-from attnwarp_eval.scene.base import SceneNotice
+from attnwarp_eval.scene.base import silence_notices
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.notices import notices
 from attnwarp_eval.scene.scene import Scene
@@ -78,6 +77,7 @@ def plan(study: Study, store: Store) -> Plan:
     Raises:
         InputError: something the study names cannot be used, or is of none of its scenes.
     """
+    silence_notices()  # the plan has them below
     scenes = _scenes(study)
     cells = cells_of(study, scenes)
     _check_names(study, list(scenes.values()), cells)
@@ -100,9 +100,7 @@ def plan(study: Study, store: Store) -> Plan:
 def _scenes(study: Study) -> dict[str, Scene]:
     scenes: dict[str, Scene] = {}
     for name in study.scenes:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", SceneNotice)  # the plan has them
-            scenes[name] = load_scene(name)
+        scenes[name] = load_scene(name)
         for other, scene in scenes.items():
             if other != name and scene.content_hash == scenes[name].content_hash:
                 raise StudyError(f"scenes: {other!r} and {name!r} are the same scene; name it once")
@@ -147,6 +145,7 @@ def verify(store: Store) -> Problems:
     Raises:
         InputError: the folder is no run.
     """
+    silence_notices()
     stored = store.read_study()
     _check_plugins(store, stored)
     problems = store.verify()

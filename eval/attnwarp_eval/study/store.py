@@ -109,8 +109,8 @@ class Store:
             StoreError: the folder has files of a run's names and no study.json, or is the current
                 folder with other things in it, as an empty path is.
         """
-        if (self.root / "study.json").exists():
-            return
+        if (self.root / "study.json").exists() or self.cells.is_dir():
+            return  # the cells of a run whose study.json is lost are taken up
         own = ("report.md", "report.html", "results.jsonl")
         there = [self.root / name for name in own if (self.root / name).exists()]
         if there:
@@ -118,10 +118,10 @@ class Store:
                 f"{there[0]}: is there without a study.json, and a run would write over it; name"
                 " another folder with --out, or move it away"
             )
-        if self.root == Path() and any(self.root.iterdir()):
+        if self.root.resolve() == Path.cwd() and any(self.root.iterdir()):
             raise StoreError(
-                "--out: is the current folder (or empty), which holds other things and no run; name"
-                " a folder of its own"
+                f"--out: got {str(self.root)!r}, the current folder, which holds other things and"
+                " no run; name a folder of its own"
             )
 
     def refuse_links(self) -> None:

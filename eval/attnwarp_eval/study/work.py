@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import traceback
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import torch
 from attnwarp.process import core_count
 from attnwarp.render.threads import set_thread_count, thread_count
 from attnwarp_eval.cost import Meter, environment, peak_memory_mb, reset_peak_memory
-from attnwarp_eval.scene.base import SceneNotice
+from attnwarp_eval.scene.base import silence_notices
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.plugins import load_plugins
 from attnwarp_eval.study.probes.base import Probe, Work
@@ -34,6 +33,7 @@ def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = Non
         InputError: the scene's file has changed since the cell was planned.
     """
     load_plugins()  # a worker has only what came with the cell
+    silence_notices()  # the run's plan has them
     # Image-sized tensor operations gain little from threads and lose much when other processes want
     # the cores; the renderer's own threads are counted apart.
     torch.set_num_threads(1)
@@ -41,15 +41,13 @@ def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = Non
     meter = Meter()
     reset_peak_memory()
     scene_world = None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SceneNotice)  # the run's plan has said them
-        if probe.needs_scenes:
-            with meter.stage("setup"):
-                scene_world = world(cell.scene_file, cell.spec["size"])
-            if scene_world.content_hash != cell.spec["scene"]:
-                raise changed(f"scene {cell.scene!r}")
-        work = Work(cell, root, scene_world, meter)
-        extra = probe.compute(work)
+    if probe.needs_scenes:
+        with meter.stage("setup"):
+            scene_world = world(cell.scene_file, cell.spec["size"])
+        if scene_world.content_hash != cell.spec["scene"]:
+            raise changed(f"scene {cell.scene!r}")
+    work = Work(cell, root, scene_world, meter)
+    extra = probe.compute(work)
     _check_metrics(probe, work)
     return Record(
         cell.id,

@@ -291,7 +291,7 @@ def test_points_far_astray_begin_no_splats_and_are_told(unit):
     said = []
     splats = first_splats(data, cameras, FitSettings(sh_degree=0), said.append)
     (line,) = said
-    assert line.startswith("2 of 100 points are left out: they lie over 100 times as far")
+    assert line.startswith("2 of 100 points are left out, over 100 times as far")
     expected = from_points(
         np.delete(points, (7, 9), 0), np.delete(colors, (7, 9), 0), kind="2d", sh_degree=0
     )

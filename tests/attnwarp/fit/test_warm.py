@@ -4,6 +4,7 @@ import time
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from attnwarp.fit import FitSettings, fit, loop, warm
 
@@ -42,10 +43,19 @@ def test_a_long_compilation_is_told_once(cold, monkeypatch):
     monkeypatch.setattr(warm, "render", slow)
     warm.compile_kernels("2d", said.append)
     warm.compile_kernels("2d", said.append)
-    assert said == ["compiling the renderer, once after an installation: about a minute"]
+    (line,) = said
+    assert line.startswith("waiting for the renderer, which is compiled once")
 
 
-def test_kernels_that_are_there_are_not_worth_a_word(cold):
+@pytest.mark.parametrize("off", [torch.no_grad, torch.inference_mode])
+def test_it_works_where_gradients_are_switched_off(cold, off):
+    with off():
+        warm.compile_kernels("2d")
+        assert not torch.is_grad_enabled()
+
+
+def test_quick_kernels_are_not_worth_a_word(cold, monkeypatch):
+    monkeypatch.setattr(warm, "SILENT_SECONDS", 600)
     said = []
     warm.compile_kernels("3d", said.append)
     assert said == []

@@ -129,7 +129,7 @@ def test_a_missing_scale_names_its_folder(tmp_path, cameras):
         path.unlink()
     with pytest.raises(FileFormatError, match="3 of 3 images are missing: .*images_4"):
         read_dataset(tmp_path / "scene", scale=4)
-    with pytest.raises(ValueError, match="scale: got 3, expected one of 1, 2, 4, 8"):
+    with pytest.raises(ValueError, match=r"scale \(--scale\): got 3, expected one of 1, 2, 4, 8"):
         read_dataset(tmp_path / "scene", scale=3)
 
 

@@ -228,7 +228,7 @@ GIVEN = ("--ply", "scene.ply", "--instruction", "red")
     [
         (["--instruction", "red"], "needs --ply"),
         (["--ply", "scene.ply"], "needs --instruction"),
-        (["--ply", "scene.ply", "--instruction", "red", "--scale", "3"], "scale: got 3"),
+        (["--ply", "scene.ply", "--instruction", "red", "--scale", "3"], "scale (--scale): got 3"),
         (["--ply", "none.ply", "--instruction", "red"], "none.ply"),
         ([*GIVEN, "--device", "gpu"], "device 'gpu': unknown, expected cpu or cuda"),
         ([*GIVEN, "--editor", "smal"], "editor 'smal': neither bundled"),

@@ -15,6 +15,7 @@ from attnwarp_eval.scene.yaml import (
     FAST,
     MOST_VALUES,
     YamlError,
+    _bare_color,
     _read,
     read_yaml,
 )
@@ -177,3 +178,15 @@ def test_what_the_two_parsers_would_read_otherwise_is_read_by_pythons_alone(text
 
     exact = outcome(lambda: _read(text, EXACT)[1])
     assert outcome(lambda: read_yaml(text)[1]) == exact
+
+
+@pytest.mark.parametrize(
+    ("line", "bare"),
+    [
+        ("color: #c04020", True), ("colors: [#c04020, b]", True), ("colors: ['#ffffff', #c04020]", True),
+        ("  - #c04020", True), ("color: '#c04020'", False), ("# a: #c04020", False),
+        ("k: 'v' # see ticket, #123456", False), ("a: b", False),
+    ],
+)  # fmt: skip
+def test_a_colour_without_quotes_is_told_from_a_comment(line, bare):
+    assert bool(_bare_color(f"first: 1\n{line}\n")) == bare

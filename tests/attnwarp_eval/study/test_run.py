@@ -157,9 +157,7 @@ def test_results_that_are_not_those_of_the_cells_are_damage(finished, folder):
     (run / "results.jsonl").write_bytes((finished / "results.jsonl").read_bytes()[:1000])
     checked = call("verify", run)
     assert checked.exit_code == 3
-    assert (
-        "damaged: results.jsonl: is not what the cells give; attnwarp-eval report" in checked.stdout
-    )
+    assert "damaged: results.jsonl: is not what was written; attnwarp-eval report" in checked.stdout
 
 
 def test_a_damaged_cell_costs_itself_and_is_mended_by_the_next_run(finished, undisturbed, folder):

@@ -91,8 +91,12 @@ def test_a_folder_of_others_results_or_the_current_one_with_other_things_is_refu
     monkeypatch.chdir(tmp_path / "new")
     Store("").refuse_strangers()  # as in a folder made for it
     (tmp_path / "new" / "study.yaml").write_text("name: mine")
-    with pytest.raises(StoreError, match=r"--out: is the current folder \(or empty\), which holds"):
+    with pytest.raises(StoreError, match=r"--out: got '.', the current folder, which holds"):
         Store("").refuse_strangers()
+    with pytest.raises(StoreError, match="the current folder, which holds"):
+        Store(tmp_path / "new").refuse_strangers()
+    (tmp_path / "new" / "cells").mkdir()  # of a run whose study.json is lost
+    Store("").refuse_strangers()
 
 
 def test_a_file_in_place_of_a_runs_folder_is_named_and_left_alone(tmp_path):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from attnwarp_eval.scene.meshes.off import read_off
 from attnwarp_eval.scene.meshes.ply import read_ply
 from attnwarp_eval.scene.meshes.polygons import triangulate
 from attnwarp_eval.scene.meshes.stl import read_stl
+from attnwarp_eval.scene.meshes.surface import Surface
 from attnwarp_eval.scene.shapes import Mesh, MeshNotice
 
 READER_PROTOCOL = 2
@@ -106,6 +109,34 @@ def read_mesh_file(path: Path) -> MeshFile:
         data = path.read_bytes()
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
+    key = str(path), hashlib.sha256(data).hexdigest()
+    if key not in _recent:
+        result = _read(path, reader, data)
+        if len(_recent) >= MOST_RECENT:
+            _recent.pop(next(iter(_recent)))
+        _recent[key] = result
+    result = _recent[key]
+    if (
+        result.crossed
+        or result.flat
+        or result.unused
+        or result.ignored
+        or result.cut_off
+        or result.inside_out
+    ):
+        warnings.warn(f"{path.name}: {result}", MeshNotice, stacklevel=3)
+    return result
+
+
+MOST_RECENT = 2
+"""Meshes that are kept: a scene is built more than once, and a large one takes seconds to read."""
+
+_recent: dict[tuple[str, str], MeshFile] = {}
+"""By path and SHA-256 of the file."""
+
+
+def _read(path: Path, reader: Callable[[bytes], Surface], data: bytes) -> MeshFile:
+    """What a file holds."""
     try:
         surface = reader(data)
         if not len(surface.sizes):
@@ -152,15 +183,8 @@ def read_mesh_file(path: Path) -> MeshFile:
         surface.cut_off,
         _inside_out(mesh),
     )
-    if (
-        result.crossed
-        or result.flat
-        or result.unused
-        or result.ignored
-        or result.cut_off
-        or result.inside_out
-    ):
-        warnings.warn(f"{path.name}: {result}", MeshNotice, stacklevel=3)
+    for array in (mesh.vertices, mesh.faces):
+        array.setflags(write=False)  # the next caller has the same ones
     return result
 
 
