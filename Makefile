@@ -1,7 +1,7 @@
 # Every target makes .venv first, with the extras it needs (scripts/venv.sh); PYTHON=... names the interpreter to make it with.
 SHELL := /bin/bash
 BIN := .venv/bin
-# Modules stay compiled: pip has compiled none (scripts/venv.sh), and every process would do it again.
+# Modules stay compiled: the installation has compiled none (scripts/venv.sh), and every process would do it again.
 unexport PYTHONDONTWRITEBYTECODE
 RUN ?= runs/demo
 # Worker processes of the demo and of the tests; each needs up to 3 GB.

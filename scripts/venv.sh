@@ -14,7 +14,7 @@ if [[ $extras == -* ]]; then
     exit 2
 fi
 venv=.venv
-hash=$(cat pyproject.toml constraints.txt scripts/venv.sh | sha256sum | cut -d' ' -f1)
+hash=$(cat pyproject.toml constraints.txt scripts/venv.sh scripts/uv_install.py | sha256sum | cut -d' ' -f1)
 stamp=$venv/.installed-$extras
 for file in "$stamp" "$venv/.installed-dev"; do
     [ -f "$file" ] && [ "$(cat "$file")" = "$hash" ] && exit 0
@@ -109,9 +109,12 @@ install_libraries
 [ -x "$venv/bin/python" ] && "$venv/bin/python" -m pip --version >/dev/null 2>&1 || make_venv
 say "attnwarp: installing the tested versions into $venv, with the extras $extras (a few minutes the first time)"
 # Python compiles a module when it is first imported; pip would compile all 20,000, of which most are never used.
-install() { PYTHONWARNINGS=ignore "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt "$@"; }
-# The pip that Debian's Python brings takes half a minute longer; without a newer one it goes on with that.
-install pip==26.3 2>/dev/null || say "attnwarp: could not fetch pip 26.3; going on with this one"
+with_pip() { PYTHONWARNINGS=ignore "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile "$@"; }
+# uv takes a third of pip's time. Where it cannot be had, or fails, pip does it and says what is wrong in its own words.
+install() {
+    "$venv/bin/python" scripts/uv_install.py --quiet -c constraints.txt "$@" 2>"$venv/uv.log" || with_pip -c constraints.txt "$@"
+}
+with_pip --only-binary uv uv==0.13.9 2>/dev/null || say "attnwarp: could not fetch uv, which is faster; going on with pip"
 # torch first and by its exact version: a range could bring the newest build with several GB of CUDA.
 install torch==2.13.0
 install -e ".[$extras]"
