@@ -4,6 +4,7 @@ import signal
 from pathlib import Path
 
 import pytest
+import typer.testing
 
 ROOT = Path(__file__).parent
 
@@ -18,6 +19,21 @@ if _WORKERS > 1:
     _affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
     _cores = len(_affinity(0)) if _affinity else os.cpu_count() or 1
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, _cores // _WORKERS)))
+
+# A test calls a command many times; its options are read from the function's signature once.
+typer.testing._get_command = functools.cache(typer.testing._get_command)
+
+
+@pytest.fixture(scope="module")
+def coarse_textures():
+    """Textures baked for pictures of 160, not 512 rows, which takes a tenth of the time."""
+    from attnwarp_eval.truth.mitsuba import build
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "TEXELS", 640)
+        build.forget()
+        yield
+        build.forget()
 
 
 # Files that take a worker 10 s and more, longest first. They begin the run, as one of them at its

@@ -123,6 +123,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.usefixtures("coarse_textures")
 @pytest.mark.parametrize("name", modules_with_examples())
 def test_examples_of_the_docstrings_give_what_they_print(name, folder):
     module = importlib.import_module(name)

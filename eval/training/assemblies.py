@@ -594,7 +594,7 @@ def draw_assembly(seed: int, kind: int, *, new_shapes: bool = False, views: int 
         drawn = seed + 1_000_000_000 * attempt
         whole = Assembly(kind, HELD_OUT_SHAPE + seed if new_shapes else seed, drawn, views)
         names = list(whole.pieces())
-        shares = np.min([_shares(whole, view, len(names)) for view in range(views)], axis=0)
+        shares = _shares(whole, len(names)).min(axis=0)
         large = [name for name, share in zip(names, shares, strict=True) if share >= LEAST_PART]
         if shares.sum() < LEAST_THING or not large:
             continue
@@ -603,9 +603,10 @@ def draw_assembly(seed: int, kind: int, *, new_shapes: bool = False, views: int 
     raise RuntimeError(f"seed {seed}: no camera saw the {KINDS[kind]} in 100 attempts")
 
 
-def _shares(world: Assembly, view: int, count: int) -> npt.NDArray[np.float64]:
-    """(count,) share of a small picture that each part covers."""
+def _shares(world: Assembly, count: int) -> npt.NDArray[np.float64]:
+    """(views, count) share of a small picture that each part covers."""
     look = Look(FINISHES.index("plain"), 0, -1, 0, 0, 0)
     scene = world.scene(look, 48)
-    ids = Geometry(scene).trace(scene.cameras[view]).object_id
-    return np.array([(ids == k).mean() for k in range(count)])
+    geometry = Geometry(scene)
+    ids = [geometry.trace(scene.cameras[view]).object_id for view in range(world.views)]
+    return np.array([[(seen == k).mean() for k in range(count)] for seen in ids])

@@ -170,8 +170,10 @@ class Mesh:
 
     def bounds(self) -> Array:
         """(2, 3) lower and upper corner of the axis-aligned bounding box."""
-        used = self.vertices[np.unique(self.faces)]
-        return np.stack([used.min(0), used.max(0)])
+        used = np.zeros(len(self.vertices), bool)
+        used[self.faces] = True
+        corners = self.vertices[used]
+        return np.stack([corners.min(0), corners.max(0)])
 
     def contains(self, point: Array) -> bool:
         """Whether the (3,) ``point`` lies inside, by the generalised winding number; never outside
@@ -211,8 +213,9 @@ class Mesh:
                 f"{name}: a face names vertex {int(self.faces.max())}, but there are"
                 f" {len(self.vertices)}"
             )
-        used = np.unique(self.faces)
-        bad = used[~np.isfinite(self.vertices[used]).all(axis=1)] if self.faces.size else used
+        used = np.zeros(len(self.vertices), bool)
+        used[self.faces] = True
+        bad = np.flatnonzero(used & ~np.isfinite(self.vertices).all(axis=1))
         if bad.size:
             raise ValueError(f"{name}: vertex {int(bad[0])} is not finite; repair the file")
         corners = self.vertices[self.faces]
