@@ -53,9 +53,37 @@ def resend_lost_interrupts() -> None:
     sys.unraisablehook = resend
 
 
+STOPS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""What asks a program to end besides Ctrl-C: a polite kill, and the terminal's end where it has
+one (not on Windows)."""
+
+
+def heeded(numbers: tuple[int, ...]) -> list[int]:
+    """Those that this process does not ignore: a shell has its background jobs ignore Ctrl-C, and
+    nohup the terminal's end.
+    """
+    return [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
+
+
+@contextmanager
+def stops_interrupt() -> Iterator[None]:
+    """A polite kill, or the terminal's end, raises KeyboardInterrupt inside, as Ctrl-C does."""
+
+    def interrupt(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    handlers = {number: signal.signal(number, interrupt) for number in heeded(STOPS)}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
 @contextmanager
 def asked_to_stop(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C or a polite kill came; a second one stops at once, as it would without this.
+    """Whether Ctrl-C, a polite kill or the terminal's end came; a second one stops at once, as it
+    would without this.
 
     Args:
         say: shows a line to the user.
@@ -69,12 +97,7 @@ def asked_to_stop(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
         asked = True
         say("stopping after this iteration; press Ctrl-C again to leave at once")
 
-    # What a shell has its background jobs ignore stays ignored.
-    handlers = {
-        number: signal.signal(number, note)
-        for number in (signal.SIGINT, signal.SIGTERM)
-        if signal.getsignal(number) is not signal.SIG_IGN
-    }
+    handlers = {number: signal.signal(number, note) for number in heeded((signal.SIGINT, *STOPS))}
     try:
         yield lambda: asked
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,11 +15,12 @@ LINE_SECONDS = 10.0
 """Seconds between two lines where there is no terminal."""
 
 PACE_SECONDS = 5.0
-"""The time left is not told earlier: the first steps compile and say little of the others."""
+"""The time left is not told earlier."""
 
 
 class Pace:
-    """Tells the time left by the mean pace since the first count, that of a resumed work included.
+    """Tells the time left by the mean pace of the latter half of what was done since the first
+    count, that of a resumed work: the first steps compile, and say little of the others.
 
     Example:
         >>> from attnwarp.progress import Pace
@@ -27,17 +29,21 @@ class Pace:
     """
 
     def __init__(self) -> None:
-        self._first: tuple[float, int] | None = None
+        self._counts: list[tuple[float, int]] = []
 
     def left(self, done: int, total: int) -> str:
         """The end of a line, such as ", 3 min left"; empty while it cannot be told."""
         now = time.perf_counter()
-        if self._first is None:
-            self._first = now, done
-        began, before = self._first
+        if self._counts and done < self._counts[-1][1]:
+            self._counts.clear()  # other work
+        if not self._counts or done > self._counts[-1][1]:
+            self._counts.append((now, done))
+        began, before = self._counts[0]
         if now - began < PACE_SECONDS or not before < done < total:
             return ""
-        return f", {_duration((now - began) / (done - before) * (total - done))} left"
+        half = before + (done - before) // 2
+        since, had = self._counts[bisect.bisect_right(self._counts, half, key=lambda c: c[1]) - 1]
+        return f", {_duration((now - since) / (done - had) * (total - done))} left"
 
 
 def _duration(seconds: float) -> str:

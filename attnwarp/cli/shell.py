@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import sys
 import warnings
 from collections.abc import Iterator
@@ -15,14 +14,14 @@ from typing import Any
 import typer
 
 from attnwarp.errors import InputWarning
-from attnwarp.process import core_count
+from attnwarp.process import core_count, stops_interrupt
 
 USAGE = 2
 """Exit code of everything that a person can mend: arguments, files, folders."""
 
 
 STOPPED = 130
-"""Exit code after Ctrl-C or a polite kill, as shells have it for Ctrl-C."""
+"""Exit code after Ctrl-C, a polite kill or the terminal's end, as shells have it for Ctrl-C."""
 
 
 CLOSED_PIPE = 141
@@ -48,7 +47,7 @@ def clear_errors(stopped: str = NOTHING, out: Path | None = None) -> Iterator[No
     """Turn errors about a person's input into one clear line and exit code 2.
 
     Args:
-        stopped: what is said after Ctrl-C or a polite kill.
+        stopped: what is said after Ctrl-C, a polite kill or the terminal's end.
         out: folder of the results that it speaks of, if it does; nothing was written while it is
             not there.
     """
@@ -59,12 +58,8 @@ def clear_errors(stopped: str = NOTHING, out: Path | None = None) -> Iterator[No
             printed.add(str(message))
             typer.echo(f"attnwarp: warning: {message}", err=True)
 
-    def terminate(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
-
-    handler = signal.signal(signal.SIGTERM, terminate)
     try:
-        with warnings.catch_warnings():
+        with stops_interrupt(), warnings.catch_warnings():
             warnings.simplefilter("always", InputWarning)
             warnings.showwarning = show
             yield
@@ -87,8 +82,6 @@ def clear_errors(stopped: str = NOTHING, out: Path | None = None) -> Iterator[No
         if error.strerror is None:  # the library's own, which says what to do
             raise fail(str(error)) from None
         raise fail(file_error(error)) from None
-    finally:
-        signal.signal(signal.SIGTERM, handler)
 
 
 def file_error(error: OSError) -> str:

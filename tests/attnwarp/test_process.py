@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 import attnwarp.cli.main
-from attnwarp.process import asked_to_stop, core_count
+from attnwarp.process import STOPS, asked_to_stop, core_count, stops_interrupt
 
 
 def test_nothing_is_left_to_search_as_the_process_ends():
@@ -89,3 +89,34 @@ def test_a_signal_that_a_shell_has_a_background_job_ignore_stays_ignored():
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, handler)
+
+
+@pytest.mark.parametrize("number", STOPS)
+def test_what_asks_a_program_to_end_interrupts_it_unless_it_is_ignored(number):
+    former = signal.getsignal(number)
+    with pytest.raises(KeyboardInterrupt), stops_interrupt():
+        signal.raise_signal(number)
+    assert signal.getsignal(number) is former
+    signal.signal(number, signal.SIG_IGN)  # as nohup does
+    try:
+        with stops_interrupt():
+            signal.raise_signal(number)
+        assert signal.getsignal(number) is signal.SIG_IGN
+    finally:
+        signal.signal(number, former)
+
+
+@pytest.mark.parametrize(
+    ("package", "command"), [("attnwarp", "attnwarp"), ("attnwarp_eval", "attnwarp-eval")]
+)
+def test_a_package_is_its_command(package, command):
+    """Oracle: the console script that the installation made."""
+    both = [
+        subprocess.run(call, capture_output=True, text=True)
+        for call in (
+            [sys.executable, "-m", package, "--version"],
+            [Path(sys.executable).parent / command, "--version"],
+        )
+    ]
+    assert [done.returncode for done in both] == [0, 0]
+    assert both[0].stdout == both[1].stdout

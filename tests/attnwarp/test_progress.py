@@ -68,3 +68,19 @@ def test_what_cannot_be_told_is_left_out(clock):
     assert pace.left(8, 90) == ""
     clock.seconds += 4
     assert pace.left(16, 90) == ", 37 s left"  # 74 at 2 a second
+
+
+def test_slow_first_steps_are_forgotten_and_other_work_begins_anew(clock):
+    pace = attnwarp.progress.Pace()
+    assert pace.left(0, 20) == ""
+    clock.seconds += 60  # one that compiles
+    pace.left(1, 20)
+    for done in range(2, 10):
+        clock.seconds += 2
+        said = pace.left(done, 20)
+    # Of 9 steps the last 5 took 10 s; 11 are left. The mean of all would have said 94 s.
+    assert said == ", 22 s left"
+    clock.seconds += 10
+    assert pace.left(0, 20) == ""
+    clock.seconds += 10
+    assert pace.left(1, 20) == ", 3 min left"  # 19 at 10 s

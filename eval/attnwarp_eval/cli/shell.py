@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from attnwarp.cli.shell import STOPPED, USAGE, closed_pipe
+from attnwarp.process import stops_interrupt
 from attnwarp.progress import LINE_SECONDS, Pace
 
 if TYPE_CHECKING:
@@ -124,23 +124,17 @@ def file_error(error: OSError) -> str:
 
 @contextmanager
 def resumable(state: Callable[[], str]) -> Iterator[None]:
-    """Turn Ctrl-C or a polite kill into one clear line and exit code 130.
+    """Turn Ctrl-C, a polite kill or the terminal's end into one clear line and exit code 130.
 
     Args:
         state: what is finished and stays, such as "3 cells are kept"; asked after the interrupt.
     """
-
-    def terminate(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
-
-    handler = signal.signal(signal.SIGTERM, terminate)
     try:
-        yield
+        with stops_interrupt():
+            yield
     except KeyboardInterrupt:
         message = f"interrupted; {state()}, the same command goes on from here"
         raise fail(message, STOPPED) from None
-    finally:
-        signal.signal(signal.SIGTERM, handler)
 
 
 def names(text: str | None) -> list[str] | None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from attnwarp.errors import InputError
-from attnwarp.process import core_count
+from attnwarp.process import STOPS, core_count, heeded
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probes import probe
@@ -305,7 +305,7 @@ def _signals_wait() -> Iterator[None]:
     # process, would unblock it.
     resource_tracker.ensure_running()
     received: list[int] = []
-    former = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    former = {n: signal.getsignal(n) for n in heeded((signal.SIGINT, *STOPS))}
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     for number in former:
         signal.signal(number, lambda number, frame: received.append(number))
