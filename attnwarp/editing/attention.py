@@ -281,12 +281,13 @@ class Recording:
 
     Attributes:
         plan: what was recorded.
-        timesteps: of the steps so far, in their order, those without features included.
+        timesteps: of the steps so far, in their order, those without features included. A scheduler
+            that evaluates a timestep twice (PNDM, Heun) has it twice.
     """
 
     plan: RecordingPlan
     timesteps: list[float] = field(default_factory=list)
-    _features: dict[tuple[float, str], Tensor | Path] = field(default_factory=dict)
+    _features: dict[tuple[int, str], Tensor | Path] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Recording({len(self.timesteps)} steps so far of: {self.plan})"
@@ -309,22 +310,25 @@ class Recording:
         return sum(storages.values()) + sum(path.stat().st_size for path in files)
 
     def features(self, timestep: float, layer: Layer, branch: str) -> Tensor:
-        """(views, H W, C) features of a step, a layer and a branch.
+        """(views, H W, C) features of a step, a layer and a branch; of the first step with that
+        timestep.
 
         Raises:
             ValueError: not recorded; the message names what is.
         """
-        number = self.step_of(timestep)
+        return self._features_of(self.step_of(timestep), layer, branch)
+
+    def _features_of(self, number: int, layer: Layer, branch: str) -> Tensor:
         if number not in self.plan.recorded:
             listed = ", ".join(map(str, sorted(self.plan.recorded)))
             raise ValueError(
-                f"timestep: {timestep:g} is step {number}, whose features were not chosen; those"
-                f" of {listed} were"
+                f"timestep: {self.timesteps[number]:g} is step {number}, whose features were not"
+                f" chosen; those of {listed} were"
             )
         if layer not in self.plan.layers:
             raise ValueError(f"layer: {layer.name} was not recorded")
         check.one_of(branch, self.plan.keep, "branch")
-        value = self._features[(timestep, layer.name)]
+        value = self._features[(number, layer.name)]
         if isinstance(value, Path):
             from safetensors import safe_open
 
@@ -341,8 +345,11 @@ class Recording:
         part: Tensor = value[row : row + views]
         return part
 
-    def step_of(self, timestep: float) -> int:
+    def step_of(self, timestep: float, begin: int = 0) -> int:
         """The number of a timestep among those of the recorded run, from 0.
+
+        Args:
+            begin: of those with that timestep, the first from this number on, or else the first.
 
         Raises:
             ValueError: the run had no such timestep.
@@ -353,16 +360,13 @@ class Recording:
                 f"timestep: got {timestep:g}, recorded are {listed}; run both with one scheduler"
                 " and the same steps"
             )
-        return self.timesteps.index(timestep)
+        later = timestep in self.timesteps[begin:]
+        return self.timesteps.index(timestep, begin if later else 0)
 
-    def put(self, timestep: float, layer: Layer, features: Tensor) -> None:
+    def _put(self, number: int, layer: Layer, features: Tensor) -> None:
         """Store (branches x views, H W, C) features of the kept branches."""
         plan = self.plan
-        key = (timestep, layer.name)
-        if key in self._features:
-            raise ValueError(
-                f"timestep: {timestep:g} came twice at {layer.name}; a recording holds one run"
-            )
+        key = (number, layer.name)
         # A copy of its own: a slice would keep the whole batch's memory alive.
         stored = torch.empty_like(features, dtype=plan.dtype, memory_format=torch.contiguous_format)
         stored.copy_(features.detach())
@@ -373,7 +377,7 @@ class Recording:
         else:
             from safetensors.torch import save_file
 
-            path = self._folder / f"{timestep:g}-{layer.name}.safetensors"
+            path = self._folder / f"{number}-{layer.name}.safetensors"
             save_file({"features": stored.cpu()}, path)
             self._features[key] = path
 
@@ -448,7 +452,8 @@ def record(
         announce: called with the plan in words, the memory included, before anything runs.
 
     Raises:
-        ValueError: latents of another size, or a batch of another number of rows, than planned.
+        ValueError: latents of another size, a batch of another number of rows, or more steps, than
+            planned.
 
     Example:
         >>> import numpy as np
@@ -467,19 +472,25 @@ def record(
     recording = Recording(plan)
     rows, chosen = len(plan.branches) * plan.views, plan.recorded
 
+    last: list[Call] = []
+
     def keep(layer: Layer, features: Tensor, call: Call) -> None:
         _check_call(plan, call, rows)
-        if call.timestep not in recording.timesteps:
+        if last != [call]:
             if len(recording.timesteps) == plan.steps:
                 raise ValueError(
-                    f"steps: timestep {call.timestep:g} is one more than the {plan.steps} planned"
+                    f"steps: timestep {call.timestep:g} is one more than the {plan.steps} planned;"
+                    " plan a step for each pass through the UNet, len(scheduler.timesteps) of them"
+                    " (some schedulers make more than they are asked for), and record one run"
                 )
             recording.timesteps.append(call.timestep)
-        if recording.step_of(call.timestep) not in chosen:
+            last[:] = [call]
+        number = len(recording.timesteps) - 1
+        if number not in chosen:
             return
         parts = features.chunk(len(plan.branches))
         selected = torch.cat([parts[plan.branches.index(branch)] for branch in plan.keep])
-        recording.put(call.timestep, layer, selected)
+        recording._put(number, layer, selected)
 
     with hooked(unet, plan.layers, keep):
         yield recording
@@ -548,8 +559,8 @@ def inject(
         layers: to inject, all recorded ones if left out.
 
     Raises:
-        ValueError: a timestep, layer, branch or size that does not match the recording; the message
-            names it.
+        ValueError: a timestep, layer, branch or size that does not match the recording, or a run
+            that was recorded in fewer steps than planned; the message names it.
 
     Example:
         >>> import numpy as np
@@ -573,6 +584,11 @@ def inject(
     for layer in chosen:
         if layer not in plan.layers:
             raise ValueError(f"layers: {layer.name} was not recorded")
+    if len(recording.timesteps) < plan.steps:
+        raise ValueError(
+            f"steps: the recorded run had {len(recording.timesteps)} of {plan.steps} planned steps,"
+            " so weights would not fall as they should; plan as many as it has"
+        )
     shared = [branch for branch in plan.keep if branch in branches]
     if not shared:
         raise ValueError(
@@ -580,11 +596,14 @@ def inject(
         )
     if mask is not None and (mask.ndim != 2 or mask.dtype != torch.bool):
         raise ValueError(f"mask: got {mask.dtype} {tuple(mask.shape)}, expected bool (H, W)")
+    step = -1
+    last: list[Call] = []
     views = len(warps)
     if plan.views not in (1, views):
         raise ValueError(f"warps: got {views}, expected {plan.views}, one for each recorded view")
 
     def blend(layer: Layer, features: Tensor, call: Call) -> Tensor:
+        nonlocal step
         rows = len(branches) * views
         if call.batch != rows:
             raise ValueError(
@@ -594,19 +613,19 @@ def inject(
         if mask is not None:
             h, w = mask.shape
             check.same_aspect((h, w), call.latent_size, "mask", "transpose a mask of (W, H)")
-        number = recording.step_of(call.timestep)
-        if number not in recorded:
+        if last != [call]:
+            step = recording.step_of(call.timestep, step + 1)
+            last[:] = [call]
+        if step not in recorded:
             return features
-        alpha = weight(number, plan.steps)
+        alpha = weight(step, plan.steps)
         _check_share(alpha, "weight")
         if alpha == 0:
             return features
         size, source_size = layer.size(call.latent_size), layer.size(plan.latent_size)
         result = features.clone()
         for branch in shared:
-            source = recording.features(call.timestep, layer, branch).to(
-                features.device, features.dtype
-            )
+            source = recording._features_of(step, layer, branch).to(features.device, features.dtype)
             for view, warp in enumerate(warps):
                 row = list(branches).index(branch) * views + view
                 own = source[view if plan.views > 1 else 0]

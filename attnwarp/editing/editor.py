@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.editing.schedule import Schedule, following, steps_as_published
+from attnwarp.errors import InputWarning
 
 Image = npt.NDArray[np.float32]
 Guide = Literal["picture", "depth"]
@@ -321,6 +323,29 @@ def check_networks(
         )
 
 
+def check_scheduler(scheduler: Any) -> None:
+    """Refuse what has no DDIM steps, and tell what these do otherwise than diffusers'.
+
+    Raises:
+        ValueError: no DDIMScheduler.
+    """
+    from diffusers import DDIMScheduler
+
+    if not isinstance(scheduler, DDIMScheduler):
+        raise ValueError(
+            f"scheduler: got {type(scheduler).__name__}, expected a DDIMScheduler;"
+            " DDIMScheduler.from_config(scheduler.config) makes one of the same schedule"
+        )
+    used = [name for name in ("clip_sample", "thresholding") if scheduler.config.get(name)]
+    if used:
+        warnings.warn(
+            f"scheduler: {' and '.join(used)} of its configuration is left out: latents are not"
+            " clipped here, so pictures differ from those of diffusers' pipelines",
+            InputWarning,
+            stacklevel=4,
+        )
+
+
 class Latent:
     """Pictures to latents and back, and texts to tokens: what both kinds of editor share."""
 
@@ -329,6 +354,7 @@ class Latent:
     ) -> None:
         self.unet, self.vae, self.text_encoder = unet, vae, text_encoder
         self.tokenizer, self.scheduler = tokenizer, scheduler
+        check_scheduler(scheduler)
         self.schedule = Schedule.of(scheduler)
         self.factor = 2 ** (len(vae.config.block_out_channels) - 1)
         for part in (unet, vae, text_encoder):

@@ -79,9 +79,9 @@ def load_parts(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -
     with readable(words):
         parts["tokenizer"] = AutoTokenizer.from_pretrained(words, local_files_only=True)
     with readable(folder / "scheduler"):
-        parts["scheduler"] = DDIMScheduler.from_pretrained(
-            folder / "scheduler", local_files_only=True
-        )
+        # DDIMScheduler clips latents unless told; a folder of another scheduler tells nothing.
+        told = DDIMScheduler.load_config(folder / "scheduler", local_files_only=True)
+        parts["scheduler"] = DDIMScheduler.from_config({"clip_sample": False, **told})
     return parts
 
 

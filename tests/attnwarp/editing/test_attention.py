@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from diffusers import UNet2DConditionModel
+from diffusers import (
+    HeunDiscreteScheduler,
+    KDPM2DiscreteScheduler,
+    PNDMScheduler,
+    UNet2DConditionModel,
+)
 from diffusers.models.attention_processor import AttnProcessor2_0
 from tiny_editors import controlnet, pix2pix, unet
 
@@ -145,6 +150,54 @@ def test_recording_changes_no_bit_of_diffusers_own_pipelines(pipeline):
     assert len(recording.timesteps) == 3
     with inject(pipe.unet, recording, branches=branches, weight=constant(1.0)):
         assert np.array_equal(before, images())
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "options", "steps"),
+    [
+        (PNDMScheduler, {"skip_prk_steps": True}, 4),
+        (HeunDiscreteScheduler, {}, 3),
+        (KDPM2DiscreteScheduler, {}, 3),
+    ],
+)
+def test_of_a_scheduler_with_more_passes_than_steps_each_pass_has_its_own_features(
+    scheduler, options, steps
+):
+    """Oracle: diffusers' own pipeline, whose pictures their own features leave as they are."""
+    pipe = controlnet()
+    pipe.scheduler = scheduler.from_config(pipe.scheduler.config, **options)
+    picture = torch.rand((1, 3, 16, 24), generator=torch.Generator().manual_seed(4))
+
+    def images():
+        return pipe(
+            "bear", image=picture, num_inference_steps=steps, output_type="np", height=16, width=24,
+            generator=torch.Generator().manual_seed(5),
+        ).images  # fmt: skip
+
+    before, passes = images(), len(pipe.scheduler.timesteps)
+    assert passes > steps
+    plan = plan_of(
+        pipe.unet,
+        size=(8, 12),
+        branches=CONTROLNET_BRANCHES,
+        keep=CONTROLNET_BRANCHES,
+        steps=passes,
+    )
+    with record(pipe.unet, plan) as recording:
+        assert np.array_equal(before, images())
+    given = recording.timesteps
+    assert given == [float(t) for t in pipe.scheduler.timesteps]
+    weights = []
+
+    def weight(step, count):
+        weights.append((step, count))
+        return 1.0
+
+    with inject(pipe.unet, recording, branches=CONTROLNET_BRANCHES, weight=weight):
+        assert np.array_equal(before, images())
+        assert np.array_equal(before, images())  # a second run begins anew
+    numbers = [step for step, _ in weights[:: len(plan.layers)]]
+    assert numbers == 2 * list(range(passes)) and {count for _, count in weights} == {passes}
 
 
 def camera(width=48, height=36, x=0.0):
@@ -447,8 +500,13 @@ def test_what_does_not_match_the_recording_is_refused_by_name():
         record(net, plan_of(net, steps=1)),
     ):
         run(net)
-    with pytest.raises(ValueError, match="timestep: 981 came twice"), record(net, plan_of(net)):
-        run(net, timesteps=(981, 981))
+    with record(net, plan_of(net, steps=3)) as short:
+        run(net)
+    with (
+        pytest.raises(ValueError, match="steps: the recorded run had 2 of 3 planned steps"),
+        inject(net, short, branches=PIX2PIX_BRANCHES),
+    ):
+        pass
     for chosen, message in (([2], "got 2"), ([-1], "got -1"), ([0.5], "got 0.5"), ([], "no step")):
         with pytest.raises(ValueError, match=f"chosen: .*{message}"):
             plan_of(net, chosen=chosen)

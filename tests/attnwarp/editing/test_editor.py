@@ -9,7 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from diffusers import AutoencoderTiny, ControlNetModel, DDIMScheduler
+from diffusers import (
+    AutoencoderTiny,
+    ControlNetModel,
+    DDIMScheduler,
+    EulerAncestralDiscreteScheduler,
+    PNDMScheduler,
+)
 from tiny_editors import controlnet, nearest_steps, pix2pix, unet
 
 from attnwarp.editing.attention import (
@@ -34,7 +40,7 @@ from attnwarp.editing.schedule import (
     steps_from,
 )
 from attnwarp.editing.small import WEIGHTS, bundled, guide_of, load_editor
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, InputWarning
 
 H, W = 16, 24
 
@@ -576,3 +582,31 @@ def test_weights_that_lack_a_tensor_are_refused_and_not_filled_with_random_numbe
         json.loads((Path(tmp_path) / "model_index.json").read_text())["unet"][1]
         == "UNet2DConditionModel"
     )
+
+
+def test_a_scheduler_without_ddim_steps_is_refused_with_the_remedy_which_works():
+    pipe = pix2pix()
+    parts = {name: getattr(pipe, name) for name in ("unet", "vae", "text_encoder", "tokenizer")}
+    for kind in (EulerAncestralDiscreteScheduler, PNDMScheduler):
+        other = kind.from_config(pipe.scheduler.config)
+        with pytest.raises(
+            ValueError, match=rf"got {kind.__name__}, expected a DDIMScheduler; .*\.config"
+        ):
+            InstructPix2Pix(**parts, scheduler=other)
+        remedy = DDIMScheduler.from_config({**other.config, "clip_sample": False})
+        assert InstructPix2Pix(**parts, scheduler=remedy).timesteps(3) == [667, 334, 1]
+    clipping = DDIMScheduler.from_config({**pipe.scheduler.config, "clip_sample": True})
+    with pytest.warns(InputWarning, match="clip_sample of its configuration is left out"):
+        InstructPix2Pix(**parts, scheduler=clipping)
+
+
+def test_a_folder_of_another_scheduler_that_says_nothing_of_clipping_clips_nothing(tmp_path):
+    """As its own scheduler, which cannot clip; a warning would fail this test."""
+    pipe = pix2pix()
+    pipe.scheduler = PNDMScheduler.from_config(pipe.scheduler.config)
+    pipe.save_pretrained(tmp_path)
+    file = tmp_path / "scheduler" / "scheduler_config.json"
+    told = json.loads(file.read_text())
+    assert told.pop("clip_sample", None) in (None, False)
+    file.write_text(json.dumps(told))
+    assert InstructPix2Pix.from_folder(tmp_path).scheduler.config.clip_sample is False
