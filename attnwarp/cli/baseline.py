@@ -8,11 +8,19 @@ from typing import Annotated
 
 import typer
 
-from attnwarp.cli.files import check_inputs_stay, check_seen, read_splats, read_views
+from attnwarp.cli.files import (
+    check_inputs_stay,
+    check_seen,
+    read_splats,
+    read_views,
+    warn_of_misfit,
+)
 from attnwarp.cli.options import (
+    AntialiasedOption,
     DataArgument,
     MaxSizeOption,
     Reading,
+    SplatKindOption,
     reading_options,
 )
 from attnwarp.cli.shell import assignments, check_out, clear_errors, echo, use_threads
@@ -58,6 +66,8 @@ def baseline(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the method."),
     ] = None,
+    kind: SplatKindOption = None,
+    antialiased: AntialiasedOption = None,
     max_size: MaxSizeOption = None,
     device: DeviceOption = "cpu",
     threads: ThreadsOption = None,
@@ -84,8 +94,9 @@ def baseline(
         from attnwarp.baselines.command import edit_dataset
 
         dataset = read_views(data, reading, points=False)
-        splats = read_splats(ply, None, None)
+        splats = read_splats(ply, kind, antialiased)
         check_seen(ply, splats, dataset.cameras)
+        warn_of_misfit(ply, splats, dataset)
         result = edit_dataset(
             method.value, dataset, splats, editor, instruction, settings, out,
             budget=budget, max_size=max_size, device=device, threads=threads,

@@ -8,8 +8,15 @@ from typing import Annotated, Any
 
 import typer
 
-from attnwarp.cli.files import check_inputs_stay, check_seen, read_splats, read_views
+from attnwarp.cli.files import (
+    check_inputs_stay,
+    check_seen,
+    read_splats,
+    read_views,
+    warn_of_misfit,
+)
 from attnwarp.cli.options import (
+    AntialiasedOption,
     DataArgument,
     Kind,
     MaxSizeOption,
@@ -35,6 +42,8 @@ from attnwarp.errors import InputWarning
 NO_FEATURES = 0.001
 """Share of the targets' pixels below which each view was, in effect, edited alone."""
 
+FIT_ITERATIONS, FIT_SPLATS = 3_000, 30_000
+"""Of the fit that begins an edit without splats."""
 
 PRESETS = ("corrected", "extended", "paper", "released", "released-controlnet")
 """What a person may type for the choices of an edit; named here as ``--help`` imports no torch."""
@@ -92,12 +101,16 @@ def edit(
         typer.Option("--set", metavar="NAME=VALUE", help="Any other setting of the preset."),
     ] = None,
     fit_iterations: Annotated[
-        int, typer.Option(min=1, help="Of the fit, where no PLY is given.")
-    ] = 3_000,
-    kind: Annotated[Kind, typer.Option(help="Flat discs or ellipsoids, for the fit.")] = Kind.two,
+        int | None, typer.Option(min=1, help="Of the fit, where no PLY is given (3000).")
+    ] = None,
+    kind: Annotated[
+        Kind | None,
+        typer.Option(help="Of the fit (2dgs), or of the PLY, whatever it says."),
+    ] = None,
     max_splats: Annotated[
-        int, typer.Option(min=1, help="Do not grow the model beyond, for the fit.")
-    ] = 30_000,
+        int | None, typer.Option(min=1, help="Do not grow the model beyond, for the fit (30000).")
+    ] = None,
+    antialiased: AntialiasedOption = None,
     max_size: MaxSizeOption = None,
     store: Annotated[Store, typer.Option(help="Where recorded features are kept.")] = Store.cpu,
     device: DeviceOption = "cpu",
@@ -117,6 +130,11 @@ def edit(
         changes = {name: value for name, value in options.items() if value is not None}
         flags = {name: f"--{name.replace('_', '-')}" for name in options}
         changes |= assignments(change or [], {**flags, "method": "--each-view-alone"})
+        _check_splat_options(
+            ply,
+            of_fit={"--fit-iterations": fit_iterations, "--max-splats": max_splats},
+            of_file={"--antialiased": antialiased},
+        )
         check_segmenter(segmenter, words)
         check_out(out)
         results = ("source.png", "edited.ply", "edited-3dgs.ply")
@@ -132,14 +150,20 @@ def edit(
         settings = attnwarp.propagate.settings.preset(preset, **changes)
         use_threads(threads)
         dataset = read_views(data, reading)
-        splats = None if ply is None else read_splats(ply, None, None)
+        splats = None if ply is None else read_splats(ply, kind, antialiased)
         if ply is not None and splats is not None:
             check_seen(ply, splats, dataset.cameras)
+            warn_of_misfit(ply, splats, dataset)
         from attnwarp.propagate.command import FitPlan, edit_dataset
 
         result, page = edit_dataset(
             dataset, splats, editor, instruction, settings, out,
-            fit_plan=FitPlan(fit_iterations, kind.value[:2], max_splats), source=source,
+            fit_plan=FitPlan(
+                fit_iterations or FIT_ITERATIONS,
+                (kind or Kind.two).value[:2],
+                max_splats or FIT_SPLATS,
+            ),
+            source=source,
             source_picture=source_picture, masks=masks, words=words,
             segmenter=segmenter or SEGMENTER, max_size=max_size, store=store.value, device=device,
             threads=threads,
@@ -165,3 +189,14 @@ def edit(
             f"{carried}"
         )
         typer.echo(page)
+
+
+def _check_splat_options(ply: Path | None, of_fit: dict[str, Any], of_file: dict[str, Any]) -> None:
+    """Refuse options that would change nothing."""
+    for name, value in (of_file if ply is None else of_fit).items():
+        if value is not None:
+            raise ValueError(
+                f"{name}: says how a PLY is read, and none is given; see --ply"
+                if ply is None
+                else f"{name}: is of the fit, and --ply gives the splats of {ply}; leave out one"
+            )

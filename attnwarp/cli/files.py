@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from attnwarp.cli.options import Kind, Reading
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, InputWarning
 
 if TYPE_CHECKING:
     from attnwarp.camera import Camera
@@ -21,6 +22,12 @@ COVERED = 0.002
 
 LOOK_SIZE = 256
 """Longest side in px of the renders that look for splats: a photograph's own takes its seconds."""
+
+LOOKS = 6
+"""Views whose renders are held against their pictures."""
+
+UNLIKE = 10**-1.8
+"""Mean squared error of renders, 18 dB, below which splats fit their pictures for certain."""
 
 UNSEEN = (
     "check that the splats and the cameras are of one scene, in the same coordinates and the same"
@@ -105,6 +112,59 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera]) -> None
             if float(render(splats, camera.resize(w, h), near=near).alpha.mean()) >= COVERED:
                 return
     raise InputError(f"{path}: its splats cover less than {COVERED:.1%} of each view; {UNSEEN}")
+
+
+def warn_of_misfit(path: Path, splats: Gaussians, dataset: Dataset) -> None:
+    """Warn of splats whose renders are unlike the pictures, such as splats that a trainer moved.
+
+    Of some views, where splats cover them, a render that is farther from the picture than one
+    colour a view explains nothing of it.
+
+    Args:
+        path: of the splats, for the message.
+        splats: of the scene.
+        dataset: its views.
+    """
+    import numpy as np
+    import torch
+
+    from attnwarp.fit import load_views
+    from attnwarp.propagate.scene import near_of
+    from attnwarp.render import render
+
+    there = [k for k, image in enumerate(dataset.image_paths) if image is not None]
+    if not there:
+        return
+    spread_out = np.linspace(0, len(there) - 1, LOOKS).round().astype(int)
+    chosen = [there[k] for k in dict.fromkeys(spread_out.tolist())]
+    views = load_views(dataset.select(chosen), max_size=LOOK_SIZE)
+    near = near_of(dataset.cameras, splats)
+    error = spread = 0.0
+    count = 0
+    for camera, image in zip(views.cameras, views.images, strict=True):
+        with torch.no_grad():
+            view = render(splats, camera, near=near)
+        alpha = view.alpha.numpy()
+        top = np.iinfo(image.dtype).max if image.dtype.kind == "u" else 1
+        colors = image.astype(np.float64) / top
+        shown = alpha > 0.5
+        if image.shape[2] == 4:
+            shown &= colors[..., 3] > 0.5
+        if not shown.any():
+            continue
+        true = colors[shown, :3]
+        error += float(((view.color.numpy()[shown] / alpha[shown, None] - true) ** 2).sum())
+        spread += float(((true - true.mean(0)) ** 2).sum())
+        count += true.size
+    if count and error > max(spread, UNLIKE * count):
+        psnr, plain = (-10 * np.log10(value / count) for value in (error, max(spread, 1e-9)))
+        warnings.warn(
+            f"{path}: where its splats cover the pictures, their renders are unlike them"
+            f" ({psnr:.1f} dB; one colour a view would have {plain:.1f}); {UNSEEN}: nerfstudio and"
+            " gsplat turn, move and scale a scene before they fit it",
+            InputWarning,
+            stacklevel=2,
+        )
 
 
 def check_inputs_stay(results: Iterable[Path], read: Iterable[Path | None]) -> None:

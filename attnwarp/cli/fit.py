@@ -14,6 +14,7 @@ from attnwarp.cli.files import (
     check_seen,
     read_splats,
     read_views,
+    warn_of_misfit,
     write_image,
 )
 from attnwarp.cli.options import (
@@ -203,6 +204,7 @@ def _fit(
     held_out = attnwarp.fit.load_views(test, max_size=max_size) if test is not None else None
     if first is not None and start is not None:
         check_seen(start, first, train.cameras)
+        warn_of_misfit(start, first, train)
         first = first.with_sh_degree(settings.sh_degree)
     else:
         first = attnwarp.fit.first_splats(

@@ -44,6 +44,9 @@ of a standard deviation changes no pixel by more than 0.6 % of the splat's peak.
 
 Coordinates = Literal["auto", "world", "relative"]
 
+FILTER_3D = "filter_3D"
+"""Property of Mip-Splatting's files."""
+
 LOGIT_OF_ZERO = -120.0
 LOGIT_OF_ONE = 40.0
 """Logits written for opacity 0 and 1, whose own are infinite.
@@ -69,11 +72,15 @@ def read_ply(
 
     For the 2D kind a third scale is dropped.
 
+    Of Mip-Splatting's files ``filter_3D``, the standard deviation of each splat's smoothing filter,
+    is merged into scales and opacities (Yu et al. 2024, the 3D smoothing
+    filter).
+
     Args:
         path: the file.
         kind: "2d" or "3d" to override the rule above.
         antialiased: overrides the comments ``SplatRenderMode: mip|default`` and ``antialiased
-            1|0``; False without any.
+            1|0``; without any, True of Mip-Splatting's files and else False.
 
     Returns:
         Gaussians in float32. ``x y z`` of type double that float32 cannot hold and that lie further
@@ -131,6 +138,17 @@ def read_ply(
             "check that the writer stored logarithms",
             log,
         )
+    with np.errstate(over="ignore"):
+        alpha = 1.0 / (1.0 + np.exp(-opacity))
+    if FILTER_3D in columns and kind == "3d":
+        scales, share = _filtered(path, columns, scales)
+        alpha *= share
+        if antialiased is None and not header.flags:
+            antialiased = True
+        _warn(
+            f"{path}: is of Mip-Splatting: its {FILTER_3D} is merged into scales and opacities, and"
+            f" the splats are {'' if antialiased else 'not '}rendered antialiased"
+        )
     if antialiased is None:
         antialiased = header.antialiased(path)
     offset, means = split_origin(xyz)
@@ -142,8 +160,6 @@ def read_ply(
             "does not fit float32",
             "remove the row",
         )
-    with np.errstate(over="ignore"):
-        alpha = 1.0 / (1.0 + np.exp(-opacity))
     return Gaussians(
         kind,
         torch.from_numpy(means),
@@ -475,6 +491,20 @@ def _refuse(
         raise FileFormatError(
             path, f"{value}in row {row} ({rows}): {what}; {remedy}", field=name, row=row
         )
+
+
+def _filtered(
+    path: Path, columns: Columns, scales: npt.NDArray[np.float32]
+) -> tuple[npt.NDArray[np.float32], Array]:
+    """(N, 3) scales of splats smoothed by their 3D filter, and (N,) what is left of opacities.
+
+    The covariance grows by the filter's, and the splat keeps its mass: its peak falls by the square
+    root of the ratio of determinants.
+    """
+    width = _column(path, columns, FILTER_3D, np.float64)
+    before = scales.astype(np.float64) ** 2
+    after = before + width[:, None] ** 2
+    return np.sqrt(after).astype(np.float32), np.sqrt((before / after).prod(axis=1))
 
 
 def _read_sh(path: Path, columns: Columns, n: int) -> npt.NDArray[np.float32]:

@@ -183,6 +183,7 @@ def _by_words(
     if kept:
         say(f"{kept} of {len(masks)} masks are those of an earlier run")
     say(_coverage(masks, cameras))
+    _say_empty(masks, cameras, f"--where: no {words!r} was detected in {{}} of {{}} views", say)
     return masks
 
 
@@ -247,18 +248,25 @@ def _masks(folder: Path, cameras: Any, say: Callable[[str], None]) -> list[npt.N
         raise InputError(f"--masks: {folder} is no folder; name one with a PNG for each view")
     paths = mask_files(folder, cameras)
     masks = [read_mask(path, camera) for path, camera in zip(paths, cameras, strict=True)]
-    black = [camera.name for mask, camera in zip(masks, cameras, strict=True) if not mask.any()]
-    if len(black) == len(masks):
+    if not any(mask.any() for mask in masks):
         raise InputError(
             f"--masks: every mask in {folder} is black, so nothing may change; white is edited"
         )
-    if black:
-        more = f" and {len(black) - MOST_NAMES} more" if len(black) > MOST_NAMES else ""
-        say(
-            f"--masks: {len(black)} of {len(masks)} are black, so nothing is edited in"
-            f" {', '.join(black[:MOST_NAMES])}{more}"
-        )
+    _say_empty(masks, cameras, "--masks: {} of {} are black", say)
     return masks
+
+
+def _say_empty(
+    masks: list[npt.NDArray[np.bool_]], cameras: Any, text: str, say: Callable[[str], None]
+) -> None:
+    """Name the views whose masks are empty; ``text`` has their number and that of all."""
+    empty = [camera.name for mask, camera in zip(masks, cameras, strict=True) if not mask.any()]
+    if empty:
+        more = f" and {len(empty) - MOST_NAMES} more" if len(empty) > MOST_NAMES else ""
+        say(
+            f"{text.format(len(empty), len(masks))}, so nothing is edited in"
+            f" {', '.join(empty[:MOST_NAMES])}{more}"
+        )
 
 
 def mask_files(folder: Path, cameras: Any) -> list[Path]:

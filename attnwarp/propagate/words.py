@@ -15,7 +15,13 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.digest import digest
-from attnwarp.editing.segment import Mask, Segmenter, segmenter_digest, segments_of
+from attnwarp.editing.segment import (
+    Mask,
+    NoDetectionError,
+    Segmenter,
+    segmenter_digest,
+    segments_of,
+)
 from attnwarp.errors import InputError
 from attnwarp.io.file import FileFormatError
 from attnwarp.io.lock import alone_in
@@ -50,11 +56,11 @@ def masks_by_words(
         watch: told how it stands after each view.
 
     Returns:
-        (H, W) bool of each view, and how many were read back.
+        (H, W) bool of each view, empty where it shows nothing that the words name, and how many
+        were read back.
 
     Raises:
-        NoDetectionError: a view shows nothing that the words name. Masks of the views before it
-            are kept.
+        NoDetectionError: no view shows anything that the words name.
         InputError: a mask was painted over, a picture is there that no such run wrote, or another
             run writes to the folder.
 
@@ -85,12 +91,18 @@ def masks_by_words(
             mask = _kept(files, picture, of)
             kept += mask is not None
             if mask is None:
-                mask = segment(k, to_float(image))
+                try:
+                    mask = segment(k, to_float(image))
+                except NoDetectionError:  # seen from elsewhere, the thing may be out of the picture
+                    mask = np.zeros(image.shape[:2], np.bool_)
                 # The record first: a picture without one is taken for somebody's own.
                 files.write_json(record_of(picture), {"of": of, "sha256": digest(mask)})
                 files.write_picture(picture, mask_picture(torch.from_numpy(mask)))
             masks.append(mask)
             watch(Step(k + 1, len(images), f"mask of {name}"))
+    if not any(mask.any() for mask in masks):
+        first = cameras[0].name
+        raise NoDetectionError(words, f"{first} or any other" if len(masks) > 1 else first)
     return masks, kept
 
 

@@ -114,7 +114,7 @@ def test_further_properties_elements_and_missing_normals_do_not_matter(tmp_path)
     columns = columns_of(3, np.random.default_rng(0))
     for name in ("nx", "ny", "nz"):
         del columns[name]
-    columns = {"segment": np.ones(3), **columns, "filter_3D": np.ones(3)}
+    columns = {"segment": np.ones(3), **columns, "label": np.ones(3)}
     g = read_ply(by_hand(tmp_path / "a.ply", columns, 3))
     assert np.array_equal(g.means[:, 2].numpy(), columns["z"])
 
@@ -346,6 +346,31 @@ def test_the_antialias_comments_of_other_programs_are_understood(tmp_path, comme
         tmp_path / "a.ply", columns_of(2, np.random.default_rng(0)), 2, comments=comments
     )
     assert read_ply(path).antialiased is expected
+
+
+@pytest.mark.parametrize("given", [None, False])
+def test_the_filter_of_mip_splatting_is_merged_into_scales_and_opacities(tmp_path, given):
+    """Oracle: the covariance matrices of both, in float64."""
+    rng = np.random.default_rng(5)
+    columns = columns_of(4, rng)
+    columns["filter_3D"] = rng.uniform(0.1, 2, 4).astype(np.float32)
+    path = by_hand(tmp_path / "mip.ply", columns, 4)
+    with pytest.warns(InputWarning, match="is of Mip-Splatting"):
+        read = read_ply(path, antialiased=given)
+    assert read.antialiased is (given is None)
+    turn = rng.normal(size=(3, 3))
+    turn = np.linalg.qr(turn)[0]  # any axes: the filter is a sphere
+    for k in range(4):
+        before = turn @ np.diag(np.exp([2.0 * columns[f"scale_{i}"][k] for i in range(3)])) @ turn.T
+        after = before + columns["filter_3D"][k].astype(float) ** 2 * np.eye(3)
+        wide = np.sqrt(np.linalg.eigvalsh(after))
+        np.testing.assert_allclose(np.sort(read.scales[k].numpy()), wide, rtol=1e-5)
+        share = np.sqrt(np.linalg.det(before) / np.linalg.det(after))
+        opacity = share / (1 + math.exp(-columns["opacity"][k]))
+        assert float(read.opacities[k]) == pytest.approx(opacity, rel=1e-5)
+    columns["filter_3D"][2] = np.nan
+    with pytest.raises(FileFormatError, match="filter_3D: nan in row 2"):
+        read_ply(by_hand(tmp_path / "bad.ply", columns, 4))
 
 
 def test_contradicting_antialias_comments_need_the_caller(tmp_path):

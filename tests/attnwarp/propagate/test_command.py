@@ -26,16 +26,18 @@ from typer.testing import CliRunner
 from attnwarp import Camera, propagate
 from attnwarp.cli import edit
 from attnwarp.cli.main import app
-from attnwarp.editing.segment import GroundedSam, load_segmenter
+from attnwarp.editing.segment import GroundedSam, NoDetectionError, load_segmenter
 from attnwarp.errors import InputError
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp.io.images import encode_png
 from attnwarp.io.lock import alone_in
+from attnwarp.propagate import command
 from attnwarp.propagate import page as page_of_edits
 from attnwarp.propagate.command import mask_files, read_mask, read_over_black
 from attnwarp.propagate.folder import Folder
 from attnwarp.propagate.scene import to_float
 from attnwarp.propagate.words import masks_by_words, words_folder
+from attnwarp.render import render
 
 runner = CliRunner()
 QUICK = (
@@ -417,6 +419,53 @@ def test_splats_that_no_camera_sees_are_refused_by_name_before_the_edit(place, t
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("how", ["turned", "scaled", "as they are"])
+def test_splats_that_do_not_show_the_pictures_are_warned_about(how, place, tmp_path):
+    """Oracle: PSNR over what the splats cover, and that of one colour a view, in numpy."""
+    model, views = splats(), cameras()
+    c, s = np.cos(1.6), np.sin(1.6)
+    turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float32)
+    means = {"turned": model.means @ turn.T, "scaled": 0.4 * model.means}.get(how, model.means)
+    moved = replace(model, means=means)
+    write_ply(tmp_path / "moved.ply", moved)
+    errors, spreads = [], []
+    for camera, image in zip(views, pictures(model, views), strict=True):
+        view = render(read_ply(tmp_path / "moved.ply"), camera)
+        alpha = view.alpha.numpy()
+        true = (np.rint(255 * image) / 255)[alpha > 0.5]
+        errors.append((view.color.numpy()[alpha > 0.5] / alpha[alpha > 0.5, None] - true) ** 2)
+        spreads.append((true - true.mean(0)) ** 2)
+    psnr, plain = (-10 * np.log10(np.concatenate(x).mean()) for x in (errors, spreads))
+    assert (psnr < min(plain, 18)) == (how != "as they are")
+    result = run(place, tmp_path / "out", "--ply", tmp_path / "moved.ply", "--stages", 1)
+    assert result.exit_code == 0, result.output
+    said = f"are unlike them ({psnr:.1f} dB; one colour a view would have {plain:.1f})"
+    assert (said in result.stderr) == (how != "as they are")
+
+
+def test_the_kind_that_a_person_names_is_that_of_the_splats_that_are_given(place, tmp_path):
+    """Oracle: the PLY that the edit leaves; its splats have a third scale that no rule takes for
+    flat."""
+    flat = splats()
+    assert flat.kind == "2d"
+    write_ply(tmp_path / "thick.ply", flat, third_scale=float(flat.scales.max()) / 2)
+    text = (tmp_path / "thick.ply").read_bytes()
+    head, body = text.split(b"end_header\n", 1)
+    lines = [line for line in head.splitlines() if not line.startswith(b"comment")]
+    (tmp_path / "thick.ply").write_bytes(b"\n".join([*lines, b"end_header\n"]) + body)
+    for kind, ending in (("2dgs", "2d"), ("3dgs", "3d")):
+        out = tmp_path / kind
+        result = run(place, out, "--ply", tmp_path / "thick.ply", "--kind", kind, "--stages", 1)
+        assert result.exit_code == 0, result.output
+        assert read_ply(out / "edited.ply").kind == ending
+    for more, message in (
+        (("--ply", tmp_path / "thick.ply", "--max-splats", 9), "--max-splats: is of the fit"),
+        (("--no-antialiased",), "--antialiased: says how a PLY is read"),
+    ):
+        result = run(place, tmp_path / "none", *more)
+        assert result.exit_code == 2 and message in result.output
+
+
 def test_stages_sources_and_a_size_that_cannot_be_had_are_said_in_one_line_each(place, tmp_path):
     """Oracle: the manifest and the pictures that the edit leaves."""
     more = ("--ply", place / "splats.ply", "--stages", 9, "--views-per-stage", 2, "--size", 31)
@@ -537,11 +586,34 @@ def tiny_segmenter(folder, *, sam_seed=2, **thresholds):
     return GroundedSam.from_folders(folder / "dino", folder / f"sam{sam_seed}", **thresholds)
 
 
-def test_words_that_a_view_does_not_show_are_one_clear_line_with_the_view(place, tmp_path):
-    result = run(place, tmp_path, "--ply", place / "splats.ply", "--where", "snowman")
-    assert result.exit_code == 2
-    assert "no 'snowman' was detected in view images/v0.png" in result.output
+def test_words_that_no_view_shows_are_one_clear_line(place, tmp_path):
+    for _ in range(2):  # kept masks say no more
+        result = run(place, tmp_path, "--ply", place / "splats.ply", "--where", "snowman")
+        assert result.exit_code == 2
+        assert "no 'snowman' was detected in view images/v0.png or any other" in result.output
     assert not (tmp_path / "edited.ply").exists()
+
+
+def test_a_view_that_does_not_show_the_words_is_named_and_has_an_empty_mask(tmp_path):
+    """Oracle: a segmenter that knows which picture shows something."""
+
+    class Bright:
+        def segment(self, image, words):
+            if image.max() < 0.5:
+                raise NoDetectionError(words)
+            return np.asarray(image[..., 0] > 0.5)
+
+    views = cameras()[:3]
+    images = [np.zeros((camera.height, camera.width, 3), np.float32) for camera in views]
+    images[1][4:9, 5:7] = 1
+    arguments = (Bright(), "bear", views, images, tmp_path, lambda step: None)
+    for kept in (0, 3):
+        masks, again = masks_by_words(*arguments)
+        assert again == kept
+        assert [int(mask.sum()) for mask in masks] == [0, 10, 0]
+    said = []
+    command._say_empty(masks, views, "{} of {} views", said.append)
+    assert said == [f"2 of 3 views, so nothing is edited in {views[0].name}, {views[2].name}"]
 
 
 def test_a_folder_of_another_edit_is_one_clear_line(place, tmp_path):
