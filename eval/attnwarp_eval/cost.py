@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -211,17 +211,43 @@ def environment() -> dict[str, Any]:
     }
 
 
+_plugins: dict[str, str] = {}
+"""SHA-256 of the source of each plugin as it was imported."""
+
+
+def count_plugin(module: str, file: Path) -> None:
+    """Let the source of a plugin be part of the code that cells are computed by.
+
+    Args:
+        module: its name.
+        file: of the module; of a package all files count.
+    """
+    whole = file.name == "__init__.py"
+    _plugins[module] = _hash_of(file.parent, file.parent.rglob("*.py") if whole else [file])
+    source_hash.cache_clear()
+    environment.cache_clear()
+
+
 @cache
 def source_hash() -> str:
-    """SHA-256 of every source file of both packages.
+    """SHA-256 of every source file of both packages, and of the plugins that are loaded.
 
     A revision would not do: an installed copy has none, and files of a checkout change without one.
     """
+    packages = [Path(attnwarp.__file__).parent, Path(__file__).parent]
+    parts = {package.name: _hash_of(package, package.rglob("*.py")) for package in packages}
     total = hashlib.sha256()
-    for package in (Path(attnwarp.__file__).parent, Path(__file__).parent):
-        for path in sorted(package.rglob("*.py")):
-            total.update(f"{package.name}/{path.relative_to(package).as_posix()}\n".encode())
-            total.update(hashlib.sha256(path.read_bytes()).digest())
+    for name, part in (*parts.items(), *sorted(_plugins.items())):
+        total.update(f"{name} {part}\n".encode())
+    return total.hexdigest()
+
+
+def _hash_of(folder: Path, files: Iterable[Path]) -> str:
+    """SHA-256 of the names and contents of files below a folder."""
+    total = hashlib.sha256()
+    for path in sorted(files):
+        total.update(f"{path.relative_to(folder).as_posix()}\n".encode())
+        total.update(hashlib.sha256(path.read_bytes()).digest())
     return total.hexdigest()
 
 

@@ -7,12 +7,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from attnwarp_eval.cli.shell import TOO_LITTLE, Regression, check_not_of_run, clear_errors, fail
+from attnwarp_eval.cli.shell import (
+    TOO_LITTLE,
+    Regression,
+    check_not_of_run,
+    clear_errors,
+    fail,
+    warn,
+)
 
 if TYPE_CHECKING:
     from attnwarp_eval.compare import Snapshot
     from attnwarp_eval.compare.judge import Comparison
     from attnwarp_eval.compare.pictures import Pictures
+    from attnwarp_eval.study.results import Results
 
 
 def compare(
@@ -38,6 +46,7 @@ def compare(
 
     Exit code 1 if so, 3 if too little can be compared.
     """
+    from attnwarp.errors import InputError
     from attnwarp_eval.canonical_json import write_json
     from attnwarp_eval.compare import compare
     from attnwarp_eval.compare.write import as_json, document
@@ -47,19 +56,23 @@ def compare(
     with clear_errors():
         outputs = {"--markdown": markdown, "--json": json, "--html": html}
         _check_outputs(baseline, run, outputs, update)
-        measured, pictures = _run(run)
+        if not update and baseline.is_dir() and run.is_dir() and baseline.samefile(run):
+            raise InputError(f"{run}: is the baseline too, so nothing can differ; name two runs")
+        measured, pictures, notes = _run(run)
         if update:
             _update(baseline, measured, pictures)
             return
         trusted, former_pictures = _baseline(baseline, measured)
         result = compare(trusted, measured)
+        for note in notes:
+            warn(note)
         if markdown is not None:
-            write_atomic(markdown, write.markdown(document(result)).encode())
+            write_atomic(markdown, write.markdown(document(result, notes)).encode())
         if html is not None:
-            text = _page(result, trusted, measured, former_pictures, pictures)
+            text = _page(result, trusted, measured, former_pictures, pictures, notes)
             write_atomic(html, text.encode())
         if json is not None:
-            write_json(json, as_json(result))
+            write_json(json, as_json(result, notes))
         _print(result)
     if result.regressed:
         accept = "accept it with --update"
@@ -99,7 +112,12 @@ def _check_outputs(
 
 
 def _page(
-    result: Comparison, trusted: Snapshot, run: Snapshot, before: Pictures, after: Pictures
+    result: Comparison,
+    trusted: Snapshot,
+    run: Snapshot,
+    before: Pictures,
+    after: Pictures,
+    notes: list[str],
 ) -> str:
     from attnwarp_eval.compare.pictures import largest_changes
     from attnwarp_eval.compare.write import page
@@ -110,18 +128,36 @@ def _page(
         why_none = f"The {' and the '.join(lacking)} has no pictures."
     else:
         why_none = "No pictured view changed by more than the tolerance of a figure."
-    return page(result, changes, why_none)
+    return page(result, changes, why_none, notes)
 
 
-def _run(folder: Path) -> tuple[Snapshot, Pictures]:
-    """A run and its pictures; its records, which are many times as large, are given back."""
+def _run(folder: Path) -> tuple[Snapshot, Pictures, list[str]]:
+    """A run, its pictures, and what a reader has to know of it; its records, which are many times
+    as large, are given back.
+    """
     from attnwarp_eval.compare.pictures import pictures_of_run
     from attnwarp_eval.compare.snapshot import snapshot
     from attnwarp_eval.report import read_results
     from attnwarp_eval.study.store import Store
 
     results = read_results(Store(folder))
-    return snapshot(results), pictures_of_run(results, folder)
+    return snapshot(results), pictures_of_run(results, folder), _of_other_code(results, folder)
+
+
+def _of_other_code(results: Results, folder: Path) -> list[str]:
+    """A line where the run was not computed by the code at hand: it says nothing about that."""
+    from attnwarp_eval.cost import environment
+    from attnwarp_eval.study.record import Environment
+
+    this = Environment.from_json(environment())
+    records = results.all_records()
+    other = sum(not record.environment.same_code(this) for record in records)
+    if not other:
+        return []
+    return [
+        f"{other} of the {len(records)} cells in {folder} were computed by other code than is here,"
+        " so the comparison does not judge what is here; for that, run the study into a new folder"
+    ]
 
 
 def _baseline(path: Path, run: Snapshot) -> tuple[Snapshot, Pictures]:
@@ -131,7 +167,7 @@ def _baseline(path: Path, run: Snapshot) -> tuple[Snapshot, Pictures]:
     from attnwarp_eval.compare.pictures import pictures_of_baseline
 
     if path.is_dir():
-        trusted, pictures = _run(path)
+        trusted, pictures, _ = _run(path)
         if trusted.missing:
             raise InputError(
                 f"{path}: {len(trusted.missing)} cells are missing, so it is no baseline; run its"

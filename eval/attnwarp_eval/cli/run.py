@@ -290,8 +290,8 @@ def run_study(
                 if planned.other_code:
                     typer.echo(
                         f"attnwarp-eval: {planned.other_code} of the cells in {store.root} were"
-                        " computed by other code than this; they are kept, and the report says"
-                        " so. Name another folder with --out to start afresh.",
+                        " computed by other code than this; they are kept, and the report names"
+                        " it. To judge this code, name another folder with --out.",
                         err=True,
                     )
                 others = len(store.done() - {cell.id for cell in planned.cells})

@@ -454,14 +454,18 @@ def _flat(table: ByView) -> dict[str, float]:
 
 
 def _means_of_shared(before: ByView, now: ByView) -> tuple[float, float]:
-    """Means over scenes of the means over the views that both define; NaN without any."""
+    """Means over scenes of the means over the views that both define; where there are none, over
+    those that each defines, and NaN without any.
+    """
     names = _flat(before).keys() & _flat(now).keys()
     one, other = _flat(before), _flat(now)
     shared = {n for n in names if math.isfinite(one[n]) and math.isfinite(other[n])}
 
     def mean(table: ByView) -> float:
         return _mean_of_defined(
-            _mean_of_defined(x for view, x in views.items() if f"{scene}/{view}" in shared)
+            _mean_of_defined(
+                x for view, x in views.items() if not shared or f"{scene}/{view}" in shared
+            )
             for scene, views in table.items()
         )
 

@@ -52,14 +52,18 @@ def summary(comparison: Comparison) -> str:
     return f"{outcome}: {text}; {len(comparison.faults)} missing or changed"
 
 
-def document(comparison: Comparison) -> Report:
+def document(comparison: Comparison, notes: Sequence[str] = ()) -> Report:
     """The comparison as a document: faults first, then every verdict but "equal".
+
+    Args:
+        comparison: the verdicts.
+        notes: sentences that come before them.
 
     Example:
         >>> document(Comparison("quick", True, 3, (), ())).title
         'Comparison of study quick'
     """
-    lead = [f"**{summary(comparison)}**", _method(comparison)]
+    lead = [f"**{summary(comparison)}**", *(f"**Note**: {n}." for n in notes), _method(comparison)]
     if comparison.too_little:
         lead.append(f"Too little to compare: {comparison.too_little}.")
     sections = []
@@ -79,20 +83,26 @@ def document(comparison: Comparison) -> Report:
     return Report(f"Comparison of study {comparison.study}", lead, sections)
 
 
-def page(comparison: Comparison, changes: Sequence[Change], why_none: str = "") -> str:
+def page(
+    comparison: Comparison,
+    changes: Sequence[Change],
+    why_none: str = "",
+    notes: Sequence[str] = (),
+) -> str:
     """The comparison as one HTML file, with every figure, and the pictures of what changed most.
 
     Args:
         comparison: the verdicts.
         changes: the pictured views that changed, the largest change first.
         why_none: why there are no pictures, where ``changes`` is empty.
+        notes: sentences that come before the verdicts.
 
     Example:
         >>> text = page(Comparison("quick", True, 3, (), ()), [], "No figure changed.")
         >>> "No figure changed." in text
         True
     """
-    report = document(comparison)
+    report = document(comparison, notes)
     pictures = Section("Pictures of what changed most", [why_none] if not changes else [HOW])
     if changes:
         pictures.gallery = Gallery([(_sentence(change), _sliders(change)) for change in changes])
@@ -135,7 +145,7 @@ def _sliders(change: Change) -> list[Slider]:
     ]
 
 
-def as_json(comparison: Comparison) -> dict[str, Any]:
+def as_json(comparison: Comparison, notes: Sequence[str] = ()) -> dict[str, Any]:
     """Everything, as JSON has it: null where undefined.
 
     Example:
@@ -148,6 +158,7 @@ def as_json(comparison: Comparison) -> dict[str, Any]:
                 "regressed": comparison.regressed,
                 "too_little": comparison.too_little,
                 "summary": summary(comparison),
+                **({"notes": list(notes)} if notes else {}),
                 **asdict(comparison),
             }
         )

@@ -70,7 +70,6 @@ class Measured:
     """What the records of one variant of a scene say of its warp.
 
     Attributes:
-        scene: content hash of the scene.
         edited: whether an editing method was measured, else a fit alone.
         settings: of the method's warp; None where it has none.
         exact_mask: whether the method injects features where the source truly sees the surface.
@@ -78,7 +77,6 @@ class Measured:
         edits: by "edit/view", those of which the run has pictures.
     """
 
-    scene: str = ""
     edited: bool = False
     settings: WarpSettings | None = None
     exact_mask: bool = False
@@ -102,7 +100,13 @@ class Measured:
 
 
 def measured(
-    folder: Path, cells: Iterable[Mapping[str, Any]], scene: str, seed: int, source: str
+    folder: Path,
+    cells: Iterable[Mapping[str, Any]],
+    scene: str,
+    seed: int,
+    source: str,
+    *,
+    content: str,
 ) -> dict[str, Measured]:
     """What a run has of its variants: those that edit the scene, or fit splats to it.
 
@@ -111,9 +115,11 @@ def measured(
         cells: the expected ones, as ``study.json`` lists them.
         scene, seed: of the cells to read.
         source: name of the source view.
+        content: hash of the scene as it is now.
 
     Raises:
         StoreError: a record is damaged.
+        InputError: a cell was measured of the scene as it was before.
     """
     from attnwarp_eval.study.probes import probes
 
@@ -128,7 +134,12 @@ def measured(
         if own.times_in_turn:
             continue  # several variants in one record, for their seconds alone
         read = partial(_measured, folder, source, own)
-        one = store.read_as(cell["id"], read)
+        measured_of, one = store.read_as(cell["id"], read)
+        if measured_of != content:
+            raise InputError(
+                f"{folder}: the scene {scene!r} has changed since the run was made; run the study"
+                " again, or name the scene instead of the run"
+            )
         for name in cell["variants"]:
             if one is None:
                 sampled.add(name)
@@ -141,24 +152,26 @@ def measured(
     return {name: one for name, one in result.items() if one.edited or name not in sampled}
 
 
-def _measured(folder: Path, source: str, own: Probe[Any], data: dict[str, Any]) -> Measured | None:
-    """From the JSON of a record; None where it neither edits nor fits."""
+def _measured(
+    folder: Path, source: str, own: Probe[Any], data: dict[str, Any]
+) -> tuple[str, Measured | None]:
+    """Hash of the scene, and what a record has of it; None where it neither edits nor fits."""
     from attnwarp_eval.study.probes.fit import folder_of
 
     record = own.read(data)
     spec = record.spec
     edited = "edit" in spec
     if not edited and "fit" not in spec:
-        return None
+        return spec["scene"], None
     warp = spec["settings"].get("warp") if edited else None
-    return Measured(
-        spec["scene"],
+    one = Measured(
         edited,
         None if warp is None else WarpSettings.from_dict(warp),
         spec.get("mask") == "truth",
         folder_of(folder, spec) / "splats.ply" if "fit" in spec else None,
         _edits(folder, record, source),
     )
+    return spec["scene"], one
 
 
 def _edits(folder: Path, record: Record[Any], source: str) -> dict[str, RunEdit]:

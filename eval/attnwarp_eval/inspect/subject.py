@@ -230,13 +230,9 @@ def of_run(
         )
     size = size or study.size
     views = world(files[name], size)
-    records = measured(folder, stored.cells, name, seed, views.source.name)
-    for own in records.values():
-        if own.scene != views.content_hash:
-            raise InputError(
-                f"{folder}: the scene {name!r} has changed since the run was made; run the study"
-                " again, or name the scene instead of the run"
-            )
+    records = measured(
+        folder, stored.cells, name, seed, views.source.name, content=views.content_hash
+    )
     pictured = [name for name, own in records.items() if own.edits]
     edited = tuple(dict.fromkeys(view for name in pictured for view in records[name].edits))
     for view in edited:

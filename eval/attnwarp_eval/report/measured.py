@@ -69,13 +69,16 @@ def _environments(records: list[Record[Any]]) -> list[str]:
     many.
     """
     counted: dict[str, int] = {}
+    states = {(record.environment.revision, record.environment.source) for record in records}
     for record in records:
         environment = record.environment
         revision = environment.revision
         code = f"revision `{revision[:12]}`" if revision else "an installed copy"
         if environment.dirty:
             code += " with local changes"
-        if environment.source and (environment.dirty or not revision):
+        # One revision has several sources where plugins changed.
+        several = sum(other == revision for other, _ in states) > 1
+        if environment.source and (environment.dirty or not revision or several):
             code += f" (source `{environment.source[:12]}`)"
         versions = ", ".join(f"{name} {version}" for name, version in environment.versions.items())
         machine = environment.machine

@@ -227,7 +227,8 @@ def export(
     """Write a scene as a data set: transforms.json, images/*.png and points.ply.
 
     One view of eight is in the split "test", the others in "train". Files that exist are
-    overwritten; a folder without transforms.json is one whose export did not end.
+    overwritten, and pictures of a former export removed; a folder without transforms.json is one
+    whose export did not end.
 
     Args:
         scene: any of scenes/.
@@ -260,4 +261,8 @@ def export(
     splits: list[str | None] = ["test" if out else "train" for out in held_out(views)]
     dataset = Dataset(cameras, paths, cloud.points, cloud.colors, splits)
     write_transforms(folder, dataset, points_name="points.ply")
+    # Pictures of a former export with other views: programs that read the folder would mix both.
+    for other in set((folder / "images").glob("*.png")) - set(paths):
+        if EXPORTED.fullmatch(f"images/{other.name}"):
+            other.unlink()
     return dataset

@@ -7,8 +7,10 @@ import os
 from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import entry_points
+from pathlib import Path
 
 from attnwarp.errors import InputError
+from attnwarp_eval.cost import count_plugin
 
 GROUP = "attnwarp_eval"
 """Group of entry points: each names a module of an installed package."""
@@ -28,12 +30,14 @@ def load_plugins() -> None:
     """
     for module, named_by in _named():
         try:
-            importlib.import_module(module)
+            file = importlib.import_module(module).__file__
         except (Exception, SystemExit) as error:
             raise InputError(
                 f"{named_by}: the plugin {module!r} cannot be imported:"
                 f" {type(error).__name__}: {' '.join(str(error).split())}"
             ) from error
+        if file is not None and file.endswith(".py"):
+            count_plugin(module, Path(file))
 
 
 def plugin_modules() -> list[str]:

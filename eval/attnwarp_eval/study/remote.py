@@ -6,15 +6,18 @@ import os
 import shutil
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from attnwarp.errors import InputError
 from attnwarp_eval.cost import environment, source_hash
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import MeshSpec
 from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.plugins import load_plugins
 from attnwarp_eval.study.probes.base import Probe
 from attnwarp_eval.study.record import Failure, Json
 from attnwarp_eval.study.store import Store
@@ -26,7 +29,7 @@ class Code:
     """What a process computes with.
 
     Attributes:
-        source: SHA-256 of the source files of both packages.
+        source: SHA-256 of the source files of both packages and of the plugins.
         versions: of Python (major and minor) and of the packages that results depend on.
         worker: its name in the cluster; empty outside one.
     """
@@ -51,6 +54,8 @@ class Code:
 
 def this_code() -> Code:
     """The code of this process."""
+    with suppress(InputError):  # a worker without a plugin has other code
+        load_plugins()
     versions = dict(environment()["versions"])
     versions["python"] = "{}.{}".format(*sys.version_info[:2])
     return Code(source_hash(), versions)

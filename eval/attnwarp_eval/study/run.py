@@ -82,6 +82,7 @@ def plan(study: Study, store: Store) -> Plan:
     cells = cells_of(study, scenes)
     _check_names(study, list(scenes.values()), cells)
     done = store.done()
+    load_plugins()  # whose source is part of the code
     this = Environment.from_json(environment())
     todo: list[Cell] = []
     other_code = 0

@@ -47,5 +47,10 @@ def test_an_export_is_made_anew_in_its_own_folder(tmp_path):
     for views in ("2", "3"):
         done = CliRunner().invoke(app, [*EXPORT, str(tmp_path / "out"), "--views", views])
         assert done.exit_code == 0, done.output
+        own = tmp_path / "out" / "images" / "mine.png"
+        own.write_bytes(b"")
     frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
     assert len(frames) == 3
+    # No picture of the former export stays among these, and those of others do.
+    there = {path.relative_to(tmp_path / "out").as_posix() for path in own.parent.iterdir()}
+    assert there == {frame["file_path"] for frame in frames} | {"images/mine.png"}

@@ -22,9 +22,10 @@ from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.compare import Snapshot, compare, read_baseline, read_snapshot, write_baseline
-from attnwarp_eval.compare.judge import FEWEST_SCENES
+from attnwarp_eval.compare.judge import FEWEST_SCENES, _means_of_shared
 from attnwarp_eval.compare.snapshot import Figure, Measured, definition, shortened, snapshot
 from attnwarp_eval.compare.write import document, summary
+from attnwarp_eval.cost import environment
 from attnwarp_eval.metrics.gates import GATES, gated
 from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.report.results import read_results
@@ -129,7 +130,38 @@ def test_a_planted_regression_is_exit_code_1_and_named(stored, run, name):
     assert done.exit_code == 1, done.output
     assert expected in done.stdout
     assert done.stdout.splitlines()[-1].startswith("regression: ")
-    assert done.stderr.count("\n") == 1
+    warned, said = done.stderr.splitlines()
+    assert "cells in" in warned and "a regression against" in said
+
+
+def test_a_run_of_other_code_is_said_to_be_one_in_everything_that_is_written(stored, run, tmp_path):
+    """Oracle: the stored records, which former code wrote, and records with this code's own."""
+    said = f"16 of the 16 cells in {run} were computed by other code than is here"
+    files = {name: tmp_path / f"compare.{name}" for name in ("markdown", "html", "json")}
+    options = [text for name, path in files.items() for text in (f"--{name}", path)]
+    done = gate(stored / "baseline.jsonl", run, *options)
+    assert done.exit_code == 0 and said in done.stderr
+    for path in files.values():
+        assert said in path.read_text()
+    store = Store(run)
+    for cell in store.read_study()["cells"]:
+        record = store.read(cell["id"])
+        del record["sha256"]
+        store.write(record | {"environment": environment()})
+    done = gate(stored / "baseline.jsonl", run, *options)
+    assert done.exit_code == 0 and done.stderr == ""
+    assert "notes" not in json.loads(files["json"].read_text())
+    done = gate(run, run)
+    assert done.exit_code == 2 and "is the baseline too, so nothing can differ" in done.stderr
+
+
+def test_a_figure_that_is_lost_has_the_value_that_it_had():
+    before = {"a": {"v": 1.0, "w": 3.0}, "b": {"v": 6.0}}
+    lost = {"a": {"v": math.nan, "w": math.nan}, "b": {"v": math.nan}}
+    had, has = _means_of_shared(before, lost)
+    assert had == 4.0 and math.isnan(has)
+    # Where some views define it on both sides, these are compared.
+    assert _means_of_shared(before, {**lost, "a": {"v": 2.0, "w": math.nan}}) == (1.0, 2.0)
 
 
 def test_depth_that_is_1_percent_off_is_a_regression(stored, run):

@@ -173,6 +173,25 @@ def test_a_hostile_study_is_one_line_without_control_characters(tmp_path):
         assert result.stderr.count("\n") == 1 and "\x1b" not in result.stderr
 
 
+def test_a_run_without_edits_is_not_shown_on_a_scene_that_has_changed(tmp_path):
+    """Oracle: the hash of the scene that ships, and another."""
+    now = world("spheres", SIZE).content_hash
+    study = STUDY | {"views": [], "variants": {"plain": {}}, "probes": {"warp": ["plain"]}}
+    for content in (now, "0" * 64):
+        store = Store(tmp_path / content[:4])
+        spec = {"probe": "warp", "scene": content, "size": SIZE, "spp": 1, "seed": 3}
+        record = {**written_runs.record([], spec=spec), "id": digest(spec)}
+        store.write(record)
+        cell = {"id": record["id"], "title": "plain", "scene": "spheres", "variants": ["plain"]}
+        cells = [cell | {"probe": "warp", "seed": 3}]
+        store.write_study({"study": study, "scenes": {}, "cells": cells})
+        if content == now:
+            assert subject.of_run(store.root).measured == {}
+            continue
+        with pytest.raises(InputError, match="'spheres' has changed since the run was made"):
+            subject.of_run(store.root)
+
+
 def test_runs_that_do_not_fit_and_damaged_ones_are_refused(tmp_path):
     run = make(tmp_path / "changed", content="0" * 64)
     with pytest.raises(InputError, match="'spheres' has changed since the run was made"):

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from attnwarp.errors import InputError
+from attnwarp_eval import cost
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, editing_methods, parse_study, plugins
 from attnwarp_eval.study.probes import probe, unregister
@@ -34,6 +35,35 @@ STUDY = {
     "variants": {"plain": {}, "double": {"stretch": 2.0, "method": "mine"}},
     "probes": {"chord": ["plain", "double"]},
 }
+
+
+@pytest.fixture(autouse=True)
+def plugins_of_this_test(monkeypatch):
+    """Plugins of one test are not part of the code of others."""
+    monkeypatch.setattr(cost, "_plugins", {})
+    yield
+    cost.source_hash.cache_clear()
+    cost.environment.cache_clear()
+
+
+@pytest.mark.parametrize("package", [False, True])
+def test_cells_of_a_plugin_that_changed_are_of_other_code(tmp_path, monkeypatch, package):
+    cost.source_hash.cache_clear()
+    alone = cost.source_hash()
+    file = tmp_path / ("my_other/inner.py" if package else "my_other.py")
+    file.parent.mkdir(exist_ok=True)
+    if package:
+        (tmp_path / "my_other/__init__.py").write_text("from my_other import inner\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("ATTNWARP_PLUGINS", "my_other")
+    hashes = []
+    for text in ("answer = 1\n", "answer = 2\n", "answer = 1\n"):
+        file.write_text(text)
+        plugins.load_plugins.__wrapped__()
+        hashes.append(cost.environment()["source"])
+        for name in ("my_other", "my_other.inner"):
+            sys.modules.pop(name, None)
+    assert hashes[0] == hashes[2] and len({alone, *hashes}) == 3
 
 
 def test_a_plugin_registers_its_probe_and_its_method(tmp_path, monkeypatch):
