@@ -223,6 +223,28 @@ def inverts(name: str, data: Data = CACHE / "data", weights: Cards = WEIGHTS) ->
 
 
 @app.command()
+def guidance(
+    names: Annotated[list[str], typer.Argument(help="Of editors, such as small-plain small.")],
+    data: Data = CACHE / "data", weights: Cards = WEIGHTS,
+    to: Annotated[Path, typer.Option(help="Folder of the report.")] = REPORTS,
+) -> None:  # fmt: skip
+    """Hold guidances against each other on worlds for choices, into guidance.md. Ten minutes an editor; a stopped run goes on."""
+    from attnwarp.io.file import write_atomically
+    from training.editing_pairs import load_pairs
+    from training.editor_guidance import figures_of, guidance_report, shown
+
+    worlds = shown(load_pairs(data, "edit-choice"))
+    results = {}
+    for name in names:
+        editor, size, kept = judged(name, weights, "guidance")
+        results[name] = figures_of(editor, worlds, kept, size=size)
+    text = guidance_report(results, worlds=len(worlds))
+    to.mkdir(parents=True, exist_ok=True)
+    write_atomically(to / "guidance.md", lambda stream: stream.write(text.encode()))
+    typer.echo(text)
+
+
+@app.command()
 def sheet(
     name: str, data: Data = CACHE / "data", weights: Cards = WEIGHTS,
     to: Annotated[Path, typer.Option(help="Folder of the picture.")] = REPORTS,

@@ -38,9 +38,15 @@ def show(
     """What a scene contains, and how its pictures are made."""
     with clear_errors():
         from attnwarp_eval.scene.file import load_scene
-        from attnwarp_eval.truth.show import describe
+        from attnwarp_eval.truth.show import contents, pictures_made
 
-        typer.echo(describe(load_scene(scene)))
+        loaded = load_scene(scene)
+        typer.echo(contents(loaded))
+        with progress() as progressing:
+            # Measured once and kept; minutes where light goes far, as through glass.
+            progressing.step(f"{loaded.name}: measuring how often its light bounces")
+            made = pictures_made(loaded)
+        typer.echo(made)
 
 
 @app.command()

@@ -139,9 +139,9 @@ class Scene:
         for camera in self.cameras:
             if camera.name == name:
                 return camera
-        raise SceneError(
-            f"no camera {name!r}{suggest(name, [c.name for c in self.cameras])}", self.path
-        )
+        there = [camera.name for camera in self.cameras]
+        near = suggest(name, there) or f"; the scene has {', '.join(there)}"
+        raise SceneError(f"no camera {name!r}{near}", self.path)
 
     @property
     def edits(self) -> tuple[EditSpec, ...]:

@@ -23,8 +23,8 @@ from attnwarp_eval.truth.plan import plan
 Image = npt.NDArray[Any]
 
 
-def describe(scene: Scene) -> str:
-    """A scene in words: objects, lights, cameras, and how its pictures are planned."""
+def contents(scene: Scene) -> str:
+    """What a scene holds, in words: objects, lights and cameras."""
     spec = scene.spec
     lines = [
         f"{scene.name}: {scene.title}",
@@ -54,7 +54,13 @@ def describe(scene: Scene) -> str:
     for camera in scene.cameras:
         x, y, z = camera.position
         lines.append(f"  {camera.name:12} at ({x:.2f}, {y:.2f}, {z:.2f})")
-    lines.append("pictures are made by")
+    return "\n".join(lines)
+
+
+def pictures_made(scene: Scene) -> str:
+    """How a scene's pictures are planned, in words; ``bounces: auto`` is measured by rendering."""
+    spec = scene.spec
+    lines = ["pictures are made by"]
     planned = plan(scene)
     for step in planned.passes:
         shining = ", ".join([spec.lights[k].type for k in step.lights] + ["lamps"] * step.lamps)

@@ -43,6 +43,14 @@ def test_an_export_leaves_the_poses_of_a_capture_alone(tmp_path, text):
     assert [path.name for path in tmp_path.iterdir()] == ["transforms.json"]
 
 
+def test_a_scene_is_shown_before_how_its_pictures_are_made():
+    done = CliRunner().invoke(app, ["scenes", "show", "spheres"])
+    assert done.exit_code == 0, done.output
+    contents, made = done.stdout.split("pictures are made by\n")
+    assert contents.startswith("spheres: ") and "\nlights: sun, sky\n" in contents
+    assert "light from sun, sky\n" in made and "because bounces: auto" in made
+
+
 def test_an_export_is_made_anew_in_its_own_folder(tmp_path):
     for views in ("2", "3"):
         done = CliRunner().invoke(app, [*EXPORT, str(tmp_path / "out"), "--views", views])
