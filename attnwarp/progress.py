@@ -17,10 +17,14 @@ LINE_SECONDS = 10.0
 PACE_SECONDS = 5.0
 """The time left is not told earlier."""
 
+FEWEST = 4
+"""Steps of which the latter half alone tells the pace; of fewer, one would decide."""
+
 
 class Pace:
     """Tells the time left by the mean pace of the latter half of what was done since the first
-    count, that of a resumed work: the first steps compile, and say little of the others.
+    count, that of a resumed work: the first steps compile, and say little of the others. Of fewer
+    than :data:`FEWEST` steps all count.
 
     Example:
         >>> from attnwarp.progress import Pace
@@ -41,7 +45,7 @@ class Pace:
         began, before = self._counts[0]
         if now - began < PACE_SECONDS or not before < done < total:
             return ""
-        half = before + (done - before) // 2
+        half = before + (done - before) // 2 if done - before >= FEWEST else before
         since, had = self._counts[bisect.bisect_right(self._counts, half, key=lambda c: c[1]) - 1]
         return f", {_duration((now - since) / (done - had) * (total - done))} left"
 
