@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from attnwarp.cli.options import Kind, Reading
+from attnwarp.cli.shell import echo
 from attnwarp.errors import InputError, InputWarning
 
 if TYPE_CHECKING:
@@ -101,9 +102,11 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera]) -> None
     """
     import torch
 
+    from attnwarp.fit import compile_kernels
     from attnwarp.propagate.scene import near_of
     from attnwarp.render import render
 
+    compile_kernels(splats.kind, echo)
     near = near_of(cameras, splats)
     with torch.no_grad():
         for camera in cameras:

@@ -166,17 +166,16 @@ class Environment:
     def same_code(self, other: Environment) -> bool:
         """Whether both were computed by the same state of the source and the same packages.
 
+        The hash of the source decides: revisions that differ in documents alone are the same code.
         Packages that only one of them names do not count: former code recorded fewer. It recorded
-        no hash of the source either, and then two states with local changes count as different.
+        no hash either, and then two states with local changes count as different.
         """
         shared = self.versions.keys() & other.versions.keys()
         if any(self.versions[name] != other.versions[name] for name in shared):
             return False
-        if (self.revision, self.dirty) != (other.revision, other.dirty):
-            return False
-        if self.source is None or other.source is None:
-            return not self.dirty
-        return self.source == other.source
+        if self.source is not None and other.source is not None:
+            return self.source == other.source
+        return not self.dirty and (self.revision, self.dirty) == (other.revision, other.dirty)
 
 
 @dataclass(frozen=True)

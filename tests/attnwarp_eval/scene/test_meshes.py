@@ -494,7 +494,7 @@ def test_a_scene_names_the_object_that_reaches_too_far(tmp_path):
 def test_a_stray_triangle_is_told_by_a_scene_and_its_truth(tmp_path):
     from attnwarp_eval.scene.extent import ExtentNotice, extent
     from attnwarp_eval.truth import Geometry
-    from attnwarp_eval.truth.show import describe
+    from attnwarp_eval.truth.show import contents
 
     ball = trimesh.creation.icosphere(3)
     stray = trimesh.Trimesh(np.eye(3) * 0.01 + [1e5, 0, 0], [[0, 1, 2]])
@@ -504,12 +504,12 @@ def test_a_stray_triangle_is_told_by_a_scene_and_its_truth(tmp_path):
     whole = load_scene(tmp_path / "whole.yaml")
     assert extent(whole).notice is None and extent(whole).makers == ("thing",)
     Geometry(whole)  # warnings are errors here
-    assert "extent: 2 x 2 x 2 metres, made by thing" in describe(whole)
-    assert "whole.ply: 1280 polygons in, 1280 triangles out" in describe(whole)
+    assert "extent: 2 x 2 x 2 metres, made by thing" in contents(whole)
+    assert "whole.ply: 1280 polygons in, 1280 triangles out" in contents(whole)
     strayed = load_scene(tmp_path / "stray.yaml")
     with pytest.warns(ExtentNotice, match=r"makes the scene 1e\+05 wide instead of 2 \(thing\)"):
         Geometry(strayed)
-    assert "a thousandth of the surface" in describe(strayed)
+    assert "a thousandth of the surface" in contents(strayed)
 
 
 def whole_or_refused(case):

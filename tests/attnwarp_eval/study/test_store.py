@@ -362,6 +362,9 @@ def test_two_states_of_files_that_are_not_committed_are_other_code():
     this = Environment.from_json(here)
     assert this.same_code(Environment.from_json(this.to_json()))
     assert not this.same_code(Environment.from_json({**here, "source": "0" * 64}))
+    # A later revision, or one with changes elsewhere, has the code that it has.
+    for git in ({"sha": "b" * 40, "dirty": True}, {"sha": "a" * 40, "dirty": False}):
+        assert this.same_code(Environment.from_json({**here, "git": git}))
     # Former code recorded no hash: the changes may be any.
     former = {name: value for name, value in here.items() if name != "source"}
     assert not this.same_code(Environment.from_json(former))
