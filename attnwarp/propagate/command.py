@@ -183,7 +183,8 @@ def _by_words(
     if kept:
         say(f"{kept} of {len(masks)} masks are those of an earlier run")
     say(_coverage(masks, cameras))
-    _say_empty(masks, cameras, f"--where: no {words!r} was detected in {{}} of {{}} views", say)
+    # Words may hold braces, so no template of them.
+    _say_empty(masks, cameras, lambda n: f"--where: no {words!r} was detected in {n} views", say)
     return masks
 
 
@@ -252,19 +253,22 @@ def _masks(folder: Path, cameras: Any, say: Callable[[str], None]) -> list[npt.N
         raise InputError(
             f"--masks: every mask in {folder} is black, so nothing may change; white is edited"
         )
-    _say_empty(masks, cameras, "--masks: {} of {} are black", say)
+    _say_empty(masks, cameras, lambda n: f"--masks: {n} are black", say)
     return masks
 
 
 def _say_empty(
-    masks: list[npt.NDArray[np.bool_]], cameras: Any, text: str, say: Callable[[str], None]
+    masks: list[npt.NDArray[np.bool_]],
+    cameras: Any,
+    text: Callable[[str], str],
+    say: Callable[[str], None],
 ) -> None:
-    """Name the views whose masks are empty; ``text`` has their number and that of all."""
+    """Name the views whose masks are empty; ``text`` begins the line, with a "2 of 9"."""
     empty = [camera.name for mask, camera in zip(masks, cameras, strict=True) if not mask.any()]
     if empty:
         more = f" and {len(empty) - MOST_NAMES} more" if len(empty) > MOST_NAMES else ""
         say(
-            f"{text.format(len(empty), len(masks))}, so nothing is edited in"
+            f"{text(f'{len(empty)} of {len(masks)}')}, so nothing is edited in"
             f" {', '.join(empty[:MOST_NAMES])}{more}"
         )
 
