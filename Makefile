@@ -7,7 +7,11 @@ RUN ?= runs/demo
 # Worker processes of the demo and of the tests; each needs up to 3 GB.
 JOBS ?= $(shell awk -v n=$$(nproc) '/MemAvailable/ { m = int($$2 / 3e6); print m < 1 ? 1 : m < n ? m : n }' /proc/meminfo)
 
-PYTEST := $(BIN)/python -m pytest -n $(JOBS) --durations=25 --durations-min=1
+# By `worksteal` a worker that dies fails its test alone; by `loadscope` and `loadfile` the run would hang.
+PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal --durations=25 --durations-min=1
+
+# Left to `make test-all` (docs/testing.md).
+THOROUGH := slow or door or damage or training or scripts
 
 # Of the gate: the run, and what it says.
 GATE := build/gate
@@ -24,7 +28,7 @@ demo:
 
 ## lint, types, layers, the gate, and the tests that fit in a coffee break (docs/testing.md)
 test: checks
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not ($(THOROUGH))"
 
 ## everything, the thorough checks too
 test-all: checks

@@ -36,55 +36,20 @@ def coarse_textures():
         build.forget()
 
 
-# Files that take a worker 10 s and more, longest first. They begin the run, as one of them at its
-# end would leave the other workers without work.
-LONGEST = [
-    "attnwarp_eval/study/test_run.py",
-    "attnwarp_eval/effects/test_detect.py",
-    "attnwarp_eval/scene/test_suite.py",
-    "attnwarp_eval/effects/test_proof.py",
-    "attnwarp/encoders/test_bundled.py",
-    "attnwarp_eval/truth/test_mitsuba.py",
-    "attnwarp/test_cli.py",
-    "attnwarp_eval/truth/test_edits.py",
-    "attnwarp_eval/effects/test_table.py",
-    "attnwarp_eval/truth/test_llvm.py",
-]
-
-
-@functools.cache
-def _shares(path):
-    """Whether the tests of a file share a fixture, or scenes and their textures in the memory of a
-    process.
-    """
-    return path.is_relative_to(ROOT / "attnwarp_eval") or 'scope="module"' in path.read_text()
+SLOW_LIMIT = 1800
+"""Seconds that a slow test may take; every other has the limit of pyproject.toml."""
 
 
 def pytest_collection_modifyitems(items):
-    """For workers: the longest files first, then the files that share, then every other test."""
-    if _WORKERS > 1:
-        ranks = {ROOT / name: rank for rank, name in enumerate(LONGEST)}
-        items.sort(key=lambda item: (ranks.get(item.path, len(ranks)), not _shares(item.path)))
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config, log):
-    """Files whose tests share something run in one worker, so that it is made once; every other test
-    goes to whichever worker is free.
-
-    xdist's own ``--dist loadgroup`` does this with marks, but has no effect with pytest 9.2, where
-    a test's id cannot be changed.
-    """
-    from xdist.scheduler import LoadScopeScheduling
-
-    config.option.loadscopereorder = False  # the order is that of pytest_collection_modifyitems
-
-    class Scheduler(LoadScopeScheduling):
-        def _split_scope(self, nodeid):
-            path = nodeid.partition("::")[0]
-            return path if _shares(config.rootpath / path) else nodeid
-
-    return Scheduler(config, log)
+    """Mark tests by their place, and give slow tests more time."""
+    for item in items:
+        room = item.path.relative_to(ROOT).parts[0]
+        if room in {"training", "scripts"}:
+            item.add_marker(room)
+        if item.path.stem == "test_damage":
+            item.add_marker("damage")
+        if any(item.iter_markers("slow")) and not any(item.iter_markers("timeout")):
+            item.add_marker(pytest.mark.timeout(SLOW_LIMIT))
 
 
 @pytest.fixture(autouse=True, scope="session")
