@@ -96,7 +96,9 @@ class Subject:
 
     def _pair(self, variant: str, target: str) -> Pair:
         chosen, model = self.variants[variant]
-        settings = chosen.settings()
+        # Methods with presets of their own have no warp: the corrected rules show where one leads.
+        own_preset = chosen.preset is not None and chosen.preset not in PRESETS
+        settings = PRESETS["corrected"] if own_preset else chosen.settings()
         if self.capture is not None:
             if variant == EDIT_VARIANT and self.edit is not None:
                 settings = self.edit.settings

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import yaml
@@ -18,7 +18,7 @@ from attnwarp_eval.scene.scene import Scene, SceneError, inside, orbit_camera, v
 from attnwarp_eval.scene.spec import MeshSpec, RectangleSpec, SceneSpec
 from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
 from attnwarp_eval.scene.transport import contradictions
-from attnwarp_eval.scene.yaml import YamlError, read_yaml
+from attnwarp_eval.scene.yaml import YamlError, line_of, read_yaml
 
 
 def scene_folders() -> list[Path]:
@@ -138,30 +138,11 @@ def _read(path: Path) -> Scene:
         more = f" (and {len(problems) - 1} more below it)" if len(problems) > 1 else ""
         loc = (*first["loc"], "type") if first["type"] == "union_tag_invalid" else first["loc"]
         raise SceneError(
-            explain(first, SceneSpec, "docs/scenes.md") + more, path, _line(root, loc)
+            explain(first, SceneSpec, "docs/scenes.md") + more, path, line_of(root, loc)
         ) from error
     scene = Scene(spec, path)
     _check(scene, root)
     return scene
-
-
-def _line(node: yaml.Node, loc: Sequence[int | str]) -> int:
-    """Line (from 1) of the deepest node that ``loc`` leads to; the tags that unions put into a loc
-    lead nowhere.
-    """
-    line = node.start_mark.line + 1
-    for step in loc:
-        if isinstance(node, yaml.MappingNode):
-            for key, value in node.value:
-                if key.value == step:
-                    line, node = key.start_mark.line + 1, value
-                    break
-        elif (
-            isinstance(node, yaml.SequenceNode) and isinstance(step, int) and step < len(node.value)
-        ):
-            node = node.value[step]
-            line = node.start_mark.line + 1
-    return line
 
 
 def _check(scene: Scene, root: yaml.Node) -> None:
@@ -170,7 +151,7 @@ def _check(scene: Scene, root: yaml.Node) -> None:
     """
 
     def refuse(message: str, *loc: int | str) -> None:
-        raise SceneError(message, scene.path, _line(root, loc))
+        raise SceneError(message, scene.path, line_of(root, loc))
 
     names: dict[str, int] = {}
     for k, item in enumerate(scene.spec.objects):

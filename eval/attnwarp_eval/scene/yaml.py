@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import yaml
@@ -84,6 +85,25 @@ def _bare_color(text: str) -> str:
         if BARE_COLOR.search(line):
             return f"; line {number} has a colour without quotes, which YAML takes for a comment"
     return ""
+
+
+def line_of(node: yaml.Node, loc: Sequence[int | str]) -> int:
+    """Line (from 1) of the deepest node that ``loc`` leads to; the tags that unions put into a loc
+    lead nowhere.
+    """
+    line = node.start_mark.line + 1
+    for step in loc:
+        if isinstance(node, yaml.MappingNode):
+            for key, value in node.value:
+                if key.value == step:
+                    line, node = key.start_mark.line + 1, value
+                    break
+        elif (
+            isinstance(node, yaml.SequenceNode) and isinstance(step, int) and step < len(node.value)
+        ):
+            node = node.value[step]
+            line = node.start_mark.line + 1
+    return line
 
 
 def _line(error: object) -> str:

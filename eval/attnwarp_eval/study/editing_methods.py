@@ -6,13 +6,15 @@ A method gets a :class:`Job` and gives an :class:`EditedScene`. A new one is one
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+
+from attnwarp_eval.study.reads import MASK_RULES, warp_reads
 
 if TYPE_CHECKING:
     from attnwarp.baselines import Budget
@@ -101,28 +103,99 @@ class EditedScene:
     cut: str | None = None
 
 
+def _reads_all(settings: Mapping[str, Any]) -> Set[str]:
+    return {"preset", "set", "options", "geometry", "mask", "editor"}
+
+
 @dataclass(frozen=True)
 class Method:
     """How a method is configured and run.
 
     Attributes:
-        settings: complete settings as JSON, from a preset's name, the fields of a study and a
-            variant, and the seed. ValueError: an unknown field or a value out of range.
+        settings: complete settings as JSON, from a preset's name (None where the study names none),
+            the fields of a study and a variant, and the seed. ValueError: an unknown field or a
+            value out of range.
         run: the method.
+        reads: keys of a variant that decide its result with these settings: of ``preset``, ``set``,
+            ``options``, ``geometry``, ``mask`` and ``editor``, or of a single one such as
+            ``options.steps``. A study that sets another is refused.
         takes_budget: whether it can be cut short by a budget.
         takes_picture: whether its source view can be edited by hand.
     """
 
-    settings: Callable[[str, dict[str, Any], int], dict[str, Any]]
+    settings: Callable[[str | None, dict[str, Any], int], dict[str, Any]]
     run: Callable[[Job], EditedScene]
+    reads: Callable[[Mapping[str, Any]], Set[str]] = _reads_all
     takes_budget: bool = False
     takes_picture: bool = False
 
 
-def _propagate_settings(name: str, fields: dict[str, Any], seed: int) -> dict[str, Any]:
+def _propagate_settings(name: str | None, fields: dict[str, Any], seed: int) -> dict[str, Any]:
     from attnwarp.propagate import preset
 
-    return preset(name, **fields, seed=seed).to_dict()
+    return preset("corrected" if name is None else name, **fields, seed=seed).to_dict()
+
+
+_LOSSES = frozenset(
+    {
+        "l1", "ssim", "perceptual", "normal", "distortion", "perceptual_encoder", "color_rate",
+        "geometry_rate", "background", "training",
+    }
+)  # fmt: skip
+"""Settings of tuning beside its length."""
+
+_FEATURES = frozenset(
+    {
+        "a0", "decay", "fractions", "kinds", "blocks", "feature_steps", "branches", "feature_type",
+    }
+)  # fmt: skip
+"""Settings of the features that are carried from the source to the views."""
+
+_NOT_IN_STUDIES = frozenset({"seed", "composite", "composite_blur", "psnr_views"})
+"""Settings that decide nothing in a study: it has seeds of its own, no segments of its scenes, and
+counts every edited view."""
+
+
+def _options(settings: Mapping[str, Any], idle: Set[str]) -> set[str]:
+    """The settings that are left, as keys of a variant."""
+    unread = set(idle)
+    if not settings["iterations"]:
+        unread |= _LOSSES
+    if not settings["perceptual"]:
+        unread.add("perceptual_encoder")
+    return {f"options.{name}" for name in settings if name not in unread} | {
+        "preset",
+        "options.preset",
+    }
+
+
+def _propagate_reads(settings: Mapping[str, Any]) -> Set[str]:
+    from attnwarp.propagate import PropagateSettings
+
+    s = PropagateSettings.from_dict(dict(settings))
+    idle = set(_NOT_IN_STUDIES)
+    if s.estimate == 0:
+        idle |= {"estimate_until", "estimate_in", "estimate_margin"}
+    if s.sources == 1:
+        idle.add("chain_coverage")
+    if s.start is None:
+        idle.add("start_picture")
+    warp = warp_reads(s.warp)
+    if s.confidence:  # weighs by the margin of depth agreement, whether that is a rule or not
+        warp |= {"set.depth_relative", "set.depth_slope"}
+    read = {"editor"}
+    alone = s.method == "each view alone"
+    if alone:
+        idle |= _FEATURES
+    if not alone or s.estimate > 0 or s.sources > 1 or s.noise == "surface":
+        read |= {"geometry", "mask"}
+    else:
+        idle |= {"mask", "confidence"}
+        warp = {"set.depth", "set.depth_statistic"}  # of the depth that guides an editor
+    if not s.mask:
+        read -= {"mask"}
+        warp -= MASK_RULES if s.sources == 1 and not s.confidence else set()
+    return read | warp | {f"options.warp.{key[4:]}" for key in warp} | _options(vars(s), idle)
 
 
 def _propagate(job: Job) -> EditedScene:
@@ -172,16 +245,27 @@ def _true_pictures(job: Job) -> EditedScene:
     return EditedScene(tuning.gaussians(), edited, seconds, counters)
 
 
+def _true_pictures_reads(settings: Mapping[str, Any]) -> Set[str]:
+    tuned = {"stages", "views_per_stage", "iterations", *_LOSSES}
+    return _options(settings, settings.keys() - tuned)
+
+
 def _baseline(name: str) -> Method:
     """A method of :mod:`attnwarp.baselines`."""
 
-    def settings(wanted: str, fields: dict[str, Any], seed: int) -> dict[str, Any]:
+    def settings(wanted: str | None, fields: dict[str, Any], seed: int) -> dict[str, Any]:
         from attnwarp.baselines import preset
-        from attnwarp.warp import PRESETS
 
-        # A variant that names no preset has one of the warp's.
-        chosen = "default" if wanted in PRESETS else wanted
+        chosen = "default" if wanted is None else wanted
         return asdict(preset(name, chosen, **fields, seed=seed))
+
+    def reads(settings: Mapping[str, Any]) -> Set[str]:
+        idle = {"seed"}
+        if settings.get("latents") == "random":
+            idle.add("source_prompt")
+        if name == "by_view" and settings["start"] is not None and settings["noise"] == "fresh":
+            idle.add("batch")
+        return {"editor"} | _options(settings, idle)
 
     def run(job: Job) -> EditedScene:
         from attnwarp import baselines
@@ -203,12 +287,12 @@ def _baseline(name: str) -> Method:
             result.gaussians, result.edited, result.seconds, result.counters, result.cut
         )
 
-    return Method(settings, run, takes_budget=True)
+    return Method(settings, run, reads, takes_budget=True)
 
 
 EDITING_METHODS: dict[str, Method] = {
-    "propagate": Method(_propagate_settings, _propagate, takes_picture=True),
-    "true pictures": Method(_propagate_settings, _true_pictures),
+    "propagate": Method(_propagate_settings, _propagate, _propagate_reads, takes_picture=True),
+    "true pictures": Method(_propagate_settings, _true_pictures, _true_pictures_reads),
     **{name: _baseline(name) for name in ("by_view", "igs2gs", "dge", "gaussctrl")},
 }
 """Every method by name. ``propagate`` with ``method: each view alone`` is the control; those of

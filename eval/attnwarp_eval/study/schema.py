@@ -84,17 +84,22 @@ class Splats(Part):
 
 
 class Variant(Part):
-    """One row of a table: where depth comes from, and how the warp is made."""
+    """One row of a table: where depth comes from, and how the warp is made.
 
-    preset: str = "corrected"
+    ``preset`` is one of the warp's, "corrected" where it is left out. Of a variant that is edited
+    it is one of its method's.
+    """
+
+    preset: str | None = None
     set: dict[str, Any] = Field(default_factory=dict)
     geometry: Literal["splats", "truth"] = "splats"
     splats: dict[str, Any] = Field(default_factory=dict)
 
     def settings(self) -> WarpSettings:
         """The preset with this variant's own fields."""
-        check.one_of(self.preset, list(PRESETS), "preset")
-        return WarpSettings.from_dict({**PRESETS[self.preset].to_dict(), **self.set})
+        name = "corrected" if self.preset is None else self.preset
+        check.one_of(name, list(PRESETS), "preset")
+        return WarpSettings.from_dict({**PRESETS[name].to_dict(), **self.set})
 
 
 class Ablation(Part):

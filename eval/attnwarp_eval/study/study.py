@@ -13,10 +13,11 @@ from pydantic import BaseModel, Field, ValidationError, create_model, model_vali
 from attnwarp_eval.scene import explain
 from attnwarp_eval.scene.file import is_scene_file, scene_name
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.scene.yaml import YamlError, read_yaml
+from attnwarp_eval.scene.yaml import YamlError, line_of, read_yaml
 from attnwarp_eval.study.cell import Cell, merged
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.probes.base import Probe
+from attnwarp_eval.study.reads import unused
 from attnwarp_eval.study.schema import (
     Front,
     Splats,
@@ -29,6 +30,14 @@ from attnwarp_eval.study.schema import (
 
 KEYS = "study/shipped/quick.yaml"
 """File of this package that shows the keys of a study, for messages."""
+
+
+class _PlacedError(ValueError):
+    """A wrong value of a study, with its place."""
+
+    def __init__(self, place: tuple[str, ...], message: str) -> None:
+        self.place = place
+        super().__init__(message)
 
 
 class _Joined(Study):
@@ -85,17 +94,20 @@ class _Joined(Study):
 
     def _check_each_variant(self) -> None:
         for name, variant in self.variants.items():
+            measuring = [p for p in probes() if name in p.measured(self)]
             try:
-                variant.settings()
+                if not measuring or not all(p.edits for p in measuring):
+                    variant.settings()
                 self.splats_of(variant)
                 for p in probes():
                     p.check_variant(self, variant)
             except ValidationError as error:
-                raise ValueError(
-                    f"variants.{name}.splats: {explain_errors(error, Splats)}"
+                raise _PlacedError(
+                    ("variants", name, "splats"),
+                    f"variants.{name}.splats: {explain_errors(error, Splats)}",
                 ) from None
             except ValueError as error:
-                raise ValueError(f"variants.{name}: {error}") from None
+                raise _PlacedError(("variants", name), f"variants.{name}: {error}") from None
 
 
 def _check_probe(name: str, available: list[str], key: str) -> None:
@@ -207,7 +219,8 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         overrides: fields to replace, such as ``size`` or ``scenes``; None leaves a field as it is.
 
     Raises:
-        StudyError: no such study, not YAML, an unknown key or a value out of range.
+        StudyError: no such study, not YAML, an unknown key, a value out of range, or a setting that
+            decides nothing of the study.
 
     Example:
         >>> study = load_study("quick", scenes=["spheres"])
@@ -222,7 +235,7 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
             " file's path"
         )
     try:
-        _, data = read_yaml(path.read_text(encoding="utf-8"))
+        root, data = read_yaml(path.read_text(encoding="utf-8"))
     except (YamlError, UnicodeDecodeError) as error:
         line = f":{error.line}" if isinstance(error, YamlError) and error.line else ""
         raise StudyError(f"{path}{line}: {error}") from None
@@ -235,6 +248,7 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
             f"{path}: is a scene; name it under 'scenes' in a study, or as run STUDY --scenes"
             f" {path}"
         )
+    keys = set(data)
     data = _beside(data, path.parent)
     every = data.get("scenes")
     named = every if isinstance(every, list) else ()
@@ -252,11 +266,25 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
     try:
         study = parse_study(data)
     except ValidationError as error:
-        raise StudyError(f"{path}: {explain_errors(error)}") from None
+        place = _place(error.errors()[0])
+        line = f":{line_of(root, place)}" if place else ""
+        raise StudyError(f"{path}{line}: {explain_errors(error)}") from None
+    if problems := [
+        (line_of(root, place), f"{'.'.join(place)}: {why}")
+        for place, why in unused(study, keys, probes())
+    ]:
+        told = "; line ".join(f"{line}: {problem}" for line, problem in sorted(problems))
+        raise StudyError(f"{path}:{told}")
     if isinstance(every, list):
         called = {scene_name(name) for name in study.scenes}
         study._left_out = tuple(name for name in every if scene_name(name) not in called)
     return study
+
+
+def _place(problem: Any) -> tuple[int | str, ...]:
+    """The place of a problem in the file; empty where the problem is of no single place."""
+    own = problem.get("ctx", {}).get("error")
+    return own.place if isinstance(own, _PlacedError) else problem["loc"]
 
 
 def _beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -28,9 +28,9 @@ fit: {views: 16, points: 300, settings: {iterations: 20, sh_degree: 0, evaluate_
 variants:
   flat: {fit: {kind: 2d}}
   flat, expected: {fit: {kind: 2d}, set: {depth_statistic: expected}}
-  flat, photometric: {fit: {kind: 2d}, set: {photometric: 0.2}}
+  flat, by name: {fit: {kind: 2d}, preset: corrected}
   solid: {fit: {kind: 3d}}
-probes: {fit: [flat, 'flat, expected', 'flat, photometric', solid]}
+probes: {fit: [flat, 'flat, expected', 'flat, by name', solid]}
 ablations: [{title: Kinds, probe: fit, baseline: flat, variants: ['flat, expected', solid]}]
 pictures: {variants: [flat], views: [orbit_008_of_16]}
 """
@@ -162,7 +162,7 @@ def finished(tmp_path_factory):
 
 def test_variants_that_read_a_fit_in_other_ways_share_it(finished):
     planned, store = finished
-    # "photometric" is a rule of warps: for the fit it is the same cell as "flat".
+    # The preset is named and the same: one cell with "flat".
     assert [cell.probe for cell in planned.cells] == ["calibration", "fit", "fit", "fit"]
     assert len(list((store.root / "fits").iterdir())) == 2  # one a kind
     records = {cell.labels[0]: store.read(cell.id) for cell in planned.cells}

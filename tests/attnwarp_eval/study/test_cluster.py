@@ -32,7 +32,6 @@ STUDY = {
     "views": ["yaw030"],
     "feature_sizes": [32],
     "spp": 1,
-    "splats": {"count": 500},
     "variants": {f"splats {n}": {"splats": {"count": n}} for n in range(200, 1000, 100)},
     "probes": {"depth": [f"splats {n}" for n in range(200, 1000, 100)]},
     "pictures": {"variants": ["splats 200"], "views": ["yaw030"]},

@@ -209,8 +209,12 @@ def test_a_view_that_a_scene_lacks_is_named(tmp_path):
     ("changes", "message"),
     [
         (
-            {"editing": {"edits": {"sphere": {"snow": None}}}},
-            "editing.edits: the study has no scene 'sphere'; did you mean 'spheres'",
+            {
+                "scenes": ["bear", "dinosaur"],
+                "editing": {"edits": {"baer": {"snow": None}}},
+                "probes": SMALL["probes"] | {"editing-timing": ["again"]},
+            },
+            "editing.edits: the study has no scene 'baer'; did you mean 'bear'",
         ),
         (
             {"pictures": {"variants": ["again"], "views": ["yaw030", "yaw35"]}},
@@ -219,8 +223,8 @@ def test_a_view_that_a_scene_lacks_is_named(tmp_path):
     ],
 )
 def test_a_key_that_names_nothing_of_any_scene_is_refused(tmp_path, changes, message):
-    path = write(tmp_path, scenes=["spheres", "opposed"], **changes | {"views": []})
-    for chosen in (None, ["spheres"]):
+    path = write(tmp_path, **{"scenes": ["spheres", "opposed"], "views": [], **changes})
+    for chosen in (None, load_study(path).scenes[1:]):
         with pytest.raises(StudyError, match=message):
             plan(load_study(path, scenes=chosen), Store(tmp_path / "run"))
     result = CliRunner().invoke(app, ["run", path, "--dry-run", "--out", str(tmp_path / "run")])
@@ -229,13 +233,13 @@ def test_a_key_that_names_nothing_of_any_scene_is_refused(tmp_path, changes, mes
 
 def test_keys_may_name_scenes_that_are_left_out(tmp_path):
     named = {
-        "editing": {"edits": {"opposed": {"snow": None}}},
+        "editing": {"edits": {"dinosaur": {"stone": None}}},
         "pictures": {"variants": ["again"], "views": ["yaw030", "yaw165", "orbit_000_of_9"]},
     }  # yaw165 is a view of opposed alone, orbit_000_of_9 one of the fits
-    probes = {"warp": ["again"], "fit": ["again"]}
-    path = write(tmp_path, scenes=["spheres", "opposed"], views=[], probes=probes, fit={"views": 9},
-                 **named)  # fmt: skip
-    planned = plan(load_study(path, scenes=["spheres"]), Store(tmp_path / "run"))
+    probes = {"warp": ["again"], "fit": ["again"], "editing-timing": ["again"]}
+    path = write(tmp_path, scenes=["bear", "opposed", "dinosaur"], views=[], probes=probes,
+                 fit={"views": 9}, variants={"again": {}}, **named)  # fmt: skip
+    planned = plan(load_study(path, scenes=["bear"]), Store(tmp_path / "run"))
     pictured = {cell.probe: cell.pictures for cell in planned.cells}
     assert (pictured["warp"], pictured["fit"]) == (("yaw030",), ("orbit_000_of_9",))
 

@@ -160,6 +160,7 @@ def test_two_names_of_the_same_settings_are_both_on_the_page(tmp_path):
     path = tmp_path / "people.yaml"
     study = yaml.safe_load(path.read_text())
     study["variants"]["again"] = study["variants"]["alone"]
+    del study["variants"]["warped"]
     names = study["probes"]["editing"] = study["pictures"]["variants"] = ["alone", "again", "third"]
     path.write_text(yaml.safe_dump(study, sort_keys=False))
     store = Store(run.root)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -154,6 +154,10 @@ class Probe(ABC, Generic[E]):
         cost, cost_of, cost_text: stage of a cell's seconds that its figures cost where nothing was
             taken in turn, what they are seconds of, and what is in them.
         picture_label: title of its pictures; the variant's name if empty.
+        draws: whether it can save pictures.
+        edits: whether it measures methods that edit, whose presets are their own.
+        study_keys: every key of a study that decides its cells; None for all of them.
+        shared: settings of the study by their place -> the variant's key that goes before them.
     """
 
     name: ClassVar[str]
@@ -178,6 +182,10 @@ class Probe(ABC, Generic[E]):
         " and is not in them, nor are set-up and checks."
     )
     picture_label: ClassVar[str] = ""
+    draws: ClassVar[bool] = True
+    edits: ClassVar[bool] = False
+    study_keys: ClassVar[Set[str] | None] = None
+    shared: ClassVar[Mapping[tuple[str, ...], str]] = {}
 
     # From a study to cells
 
@@ -195,6 +203,18 @@ class Probe(ABC, Generic[E]):
 
     def check_variant(self, study: Study, variant: Variant) -> None:
         """Raise ValueError if a variant cannot be measured; its name is put before the message."""
+
+    def measured(self, study: Study) -> Set[str]:
+        """Variants of a study that decide cells of this probe."""
+        return set(study.probes.get(self.name, ()))
+
+    def reads(self, study: Study, variant: Variant) -> Set[str]:
+        """Keys of a variant that decide its cells of this probe; here, all of them.
+
+        ``splats`` stands for all that is below it, ``splats.count`` for that alone. A study that
+        sets what none of its probes reads is refused.
+        """
+        return set(type(variant).model_fields)
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

@@ -99,6 +99,7 @@ class Calibration(Probe[Extra]):
     metrics = metrics_of("calibration.", "warp.", "occlusion.")
     judges_variants = False
     always = True
+    study_keys = frozenset({"size", "views", "seeds", "spp", "feature_sizes", "feature_channels"})
     picture_label = "truth's own depth"
 
     def cells(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from functools import partial
 from typing import Any, ClassVar
 
@@ -12,7 +12,14 @@ from attnwarp_eval.document.model import Finding, Section, Table
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, mean_values, metrics_of
-from attnwarp_eval.study.probes.variant_splats import splats_of, surface_meaning, surface_spec
+from attnwarp_eval.study.probes.variant_splats import (
+    check_splats,
+    splats_of,
+    surface_meaning,
+    surface_reads,
+    surface_spec,
+)
+from attnwarp_eval.study.reads import DEPTH_READS
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Study, Variant
@@ -50,6 +57,15 @@ class Depth(Probe[NoExtra]):
         "depth.normal_median",
     )
     stage = "render"
+    study_keys = frozenset({"size", "views", "seeds", "spp"})
+
+    def check(self, study: Study) -> None:
+        """A variant without splats renders nothing."""
+        check_splats(study, self.name, "depth to measure")
+
+    def reads(self, study: Study, variant: Variant) -> Set[str]:
+        """Splats, and how depth is read off them."""
+        return surface_reads(variant) | DEPTH_READS
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """Splats, and how depth is read off them."""

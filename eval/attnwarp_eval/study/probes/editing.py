@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -52,7 +52,13 @@ from attnwarp_eval.study.editing_methods import (
 from attnwarp_eval.study.hand_made import Kind, hand_made
 from attnwarp_eval.study.probes import editing_sections, register, sensitivity
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
-from attnwarp_eval.study.probes.variant_splats import splats_meaning, splats_of, splats_spec
+from attnwarp_eval.study.probes.variant_splats import (
+    splats_meaning,
+    splats_of,
+    splats_reads,
+    splats_spec,
+)
+from attnwarp_eval.study.reads import MASK_RULES
 from attnwarp_eval.study.record import Json, Record, with_nan
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, did_you_mean
@@ -84,6 +90,9 @@ whole view."""
 
 STOPWATCH = Stopwatch()
 """Seconds of the methods that this process has run."""
+
+EDITS = frozenset({"editing", "editing-timing", "variability"})
+"""Probes of methods that edit."""
 
 CHOSEN_BY = ("multiview.delta_e_above.edit_inside", "fidelity.mse.edit_inside")
 """What the variant for a given time is chosen by; less is better."""
@@ -128,8 +137,8 @@ class StudyPart(Part):
 class VariantPart(Part):
     """Keys of a variant that only this probe reads.
 
-    ``options`` are fields of the method's settings, over the study's; ``preset`` among them names
-    its preset, else the variant's. ``{source}`` in ``source_prompt`` stands for the edit's
+    ``options`` are fields of the method's settings, over the study's; ``preset`` among them goes
+    before the variant's. ``{source}`` in ``source_prompt`` stands for the edit's
     ``source`` words. ``mask: truth`` injects where the source truly sees the
     surface, ``geometry: truth`` warps by exact depth. ``budget`` cuts the method short.
     ``by_hand`` gives the method a source view that was edited by hand
@@ -234,6 +243,12 @@ class EditingProbe(Probe[EditResult]):
     stage = "whole"
     cost = "whole"
     cost_of = "an edit"
+    edits = True
+    study_keys = frozenset({"size", "views", "seeds", "spp", "editing", "encoders"})
+    shared: ClassVar[Mapping[tuple[str, ...], str]] = {
+        ("editing", "options"): "options",
+        ("editing", "editor"): "editor",
+    }
     cost_text = (
         "Seconds are those of one whole edit of a scene: source, warps, edited views and tuning."
     )
@@ -286,8 +301,32 @@ class EditingProbe(Probe[EditResult]):
                 f"by_hand: method {own.method!r} edits its source itself; methods that take a"
                 f" picture are {able}"
             )
-        if self.name in study.probes or own.options or study.part(StudyPart).editing.options:
+        if own.options or not EDITS.isdisjoint(study.probes):
             settings_of(study, variant, 0)
+
+    def measured(self, study: Study) -> Set[str]:
+        """Variants whose seconds limit others are run too."""
+        names = study.variants.keys() & super().measured(study)
+        references = {_reference(study.variants[name]) for name in names}
+        return names | {name for name in references if name is not None}
+
+    def reads(self, study: Study, variant: Variant) -> Set[str]:
+        """Keys that the method reads, and those of its editor and its splats."""
+        own = variant.part(VariantPart)
+        settings = settings_of(study, variant, 0)
+        read = {"method", "budget", "by_hand", *splats_reads(variant)}
+        read |= EDITING_METHODS[own.method].reads(settings)
+        one_mask = settings.get("sources", 1) == 1 and not settings.get("confidence")
+        if own.mask == "truth" and one_mask:
+            read -= MASK_RULES
+        if "preset" in own.options:
+            read -= {"preset"}
+        if "editor" in read:
+            guidance = ("text_guidance", "image_guidance")
+            read -= {"editor"}
+            read |= {"editor.name"}
+            read |= {f"editor.{name}" for name in guidance if settings.get(name) is None}
+        return read
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
@@ -754,9 +793,12 @@ def settings_of(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
     Raises:
         ValueError: an unknown preset or field, or a value out of range.
     """
-    own = variant.part(VariantPart)
-    fields = {**study.part(StudyPart).editing.options, **own.options}
-    name = fields.pop("preset", variant.preset)
+    own, shared = variant.part(VariantPart), study.part(StudyPart).editing.options
+    fields = {**shared, **own.options}
+    if "seed" in fields:
+        raise ValueError("options.seed: the seeds are the study's own; set seeds there")
+    presets = (own.options.get("preset"), variant.preset, fields.pop("preset", None))
+    name = next((preset for preset in presets if preset is not None), None)
     warp = {f"warp.{key}": value for key, value in variant.set.items()}
     return EDITING_METHODS[own.method].settings(name, {**fields, **warp}, seed)
 

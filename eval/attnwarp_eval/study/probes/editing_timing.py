@@ -7,7 +7,7 @@ whose speed drifts. Here every variant edits the same scene in each round.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
@@ -28,7 +28,7 @@ from attnwarp_eval.study.probes.turns import Timed, timed_in_turn
 from attnwarp_eval.study.probes.variant_splats import splats_of
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Outcome, Results
-from attnwarp_eval.study.schema import Part, Study
+from attnwarp_eval.study.schema import Part, Study, Variant
 
 EDITING = "editing"
 """Source, warps and edited views together, tuning apart."""
@@ -75,6 +75,10 @@ class EditingTimingProbe(Probe[Rounds]):
     name = "editing-timing"
     study_part = StudyPart
     times_in_turn = STAGES
+    draws = False
+    edits = True
+    study_keys = frozenset({"size", "views", "spp", "timing_rounds", "editing", "editing_timing"})
+    shared = editing.EditingProbe.shared
 
     def check(self, study: Study) -> None:
         """Every contestant runs to its end, by what it sees itself."""
@@ -96,6 +100,10 @@ class EditingTimingProbe(Probe[Rounds]):
                     f"probes.editing-timing: {name!r} has a budget, which may cut it short; leave"
                     " it out"
                 )
+
+    def reads(self, study: Study, variant: Variant) -> Set[str]:
+        """A method of editing."""
+        return editing.EditingProbe().reads(study, variant)
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

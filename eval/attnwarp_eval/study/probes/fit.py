@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Set
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -27,6 +27,7 @@ from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
+from attnwarp_eval.study.reads import DEPTH_READS
 from attnwarp_eval.study.record import Json, Record, finite, with_nan
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Part, Study, Variant
@@ -59,6 +60,10 @@ class VariantPart(Part):
 
     fitted: bool = False
     fit: dict[str, Any] = Field(default_factory=dict)
+
+
+FIT_READS = frozenset(f"fit.{f.name}" for f in fields(FitSettings))
+"""Keys of a variant that decide its fit."""
 
 
 @dataclass(frozen=True)
@@ -144,6 +149,13 @@ class Fit(Probe[Curve]):
         "depth.abs_rel.interior",
         "depth.normal_median",
     )
+
+    study_keys = frozenset({"size", "seeds", "spp", "fit"})
+    shared: ClassVar[Mapping[tuple[str, ...], str]] = {("fit", "settings"): "fit"}
+
+    def reads(self, study: Study, variant: Variant) -> Set[str]:
+        """The fit, and how depth is read off it."""
+        return FIT_READS | DEPTH_READS | {"fitted"}
 
     def check_variant(self, study: Study, variant: Variant) -> None:
         """Fit settings are refused even where nothing is fitted."""
@@ -322,6 +334,8 @@ class Fit(Probe[Curve]):
 def settings_of(study: Study, variant: Variant, seed: int) -> FitSettings:
     """The study's fit settings with the variant's own fields."""
     shared, own = study.part(StudyPart).fit.settings, variant.part(VariantPart).fit
+    if "seed" in {**shared, **own}:
+        raise ValueError("fit.seed: the seeds are the study's own; set seeds there")
     return FitSettings.from_dict({**shared, **own, "seed": seed})
 
 

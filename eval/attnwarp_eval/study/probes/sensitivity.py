@@ -174,6 +174,8 @@ class Sensitivity(Probe[Seconds]):
     study_part = StudyPart
     metrics = metrics_of("fidelity.", "consistency.", "embedding.")
     judges_variants = False
+    draws = False
+    study_keys = frozenset({"size", "views", "seeds", "spp", "timing_rounds", "encoders", "edits"})
 
     def check(self, study: Study) -> None:
         """Variants change no metric."""

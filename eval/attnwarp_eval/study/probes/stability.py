@@ -94,6 +94,8 @@ class Stability(Probe[Extra]):
     metrics = metrics_of("stability.")
     needs_scenes = False
     judges_variants = False
+    draws = False
+    study_keys = frozenset({"stability"})
 
     def check(self, study: Study) -> None:
         """Cases have names; variants change none of them."""
@@ -102,8 +104,6 @@ class Stability(Probe[Extra]):
             raise ValueError(
                 "probes.stability: got variants, expected []; a hard case has ways of its own"
             )
-        if sweep is not None and self.name not in study.probes:
-            raise ValueError("stability: this study has no probe of that name; add it to probes")
         for name in sweep.cases if sweep else ():
             try:
                 hard_case(name)

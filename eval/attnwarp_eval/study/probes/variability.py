@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
@@ -78,6 +78,9 @@ class VariabilityProbe(Probe[Varied]):
 
     name = "variability"
     metrics = metrics_of("variability.")
+    edits = True
+    study_keys = frozenset({"size", "views", "seeds", "spp", "editing"})
+    shared = editing.EditingProbe.shared
 
     def check(self, study: Study) -> None:
         """One seed varies from no other, and a method that was cut short varies with the clock."""
@@ -93,10 +96,9 @@ class VariabilityProbe(Probe[Varied]):
                     f"probes.{self.name}: {name!r} has a budget; name a variant without one"
                 )
 
-    def check_variant(self, study: Study, variant: Variant) -> None:
-        """Settings are refused before anything is edited."""
-        if self.name in study.probes:
-            editing.settings_of(study, variant, 0)
+    def reads(self, study: Study, variant: Variant) -> Set[str]:
+        """A method of editing."""
+        return editing.EditingProbe().reads(study, variant)
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

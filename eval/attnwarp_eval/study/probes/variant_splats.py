@@ -31,6 +31,31 @@ def surface_spec(study: Study, variant: Variant, seed: int) -> Json:
     return splats_spec(study, variant, seed)
 
 
+def check_splats(study: Study, probe: str, what: str) -> None:
+    """Raise ValueError if a probe of renders measures a variant that renders nothing.
+
+    Args:
+        study: with or without the probe.
+        probe: its name.
+        what: of a render it measures.
+    """
+    for name in study.probes.get(probe, []):
+        if study.variants[name].geometry != "splats":
+            raise ValueError(
+                f"probes.{probe}: {name!r} renders nothing, so there is no {what}; leave it out"
+            )
+
+
+def splats_reads(variant: Variant) -> set[str]:
+    """Keys of a variant that decide its splats."""
+    return {"fitted", *fit.FIT_READS} if variant.part(fit.VariantPart).fitted else {"splats"}
+
+
+def surface_reads(variant: Variant) -> set[str]:
+    """Keys of a variant that decide where its depth comes from."""
+    return {"geometry"} | (set() if variant.geometry == "truth" else splats_reads(variant))
+
+
 def splats_meaning(study: Study, variant: Variant) -> str:
     """What variants of the same splats share, for claims."""
     return canonical_json(splats_spec(study, variant, 0))

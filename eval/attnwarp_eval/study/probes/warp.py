@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from functools import partial
 from typing import Any, ClassVar
 
@@ -26,7 +26,13 @@ from attnwarp_eval.study.probes.base import (
     mean_values,
     metrics_of,
 )
-from attnwarp_eval.study.probes.variant_splats import splats_of, surface_meaning, surface_spec
+from attnwarp_eval.study.probes.variant_splats import (
+    splats_of,
+    surface_meaning,
+    surface_reads,
+    surface_spec,
+)
+from attnwarp_eval.study.reads import warp_reads
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Part, Study, Variant
@@ -84,11 +90,19 @@ class Warp(Probe[NoExtra]):
         "occlusion.recall",
     )
     stage = "pair"
+    study_keys = frozenset(
+        {"size", "views", "seeds", "spp", "feature_sizes", "feature_channels", "yaw"}
+    )
 
     def check(self, study: Study) -> None:
         """Masks by yaw need their variants measured."""
         names = study.part(StudyPart).yaw.variants
         study.check_variants(names, "yaw.variants", self.name)
+
+    def reads(self, study: Study, variant: Variant) -> Set[str]:
+        """Depth and rules."""
+        truth = variant.geometry == "truth"
+        return surface_reads(variant) | warp_reads(variant.settings(), truth)
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """Depth, rules and feature grids."""

@@ -42,7 +42,7 @@ STUDY = {
     "scenes": ["ball.yaml"],
     "spp": 4,
     "splats": {"count": 300},
-    "editing": {"options": {"views_per_stage": 2, "stages": 2, "steps": 1, "iterations": 1}},
+    "editing": {"options": {"views_per_stage": 2, "stages": 2, "iterations": 1}},
     "variants": {"planned": {"method": "true pictures"}},
     "probes": {"editing": ["planned"]},
 }  # fmt: skip
@@ -240,8 +240,9 @@ def test_seconds_are_in_the_record_and_not_in_the_report_without_timings(
 
 
 def test_the_exact_mask_injects_where_the_source_truly_sees(folder, tmp_path):
-    own = {"options": {"stages": 1, "views_per_stage": 3}, "mask": "truth", "geometry": "truth"}
-    record = record_of(folder, tmp_path, variants={"planned": own})
+    options = {"stages": 1, "views_per_stage": 3, "steps": 1, "iterations": 1}
+    own = {"options": options, "mask": "truth", "geometry": "truth"}
+    record = record_of(folder, tmp_path, editing={}, variants={"planned": own})
     scene = load_scene(load_study(str(folder / "mine.yaml")).scenes[0]).with_size(32, 32)
     geometry, targets = Geometry(scene), {camera.name: camera for camera in scene.targets}
     seen = [
@@ -396,7 +397,7 @@ def test_only_cells_whose_views_have_noise_of_their_own_say_how_it_is_drawn(fold
     """A record of former draws is then not taken for one of these."""
     fresh = {"noise": "fresh"}
     variants = {
-        "full": {}, "fresh": {"options": fresh}, "truth": {"method": "true pictures", "options": fresh},
+        "full": {}, "fresh": {"options": fresh}, "truth": {"method": "true pictures"},
         "released": {"options": {"preset": "released-controlnet"}}, "by view": {"method": "by_view"},
         "timed": {"method": "by_view", "budget": {"seconds_of": "fresh"}},
     }  # fmt: skip
@@ -502,7 +503,10 @@ def test_the_scenes_words_are_handed_to_an_inversion_that_asks_for_them(
         ({"variants": {"planned": {"options": {"stagse": 2}}}}, "stagse"),
         ({"editing": {"edits": {"ball": {"gold": None}}}}, "no edit 'gold'"),
         ({"editing": {"edits": {"ball": {"some_colour=gold": None}}}}, "no answer 'gold'"),
-        ({"editing": {"editor": {"name": "no-such"}}}, "editor 'no-such'"),
+        (
+            {"editing": {"editor": {"name": "no-such"}}, "variants": {"planned": {}}},
+            "editor 'no-such'",
+        ),
         ({"variants": {"planned": {"budget": {"seconds": 9}}}}, "'propagate' runs to its end"),
         ({"variants": {"planned": {"method": "dge", "budget": {}}}}, "got no limit"),
         (

@@ -46,7 +46,10 @@ PLANNED = {
 
 def load(folder, **changes):
     (folder / "ball.yaml").write_text(yaml.safe_dump(SCENE))
-    (folder / "mine.yaml").write_text(yaml.safe_dump({**STUDY, **changes}, sort_keys=False))
+    content = {**STUDY, **changes}
+    named = {name for names in content["probes"].values() for name in names}
+    content["variants"] = {k: v for k, v in content["variants"].items() if k in named}
+    (folder / "mine.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
     return load_study(str(folder / "mine.yaml"))
 
 

@@ -39,7 +39,10 @@ STUDY = {
 
 
 def load(folder, **probes):
-    (folder / "fitted.yaml").write_text(yaml.safe_dump({**STUDY, "probes": probes}))
+    named = {name for names in probes.values() for name in names}
+    variants = {name: STUDY["variants"][name] for name in sorted(named)}
+    content = {**STUDY, "variants": variants, "probes": probes}
+    (folder / "fitted.yaml").write_text(yaml.safe_dump(content))
     return load_study(str(folder / "fitted.yaml"))
 
 
@@ -94,7 +97,7 @@ def test_a_fit_waits_for_the_process_that_is_at_it(tmp_path, monkeypatch):
 
 
 def test_a_variant_takes_its_own_kind_of_fit_and_none_where_it_does_not_say_fitted(folder):
-    study = load(folder, warp=list(STUDY["variants"]))
+    study = load(folder, warp=list(STUDY["variants"]), fit=["own fit, sampled splats"])
     cells = cells_of(study, {name: load_scene(name) for name in study.scenes})
     specs = {name: cell.spec for cell in cells if cell.probe == "warp" for name in cell.labels}
     assert specs["2D"]["fit"]["settings"]["kind"] == "2d"
