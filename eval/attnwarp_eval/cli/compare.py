@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from attnwarp_eval.study.results import Results
 
 
+MOST_NAMED = 5
+"""Scenes and cells that a line names."""
+
+
 def compare(
     baseline: Annotated[
         Path, typer.Argument(help="A baseline's file (.jsonl), or the folder of another run.")
@@ -38,13 +42,20 @@ def compare(
         Path | None,
         typer.Option(help="Write a page here, with pictures before and after of what changed."),
     ] = None,
+    common: Annotated[
+        bool,
+        typer.Option(
+            "--common",
+            help="Compare what both have; exit code 3 if something is left out. Not for a gate.",
+        ),
+    ] = False,
     update: Annotated[
         bool, typer.Option("--update", help="Rewrite the baseline's file from the run.")
     ] = False,
 ) -> None:
     """Did my change make anything worse?
 
-    Exit code 1 if so, 3 if too little can be compared.
+    Exit code 1 if so, 3 if too little can be compared, or --common leaves something out.
     """
     from attnwarp.errors import InputError
     from attnwarp_eval.canonical_json import write_json
@@ -56,14 +67,16 @@ def compare(
     with clear_errors():
         outputs = {"--markdown": markdown, "--json": json, "--html": html}
         _check_outputs(baseline, run, outputs, update)
+        if update and common:
+            raise InputError("--common: --update takes the whole run; leave one of the two out")
         if not update and baseline.is_dir() and run.is_dir() and baseline.samefile(run):
             raise InputError(f"{run}: is the baseline too, so nothing can differ; name two runs")
         measured, pictures, notes = _run(run)
         if update:
             _update(baseline, measured, pictures)
             return
-        trusted, former_pictures = _baseline(baseline, measured)
-        result = compare(trusted, measured)
+        trusted, former_pictures = _baseline(baseline, measured, common)
+        result = compare(trusted, measured, common)
         for note in notes:
             warn(note)
         if markdown is not None:
@@ -74,6 +87,15 @@ def compare(
         if json is not None:
             write_json(json, as_json(result, notes))
         _print(result)
+    if result.incomplete:
+        lacking = "; ".join(fault.name for fault in result.faults[:MOST_NAMED])
+        more = len(result.faults) - MOST_NAMED
+        typer.echo(
+            f"attnwarp-eval: {run}: lacks {lacking}{f' and {more} more' if more > 0 else ''}, which"
+            f" {baseline} has; measure them, or compare what both have with --common",
+            err=True,
+        )
+        raise Regression
     if result.regressed:
         accept = "accept it with --update"
         if baseline.is_dir():
@@ -86,6 +108,8 @@ def compare(
         raise Regression
     if result.too_little:
         raise fail(f"{run}: {result.too_little}", TOO_LITTLE)
+    if result.left_out:
+        raise fail(f"{run}: only what {baseline} has too was compared", TOO_LITTLE)
 
 
 def _check_outputs(
@@ -160,15 +184,15 @@ def _of_other_code(results: Results, folder: Path) -> list[str]:
     ]
 
 
-def _baseline(path: Path, run: Snapshot) -> tuple[Snapshot, Pictures]:
-    """The baseline and its pictures."""
+def _baseline(path: Path, run: Snapshot, common: bool) -> tuple[Snapshot, Pictures]:
+    """The baseline and its pictures; an unfinished one only where what both have is compared."""
     from attnwarp.errors import InputError
     from attnwarp_eval.compare import read_baseline
     from attnwarp_eval.compare.pictures import pictures_of_baseline
 
     if path.is_dir():
         trusted, pictures, _ = _run(path)
-        if trusted.missing:
+        if trusted.missing and not common:
             raise InputError(
                 f"{path}: {len(trusted.missing)} cells are missing, so it is no baseline; run its"
                 " study again to measure them"

@@ -8,13 +8,13 @@ with the p-values of all tests adjusted together.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Set
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 
-from attnwarp_eval.compare.snapshot import Measured, Snapshot
+from attnwarp_eval.compare.snapshot import NOT_MEASURED, Measured, Snapshot
 from attnwarp_eval.metrics.gates import GATES, Margin, margin, same_count
 from attnwarp_eval.metrics.registry import METRICS, Metric
 from attnwarp_eval.statistics.intervals import (
@@ -31,10 +31,12 @@ Verdict = Literal["worse", "better", "equal", "can't tell"]
 FEWEST_SCENES = 6
 """A test over fewer pairs of scenes flags nothing."""
 
+NOT_IN_STUDY = "not in the run's study"
+
 SEVERAL_VIEWS = 3
 """Views of a scene that other seeds hardly leave undefined all at once."""
 
-FaultKind = Literal["missing", "redefined", "counter"]
+FaultKind = Literal["missing", "unmeasured", "redefined", "counter"]
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,8 @@ class Fault:
     """What fails without a figure.
 
     Attributes:
-        kind: ``missing``: the baseline has it and the run lacks it; ``redefined``: the cell
+        kind: ``missing``: the baseline has it and the run lacks it; ``unmeasured``: scenes,
+            variants, probes or seeds of which the run has nothing; ``redefined``: the cell
             computes something else; ``counter``: its work is another.
         name: of the cell, metric or view.
         detail: what was expected and what came.
@@ -95,6 +98,7 @@ class Comparison:
         faults: what fails without a figure.
         added: what only the run has; it passes until ``--update`` takes it into the baseline.
         unread: probes that both sides have cells of, with figures none of which was compared.
+        left_out: what one side alone has and a comparison of what both have passed over.
     """
 
     study: str
@@ -104,6 +108,13 @@ class Comparison:
     faults: tuple[Fault, ...]
     added: tuple[str, ...] = field(default=())
     unread: tuple[str, ...] = field(default=())
+    left_out: tuple[str, ...] = field(default=())
+
+    @property
+    def incomplete(self) -> bool:
+        """Whether the run measured less than the baseline, and nothing else is wrong."""
+        worse = any(row.verdict == "worse" for row in self.rows)
+        return bool(self.faults) and not worse and {f.kind for f in self.faults} == {"unmeasured"}
 
     @property
     def regressed(self) -> bool:
@@ -132,8 +143,14 @@ Key = tuple[str, ...]
 """(scene, probe, variant), with the seed behind it where the seeds are the same."""
 
 
-def compare(baseline: Snapshot, run: Snapshot) -> Comparison:
+def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparison:
     """Compare a run with a baseline over the union of their cells, metrics and views.
+
+    Args:
+        baseline: what is trusted.
+        run: what is judged.
+        common: whether to compare what both have alone, seeds included. The rest is then no fault,
+            and stands in ``left_out``.
 
     Example:
         >>> from attnwarp_eval.compare.snapshot import Figure
@@ -145,6 +162,13 @@ def compare(baseline: Snapshot, run: Snapshot) -> Comparison:
         >>> compare(measured(0.01), measured(0.02)).rows[0].verdict
         'worse'
     """
+    left_out: list[str] = []
+    if common and (seeds := baseline.seeds & run.seeds):
+        for where, side in (("baseline", baseline), ("run", run)):
+            if own := sorted(side.seeds - seeds):
+                numbers = ", ".join(map(str, own))
+                left_out.append(f"{_plural('seed', own)} {numbers} (only in the {where})")
+        baseline, run = (_of_seeds(side, seeds) for side in (baseline, run))
     exact = baseline.seeds == run.seeds
     left, right = _by_key(baseline.cells, exact), _by_key(run.cells, exact)
     faults, added = _missing_cells(left, right, run, exact)
@@ -166,7 +190,22 @@ def compare(baseline: Snapshot, run: Snapshot) -> Comparison:
     both = {probe for _, probe, *_ in left.keys() & right.keys()}
     # A probe of one's own has figures that no gate knows: nothing of it was dropped.
     unread = sorted(name for name in both - {r.probe for r in rows} if _has_gates(name))
-    return Comparison(run.study, exact, most, rows, tuple(faults), tuple(added), tuple(unread))
+    if common:
+        lacking = [fault for fault in faults if fault.kind in ("missing", "unmeasured")]
+        faults = [fault for fault in faults if fault not in lacking]
+        left_out += [f"{fault.name} ({fault.detail})" for fault in lacking]
+        left_out += [f"{name} (only in the run)" for name in added]
+        added = []
+    return Comparison(
+        run.study, exact, most, rows, tuple(faults), tuple(added), tuple(unread), tuple(left_out)
+    )
+
+
+def _of_seeds(side: Snapshot, seeds: Set[int]) -> Snapshot:
+    """The cells of some seeds; a cell of several has them all, and no other."""
+    cells = [cell for cell in side.cells if seeds >= set(cell.seeds or (cell.seed,))]
+    missing = {key: reason for key, reason in side.missing.items() if key[3] in seeds}
+    return replace(side, cells=tuple(cells), missing=missing)
 
 
 def _has_gates(name: str) -> bool:
@@ -212,12 +251,49 @@ def _key(scene: str, probe: str, variant: str, seed: int, exact: bool) -> Key:
 def _missing_cells(
     left: Mapping[Key, object], right: Mapping[Key, object], run: Snapshot, exact: bool
 ) -> tuple[list[Fault], list[str]]:
-    reasons: dict[Key, str] = {key: "not in the run's study" for key in left.keys() - right.keys()}
+    reasons: dict[Key, str] = dict.fromkeys(left.keys() - right.keys(), NOT_IN_STUDY)
     # A run that lacks one of its own cells is incomplete, whatever the baseline has.
     for (scene, probe, variant, seed), reason in run.missing.items():
         reasons[_key(scene, probe, variant, seed, exact)] = reason
-    faults = [Fault("missing", " / ".join(key), reason) for key, reason in sorted(reasons.items())]
-    return faults, [" / ".join(key) for key in sorted(right.keys() - left.keys())]
+    only_here = dict.fromkeys(right.keys() - left.keys(), "")
+    return _lacking(reasons, right), [fault.name for fault in _lacking(only_here, left)]
+
+
+_WHOLE = ("scene", "probe", "variant", "seed")
+"""Parts of a key; all that a side lacks of one is told in one line."""
+
+_NOT_FAILED = ("", NOT_IN_STUDY, NOT_MEASURED)
+
+
+def _lacking(lacking: Mapping[Key, str], there: Mapping[Key, object]) -> list[Fault]:
+    """What a side lacks: scenes, probes, variants and seeds of which it has nothing, then single
+    cells. A cell that failed has a line of its own, with its error.
+
+    Args:
+        lacking: keys -> the reason.
+        there: keys that the side has.
+    """
+    rest, faults = dict(lacking), []
+    for place, what in enumerate(_WHOLE):
+        has = {key[place] for key in there if place < len(key)}
+        for reason in _NOT_FAILED:
+            keys = [
+                key
+                for key, why in rest.items()
+                if place < len(key) and key[place] not in has and why == reason
+            ]
+            names = sorted({key[place].removeprefix("seed ") for key in keys})
+            if keys:
+                cells = f"{len(keys)} {_plural('cell', keys)}"
+                detail = f"{cells} {reason}" if reason else cells
+                name = f"{_plural(what, names)} {', '.join(names)}"
+                faults.append(Fault("unmeasured", name, detail))
+                rest = {key: why for key, why in rest.items() if key not in keys}
+    return faults + [Fault("missing", " / ".join(key), why) for key, why in sorted(rest.items())]
+
+
+def _plural(word: str, counted: Collection[object]) -> str:
+    return word if len(counted) == 1 else f"{word}s"
 
 
 def _counters(name: str, first: Mapping[str, int], second: Mapping[str, int]) -> list[Fault]:

@@ -16,6 +16,9 @@ from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Outcome, Results
 from attnwarp_eval.study.store import Store
 
+NOT_MEASURED = "not measured"
+"""The reason why a cell is missing that was never begun."""
+
 
 @dataclass(frozen=True)
 class Figure:
@@ -114,7 +117,7 @@ def snapshot(results: Results) -> Snapshot:
         if cell.record is not None:
             cells.append(_measured(cell, cell.record))
             continue
-        reason = reasons.get(cell.id, "not measured")
+        reason = reasons.get(cell.id, NOT_MEASURED)
         for variant in cell.variants:
             missing[cell.scene, cell.probe, variant, cell.seed] = reason
     return Snapshot(

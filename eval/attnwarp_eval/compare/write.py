@@ -43,12 +43,16 @@ def summary(comparison: Comparison) -> str:
     """
     counts = Counter[str](row.verdict for row in comparison.rows)
     text = ", ".join(f"{counts[name]} {name}" for name in ORDER)
-    if comparison.regressed:
+    if comparison.incomplete:
+        outcome = "the run lacks some of the baseline"
+    elif comparison.regressed:
         outcome = "regression"
     elif comparison.too_little:
         outcome = f"{'too little' if comparison.rows else 'nothing'} to compare"
     else:
         outcome = "pass"
+    if comparison.left_out:
+        outcome += " of what both have"
     return f"{outcome}: {text}; {len(comparison.faults)} missing or changed"
 
 
@@ -77,6 +81,9 @@ def document(comparison: Comparison, notes: Sequence[str] = ()) -> Report:
     if changed:
         rows = [_cells(row) for row in changed]
         sections.append(_section("Figures that changed", COLUMNS, rows))
+    if comparison.left_out:
+        rows = [[name] for name in comparison.left_out]
+        sections.append(_section("Left out, as one side alone has it", ["name"], rows))
     if comparison.added:
         rows = [[name] for name in comparison.added]
         sections.append(_section("Only in the run (take in with --update)", ["name"], rows))

@@ -414,6 +414,97 @@ def test_missing_files_and_runs_of_other_studies_are_exit_code_2(stored, tmp_pat
         assert message in done.stderr
 
 
+def more(stored, folder, **parts):
+    """A baseline of the stored run that also has its cells under other names, and their number."""
+    trusted = read_snapshot(Store(stored / "variants"))
+    ((key, names),) = parts.items()
+    renamed = [
+        dataclasses.replace(cell, **{key: (name,) if key == "variants" else name})
+        for name in names
+        for cell in trusted.cells
+        if cell.probe != "calibration" or key != "variants"
+    ]
+    cells = {cell.key: cell for cell in renamed}
+    both = tuple(sorted((*trusted.cells, *cells.values()), key=lambda cell: cell.key))
+    path = folder / "more.jsonl"
+    write_baseline(path, dataclasses.replace(trusted, cells=both))
+    return path, sum(len(cell.variants) for cell in cells.values())
+
+
+@pytest.mark.parametrize(
+    ("parts", "told"),
+    [
+        ({"scene": ["stump", "garden"]}, "scenes garden, stump"),
+        ({"scene": ["garden"]}, "scene garden"),
+        ({"variants": ["blurred", "sharp"]}, "variants blurred, sharp"),
+    ],
+)
+def test_scenes_and_variants_that_a_run_lacks_are_told_in_one_line(stored, tmp_path, parts, told):
+    baseline, cells = more(stored, tmp_path, **parts)
+    done = gate(baseline, stored / "variants")
+    assert done.exit_code == 1
+    first, second, last = done.stdout.splitlines()
+    assert (first, second) == (
+        "Missing or changed:",
+        f"  unmeasured  {told}  {cells} cells not in the run's study",
+    )
+    assert (
+        last.startswith("the run lacks some of the baseline: 0 worse, ")
+        and "regression" not in done.output
+    )
+    assert f"lacks {told}, which {baseline} has" in done.stderr and "--common" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "parts", [{"scene": ["garden"]}, {"variants": ["blurred"]}, {"seed": [5, 6]}]
+)
+def test_what_both_have_is_compared_alone_and_the_rest_is_said(stored, run, tmp_path, parts):
+    baseline, _ = more(stored, tmp_path, **parts)
+    (names,) = parts.values()
+    data = tmp_path / "compare.json"
+    done = gate(baseline, run, "--common", "--json", data)
+    assert done.exit_code == 3 and "of what both have: 0 worse" in done.stdout, done.output
+    (left_out,) = json.loads(data.read_text())["left_out"]
+    assert all(str(name) in left_out for name in names)
+    assert left_out in done.stdout
+    # The figures are those of the comparison with a baseline that has nothing else.
+    assert (
+        json.loads(data.read_text())["rows"] == json.loads(data_of(stored, run, tmp_path))["rows"]
+    )
+    change(run, "warp", add_half_a_pixel)
+    assert gate(baseline, run, "--common").exit_code == 1  # worse in what both have
+    # Nothing is left out of equal sides.
+    assert gate(stored / "baseline.jsonl", stored / "variants", "--common").exit_code == 0
+    assert gate(baseline, run, "--common", "--update").exit_code == 2
+
+
+def data_of(stored, run, folder):
+    path = folder / "whole.json"
+    assert gate(stored / "baseline.jsonl", run, "--json", path).exit_code == 0
+    return path.read_text()
+
+
+def test_what_only_the_run_has_is_left_out_of_what_both_have(stored, tmp_path):
+    trusted = read_snapshot(Store(stored / "variants"))
+    cells = [cell for cell in trusted.cells if cell.probe != "warp"]
+    path = tmp_path / "less.jsonl"
+    write_baseline(path, dataclasses.replace(trusted, cells=tuple(cells)))
+    done = gate(path, stored / "variants", "--common")
+    assert done.exit_code == 3 and "probe warp (only in the run)" in done.stdout
+    # An unfinished run is no baseline, but what it has can be compared.
+    unfinished = tmp_path / "unfinished"
+    shutil.copytree(stored / "variants", unfinished)
+    store = Store(unfinished)
+    for cell in store.read_study()["cells"]:
+        if cell["probe"] == "depth":
+            next(store.cells.rglob(f"{cell['id']}*.json")).unlink()
+    assert gate(unfinished, stored / "variants").exit_code == 2
+    done = gate(unfinished, stored / "variants", "--common")
+    assert done.exit_code == 3 and "probe depth (only in the run)" in done.stdout
+    done = gate(stored / "variants", unfinished, "--common")
+    assert done.exit_code == 3 and "not measured" in done.stdout
+
+
 def test_markdown_and_json_hold_the_verdicts(stored, run, tmp_path):
     change(run, "warp", add_half_a_pixel)
     markdown, data = tmp_path / "a" / "summary.md", tmp_path / "compare.json"
