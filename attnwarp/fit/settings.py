@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, get_args
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
-from attnwarp import check
 from attnwarp.gaussians import Kind
 from attnwarp.losses import Distortion
+from attnwarp.settings import Count, Number, Range, Settings, Share, Weight
 
 Background = Literal["auto", "random", "black", "white"]
 
 
 @dataclass(frozen=True)
-class FitSettings:
+class FitSettings(Settings):
     """What a fit optimises and how. Equal settings, views, first splats and threads give equal
     bits.
 
@@ -83,60 +82,48 @@ class FitSettings:
     """
 
     kind: Kind = "2d"
-    iterations: int = 7000
-    seed: int = 0
-    sh_degree: int = 3
-    sh_every: int = 1000
-    lr_means: float = 1.6e-4
-    lr_means_final: float = 1.6e-6
-    lr_dc: float = 2.5e-3
-    lr_rest: float = 1.25e-4
-    lr_opacity: float = 5e-2
-    lr_scales: float = 5e-3
-    lr_quats: float = 1e-3
-    ssim: float = 0.2
-    normal: float | None = None
-    distortion: float | None = None
+    iterations: Count = 7000
+    seed: Annotated[int, Range(0, 2**63 - 1)] = 0
+    sh_degree: Annotated[int, Range(0, 3)] = 3
+    sh_every: Count = 1000
+    lr_means: Weight = 1.6e-4
+    lr_means_final: Weight = 1.6e-6
+    lr_dc: Weight = 2.5e-3
+    lr_rest: Weight = 1.25e-4
+    lr_opacity: Weight = 5e-2
+    lr_scales: Weight = 5e-3
+    lr_quats: Weight = 1e-3
+    ssim: Share = 0.2
+    normal: Weight | None = None
+    distortion: Weight | None = None
     distortion_form: Distortion = "l1"
-    normal_from: float = 0.23
-    distortion_from: float = 0.1
+    normal_from: Share = 0.23
+    distortion_from: Share = 0.1
     background: Background = "auto"
     densify: bool = True
-    densify_from: int = 500
-    densify_every: int = 100
-    densify_until: float = 0.5
-    grow_gradient: float = 2e-4
-    grow_scale: float = 0.01
-    split_shrink: float = 1.6
-    max_splats: int | None = None
-    prune_opacity: float | None = None
-    prune_scale: float = 0.1
-    reset_every: int = 3000
-    reset_opacity: float = 0.01
+    densify_from: Number = 500
+    densify_every: Count = 100
+    densify_until: Share = 0.5
+    grow_gradient: Weight = 2e-4
+    grow_scale: Weight = 0.01
+    split_shrink: Annotated[float, Range(1)] = 1.6
+    max_splats: Count | None = None
+    prune_opacity: Share | None = None
+    prune_scale: Annotated[float, Range(1e-6)] = 0.1
+    reset_every: Count = 3000
+    reset_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)] = 0.01  # its logit is finite
     antialiased: bool = False
-    near: float = 0.01
-    evaluate_every: int = 500
-    patience: int | None = None
-    min_gain: float = 0.02
+    near: Annotated[float, Range(1e-9)] = 0.01
+    evaluate_every: Count = 500
+    patience: Count | None = None
+    min_gain: Weight = 0.02
 
     def __post_init__(self) -> None:
-        check.one_of(self.kind, ("2d", "3d"), "kind")
-        check.one_of(self.distortion_form, get_args(Distortion), "distortion_form")
-        check.one_of(self.background, get_args(Background), "background")
-        for name in ("densify", "antialiased"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected true or false")
+        super().__post_init__()
         if self.antialiased and self.kind == "2d":
             raise ValueError(
                 "antialiased: applies to kind '3d' only; 2D splats have a screen filter instead"
             )
-        for name, (low, high) in _LIMITS.items():
-            value = getattr(self, name)
-            if value is None and name in _OPTIONAL:
-                continue
-            whole = name in _WHOLE
-            value = check.number(value, low, high, name, whole=whole)
-            object.__setattr__(self, name, value if whole else float(value))
 
     @property
     def normal_weight(self) -> float:
@@ -156,64 +143,3 @@ class FitSettings:
             if self.prune_opacity is None
             else self.prune_opacity
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values in the order of the fields; equal settings give equal dictionaries."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> FitSettings:
-        """The settings :meth:`to_dict` wrote. Fields left out take the default.
-
-        Raises:
-            ValueError: a key that is no field, or a value out of range.
-        """
-        for key in data:
-            check.one_of(key, [field.name for field in fields(cls)], "fit setting")
-        return cls(**data)
-
-
-_WHOLE = {
-    "iterations",
-    "seed",
-    "sh_degree",
-    "sh_every",
-    "densify_from",
-    "densify_every",
-    "max_splats",
-    "reset_every",
-    "evaluate_every",
-    "patience",
-}
-_OPTIONAL = {"normal", "distortion", "prune_opacity", "max_splats", "patience"}
-_LIMITS: dict[str, tuple[float, float]] = {
-    "iterations": (1, math.inf),
-    "seed": (0, 2**63 - 1),
-    "sh_degree": (0, 3),
-    "sh_every": (1, math.inf),
-    **{
-        f"lr_{name}": (0, math.inf)
-        for name in ("means_final", "dc", "rest", "opacity", "scales", "quats")
-    },
-    "lr_means": (0, math.inf),
-    "ssim": (0, 1),
-    "normal": (0, math.inf),
-    "distortion": (0, math.inf),
-    "normal_from": (0, 1),
-    "distortion_from": (0, 1),
-    "densify_from": (0, math.inf),
-    "densify_every": (1, math.inf),
-    "densify_until": (0, 1),
-    "grow_gradient": (0, math.inf),
-    "grow_scale": (0, math.inf),
-    "split_shrink": (1, math.inf),
-    "max_splats": (1, math.inf),
-    "prune_opacity": (0, 1),
-    "prune_scale": (1e-6, math.inf),
-    "reset_every": (1, math.inf),
-    "reset_opacity": (1e-6, 1 - 1e-6),  # its logit must be finite
-    "near": (1e-9, math.inf),
-    "evaluate_every": (1, math.inf),
-    "patience": (1, math.inf),
-    "min_gain": (0, math.inf),
-}

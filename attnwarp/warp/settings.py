@@ -4,10 +4,11 @@ measures right.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, get_args
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 from attnwarp import check
+from attnwarp.settings import Range, Settings, Share, Weight
 
 PixelCenters = Literal["half", "integer"]
 DepthInterpolation = Literal["inverse", "bilinear", "nearest"]
@@ -18,20 +19,9 @@ SplatDepth = Literal["intersection", "center"]
 DepthStatistic = Literal["expected", "median"]
 MaskResize = Literal["area", "bilinear", "nearest"]
 
-_CHOICES: dict[str, Any] = {
-    "pixel_centers": PixelCenters,
-    "bounds": Bounds,
-    "normal_test": NormalTest,
-    "gaussian_filter": GaussianFilter,
-    "depth": SplatDepth,
-    "depth_statistic": DepthStatistic,
-    "depth_interpolation": DepthInterpolation,
-    "mask_resize": MaskResize,
-}
-
 
 @dataclass(frozen=True)
-class WarpSettings:
+class WarpSettings(Settings):
     """Everything about a warp and its mask that papers and codes decide differently.
 
     Each field can be varied alone with ``dataclasses.replace``; the defaults are the ``corrected``
@@ -89,56 +79,20 @@ class WarpSettings:
     pixel_centers: PixelCenters = "half"
     bounds: Bounds = "source"
     in_front: bool = True
-    opaque: float | None = 0.5
+    opaque: Share | None = 0.5
     depth_agreement: bool = True
-    depth_relative: float = 1e-2
-    depth_slope: float = 0.5
-    photometric: float | None = None
+    depth_relative: Weight = 1e-2
+    depth_slope: Weight = 0.5
+    photometric: Share | None = None
     segment: bool = False
     normal_test: NormalTest = "facing"
     gaussian_filter: GaussianFilter = "none"
-    normal_angle: float = 60.0
+    normal_angle: Annotated[float, Range(0, 180)] = 60.0
     depth: SplatDepth = "intersection"
     depth_statistic: DepthStatistic = "median"
     depth_interpolation: DepthInterpolation = "inverse"
-    depth_spread: float | None = 0.05
+    depth_spread: Weight | None = 0.05
     mask_resize: MaskResize = "area"
-
-    def __post_init__(self) -> None:
-        for name, choices in _CHOICES.items():
-            check.one_of(getattr(self, name), get_args(choices), name)
-        for name in ("in_front", "depth_agreement", "segment"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected true or false")
-        limits = {"opaque": 1.0, "photometric": 1.0, "normal_angle": 180.0}
-        for name in (
-            "opaque",
-            "photometric",
-            "normal_angle",
-            "depth_relative",
-            "depth_slope",
-            "depth_spread",
-        ):
-            value = getattr(self, name)
-            if value is None and name in ("opaque", "photometric", "depth_spread"):
-                continue
-            value = check.number(value, 0, limits.get(name, float("inf")), name)
-            object.__setattr__(self, name, float(value))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values in the order of the fields; equal settings give equal dictionaries."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> WarpSettings:
-        """The settings :meth:`to_dict` wrote. Fields left out take the default.
-
-        Raises:
-            ValueError: a key that is no field.
-        """
-        for key in data:
-            check.one_of(key, [field.name for field in fields(cls)], "warp setting")
-        return cls(**data)
 
 
 PRESETS: dict[str, WarpSettings] = {
@@ -212,4 +166,4 @@ def preset(name: str, **changes: Any) -> WarpSettings:
         0.9
     """
     check.one_of(name, list(PRESETS), "preset")
-    return WarpSettings.from_dict({**PRESETS[name].to_dict(), **changes})
+    return PRESETS[name].changed(**changes)

@@ -111,7 +111,7 @@ def test_every_field_changes_what_it_says():
         ({"in_front": 1}, r"in_front: got 1, expected true or false"),
         (
             {"pixel_centres": "half"},
-            r"warp setting: got 'pixel_centres'.*did you mean 'pixel_centers'",
+            r"setting: got 'pixel_centres'.*did you mean 'pixel_centers'",
         ),
     ],
 )

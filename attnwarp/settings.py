@@ -1,0 +1,124 @@
+"""The base of settings: frozen dataclasses whose annotations say what each field takes."""
+
+from __future__ import annotations
+
+import functools
+import math
+import types
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from attnwarp import check
+
+S = TypeVar("S", bound="Settings")
+
+
+@dataclass(frozen=True)
+class Range:
+    """Limits of a number, both included."""
+
+    low: float = 0.0
+    high: float = math.inf
+
+
+Share = Annotated[float, Range(0, 1)]
+Weight = Annotated[float, Range(0)]
+Count = Annotated[int, Range(1)]
+Number = Annotated[int, Range(0)]
+Seed = Annotated[int, Range(0, 2**62)]
+
+
+@functools.cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
+class Settings:
+    """Checks each field against its annotation when an instance is made.
+
+    ``Literal`` lists choices, ``Annotated[int, Range(1)]`` has limits, ``X | None`` may be left
+    empty, a tuple may come as a list, and other settings may come as a dictionary. Numbers of numpy
+    become Python's own.
+
+    Raises:
+        ValueError: a value that its annotation does not allow; the message names the field.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> from attnwarp.settings import Count, Settings
+        >>> @dataclass(frozen=True)
+        ... class Steps(Settings):
+        ...     steps: Count = 20
+        >>> Steps().changed(steps=2).to_dict()
+        {'steps': 2}
+        >>> Steps(steps=0)
+        Traceback (most recent call last):
+        ValueError: steps: got 0, expected a whole number >= 1
+    """
+
+    def __post_init__(self) -> None:
+        for name, hint in _hints(type(self)).items():  # type: ignore[arg-type]
+            object.__setattr__(self, name, _checked(getattr(self, name), hint, name))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values in the order of the fields; equal settings give equal dictionaries."""
+        values = asdict(self)  # type: ignore[call-overload]
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
+
+    @classmethod
+    def from_dict(cls: type[S], data: dict[str, Any]) -> S:
+        """Settings from what :meth:`to_dict` wrote; fields left out take their default.
+
+        Raises:
+            ValueError: a key that is no field, or a value out of range.
+        """
+        _check_names(cls, data)
+        return cls(**data)
+
+    def changed(self: S, **changes: Any) -> S:
+        """The same settings with some fields changed.
+
+        Raises:
+            ValueError: no such field, or a value out of range; the message names it.
+        """
+        _check_names(type(self), changes)
+        return replace(self, **changes)  # type: ignore[type-var]
+
+
+def _check_names(kind: Any, data: dict[str, Any]) -> None:
+    for name in data:
+        check.one_of(name, [field.name for field in fields(kind)], "setting")
+
+
+def _checked(value: Any, hint: Any, name: str) -> Any:
+    """``value`` as the annotation has it."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        (hint,) = (part for part in arguments if part is not type(None))
+        return _checked(value, hint, name)
+    if origin is Annotated:
+        (kind, limits) = arguments
+        value = check.number(value, limits.low, limits.high, name, whole=kind is int)
+        return value if kind is int else float(value)
+    if origin is Literal:
+        return check.one_of(value, arguments, name)
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"{name}: got {value!r}, expected a list")
+        # Numbers of numpy have no JSON.
+        return tuple(v.item() if isinstance(v, np.generic) else v for v in value)
+    if hint is bool:
+        if not isinstance(value, bool):
+            raise ValueError(f"{name}: got {value!r}, expected true or false")
+    elif hint is str:
+        check.text(value, name)
+    elif isinstance(hint, type) and issubclass(hint, Settings):
+        if isinstance(value, dict):
+            return hint.from_dict(value)
+        if not isinstance(value, hint):
+            raise ValueError(f"{name}: got {value!r}, expected {hint.__name__}")
+    return value
