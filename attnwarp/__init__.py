@@ -4,8 +4,8 @@
 - :mod:`attnwarp.fit` and :mod:`attnwarp.render`: pictures to splats, and splats to pictures.
 - :mod:`attnwarp.warp`: correspondences, visibility and sampling between two views.
 - :mod:`attnwarp.editing`: editors, and their attention recorded, warped and injected.
-- :mod:`attnwarp.propagate`: Algorithm 1, from one edited view to an edited scene.
-- :mod:`attnwarp.baselines`: the methods that it is compared with.
+- :mod:`attnwarp.methods`: Algorithm 1 (:mod:`attnwarp.methods.attention_warping`), from one edited
+  view to an edited scene, and the methods that it is compared with.
 - :mod:`attnwarp.encoders` and :mod:`attnwarp.losses`: what tuning and metrics need.
 """
 

@@ -29,9 +29,9 @@ import torch
 from attnwarp.editing.small import load_editor, thread_count
 from attnwarp.fit import FitSettings, fit, from_points, hold_out, load_views
 from attnwarp.io import read_dataset
+from attnwarp.methods import AttentionWarpingSettings, attention_warping, preset
+from attnwarp.methods.command import FitPlan
 from attnwarp.process import core_count
-from attnwarp.propagate import PRESETS, PropagateSettings, preset, propagate
-from attnwarp.propagate.command import FitPlan
 from attnwarp.render.threads import set_thread_count
 from attnwarp_eval.cost import peak_memory_mb
 from benchmarks import command
@@ -68,7 +68,7 @@ class Plan:
 
 def plans() -> list[Plan]:
     """The default of `attnwarp edit`, and about half and twice its time."""
-    default, tuning = FitPlan(), PRESETS["corrected"].iterations
+    default, tuning = FitPlan(), preset("attention_warping").iterations
     return [
         Plan("default", default, tuning),
         Plan("half", FitPlan(default.iterations // 2, max_splats=15_000), tuning // 2),
@@ -112,9 +112,9 @@ def measure(
     editor = load_editor(editor_name)
     torch.set_num_threads(thread_count(editor))
     size = editor.unet.config.sample_size * editor.factor
-    chosen = preset("corrected", iterations=plan.tuning, size=size)
+    chosen = preset("attention_warping", iterations=plan.tuning, size=size)
     wall, cpu = time.perf_counter(), time.process_time()
-    result = propagate(fitted.gaussians, views.cameras, images, editor, INSTRUCTION, chosen)
+    result = attention_warping(fitted.gaussians, views.cameras, images, editor, INSTRUCTION, chosen)
     figures["edit"] = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
     figures["edit_psnr"] = result.edit_psnr["mean"]
     figures["views"] = [len(result.edited), *images[0].shape[1::-1]]
@@ -193,11 +193,11 @@ def against_one_by_one(
     editor = load_editor(editor_name)
     torch.set_num_threads(thread_count(editor))
     size = editor.unet.config.sample_size * editor.factor
-    warped = preset("corrected", steps=steps, iterations=0, size=size)
+    warped = preset("attention_warping", steps=steps, iterations=0, size=size)
     figures: dict[str, list[dict[str, float]]] = {"propagation": [], "again": [], "one by one": []}
 
-    def run(name: str, settings: PropagateSettings, turn: int) -> None:
-        result = propagate(model, cameras, None, editor, INSTRUCTION, settings)
+    def run(name: str, settings: AttentionWarpingSettings, turn: int) -> None:
+        result = attention_warping(model, cameras, None, editor, INSTRUCTION, settings)
         row = {**result.seconds, "network_rows": result.counters["network_rows"]}
         figures["again" if turn >= AGAIN else name].append(row)
 

@@ -13,9 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib import pyplot
 
-from attnwarp.baselines import ByViewSettings, by_view
 from attnwarp.editing.small import load_editor
-from attnwarp.propagate import preset, propagate
+from attnwarp.methods import ByViewSettings, attention_warping, by_view, preset
 from attnwarp_eval.world import splats, world
 
 VIEWS = ("yaw030", "yaw060", "yaw090", "yaw120")
@@ -41,10 +40,12 @@ def draw(out: Path, scene: str, instruction: str, seed: int) -> None:
     for noise, words in noises.items():
         alone = by_view(*scene_and_words, ByViewSettings(noise=noise, **few))
         rows[f"each view alone,\n{words}"] = alone.edited
-        warped = propagate(*scene_and_words, preset("corrected", noise=noise, **stage, **few))
+        warped = attention_warping(
+            *scene_and_words, preset("attention_warping", noise=noise, **stage, **few)
+        )
         rows[f"attention warped,\n{words}"] = warped.edited
-    beyond = preset("extended", **stage, **few)
-    rows["extended"] = propagate(*scene_and_words, beyond).edited
+    beyond = preset("attention_warping", "extended", **stage, **few)
+    rows["extended"] = attention_warping(*scene_and_words, beyond).edited
     figure, axes = pyplot.subplots(len(rows), len(cameras), figsize=(11, 13.5), dpi=80)
     for axis, title in zip(axes[0], ("source view", *VIEWS), strict=True):
         axis.set_title(title)

@@ -22,12 +22,12 @@ PACKAGES = {"attnwarp": ROOT / "attnwarp", "attnwarp_eval": ROOT / "eval" / "att
 
 DOORS = [
     "attnwarp",
-    "attnwarp.baselines",
+    "attnwarp.methods",
     "attnwarp.encoders",
     "attnwarp.fit",
     "attnwarp.io",
     "attnwarp.losses",
-    "attnwarp.propagate",
+    "attnwarp.methods",
     "attnwarp.render",
     "attnwarp.warp",
     "attnwarp_eval.compare",

@@ -27,14 +27,6 @@ from attnwarp.cli.shell import assignments, check_out, clear_errors, echo, use_t
 from attnwarp.editing.command import DeviceOption, EditorOption, InstructionOption, ThreadsOption
 from attnwarp.editing.small import check_words, guide_of
 
-PRESETS = {
-    "by_view": ("default",),
-    "igs2gs": ("default", "released", "improved"),
-    "dge": ("default", "released"),
-    "gaussctrl": ("default", "paper", "released", "random"),
-}
-"""What a person may type for a method's choices; named here to refuse others without torch."""
-
 
 class BaselineMethod(StrEnum):
     """What a person may type for a method that edits are compared with."""
@@ -54,7 +46,11 @@ def baseline(
     out: Annotated[Path, typer.Option(help="Folder for the result; a run in it is resumed.")],
     editor: EditorOption = "small-plain",
     preset: Annotated[
-        str, typer.Option(help="The method's choices; see docs/baselines.md.")
+        str,
+        typer.Option(
+            help="The method's choices: default, or as published: released, improved (igs2gs),"
+            " paper, random (gaussctrl); see docs/baselines.md."
+        ),
     ] = "default",
     seconds: Annotated[
         float | None, typer.Option(min=0, help="Begin no edit and no iteration after so many.")
@@ -83,21 +79,18 @@ def baseline(
         check_inputs_stay([out / "edited.ply"], [ply])
         check_words(instruction)
         guide_of(editor)  # refuses what is no editor
-        from attnwarp import check
+        from attnwarp import methods
 
-        check.one_of(preset, PRESETS[method.value], "preset")
-        import attnwarp.baselines.settings
-
-        settings = attnwarp.baselines.settings.preset(method.value, preset, **changes)
-        budget = attnwarp.baselines.settings.Budget(seconds, network_rows)
+        settings = methods.preset(method.value, preset, **changes)
+        budget = methods.Budget(seconds, network_rows)
         use_threads(threads)
-        from attnwarp.baselines.command import edit_dataset
+        from attnwarp.methods.command import run_baseline
 
         dataset = read_views(data, reading, points=False)
         splats = read_splats(ply, kind, antialiased)
         check_seen(ply, splats, dataset.cameras)
         warn_of_misfit(ply, splats, dataset)
-        result = edit_dataset(
+        result = run_baseline(
             method.value, dataset, splats, editor, instruction, settings, out,
             budget=budget, max_size=max_size, device=device, threads=threads,
             say=echo,

@@ -45,9 +45,6 @@ NO_FEATURES = 0.001
 FIT_ITERATIONS, FIT_SPLATS = 3_000, 30_000
 """Of the fit that begins an edit without splats."""
 
-PRESETS = ("corrected", "extended", "paper", "released", "released-controlnet")
-"""What a person may type for the choices of an edit; named here as ``--help`` imports no torch."""
-
 
 @reading_options()
 def edit(
@@ -62,7 +59,8 @@ def edit(
         str,
         typer.Option(
             metavar="NAME",
-            help=f"The method's choices: {', '.join(PRESETS)} (see docs/presets.md).",
+            help="The method's choices: corrected, extended, paper, released, released-controlnet"
+            " (see docs/presets.md).",
         ),
     ] = "corrected",
     source: Annotated[
@@ -137,24 +135,20 @@ def edit(
         )
         check_segmenter(segmenter, words)
         check_out(out)
-        results = ("source.png", "edited.ply", "edited-3dgs.ply")
+        results = ("edited.ply", "edited-3dgs.ply")
         check_inputs_stay((out / name for name in results), (source_picture, ply))
         check_words(instruction)
         guide_of(editor)  # refuses what is no editor
-        from attnwarp import check
+        from attnwarp import methods
 
-        check.one_of(preset, PRESETS, "preset")
-
-        import attnwarp.propagate.settings
-
-        settings = attnwarp.propagate.settings.preset(preset, **changes)
+        settings = methods.preset("attention_warping", preset, **changes)
         use_threads(threads)
         dataset = read_views(data, reading)
         splats = None if ply is None else read_splats(ply, kind, antialiased)
         if ply is not None and splats is not None:
             check_seen(ply, splats, dataset.cameras)
             warn_of_misfit(ply, splats, dataset)
-        from attnwarp.propagate.command import FitPlan, edit_dataset
+        from attnwarp.methods.command import FitPlan, edit_dataset
 
         result, page = edit_dataset(
             dataset, splats, editor, instruction, settings, out,

@@ -103,7 +103,7 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera]) -> None
     import torch
 
     from attnwarp.fit import compile_kernels
-    from attnwarp.propagate.scene import near_of
+    from attnwarp.methods.scene import near_of
     from attnwarp.render import render
 
     compile_kernels(splats.kind, echo)
@@ -132,7 +132,7 @@ def warn_of_misfit(path: Path, splats: Gaussians, dataset: Dataset) -> None:
     import torch
 
     from attnwarp.fit import load_views
-    from attnwarp.propagate.scene import near_of
+    from attnwarp.methods.scene import near_of
     from attnwarp.render import render
 
     there = [k for k, image in enumerate(dataset.image_paths) if image is not None]

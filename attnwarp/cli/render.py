@@ -20,7 +20,7 @@ from attnwarp.cli.options import (
 )
 from attnwarp.cli.shell import check_out, clear_errors, use_threads
 from attnwarp.errors import InputWarning
-from attnwarp.progress import display
+from attnwarp.reporting import display
 
 
 @reading_options(without="missing_images")

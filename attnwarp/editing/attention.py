@@ -37,6 +37,15 @@ CONTROLNET_BRANCHES = ("uncond", "text")
 class TokenWarp(Protocol):
     """The warp of one grid, such as :class:`attnwarp.warp.FeatureWarp`."""
 
+    @property
+    def weight(self) -> Tensor:
+        """(H W, 1) in [0, 1]: M, 1 where the source shows what the target does."""
+        ...
+
+    def warp_tokens(self, source: Tensor) -> Tensor:
+        """(1, H W, C) of the source's (1, h w, C) tokens."""
+        ...
+
     def blend_tokens(self, source: Tensor, new: Tensor, alpha: float) -> Tensor:
         """(1, H W, C) of the source's (1, h w, C) tokens, warped, and the target's own."""
         ...
@@ -49,6 +58,10 @@ class LayerWarp(Protocol):
     def at(self, size: Size, *, source_size: Size | None = None) -> TokenWarp:
         """The warp of an (h, w) grid of the target from a grid of the source."""
         ...
+
+
+Blend = Callable[[TokenWarp, Tensor, Tensor, float], Tensor]
+"""(1, H W, C) of a warp, the source's (1, h w, C) tokens, the target's own and the weight a_t."""
 
 
 @dataclass(frozen=True)
@@ -540,6 +553,7 @@ def inject(
     weight: Callable[[int, int], float] | None = None,
     mask: Tensor | None = None,
     layers: Sequence[Layer] | None = None,
+    blend: Blend | None = None,
 ) -> Iterator[None]:
     """Blend recorded features into the UNet's attention while the block runs.
 
@@ -557,6 +571,8 @@ def inject(
         mask: (H, W) bool of the target where features may be injected, at any size with the
             target's proportions; everywhere if left out.
         layers: to inject, all recorded ones if left out.
+        blend: of tokens along a warp; the formula above if left out. Half precision comes to it as
+            float32.
 
     Raises:
         ValueError: a timestep, layer, branch or size that does not match the recording, or a run
@@ -602,7 +618,7 @@ def inject(
     if plan.views not in (1, views):
         raise ValueError(f"warps: got {views}, expected {plan.views}, one for each recorded view")
 
-    def blend(layer: Layer, features: Tensor, call: Call) -> Tensor:
+    def change(layer: Layer, features: Tensor, call: Call) -> Tensor:
         nonlocal step
         rows = len(branches) * views
         if call.batch != rows:
@@ -630,13 +646,13 @@ def inject(
                 row = list(branches).index(branch) * views + view
                 own = source[view if plan.views > 1 else 0]
                 new = features[row]
-                _blend_into(result[row], new, warp, own, alpha, source_size, size)
+                _blend_into(result[row], new, warp, own, alpha, source_size, size, blend)
                 if mask is not None:
                     inside = resize_mask(mask.cpu(), size).reshape(-1, 1).to(features.device)
                     result[row] = torch.where(inside, result[row], new)
         return result
 
-    with hooked(unet, chosen, blend):
+    with hooked(unet, chosen, change):
         yield
 
 
@@ -648,6 +664,7 @@ def _blend_into(
     alpha: float,
     source_size: Size,
     size: Size,
+    blend: Blend | None,
 ) -> None:
     """Source tokens, warped and blended into the target's own; None is the identity."""
     if warp is None:
@@ -660,7 +677,10 @@ def _blend_into(
         result.copy_(alpha * source.to(work) + (1 - alpha) * new.to(work))
         return
     layer = warp.at(size, source_size=source_size)
-    if isinstance(layer, FeatureWarp) and not torch.is_grad_enabled():
+    if blend is not None:
+        work = work_type(new.dtype)
+        result.copy_(blend(layer, source[None].to(work), new[None].to(work), alpha)[0])
+    elif isinstance(layer, FeatureWarp) and not torch.is_grad_enabled():
         # A layer is small: most of a blend's time would go into results and their copies.
         layer.blend_tokens(source[None], result[None], alpha, in_place=True)
     else:

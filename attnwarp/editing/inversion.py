@@ -206,6 +206,25 @@ def edit_friendly_invert(
     return NoiseMaps(list(timesteps), start, torch.stack(maps))
 
 
+def noise_maps(
+    editor: Any, task: Any, picture: Image, timesteps: list[int], seed: int
+) -> NoiseMaps:
+    """Noise maps of a picture made elsewhere, whose first state has the noise of all views.
+
+    Args:
+        editor: the model.
+        task: of its edit.
+        picture: (H, W, 3) in [0, 1].
+        timesteps: falling.
+        seed: of :func:`attnwarp.editing.editor.shared_noise`.
+    """
+    latents = editor.encode([picture])
+    generator = torch.Generator().manual_seed(seed + 1)
+    noises = torch.randn((len(timesteps), *latents.shape), generator=generator)
+    noises[0] = shared_noise((1, *latents.shape[1:]), seed)
+    return edit_friendly_invert(editor.schedule, task.predict, latents, timesteps, noises=noises)
+
+
 def replay(
     schedule: Schedule,
     predict: Predict,

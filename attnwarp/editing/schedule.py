@@ -25,7 +25,7 @@ step of the editor's own schedule. Manifests and studies record it, so that no r
 """
 
 FRESH_PROTOCOL = 2
-"""Of edits by ``propagate`` whose views have noise of their own: how it is drawn.
+"""Of edits by attention warping whose views have noise of their own: how it is drawn.
 
 Each seed and view has a draw that no other has. Up to 1, neighbouring seeds shared draws. Manifests
 and studies record it, as they do :data:`START_PROTOCOL`.

@@ -78,7 +78,7 @@ class NoDetectionError(InputError):
 def segments_of(
     segmenter: Segmenter, words: str, names: Sequence[str]
 ) -> Callable[[int, Image], Mask]:
-    """Masks of views as a function of a view's number and picture, as ``propagate`` takes them.
+    """Masks of views as a function of a view's number and picture, as methods take them.
 
     Args:
         segmenter: see :class:`Segmenter`.

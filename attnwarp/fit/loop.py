@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from attnwarp import check, losses
-from attnwarp.fit import checkpoint
 from attnwarp.fit.densify import Density
 from attnwarp.fit.model import Model, check_on_cpu
 from attnwarp.fit.settings import FitSettings
@@ -24,8 +23,8 @@ from attnwarp.fit.views import Views
 from attnwarp.fit.warm import compile_kernels
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError, write_ply
-from attnwarp.io.lock import alone_in
 from attnwarp.render import Render, render
+from attnwarp.workdir import CheckpointClock, Workdir, results_in
 
 Tensor = torch.Tensor
 Measure = Callable[[Gaussians], dict[str, float]]
@@ -154,8 +153,8 @@ def fit(
 ) -> Fit:
     """Fit splats to posed pictures.
 
-    With ``folder``, the splats (``splats.ply``) and a checkpoint are written there every
-    ``checkpoint_seconds`` and at the end, each atomically. A fit with a checkpoint is
+    With ``folder``, a checkpoint is written there every ``checkpoint_seconds`` and at the end,
+    which also writes the splats (``splats.ply``), each atomically. A fit with a checkpoint is
     resumed. On the same machine, with the same number of torch threads, it gives the bits of an
     uninterrupted fit.
 
@@ -169,7 +168,8 @@ def fit(
         restart: begin again, without the folder's checkpoint, and write over its splats.
         max_seconds: stop after so many seconds of iterations, over all sittings; compiling kernels
             is none of them. The learning rates follow ``settings.iterations`` all the same.
-        checkpoint_seconds: see above.
+        checkpoint_seconds: see above; more where a checkpoint takes long, of which the writing
+            then takes 5 % of the time.
         third_scale: of 2D splats in ``splats.ply``, for viewers of 3D ones; see
             :func:`attnwarp.io.write_ply`.
         backend: of :func:`attnwarp.render.render`.
@@ -229,10 +229,10 @@ def fit(
     if third_scale is not None and settings.kind != "2d":
         raise ValueError(f"third_scale: got {third_scale} for kind '3d', expected None")
     run = _Run(start, views, settings, held_out, backend, measure, third_scale)
-    with nullcontext() if folder is None else alone_in(folder):
-        if folder is not None:
-            run.resume(Path(folder), restart=restart)
-        return run.go(max_seconds, checkpoint_seconds, watch, stop)
+    with nullcontext() if folder is None else results_in(Path(folder)) as place:
+        if place is not None:
+            run.resume(Workdir(place, "a fit"), restart=restart)
+        return run.go(max_seconds, CheckpointClock(checkpoint_seconds), watch, stop)
 
 
 class _Run:
@@ -263,7 +263,7 @@ class _Run:
         self.seconds = self.cpu_seconds = 0.0
         self.loss = self.error = math.nan
         self.history: list[Record] = []
-        self.folder: Path | None = None
+        self.folder: Workdir | None = None
 
     def identity(self) -> dict[str, Any]:
         """Settings and data that a checkpoint must match to be resumed."""
@@ -275,13 +275,13 @@ class _Run:
             "origin": [float(v) for v in self.model.origin],
         }
 
-    def resume(self, folder: Path, *, restart: bool) -> None:
+    def resume(self, folder: Workdir, *, restart: bool) -> None:
         self.folder = folder
-        path = folder / CHECKPOINT
+        path = folder.path / CHECKPOINT
         if restart:
             return  # What is there stays until the first save replaces it.
         if not path.exists():
-            splats = folder / SPLATS
+            splats = folder.path / SPLATS
             if splats.exists():
                 raise ValueError(
                     f"folder: {splats} is there without {CHECKPOINT}, and a fit would write over"
@@ -289,7 +289,7 @@ class _Run:
                 )
             return
         remedy = f"remove it and {SPLATS} to begin again"
-        state = checkpoint.load(path, remedy)
+        state = folder.load(CHECKPOINT, remedy)
         # Checkpoints from before they named the first splats can't be held to them.
         stored_of = {"start": self.start, **state}
         for name, expected in self.identity().items():
@@ -304,8 +304,9 @@ class _Run:
                 ]
                 name = f"settings ({'; '.join(differ)})"
             raise ValueError(
-                f"folder: {folder} holds a fit of other {NAMED.get(name, name)}; go on with the"
-                f" same ones, or name another folder, or remove {path} and {SPLATS} to begin again"
+                f"folder: {folder.path} holds a fit of other {NAMED.get(name, name)}; go on with"
+                f" the same ones, or name another folder, or remove {path} and {SPLATS} to begin"
+                " again"
             )
         try:
             self.model.restore(state["model"])
@@ -324,9 +325,8 @@ class _Run:
     def save(self) -> None:
         if self.folder is None:
             return
-        # The checkpoint first: splats without one are taken for somebody's own.
-        checkpoint.save(
-            self.folder / CHECKPOINT,
+        self.folder.save(
+            CHECKPOINT,
             {
                 **self.identity(),
                 "model": self.model.state(),
@@ -341,19 +341,17 @@ class _Run:
                 "history": [asdict(record) for record in self.history],
             },
         )
-        write_ply(self.folder / SPLATS, self.model.gaussians(), third_scale=self.third_scale)
 
     def go(
         self,
         max_seconds: float | None,
-        checkpoint_seconds: float,
+        clock: CheckpointClock,
         watch: Callable[[Step], object] | None,
         stop: Callable[[], bool] | None,
     ) -> Fit:
         s = self.settings
         if self.backend in ("auto", "cpu") and self.iteration < s.iterations:
             compile_kernels(s.kind)
-        written = time.perf_counter()
         if not self.history:
             self.evaluate()
         while True:
@@ -369,14 +367,18 @@ class _Run:
                 self.evaluate()
             if watch is not None:
                 watch(self.step())
-            if self.folder is not None and time.perf_counter() - written >= checkpoint_seconds:
-                self.save()
-                written = time.perf_counter()
+            if self.folder is not None and clock.due:
+                with clock.saving():
+                    self.save()
         if self.history[-1].iteration != self.iteration:
             self.evaluate()
         self.save()
+        gaussians = self.model.gaussians().detach()
+        if self.folder is not None:
+            # After the checkpoint: splats without one are taken for somebody's own.
+            write_ply(self.folder.path / SPLATS, gaussians, third_scale=self.third_scale)
         return Fit(
-            self.model.gaussians().detach(),
+            gaussians,
             s,
             list(self.history),
             self.iteration,

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from attnwarp.fit.loop import Step
-from attnwarp.progress import display
+from attnwarp.reporting import display
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from numbers import Real
 from typing import Any, Literal, TypeAlias
 
@@ -47,6 +48,11 @@ class FeatureWarp:
     backend: Backend = "auto"
     _taps: dict[tuple[Any, ...], Taps] = field(default_factory=dict, repr=False)
     _masks: dict[torch.device, Tensor] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def weight(self) -> Tensor:
+        """(H W, 1) float32: 1 in the mask, 0 elsewhere."""
+        return self.mask.reshape(-1, 1).float()
 
     def warp(self, features: Tensor) -> Tensor:
         """Target features (C, H, W) or (B, C, H, W) from the source's.

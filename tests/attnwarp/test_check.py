@@ -8,10 +8,9 @@ import pytest
 import torch
 
 from attnwarp import Camera, check
-from attnwarp.baselines import Budget
-from attnwarp.baselines import preset as baseline_preset
 from attnwarp.fit import FitSettings
-from attnwarp.propagate import preset as propagate_preset
+from attnwarp.methods import Budget
+from attnwarp.methods import preset as method_preset
 from attnwarp.warp import (
     Surface,
     correspond_at,
@@ -30,10 +29,10 @@ from attnwarp.warp import (
          lambda: FitSettings(iterations=20, ssim=0.5)),
         (lambda: preset("corrected", normal_angle=np.int32(60)),
          lambda: preset("corrected", normal_angle=60)),
-        (lambda: propagate_preset("corrected", steps=np.int16(10), a0=np.float32(0.25), start=(np.int64(500), np.int64(900)), feature_steps=(np.float32(0), np.float32(0.5))),
-         lambda: propagate_preset("corrected", steps=10, a0=0.25, start=(500, 900), feature_steps=(0.0, 0.5))),
-        (lambda: baseline_preset("dge", views=np.int64(4), starts=(np.int64(998), np.int64(299)), epipolar=np.float32(1.5)),
-         lambda: baseline_preset("dge", views=4, starts=(998, 299), epipolar=1.5)),
+        (lambda: method_preset("attention_warping", steps=np.int16(10), a0=np.float32(0.25), start=(np.int64(500), np.int64(900)), feature_steps=(np.float32(0), np.float32(0.5))),
+         lambda: method_preset("attention_warping", steps=10, a0=0.25, start=(500, 900), feature_steps=(0.0, 0.5))),
+        (lambda: method_preset("dge", views=np.int64(4), starts=(np.int64(998), np.int64(299)), epipolar=np.float32(1.5)),
+         lambda: method_preset("dge", views=4, starts=(998, 299), epipolar=1.5)),
     ],
     ids=["fit", "warp", "propagate", "baseline"],
 )  # fmt: skip

@@ -3,9 +3,9 @@
 import json
 from pathlib import Path
 
-from attnwarp.fit import checkpoint
+from attnwarp import workdir
 from attnwarp.io import ply
-from attnwarp.propagate import folder
+from attnwarp.reporting import Reporter
 
 
 def files(folder):
@@ -23,6 +23,13 @@ def without(folder, key):
     manifest = json.loads(path.read_text())
     del manifest[key]
     path.write_text(json.dumps(manifest))
+
+
+class Watched(Reporter):
+    """Calls functions with (done, total, text) of a step, and with a line."""
+
+    def __init__(self, step=lambda *_: None, log=lambda _: None):
+        self.step, self.log = step, log
 
 
 class Killed(BaseException):
@@ -51,6 +58,6 @@ def events(monkeypatch, stop):
 
         return around
 
-    for module in (checkpoint, ply, folder):
+    for module in (ply, workdir):
         monkeypatch.setattr(module, "write_atomically", wrapped(module.write_atomically))
     return event, lambda: count

@@ -3,8 +3,8 @@
 import weakref
 from functools import partial
 
-from attnwarp.propagate.pictures import full_size
-from attnwarp.propagate.tune import DrawnViews
+from attnwarp.methods.pictures import full_size
+from attnwarp.methods.tuning import DrawnViews
 
 
 def watch(monkeypatch, module, held_bytes):

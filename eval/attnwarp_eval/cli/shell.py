@@ -13,7 +13,7 @@ import typer
 
 from attnwarp.cli.shell import STOPPED, USAGE, closed_pipe
 from attnwarp.process import stops_interrupt
-from attnwarp.progress import LINE_SECONDS, Pace
+from attnwarp.reporting import LINE_SECONDS, Pace
 
 if TYPE_CHECKING:
     import rich.progress

@@ -254,8 +254,8 @@ def _edit(
 ) -> EditedScene:
     import torch
 
-    from attnwarp.baselines import Budget
     from attnwarp.editing.editor import own_size
+    from attnwarp.methods import Budget
 
     variant = study.variants[name]
     own = variant.part(editing.VariantPart)
@@ -293,8 +293,8 @@ def _write_pictures(
     folder: Path,
 ) -> None:
     """Renders of all views and the edited views, at the capture's size."""
-    from attnwarp.propagate.pictures import enlarged_change
-    from attnwarp.propagate.scene import near_of, render_picture
+    from attnwarp.methods.pictures import enlarged_change
+    from attnwarp.methods.scene import near_of, render_picture
 
     near = near_of(cameras, before)
     for k, camera in enumerate(cameras):

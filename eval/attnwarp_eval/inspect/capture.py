@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -122,11 +123,13 @@ class Edit:
     def splats(self, step: str) -> Gaussians:
         """The splats after a step other than "before"."""
         number = step.removeprefix("stage ")
-        return read_ply(self.path / ("edited.ply" if step == EDITED else f"stages/{number}.ply"))
+        return read_ply(self.path / ("edited.ply" if step == EDITED else f"rounds/{number}.ply"))
 
     def edited(self, view: str) -> Image | None:
         """(h, w, 3) the edited picture of a view."""
-        return self._picture("source.png" if view == self.source else f"views/{view}.png")
+        for path in sorted(self.path.glob(f"rounds/*/{glob.escape(view)}.png")):
+            return read_picture(path)
+        return None
 
     def after(self, view: str, step: str) -> Image | None:
         """(h, w, 3) render of the scene after a step; None where the edit has not made it."""
@@ -155,8 +158,7 @@ def is_edit(path: Path) -> bool:
 
 
 def _manifest() -> str:
-    # Editors take their time to import.
-    from attnwarp.propagate.folder import MANIFEST
+    from attnwarp.workdir import MANIFEST
 
     return MANIFEST
 
@@ -177,7 +179,8 @@ def read_edit(path: Path, names: Sequence[str]) -> Edit:
     try:
         manifest: Any = json.loads(file.read_text(encoding="utf-8"))
         source, instruction = manifest["source"], manifest["instruction"]
-        views = [name for stage in manifest["stages"] for name in stage]
+        edited = [name for part in manifest["rounds"] for name in part["views"]]
+        views = [name for name in edited if name != source]
         settings = WarpSettings.from_dict(manifest["settings"]["warp"])
         if not all(isinstance(text, str) for text in (source, instruction, *views)):
             raise TypeError("a name that is no text")
@@ -195,12 +198,12 @@ def read_edit(path: Path, names: Sequence[str]) -> Edit:
         )
     stages = [
         f"stage {number + 1}"
-        for number in range(len(manifest["stages"]))
-        if (path / f"stages/{number + 1}.ply").is_file()
+        for number in range(len(manifest["rounds"]))
+        if (path / f"rounds/{number + 1}.ply").is_file()
     ]
     if (path / "edited.ply").is_file():
         # The last stage's splats are the edited ones.
-        stages = [*stages[: len(manifest["stages"]) - 1], EDITED]
+        stages = [*stages[: len(manifest["rounds"]) - 1], EDITED]
     return Edit(path, instruction, source, tuple(views), settings, (BEFORE, *stages))
 
 

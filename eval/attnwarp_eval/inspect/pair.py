@@ -553,7 +553,7 @@ def fitted(picture: Image, camera: Camera) -> Image:
     if picture.shape[:2] == (camera.height, camera.width):
         return picture
     # Editors take their time to import.
-    from attnwarp.propagate.pictures import resized
+    from attnwarp.methods.pictures import resized
 
     return resized(picture, (camera.height, camera.width))
 

@@ -7,7 +7,7 @@ A method gets a :class:`Job` and gives an :class:`EditedScene`. A new one is one
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,10 +17,10 @@ import numpy.typing as npt
 from attnwarp_eval.study.reads import MASK_RULES, warp_reads
 
 if TYPE_CHECKING:
-    from attnwarp.baselines import Budget
     from attnwarp.camera import Camera
     from attnwarp.editing.editor import Editor
     from attnwarp.gaussians import Gaussians
+    from attnwarp.methods import Budget
     from attnwarp.warp import WarpedView
 
 Image = npt.NDArray[np.float32]
@@ -130,10 +130,12 @@ class Method:
     takes_picture: bool = False
 
 
-def _propagate_settings(name: str | None, fields: dict[str, Any], seed: int) -> dict[str, Any]:
-    from attnwarp.propagate import preset
+def _attention_warping_settings(
+    name: str | None, fields: dict[str, Any], seed: int
+) -> dict[str, Any]:
+    from attnwarp.methods import preset
 
-    return preset("corrected" if name is None else name, **fields, seed=seed).to_dict()
+    return dict(preset("attention_warping", name, **fields, seed=seed).to_dict())
 
 
 _LOSSES = frozenset(
@@ -169,10 +171,10 @@ def _options(settings: Mapping[str, Any], idle: Set[str]) -> set[str]:
     }
 
 
-def _propagate_reads(settings: Mapping[str, Any]) -> Set[str]:
-    from attnwarp.propagate import PropagateSettings
+def _attention_warping_reads(settings: Mapping[str, Any]) -> Set[str]:
+    from attnwarp.methods import AttentionWarpingSettings
 
-    s = PropagateSettings.from_dict(dict(settings))
+    s = AttentionWarpingSettings.from_dict(dict(settings))
     idle = set(_NOT_IN_STUDIES)
     if s.estimate == 0:
         idle |= {"estimate_until", "estimate_in", "estimate_margin"}
@@ -198,51 +200,61 @@ def _propagate_reads(settings: Mapping[str, Any]) -> Set[str]:
     return read | warp | {f"options.warp.{key[4:]}" for key in warp} | _options(vars(s), idle)
 
 
-def _propagate(job: Job) -> EditedScene:
-    """:func:`attnwarp.propagate.propagate`."""
-    from attnwarp.propagate import PropagateSettings, propagate
+def _attention_warping(job: Job) -> EditedScene:
+    """:func:`attnwarp.methods.attention_warping`."""
+    from attnwarp.methods import AttentionWarpingSettings, attention_warping
 
-    result = propagate(
-        job.gaussians,
-        job.cameras,
-        job.images,
-        job.editor,
-        job.instruction,
-        PropagateSettings.from_dict(job.settings),
-        warps=job.warps,
-        folder=job.folder,
-        source_picture=job.source_picture,
+    return _edited(
+        attention_warping(
+            job.gaussians,
+            job.cameras,
+            job.images,
+            job.editor,
+            job.instruction,
+            AttentionWarpingSettings.from_dict(job.settings),
+            warps=job.warps,
+            folder=job.folder,
+            source_picture=job.source_picture,
+            budget=job.budget,
+        )
     )
-    return EditedScene(result.gaussians, result.edited, result.seconds, result.counters)
+
+
+def _edited(result: Any) -> EditedScene:
+    return EditedScene(result.gaussians, result.edited, result.seconds, result.counters, result.cut)
 
 
 def _true_pictures(job: Job) -> EditedScene:
     """The first answer's true pictures in every view, and splats tuned on them: the ceiling.
 
-    Stages, their views and their tuning are those of ``propagate``.
+    Stages, their views and their tuning are those of ``attention_warping``.
     """
-    import time
+    from attnwarp.methods import AttentionWarpingSettings
+    from attnwarp.methods.attention_warping import AttentionWarping
+    from attnwarp.methods.base import ViewEdit, run
 
-    from attnwarp.propagate import Plan, PropagateSettings
-    from attnwarp.propagate.pictures import to_bytes
-    from attnwarp.propagate.tune import TrainingView, Tuning
-
-    settings = PropagateSettings.from_dict(job.settings)
     pictures = next(iter(job.truth.values()))
-    plan = Plan.draw(len(job.cameras), 0, settings)
-    edited = {view: to_bytes(pictures[view]) for view in plan.edited}
-    training = {
-        view: TrainingView(view, job.cameras[view], pixels.astype(np.float32) / np.float32(255))
-        for view, pixels in edited.items()
-    }
-    tuning = Tuning(job.gaussians, job.cameras, settings, len(plan.stages))
-    begin = time.perf_counter()
-    for stage in range(len(plan.stages)):
-        views = [training[view] for view in plan.training(stage, settings.training)]
-        tuning.stage(stage, views, training[0], checkpoint=job.folder / "stage.pt")
-    seconds = {"tune": time.perf_counter() - begin}
-    counters = {"iterations": tuning.iteration, "views": len(edited), "network_rows": 0}
-    return EditedScene(tuning.gaussians(), edited, seconds, counters)
+
+    class TruePictures(AttentionWarping):
+        """Views become their true pictures."""
+
+        def edit_source(self, number: int, *_: Any) -> list[ViewEdit]:
+            return self.edit_targets(0, [self.sources[number]])
+
+        def edit_targets(self, stage: int, batch: Sequence[int], *_: Any) -> list[ViewEdit]:
+            return [ViewEdit(pictures[view], {"injected": 0.0}) for view in batch]
+
+    def make(work: Any, settings: Any) -> TruePictures:
+        return TruePictures(work, settings, 0, None, None, "cpu")
+
+    result = _edited(
+        run(
+            "true pictures", make, AttentionWarpingSettings,
+            job.gaussians, job.cameras, job.images, job.editor, job.instruction,
+            AttentionWarpingSettings.from_dict(job.settings), folder=job.folder,
+        )
+    )  # fmt: skip
+    return replace(result, counters={**result.counters, "network_rows": 0})
 
 
 def _true_pictures_reads(settings: Mapping[str, Any]) -> Set[str]:
@@ -251,16 +263,15 @@ def _true_pictures_reads(settings: Mapping[str, Any]) -> Set[str]:
 
 
 def _baseline(name: str) -> Method:
-    """A method of :mod:`attnwarp.baselines`."""
+    """A method of :mod:`attnwarp.methods`."""
 
     def settings(wanted: str | None, fields: dict[str, Any], seed: int) -> dict[str, Any]:
-        from attnwarp.baselines import preset
+        from attnwarp.methods import preset
 
-        chosen = "default" if wanted is None else wanted
-        return asdict(preset(name, chosen, **fields, seed=seed))
+        return dict(preset(name, wanted, **fields, seed=seed).to_dict())
 
     def reads(settings: Mapping[str, Any]) -> Set[str]:
-        idle = {"seed"}
+        idle = set(_NOT_IN_STUDIES)
         if settings.get("latents") == "random":
             idle.add("source_prompt")
         if name == "by_view" and settings["start"] is not None and settings["noise"] == "fresh":
@@ -268,32 +279,34 @@ def _baseline(name: str) -> Method:
         return {"editor"} | _options(settings, idle)
 
     def run(job: Job) -> EditedScene:
-        from attnwarp import baselines
+        from attnwarp import methods
 
-        fields: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in job.settings.items()
-        }
-        result = baselines.METHODS[name](
-            job.gaussians,
-            job.cameras,
-            job.images,
-            job.editor,
-            job.instruction,
-            baselines.preset(name, **fields),
-            folder=job.folder,
-            budget=job.budget or baselines.Budget(),
-        )
-        return EditedScene(
-            result.gaussians, result.edited, result.seconds, result.counters, result.cut
+        return _edited(
+            methods.METHODS[name](
+                job.gaussians,
+                job.cameras,
+                job.images,
+                job.editor,
+                job.instruction,
+                methods.preset(name, **job.settings),
+                folder=job.folder,
+                budget=job.budget,
+            )
         )
 
     return Method(settings, run, reads, takes_budget=True)
 
 
 EDITING_METHODS: dict[str, Method] = {
-    "propagate": Method(_propagate_settings, _propagate, _propagate_reads, takes_picture=True),
-    "true pictures": Method(_propagate_settings, _true_pictures, _true_pictures_reads),
+    "attention_warping": Method(
+        _attention_warping_settings,
+        _attention_warping,
+        _attention_warping_reads,
+        takes_budget=True,
+        takes_picture=True,
+    ),
+    "true pictures": Method(_attention_warping_settings, _true_pictures, _true_pictures_reads),
     **{name: _baseline(name) for name in ("by_view", "igs2gs", "dge", "gaussctrl")},
 }
-"""Every method by name. ``propagate`` with ``method: each view alone`` is the control; those of
-:mod:`attnwarp.baselines` keep their names."""
+"""Every method by name, as in :mod:`attnwarp.methods`. ``attention_warping`` with ``method: each
+view alone`` is the control."""

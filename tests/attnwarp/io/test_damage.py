@@ -18,7 +18,6 @@ from PIL import Image
 
 from attnwarp import Camera, Gaussians
 from attnwarp.errors import InputError, InputWarning
-from attnwarp.fit import checkpoint
 from attnwarp.io import (
     Dataset,
     read_dataset,
@@ -31,6 +30,7 @@ from attnwarp.io import (
     write_splat,
     write_transforms,
 )
+from attnwarp.workdir import Workdir
 
 from .test_colmap import pictures, write_binary, write_text
 
@@ -189,12 +189,12 @@ class ColmapPoints(ColmapImages):
 class Checkpoint:
     def original(self, folder):
         state = {"tensors": {"means": torch.arange(12.0)}, "queue": [1, 2], "iteration": 7}
-        checkpoint.save(folder / "checkpoint.pt", state)
+        Workdir(folder, "a fit").save("checkpoint.pt", state)
         return (folder / "checkpoint.pt").read_bytes()
 
     def use(self, folder, data):
         (folder / "checkpoint.pt").write_bytes(data)
-        checkpoint.load(folder / "checkpoint.pt")
+        Workdir(folder, "a fit").load("checkpoint.pt")
         raise AssertionError("damage was not seen")
 
 

@@ -134,7 +134,7 @@ def test_a_bar_says_left_only_where_that_is_known(monkeypatch):
 def test_a_log_file_gets_the_time_left_by_the_mean_of_the_cells_so_far(capsys, monkeypatch):
     seconds = iter((0.0, 20.0, 70.0, 90.0))
     fake = types.SimpleNamespace(perf_counter=lambda: next(seconds))
-    monkeypatch.setattr("attnwarp.progress.time", fake)
+    monkeypatch.setattr("attnwarp.reporting.time", fake)
     with progress(9, done=5, lines=True) as show:
         for done in (6, 7, 8, 9):
             show(done, 9, "cell")

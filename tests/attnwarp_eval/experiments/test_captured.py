@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from attnwarp import Camera
 from attnwarp.editing.small import load_editor
 from attnwarp.io import Dataset, write_ply, write_transforms
-from attnwarp.propagate.scene import editor_digest
+from attnwarp.methods.scene import editor_digest
 from attnwarp.render import render
 from attnwarp_eval.cli.main import app
 

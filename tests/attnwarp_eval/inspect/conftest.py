@@ -29,8 +29,8 @@ def folders(tmp_path_factory, one_thread):
     from attnwarp.editing.pix2pix import InstructPix2Pix
     from attnwarp.io import Dataset, write_ply, write_transforms
     from attnwarp.io.images import encode_png
-    from attnwarp.propagate import preset
-    from attnwarp.propagate.run import propagate
+    from attnwarp.methods import preset
+    from attnwarp.methods.attention_warping import attention_warping
 
     folder = tmp_path_factory.mktemp("own")
     model = splats()
@@ -45,10 +45,10 @@ def folders(tmp_path_factory, one_thread):
     write_transforms(
         folder / "transforms.json", Dataset(views, [folder / camera.name for camera in views])
     )
-    settings = preset("corrected", stages=2, views_per_stage=1, steps=1, iterations=0)
+    settings = preset("attention_warping", stages=2, views_per_stage=1, steps=1, iterations=0)
     pipe = pix2pix()
     editor = InstructPix2Pix(
         pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler, text_guidance=3.0
     )
-    propagate(model, views, images, editor, "red", settings, folder=folder / "edit")
+    attention_warping(model, views, images, editor, "red", settings, folder=folder / "edit")
     return folder

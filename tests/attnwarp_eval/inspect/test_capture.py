@@ -74,7 +74,7 @@ def test_an_edit_shows_its_own_files_and_settings(edited, folders):
     assert pair.settings.to_dict() == manifest["settings"]["warp"]
     assert edited.preferred == subject.EDIT_VARIANT
     assert edited.edit.steps == ("before", "stage 1", "edited")
-    first = [name for stage in manifest["stages"] for name in stage]
+    first = [name for part in manifest["rounds"] for name in part["views"]][1:]
     assert set(edited.targets[: len(first)]) == set(first)
     name = edited.targets[0]
     insets = pair.insets()
@@ -82,7 +82,7 @@ def test_an_edit_shows_its_own_files_and_settings(edited, folders):
     assert insets["target, edited"] == pytest.approx(picture, abs=1e-6)
     after = read_image(folders / f"edit/renders/after/{name}.png") / 255
     assert pair.picture("edited") == pytest.approx(after, abs=1e-6)
-    stage = render(read_ply(folders / "edit/stages/1.ply"), pair.cameras[1]).color.clamp(0, 1)
+    stage = render(read_ply(folders / "edit/rounds/1.ply"), pair.cameras[1]).color.clamp(0, 1)
     assert pair.picture("stage 1") == pytest.approx(stage.numpy(), abs=1e-6)
     assert torch.equal(edited.edit.splats("edited").sh, read_ply(folders / "edit/edited.ply").sh)
 
@@ -90,7 +90,8 @@ def test_an_edit_shows_its_own_files_and_settings(edited, folders):
 def test_disagreement_is_the_difference_of_the_edits_along_the_warp(edited, folders):
     name = edited.targets[0]
     pair = edited.pair(subject.EDIT_VARIANT, name)
-    source = torch.as_tensor(read_image(folders / "edit/source.png") / 255).permute(2, 0, 1)
+    place = folders / f"edit/views/{edited.source}.png"
+    source = torch.as_tensor(read_image(place) / 255).permute(2, 0, 1)
     target = read_image(folders / f"edit/views/{name}.png") / 255
     warped = sample(source, pair.view.correspondence)[0].permute(1, 2, 0).numpy()
     expected = abs(warped - target).mean(axis=2)
@@ -105,9 +106,9 @@ def test_disagreement_is_the_difference_of_the_edits_along_the_warp(edited, fold
     ("change", "message"),
     [
         (lambda m: m.update(source="../../etc/passwd"), "view '../../etc/passwd', which DATA has"),
-        (lambda m: m.update(stages=[["../x"]]), "view '../x', which DATA has"),
-        (lambda m: m.update(stages=[[1]]), "not the manifest of an edit"),
-        (lambda m: m.update(stages=7), "not the manifest of an edit"),
+        (lambda m: m.update(rounds=[{"views": ["../x"]}]), "view '../x', which DATA has"),
+        (lambda m: m.update(rounds=[{"views": [1]}]), "not the manifest of an edit"),
+        (lambda m: m.update(rounds=7), "not the manifest of an edit"),
         (lambda m: m["settings"].update(warp={"opaque": 7}), "not the manifest of an edit"),
         (lambda m: m.clear(), "not the manifest of an edit"),
     ],

@@ -440,7 +440,7 @@ def edited(
     extra = EditResult("red", "paint it red", source, source, {}, {}, 30.0, 2, 0.0)
     data = written_runs.record(
         [("red/v0", 15.0, {metric: value})],
-        spec={"method": "propagate", "settings": {}, **spec},
+        spec={"method": "attention_warping", "settings": {}, **spec},
         **extra.to_json(),
     )
     return written_runs.outcome("editing", scene, [name], data, f"{name}-{scene}")
@@ -484,7 +484,7 @@ def test_a_scene_without_a_part_of_the_controls_disagreement_says_why():
             scene=scene,
             done=(name, scene) not in undone,
             editor={"sha256": "e"},
-            method={"alone": "by_view", "mine": "propagate"}[name],
+            method={"alone": "by_view", "mine": "attention_warping"}[name],
         )
         for name, own in values.items()
         for scene, value in own.items()

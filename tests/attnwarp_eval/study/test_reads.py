@@ -307,11 +307,11 @@ QUICK = {"stages": 2, "views_per_stage": 2, "steps": 2, "iterations": 1}
 @pytest.mark.parametrize(
     ("method", "own"),
     [
-        ("propagate", {}),
-        ("propagate", {"method": "each view alone"}),
-        ("propagate", {"method": "each view alone", "estimate": 0.5}),
-        ("propagate", {"mask": False}),
-        ("propagate", {"iterations": 0}),
+        ("attention_warping", {}),
+        ("attention_warping", {"method": "each view alone"}),
+        ("attention_warping", {"method": "each view alone", "estimate": 0.5}),
+        ("attention_warping", {"mask": False}),
+        ("attention_warping", {"iterations": 0}),
         ("true pictures", {}),
     ],
 )

@@ -65,9 +65,9 @@ from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, did_you
 from attnwarp_eval.study.warping import warp_truth
 
 if TYPE_CHECKING:
-    from attnwarp.baselines import Budget
     from attnwarp.editing.controlnet import DepthControlNet
     from attnwarp.editing.pix2pix import InstructPix2Pix
+    from attnwarp.methods import Budget
     from attnwarp_eval.two_view import Hits
 
 Image = npt.NDArray[np.float32]
@@ -120,7 +120,7 @@ class Editing(Part):
     editor: EditorPart = EditorPart()
     edits: dict[str, dict[str, str | None]] = Field(default_factory=dict)
     options: dict[str, Any] = Field(
-        default_factory=dict, description="fields of attnwarp.propagate.PropagateSettings"
+        default_factory=dict, description="fields of attnwarp.methods.PropagateSettings"
     )
     by_yaw: list[str] = Field(default_factory=list)
     choice: list[str] = Field(
@@ -145,7 +145,7 @@ class VariantPart(Part):
     (:mod:`attnwarp_eval.study.hand_made`) instead of letting the editor edit it.
     """
 
-    method: str = "propagate"
+    method: str = "attention_warping"
     options: dict[str, Any] = Field(default_factory=dict)
     mask: Literal["rules", "truth"] = "rules"
     editor: EditorPart | None = None
@@ -364,7 +364,7 @@ class EditingProbe(Probe[EditResult]):
         own = variant.part(VariantPart)
         settings = settings_of(study, variant, seed)
         noised = settings.get("start") or settings.get("starts")
-        fresh = own.method == "propagate" and settings.get("noise") == "fresh"
+        fresh = own.method == "attention_warping" and settings.get("noise") == "fresh"
         return {
             "spp": study.spp,
             "method": own.method,
@@ -447,7 +447,7 @@ class EditingProbe(Probe[EditResult]):
 
     def _budget(self, work: Work, truth: EditTruth, names: Sequence[str]) -> Budget | None:
         """Limits of the work's method; a variant whose seconds are the limit is run if need be."""
-        from attnwarp.baselines import Budget
+        from attnwarp.methods import Budget
 
         given = work.spec.get("budget")
         if given is None:
@@ -756,7 +756,7 @@ class _Measure:
         return row
 
     def _renders(self, model: Gaussians) -> dict[str, Image]:
-        from attnwarp.propagate.scene import near_of
+        from attnwarp.methods.scene import near_of
         from attnwarp.render import render
 
         cameras = [self.work.world.camera(name) for name in self.names]
@@ -946,7 +946,7 @@ def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
 
 def _full(original: Image, edited: npt.NDArray[np.uint8]) -> Image:
     """An edited view at the size of the original."""
-    from attnwarp.propagate.pictures import enlarged_change
+    from attnwarp.methods.pictures import enlarged_change
 
     return enlarged_change(original, edited.astype(np.float32) / np.float32(255))
 

@@ -55,7 +55,7 @@ OWN = "each view alone"
 FLOOR = "by_view"
 """The method of a comparison that does so."""
 
-ONE_SOURCE = frozenset({"propagate", "true pictures"})
+ONE_SOURCE = frozenset({"attention_warping", "true pictures"})
 """Methods whose source view is edited alike, whatever happens to the others."""
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp.propagate.pictures import enlarged_change
+from attnwarp.methods.pictures import enlarged_change
 from attnwarp_eval import metrics
 from attnwarp_eval.document.model import Gallery, Picture, Section, Table
 from attnwarp_eval.document.numbers import spread

@@ -17,8 +17,8 @@ from PIL import Image
 from torch_threads import on_one_thread
 
 import attnwarp_eval
-from attnwarp.baselines import Budget
 from attnwarp.encoders.bundled import WEIGHTS
+from attnwarp.methods import Budget
 from attnwarp_eval import metrics
 from attnwarp_eval.compare.snapshot import read_snapshot
 from attnwarp_eval.metrics.gates import gated
@@ -86,7 +86,7 @@ def planned(answers):
         }
         return EditedScene(job.gaussians, edited, {"edit": 1.0}, {"views": len(edited)})
 
-    return Method(EDITING_METHODS["propagate"].settings, run)
+    return Method(EDITING_METHODS["attention_warping"].settings, run)
 
 
 def test_true_pictures_have_the_highest_fidelity_the_least_disagreement_and_one_answer(
@@ -262,7 +262,7 @@ def test_each_source_has_its_own_exact_warp_to_a_target(folder, tmp_path, monkey
         asked.update({pair: job.warps(*pair) for pair in ((0, 3), (2, 3), (1, 3))})
         return planned(["red"] * 4).run(job)
 
-    method = Method(EDITING_METHODS["propagate"].settings, run)
+    method = Method(EDITING_METHODS["attention_warping"].settings, run)
     monkeypatch.setitem(EDITING_METHODS, "planned", method)
     own = {"method": "planned", "mask": "truth", "geometry": "truth"}
     record_of(folder, tmp_path, variants={"planned": own})
@@ -329,7 +329,7 @@ def sleeping(seconds):
     def run(job):
         return dataclasses.replace(planned(["red"] * 4).run(job), seconds={"edit": seconds})
 
-    return Method(EDITING_METHODS["propagate"].settings, run)
+    return Method(EDITING_METHODS["attention_warping"].settings, run)
 
 
 def test_the_seconds_of_another_variant_are_the_limit_and_the_report_names_who_did_not_finish(
@@ -345,11 +345,11 @@ def test_the_seconds_of_another_variant_are_the_limit_and_the_report_names_who_d
 
     # The first run in a process pays for compilation, and is not taken.
     monkeypatch.setitem(EDITING_METHODS, "true pictures", Method(
-        EDITING_METHODS["propagate"].settings, lambda job: sleeping(next(times)).run(job)))  # fmt: skip
+        EDITING_METHODS["attention_warping"].settings, lambda job: sleeping(next(times)).run(job)))  # fmt: skip
     monkeypatch.setitem(
         EDITING_METHODS,
         "slow",
-        Method(EDITING_METHODS["propagate"].settings, cut_short, takes_budget=True),
+        Method(EDITING_METHODS["attention_warping"].settings, cut_short, takes_budget=True),
     )
     monkeypatch.setattr(editing, "STOPWATCH", Stopwatch())
     study = load(
@@ -420,7 +420,10 @@ def test_studies_that_compare_methods_tune_attention_warping_alike(name):
     for label in study.probes["editing"]:
         variant = study.variants[label]
         fields = editing.settings_of(study, variant, 0)
-        if variant.part(editing.VariantPart).method == "propagate" and fields["method"] == "warp":
+        if (
+            variant.part(editing.VariantPart).method == "attention_warping"
+            and fields["method"] == "warp"
+        ):
             left = len(study.views) + 1 - fields["sources"]
             stages = min(fields["stages"], math.ceil(left / fields["views_per_stage"]))
             totals[label] = stages * fields["iterations"]
@@ -464,7 +467,7 @@ def test_an_editor_of_depth_maps_gets_the_description_and_others_the_instruction
         return planned(["red"] * 4).run(job)
 
     monkeypatch.setitem(
-        EDITING_METHODS, "planned", Method(EDITING_METHODS["propagate"].settings, run)
+        EDITING_METHODS, "planned", Method(EDITING_METHODS["attention_warping"].settings, run)
     )
     for name in ("small-depth", "small-plain"):
         own = {"method": "planned", "editor": {"name": name, "text_guidance": 1.5}}
@@ -473,7 +476,7 @@ def test_an_editor_of_depth_maps_gets_the_description_and_others_the_instruction
     assert words == [("depth", edit["target"]), ("picture", edit["instruction"])]
 
 
-@pytest.mark.parametrize("method", ["gaussctrl", "propagate"])
+@pytest.mark.parametrize("method", ["gaussctrl", "attention_warping"])
 def test_the_scenes_words_are_handed_to_an_inversion_that_asks_for_them(
     method, folder, tmp_path, monkeypatch
 ):
@@ -507,7 +510,10 @@ def test_the_scenes_words_are_handed_to_an_inversion_that_asks_for_them(
             {"editing": {"editor": {"name": "no-such"}}, "variants": {"planned": {}}},
             "editor 'no-such'",
         ),
-        ({"variants": {"planned": {"budget": {"seconds": 9}}}}, "'propagate' runs to its end"),
+        (
+            {"variants": {"planned": {"method": "true pictures", "budget": {"seconds": 9}}}},
+            "'true pictures' runs to its end",
+        ),
         ({"variants": {"planned": {"method": "dge", "budget": {}}}}, "got no limit"),
         (
             {"editing": {}, "variants": {"planned": {"method": "dge", "by_hand": "painted"}}},

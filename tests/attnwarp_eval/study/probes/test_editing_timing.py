@@ -147,7 +147,7 @@ def edited(scene, name, edit="red", times=1.0):
     extra = EditResult(edit, "paint it red", done, done, {}, {}, 30.0, 2, 0.0)
     data = written_runs.record(
         [(f"{edit}/v0", 15.0, {ERROR: ERRORS[name], "fidelity.mse.edit_inside": ERRORS[name]})],
-        spec={"method": "propagate", "settings": {}, "editor": {"sha256": "a"}},
+        spec={"method": "attention_warping", "settings": {}, "editor": {"sha256": "a"}},
         cost={"seconds": {part: times * BY_CELLS[name] for part in ("whole", "method: edit")}},
         **extra.to_json(),
     )
@@ -167,7 +167,7 @@ def in_turn(scene, names, drift=DRIFT):
             "rounds": len(drift),
             "edit": {"name": "red"},
             "contestants": [
-                {"method": "propagate", "settings": alone.get(name, {})} for name in names
+                {"method": "attention_warping", "settings": alone.get(name, {})} for name in names
             ],
         },
         cost={

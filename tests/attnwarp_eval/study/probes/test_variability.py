@@ -43,7 +43,7 @@ def planned(answer):
             edited[view] = np.rint(255 * image).astype(np.uint8)
         return EditedScene(job.gaussians, edited, {"edit": 1.0}, {"network_rows": 2})
 
-    return Method(EDITING_METHODS["propagate"].settings, run)
+    return Method(EDITING_METHODS["attention_warping"].settings, run)
 
 
 PLANS = {
@@ -218,7 +218,9 @@ def test_every_seed_has_its_own_settings_and_all_share_the_splats(folder, monkey
         jobs.append((job.settings["seed"], job.gaussians.means.numpy().tobytes()))
         return planned(PLANS["always red"]).run(job)
 
-    monkeypatch.setitem(EDITING_METHODS, "spy", Method(EDITING_METHODS["propagate"].settings, run))
+    monkeypatch.setitem(
+        EDITING_METHODS, "spy", Method(EDITING_METHODS["attention_warping"].settings, run)
+    )
     from attnwarp_eval.study.work import compute
 
     study = study_of(

@@ -1,0 +1,57 @@
+"""Methods that edit a scene: attention warping, and those that it is compared with.
+
+All have the same arguments, ``method(gaussians, cameras, images, editor, instruction, settings,
+folder=..., budget=..., report=...)``, and return a :class:`Result`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from attnwarp.methods.attention_warping import attention_warping
+from attnwarp.methods.base import Options, Result, Round
+from attnwarp.methods.by_view import by_view
+from attnwarp.methods.dge import dge
+from attnwarp.methods.gaussctrl import gaussctrl
+from attnwarp.methods.igs2gs import igs2gs
+from attnwarp.methods.settings import (
+    PRESETS,
+    AttentionWarpingSettings,
+    ByViewSettings,
+    DGESettings,
+    GaussCtrlSettings,
+    IGS2GSSettings,
+    MethodSettings,
+    preset,
+)
+from attnwarp.workdir import Budget
+
+METHODS: dict[str, Callable[..., Result]] = {
+    "attention_warping": attention_warping,
+    "by_view": by_view,
+    "igs2gs": igs2gs,
+    "dge": dge,
+    "gaussctrl": gaussctrl,
+}
+"""The methods by name."""
+
+__all__ = [
+    "METHODS",
+    "PRESETS",
+    "AttentionWarpingSettings",
+    "Budget",
+    "ByViewSettings",
+    "DGESettings",
+    "GaussCtrlSettings",
+    "IGS2GSSettings",
+    "MethodSettings",
+    "Options",
+    "Result",
+    "Round",
+    "attention_warping",
+    "by_view",
+    "dge",
+    "gaussctrl",
+    "igs2gs",
+    "preset",
+]

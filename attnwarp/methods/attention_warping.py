@@ -1,0 +1,252 @@
+"""Attention warping: an edit of one view is carried into the others, and the splats are tuned.
+
+:meth:`AttentionWarping.run` is Algorithm 1 of "Diffusion-Based Attention Warping for Consistent 3D
+Scene Editing"; the numbers in comments are those of its lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from functools import partial
+from itertools import chain, groupby, islice
+from typing import Any, Literal, Unpack
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from attnwarp import check
+from attnwarp.camera import Camera
+from attnwarp.editing.attention import TokenWarp, inject, record
+from attnwarp.editing.editor import Editor
+from attnwarp.gaussians import Gaussians
+from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
+from attnwarp.methods.geometry import Warps
+from attnwarp.methods.settings import MOST_VIEWS, AttentionWarpingSettings
+from attnwarp.methods.sight import Sight
+from attnwarp.methods.view_edits import RecordedSource, ViewEdits
+from attnwarp.methods.work import Work, chunks
+
+SOURCE_EVERY = 10
+"""The released code tunes on the source at every tenth step."""
+
+
+def attention_warping(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    images: Sequence[npt.NDArray[Any]] | None,
+    editor: Editor,
+    instruction: str,
+    settings: AttentionWarpingSettings | None = None,
+    *,
+    source: int = 0,
+    source_picture: npt.NDArray[Any] | None = None,
+    warps: Warps | None = None,
+    store: Literal["device", "cpu", "disk"] = "cpu",
+    **options: Unpack[Options],
+) -> Result:
+    """Edit one view of a scene, carry the edit into others, and tune the splats on all of them.
+
+    Args:
+        gaussians, cameras, images, editor, instruction, options: see :func:`by_view`.
+        settings: every choice of the method; ``corrected`` if left out.
+        source: number of the source view.
+        source_picture: (h, w, 3) the source view edited elsewhere, such as by hand, of a type that
+            ``images`` may have and the view's aspect ratio. Its features are recorded while its own
+            noise is replayed (edit-friendly inversion).
+        warps: the warp from the source to a target, by their numbers, such as one from exact depth;
+            used in place of those from the splats' depth.
+        store: of the recorded features: on the editor's "device", in main memory ("cpu"), or in
+            the folder ("disk") until the edit is done.
+
+    Raises:
+        ValueError, InputError, RuntimeError: see :func:`by_view`.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.editing.small import load_editor
+        >>> from attnwarp.methods import attention_warping, preset
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = dict(width=32, height=32, fov_y=40, up=(0, 1, 0))
+        >>> cameras = [Camera.look_at((x, 0, 3), (0, 0, 0), **view) for x in (0, 1)]
+        >>> quick = preset("attention_warping", stages=1, steps=1, iterations=1)
+        >>> editor = load_editor("small-plain")
+        >>> result = attention_warping(disc, cameras, None, editor, "red", quick)
+        >>> result.rounds[0].views, result.edited[1].shape  # the source, then the target
+        ((0, 1), (32, 32, 3))
+    """
+    check.one_of(store, ("device", "cpu", "disk"), "store")
+    make = partial(
+        AttentionWarping, source=source, by_hand=source_picture, warps=warps, store=store
+    )
+    return run(
+        "attention_warping", make, AttentionWarpingSettings,
+        gaussians, cameras, images, editor, instruction, settings, **options,
+    )  # fmt: skip
+
+
+class AttentionWarping(Method):
+    """Algorithm 1, with the choices of the settings."""
+
+    def __init__(
+        self,
+        work: Work,
+        settings: AttentionWarpingSettings,
+        source: int,
+        by_hand: npt.NDArray[Any] | None,
+        warps: Warps | None,
+        store: str,
+    ) -> None:
+        self.work, self.settings = work, settings
+        self.views = ViewEdits(work, settings, source, by_hand, warps, store, self.edit_source)
+        self.sources = self.views.sources
+        unedited = [view for view in range(len(work.sizes)) if view not in self.sources]
+        self.stages = draw_stages(unedited, settings)
+        self.views.check_stages(len(self.stages) if unedited else 0)
+        self.about, self.inputs = self.views.about, self.views.inputs
+        if warps is not None:
+            targets = [*self.sources[1:], *chain(*self.stages)]
+            self.inputs["warps"] = self.views.geometry.digest(self.sources, targets)
+        self.notes = self.views.notes(len(self.stages))
+        if settings.psnr_views == "before_last_stage" and len(self.stages) > 1:
+            self.psnr_leaves_out = self.stages[-1]
+
+    def run(self, loop: Loop) -> None:
+        """Algorithm 1."""
+        s, edited = self.settings, [*self.sources]
+        # (1) Edit the source and record its features; further sources, if any, take them.
+        for number, view in enumerate(self.sources):
+            rows = self.views.rows_of_source(number)
+            loop.edit(0, (view,), partial(self.edit_source, number), rows=rows)
+        # (2) For each stage:
+        for stage, views in enumerate(self.stages):
+            # (3) choose views, at random among those not edited: see draw_stages;
+            for _, same in groupby(views, key=lambda view: self.work.sizes[view]):
+                for batch in chunks(list(same), s.batch):
+                    # (4) warp the source's features to them, (5) edit them with these injected;
+                    rows = self.views.rows(len(batch), s.guidance(stage))
+                    loop.edit(stage, batch, partial(self.edit_targets, stage, batch), rows=rows)
+            # (6) tune the splats on edited views.
+            edited += views
+            own = [*(self.sources[1:] if stage == 0 else ()), *views]
+            if s.training == "all" or not views:
+                loop.tune(stage, edited, s.iterations)
+            elif s.training == "stage":
+                loop.tune(stage, own, s.iterations)
+            else:  # "modulo"
+                loop.tune(stage, [self.sources[0], *own], s.iterations, released_order(len(own)))
+
+    def edit_source(
+        self, number: int, model: Gaussians, step: Callable[[], None]
+    ) -> list[ViewEdit]:
+        """Edit a source, by its place among them, and record its features on the way (line 1)."""
+        work, views, view = self.work, self.views, self.sources[number]
+        before = views.recorded(number)
+        sights = [views.sight(number, view, work.frozen)]
+        with (
+            work.folder.seconds.part("source"),
+            work.guided(views.features.source_guidance(further=number > 0)),
+            ExitStack() as stack,
+        ):
+            start = views.start([view], work.frozen, by_hand=number == 0)
+            self._inject(stack, before, sights)
+            recording = None
+            if views.features.layers:
+                # After the injection: what the next source gets is what this one went on with.
+                plan = views.features.plan(view, views.latent_size(view), further=number > 0)
+                recording = stack.enter_context(record(work.editor.unet, plan))
+            pictures, estimates = views.denoise(start, sights, step)
+        views.keep(number, RecordedSource(pictures[0], recording, estimates, sights[0]))
+        return [views.result(view, pictures[0], sights[0], number)]
+
+    def edit_targets(
+        self, stage: int, batch: Sequence[int], model: Gaussians, step: Callable[[], None]
+    ) -> list[ViewEdit]:
+        """Warp the sources' features to views of one size, and edit these (lines 4 and 5)."""
+        work, views, count = self.work, self.views, len(self.sources)
+        recorded = views.recorded(count)
+        with work.folder.seconds.part("warp"):
+            sights = [views.sight(count, view, model) for view in batch]
+        with work.guided(self.settings.guidance(stage)), ExitStack() as stack:
+            start = views.start(batch, model)
+            self._inject(stack, recorded, sights)
+            pictures, _ = views.denoise(start, sights, step)
+        return [
+            views.result(view, picture, sight, count)
+            for view, picture, sight in zip(batch, pictures, sights, strict=True)
+        ]
+
+    def _inject(
+        self, stack: ExitStack, recorded: Sequence[RecordedSource], sights: Sequence[Sight | None]
+    ) -> None:
+        """Blend recorded features into the editor's while the stack is open. No pixel takes the
+        features of two sources.
+        """
+        s, editor = self.settings, self.work.editor
+
+        def weight(t: int, T: int) -> float:
+            """a_t = a0 (T - t) / T at step t of T."""
+            return s.a0 * (T - t) / T if s.decay == "linear" else s.a0
+
+        def blend(warp: TokenWarp, F_src: Tensor, F_new: Tensor, a: float) -> Tensor:
+            """F_final = a F_masked + (1 - a) F_new, with F_masked = M F_warp + (1 - M) F_new."""
+            F_warp, aM = warp.warp_tokens(F_src), a * warp.weight.to(F_new)
+            return torch.lerp(F_new, F_warp, aM)  # aM F_warp + (1 - aM) F_new
+
+        for number, source in enumerate(recorded):
+            if source.recording is None:
+                continue
+            warps = [None if sight is None else sight.warp(number) for sight in sights]
+            stack.enter_context(
+                inject(
+                    editor.unet, source.recording, branches=editor.branches,
+                    warps=warps, weight=weight, blend=blend,
+                )
+            )  # fmt: skip
+
+    def clear(self) -> None:
+        """Remove recordings on disk."""
+        self.views.clear()
+
+    def counters(self, records: dict[int, dict[str, Any]]) -> dict[str, float]:
+        """Number of sources, bytes of their features, and the mean weight of the warped features
+        over the targets' pixels, before a_t.
+        """
+        shares = [about["injected"] for view, about in records.items() if view != self.sources[0]]
+        return {
+            "sources": len(self.sources),
+            "feature_bytes": sum(about.get("feature_bytes", 0) for about in records.values()),
+            "injected": sum(shares) / len(shares) if shares else 0.0,
+        }
+
+
+def draw_stages(unedited: Sequence[int], settings: AttentionWarpingSettings) -> list[list[int]]:
+    """Draw each stage's views at random from those not edited so far (line 3).
+
+    Where all are sources, one stage without views is left, which tunes on these.
+
+    Example:
+        >>> stages = draw_stages(range(1, 7), AttentionWarpingSettings(stages=2))
+        >>> [len(views) for views in stages], sorted(sum(stages, []))
+        ([3, 3], [1, 2, 3, 4, 5, 6])
+    """
+    s = settings
+    if s.views_per_stage is None:
+        shares = np.array_split(np.arange(len(unedited)), s.stages)
+        sizes = [min(MOST_VIEWS, len(share)) for share in shares]
+    else:
+        sizes = [s.views_per_stage] * s.stages
+    # Parts of one permutation are draws without replacement.
+    generator = torch.Generator().manual_seed(s.seed)
+    order = iter([unedited[k] for k in torch.randperm(len(unedited), generator=generator).tolist()])
+    stages = [list(islice(order, size)) for size in sizes]
+    return [views for views in stages if views] or [[]]
+
+
+def released_order(views: int) -> Callable[[int], int]:
+    """The released code's order: the source, then view ``step % views``, which misses some."""
+    return lambda step: 0 if step % SOURCE_EVERY == 0 else 1 + step % views

@@ -1,0 +1,615 @@
+"""How a method runs: its edits and its tuning, resumed after a kill, within a budget.
+
+manifest.json         method, settings, rounds, hashes of the inputs
+rounds/N/NAME.png     each edited view of a round; NAME.json: its record
+rounds/N.pt  N.ply    the splats after the round's tuning, with their optimiser and without
+masks/  features/     where features were injected, and the features as colours (attention warping)
+segments/             what is edited of each view, where segments are given
+views/NAME.png        the last edit of each view
+renders/before/ after/  the scene from every view
+sheet.png             both and the edits, side by side
+cut.json              the budget's limit that ended the run, and its place; absent if none did
+edited.ply  result.json  times.json  the edited splats; counters and Edit PSNR; seconds by part
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol, TypedDict, Unpack
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp import check, losses
+from attnwarp.camera import Camera
+from attnwarp.editing.editor import Editor
+from attnwarp.fit import compile_kernels
+from attnwarp.gaussians import Gaussians
+from attnwarp.io import write_ply
+from attnwarp.io.names import file_stems
+from attnwarp.methods.pictures import (
+    Bytes,
+    Image,
+    enlarged,
+    full_size,
+    mask_picture,
+    resized,
+    to_bytes,
+)
+from attnwarp.methods.scene import (
+    Scene,
+    Segments,
+    check_cameras,
+    check_loaded,
+    editor_digest,
+    near_of,
+    render_picture,
+)
+from attnwarp.methods.settings import MethodSettings
+from attnwarp.methods.tuning import DrawnViews, Order, TrainingView, Tuning
+from attnwarp.methods.work import Work
+from attnwarp.reporting import SILENT, Reporter
+from attnwarp.workdir import Budget, CheckpointClock, Workdir, results_in
+
+FOLDERS = ("rounds", "masks", "features", "segments", "views", "renders/before", "renders/after")
+
+VIEWER_PLY = "edited-3dgs.ply"
+"""Edited 2D splats as thin 3D ones, for viewers of 3DGS; the command writes it."""
+
+RESULTS = ("edited.ply", VIEWER_PLY, "result.json", "sheet.png")
+"""Files beside the manifest."""
+
+BUDGETED = ("warp", "edit", "tune")
+"""Parts of the seconds that a budget limits; files and renders are for people."""
+
+SHEET_VIEWS = 8
+"""Views on the sheet, evenly spread."""
+
+
+class Options(TypedDict, total=False):
+    """Options that every method takes by name.
+
+    Args:
+        folder: of all results, created if need be; one that another run writes to is refused. A
+            killed run resumes from it. All files but ``times.json`` then get the bytes of an
+            uninterrupted run, on one machine, with the same number of threads and without a budget
+            in seconds.
+        budget: limits of the run, :class:`Budget`; None for a whole run.
+        segments: what is edited: (H, W) bool masks of the views, or a function of a view's number
+            and picture. The original stays outside.
+        checkpoint_seconds: between two checkpoints of tuning (30); more where one takes long.
+        backend: of :func:`attnwarp.render.render` ("auto").
+        report: receives how the run stands, :class:`attnwarp.reporting.Reporter`.
+
+    Example:
+        >>> from attnwarp.methods import Budget, Options
+        >>> Options(budget=Budget(seconds=600))["budget"].seconds
+        600.0
+    """
+
+    folder: Path | str | None
+    budget: Budget | None
+    segments: Segments | None
+    checkpoint_seconds: float
+    backend: str
+    report: Reporter
+
+
+@dataclass(frozen=True)
+class Round:
+    """A round: views are edited, and the splats are tuned on edited views.
+
+    Attributes:
+        views: numbers of the views that it edits, in the order of editing.
+        training: numbers of the views that it tunes on.
+        iterations: of tuning.
+
+    Example:
+        >>> from attnwarp.methods import Round
+        >>> Round(views=(0, 2), training=(0, 2), iterations=300).views
+        (0, 2)
+    """
+
+    views: tuple[int, ...] = ()
+    training: tuple[int, ...] = ()
+    iterations: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """The result of a method.
+
+    Attributes:
+        method: its name.
+        gaussians: the edited splats, float32, outside autograd.
+        edited: (h, w, 3) uint8 sRGB by the view's number, in the order of editing: its last edit,
+            at the size of the editor's work.
+        rounds: the views of each round, as planned.
+        edit_psnr: dB: "pooled" (of the mean squared error over views), "mean" (of the views'
+            PSNRs), and "views", the names that were counted.
+        counters: "network_rows" (rows through the UNet), "edits", "views" (edited at least once),
+            "rounds" (begun), "iterations" of tuning, "splats", and the method's own.
+        seconds: by part, over all sittings.
+        cut: "seconds" or "network_rows" where that limit of the budget ended the run; None for a
+            whole run.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from attnwarp import Gaussians
+        >>> from attnwarp.methods import Result
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> edited = {0: np.zeros((8, 8, 3), np.uint8)}
+        >>> Result("dge", disc, edited, (), {}, {"views": 1}, {"edit": 2.5}).cut is None
+        True
+    """
+
+    method: str
+    gaussians: Gaussians
+    edited: dict[int, Bytes]
+    rounds: tuple[Round, ...]
+    edit_psnr: dict[str, Any]
+    counters: dict[str, float]
+    seconds: dict[str, float]
+    cut: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ViewEdit:
+    """An edited view.
+
+    Attributes:
+        picture: (h, w, 3) in [0, 1].
+        about: what the edit was, for its record.
+        pictures: (H, W, 3) uint8 for people, by the folder that they go to.
+    """
+
+    picture: Image
+    about: dict[str, Any] = field(default_factory=dict)
+    pictures: dict[str, Bytes] = field(default_factory=dict)
+
+
+Edit = Callable[[Gaussians, Callable[[], None]], list[ViewEdit]]
+"""Edits views, given the splats as they stand and what to call after each step of denoising."""
+
+
+class Loop(Protocol):
+    """What a method does, one step after another, in the order that its ``run`` gives."""
+
+    def edit(self, number: int, views: Sequence[int], edit: Edit, *, rows: int) -> None:
+        """Edit views together.
+
+        Args:
+            number: of the round, from 0.
+            views: their numbers.
+            edit: does it; not called where the folder has the edits.
+            rows: through the UNet that it takes.
+        """
+        ...
+
+    def tune(
+        self, number: int, views: Sequence[int], iterations: int, order: Order | None = None
+    ) -> None:
+        """Tune the splats on edited views.
+
+        Args:
+            number: of the round, from 0.
+            views: numbers of views; those without an edit are left out.
+            iterations: one view each.
+            order: see :meth:`attnwarp.methods.tuning.Tuning.advance`.
+        """
+        ...
+
+
+class Method(ABC):
+    """A method of editing a scene.
+
+    Attributes:
+        about: further JSON of the run's manifest.
+        inputs: SHA-256 of further inputs, by name.
+        notes: lines that a person is told at the beginning.
+        psnr_leaves_out: numbers of views that Edit PSNR does not count.
+    """
+
+    about: dict[str, Any] = {}  # noqa: RUF012  (never written to)
+    inputs: dict[str, str | None] = {}  # noqa: RUF012
+    notes: Sequence[str] = ()
+    psnr_leaves_out: Collection[int] = ()
+
+    @abstractmethod
+    def run(self, loop: Loop) -> None:
+        """Make all edits and all tuning, by way of the loop. It is called twice, once to learn the
+        plan, so that it draws the same numbers each time.
+        """
+
+    def clear(self) -> None:  # noqa: B027  (most have nothing)
+        """Remove files that only a sitting needs; called as it begins and ends."""
+
+    def counters(self, records: dict[int, dict[str, Any]]) -> dict[str, float]:
+        """Further counters, of the edits' records by view."""
+        return {}
+
+
+class Plan:
+    """A loop that does nothing but note what a method would do."""
+
+    def __init__(self, method: Method) -> None:
+        self.rounds: list[Round] = []
+        method.run(self)
+
+    def edit(self, number: int, views: Sequence[int], edit: Edit, *, rows: int) -> None:
+        """See :class:`Loop`."""
+        self._change(number, views=(*self._round(number).views, *views))
+
+    def tune(
+        self, number: int, views: Sequence[int], iterations: int, order: Order | None = None
+    ) -> None:
+        """See :class:`Loop`."""
+        self._change(number, training=tuple(views), iterations=iterations)
+
+    def _round(self, number: int) -> Round:
+        self.rounds += [Round()] * (number + 1 - len(self.rounds))
+        return self.rounds[number]
+
+    def _change(self, number: int, **changes: Any) -> None:
+        self.rounds[number] = Round(**{**vars(self._round(number)), **changes})
+
+
+def run(
+    name: str,
+    make: Callable[[Work, Any], Method],
+    kind: type[MethodSettings],
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    images: Sequence[npt.NDArray[Any]] | None,
+    editor: Editor,
+    instruction: str,
+    settings: MethodSettings | None,
+    **options: Unpack[Options],
+) -> Result:
+    """Run a method; the other arguments as of :func:`attnwarp.methods.by_view`.
+
+    Args:
+        name: of the method.
+        make: the method, of the work and its settings.
+        kind: of the settings.
+    """
+    for option in options:
+        check.one_of(option, list(Options.__annotations__), "option")
+    chosen = kind() if settings is None else settings
+    check.instance(chosen, kind, "settings", f"attnwarp.methods.{kind.__name__}")
+    check.instance(gaussians, Gaussians, "gaussians", "attnwarp.Gaussians")
+    check_loaded(editor)
+    cameras = check_cameras(cameras)
+    if options.get("budget") is not None:
+        check.instance(options["budget"], Budget, "budget", "attnwarp.methods.Budget")
+    check.seconds(options.get("checkpoint_seconds", 30.0), "checkpoint_seconds")
+    if not instruction.strip():
+        raise ValueError("instruction: is empty, expected words such as 'make it red'")
+    backend, folder = options.get("backend", "auto"), options.get("folder")
+    if images is None:
+        near = near_of(cameras, gaussians)
+        images = [render_picture(gaussians, camera, near, backend) for camera in cameras]
+    scene = Scene.checked(cameras, images, options.get("segments"))
+    with results_in(folder) as place:
+        work = Work(
+            gaussians, scene, editor, instruction, chosen, backend,
+            workdir_of(place), options.get("report", SILENT),
+        )  # fmt: skip
+        return _Run(name, make(work, chosen), work, options).go()
+
+
+def workdir_of(path: Path) -> Workdir:
+    """The folder of a method's run."""
+    return Workdir(path, "an edit", FOLDERS, RESULTS)
+
+
+def edit_file(number: int, name: str) -> str:
+    """The file of a view's edit in a round from 0, in the run's folder."""
+    return f"rounds/{number + 1}/{name}.png"
+
+
+class _Run:
+    """A run in progress: the loop that does the work, or finds it done."""
+
+    def __init__(self, name: str, method: Method, work: Work, options: Options) -> None:
+        self.name, self.method, self.work, self.folder = name, method, work, work.folder
+        self.budget = options.get("budget") or Budget()
+        self.clock = CheckpointClock(options.get("checkpoint_seconds", 30.0))
+        self.names = file_stems(work.scene.cameras)
+        self.seconds = self.folder.seconds
+        self.rounds = tuple(Plan(method).rounds)
+        self.tuning = Tuning(
+            work.frozen, work.scene.cameras, work.settings,
+            sum(part.iterations for part in self.rounds), work.backend,
+        )  # fmt: skip
+        tuned = sorted({view for part in self.rounds for view in part.training})
+        self.tuning.check_sizes(
+            [work.scene.cameras[view] for view in tuned],
+            None if work.settings.detail == "change" else [work.sizes[view] for view in tuned],
+        )
+        self.done, self.rows, self.edits = 0, 0, 0
+        self.latest: dict[int, int] = {}  # by the view: the round of its last edit
+        self.places = [0] * len(self.rounds)  # groups of each round so far
+        self.total = sum(
+            len(part.views) * work.settings.steps + part.iterations for part in self.rounds
+        )
+        self.folder.folders = (
+            *FOLDERS, *(f"rounds/{number + 1}" for number in range(len(self.rounds))),
+        )  # fmt: skip
+        self.folder.claim(
+            {
+                "method": name,
+                "instruction": work.instruction,
+                "settings": work.settings.to_dict(),
+                "budget": self.budget.to_dict(),
+                **method.about,
+                "rounds": [
+                    {
+                        "views": [self.names[view] for view in part.views],
+                        "iterations": part.iterations,
+                    }
+                    for part in self.rounds
+                ],
+                "inputs": {
+                    "splats": work.frozen.digest(),
+                    **work.scene.digest(),
+                    "editor": editor_digest(work.editor),
+                    **self.tuning.weights,
+                    **method.inputs,
+                },
+            }
+        )
+
+    def go(self) -> Result:
+        # After the claim: in the folder of another run nothing of this one is true.
+        for line in self.method.notes:
+            self.work.report.log(line)
+        self._write_segments()
+        self.method.clear()
+        self.method.run(self)
+        self.method.clear()
+        result = self._finish()
+        if self.cut is None:
+            self._tell("done", done=self.total)
+        else:
+            self._tell(f"cut short by its {self.cut['limit'].replace('_', ' ')}")
+        return result
+
+    # --- budget
+
+    @property
+    def cut(self) -> dict[str, Any] | None:
+        """Limit that ended the run, and its round; it stands in the folder, so that no later
+        sitting goes beyond."""
+        return self.folder.read_json("cut.json") if self.folder.has("cut.json") else None
+
+    def _cut(self, limit: str, number: int, groups: int) -> None:
+        """End the run in a round, of which so many groups are edited."""
+        self.folder.write_json("cut.json", {"limit": limit, "round": number, "groups": groups})
+
+    def _out_of_seconds(self) -> bool:
+        limit, seconds = self.budget.seconds, self.seconds.parts
+        return limit is not None and sum(seconds.get(part, 0.0) for part in BUDGETED) >= limit
+
+    def _limit(self, rows: int) -> str | None:
+        """The limit that forbids an edit of so many rows through the network."""
+        if self._out_of_seconds():
+            return "seconds"
+        limit = self.budget.network_rows
+        return "network_rows" if limit is not None and self.rows + rows > limit else None
+
+    # --- editing
+
+    def edit(self, number: int, views: Sequence[int], edit: Edit, *, rows: int) -> None:
+        """See :class:`Loop`."""
+        place = self.places[number]
+        self.places[number] += 1
+        if all([self.folder.made(self._picture(number, view)) for view in views]):
+            self.done += len(views) * self.work.settings.steps
+        else:
+            limit = None if self.cut else self._limit(rows)
+            if limit is not None:
+                self._cut(limit, number, place)
+            # A run that was cut edits no further, but for files that were damaged since.
+            if self.cut is not None and (number, place) >= (self.cut["round"], self.cut["groups"]):
+                return
+            self._edit_now(number, views, edit)
+        self.rows += rows
+        self.edits += len(views)
+        self.latest |= dict.fromkeys(views, number)
+
+    def _edit_now(self, number: int, views: Sequence[int], edit: Edit) -> None:
+        first = self.rounds[number].views.index(views[0])
+        text = (
+            f"round {number + 1} of {len(self.rounds)}: editing view {first + 1} of"
+            f" {len(self.rounds[number].views)}"
+        )
+        # Rounds before are tuned by now: this is the current model.
+        model = self.tuning.gaussians()
+        with self.seconds.part("edit"):
+            edits = edit(model, lambda: self._tell(text, len(views)))
+        with self.seconds.part("write"):
+            for view, result in zip(views, edits, strict=True):
+                self._write_edit(number, view, result)
+        self.seconds.write()
+
+    def _write_edit(self, number: int, view: int, edit: ViewEdit) -> None:
+        file = self._picture(number, view)
+        pixels = to_bytes(self.work.composite(view, edit.picture))
+        self.folder.check_same(file, pixels)  # before anything is drawn anew beside it
+        pictures = {f"{part}/{self.names[view]}.png": p for part, p in edit.pictures.items()}
+        for name, picture in pictures.items():
+            self.folder.write_picture(name, picture)
+        about = {"view": self.names[view], "round": number + 1, **edit.about}
+        self.folder.write_record(file, pixels, {**about, "pictures": list(pictures)})
+
+    def _picture(self, number: int, view: int) -> str:
+        return edit_file(number, self.names[view])
+
+    def _edited(self, view: int) -> Bytes:
+        """The last edit of a view."""
+        return self.folder.read_picture(self._picture(self.latest[view], view))
+
+    # --- tuning
+
+    def tune(
+        self, number: int, views: Sequence[int], iterations: int, order: Order | None = None
+    ) -> None:
+        """See :class:`Loop`."""
+        cut = self.cut
+        # A round without an edit would tune on those before once more.
+        edited = number in self.latest.values() or not self.rounds[number].views
+        if (cut is not None and cut["round"] < number) or not edited:
+            return
+        begin = sum(part.iterations for part in self.rounds[:number])
+        end, state = begin + iterations, f"rounds/{number + 1}.pt"
+        if self.folder.has(state):
+            self.tuning.restore(self.folder, state)
+            self.done += self.tuning.iteration - begin
+        finished = self.folder.has(state) and self.tuning.iteration >= end
+        training = [view for view in views if view in self.latest]
+        if not training or (cut is not None and cut["limit"] == "seconds"):
+            return
+        if not finished:
+            self._tune_now(number, training, begin, end, state, order)
+        splats = f"rounds/{number + 1}.ply"
+        if not (finished and self.folder.has_splats(splats)):
+            write_ply(self.folder.path / splats, self.tuning.gaussians())
+        self.seconds.write()
+
+    def _tune_now(
+        self,
+        number: int,
+        training: Sequence[int],
+        begin: int,
+        end: int,
+        state: str,
+        order: Order | None,
+    ) -> None:
+        if self.work.backend in ("auto", "cpu"):
+            compile_kernels(self.work.frozen.kind)  # not within the budget's seconds
+        views = DrawnViews([partial(self._training, view) for view in training])
+        text = f"round {number + 1} of {len(self.rounds)}: tuning"
+
+        def step() -> None:
+            self._tell(f"{text}, loss {self.tuning.loss:.4f}", 1)
+            if self.tuning.iteration < end and self.clock.due:
+                with self.clock.saving():
+                    self.folder.save(state, self.tuning.state())
+                    self.seconds.write()
+
+        with self.seconds.part("tune"):
+            self.tuning.advance(begin, end, views, order, spent=self._out_of_seconds, step=step)
+            self.folder.save(state, self.tuning.state())
+        if self.tuning.iteration < end:
+            self._cut("seconds", number, self.places[number])
+
+    def _training(self, view: int) -> TrainingView:
+        camera = self.work.scene.cameras[view]
+        edited = self._edited(view).astype(np.float32) / np.float32(255)
+        s, segments = self.work.settings, self.work.scene.segments
+        if s.detail == "change":
+            segment = None if segments is None else segments[view]
+            original = self.work.scene.picture(view)
+            picture = full_size(original, edited, segment, s.composite, s.composite_blur)
+            return TrainingView(view, camera, picture)
+        h, w = self.work.sizes[view]
+        return TrainingView(view, camera.resize(w, h), edited)
+
+    # --- results
+
+    def _finish(self) -> Result:
+        final, cut = self.tuning.gaussians(), self.cut
+        edited = {view: self._edited(view) for view in self.latest}
+        with self.seconds.part("render"):
+            write_ply(self.folder.path / "edited.ply", final)
+            for view, pixels in edited.items():
+                self.folder.write_picture(f"views/{self.names[view]}.png", pixels)
+            for part, model in (("before", self.work.frozen), ("after", final)):
+                for camera, name in zip(self.work.scene.cameras, self.names, strict=True):
+                    path = f"renders/{part}/{name}.png"
+                    if not self.folder.has_picture(path):
+                        picture = render_picture(model, camera, self.work.near, self.work.backend)
+                        self.folder.write_picture(path, to_bytes(picture))
+            self.folder.write_picture("sheet.png", self._sheet())
+            psnr = self._edit_psnr(final)
+        records = {
+            view: self.folder.record(self._picture(number, view))
+            for view, number in self.latest.items()
+        }
+        counters = {
+            "network_rows": self.rows,
+            "edits": self.edits,
+            "views": len(edited),
+            "rounds": 1 + max(self.latest.values(), default=-1),
+            "iterations": self.tuning.iteration,
+            "splats": len(final),
+            **self.method.counters(records),
+        }
+        tuned = {self.names[view]: n for view, n in sorted(self.tuning.visits.items())}
+        limit = None if cut is None else cut["limit"]
+        self.folder.write_json(
+            "result.json", {"edit_psnr": psnr, "counters": counters, "tuned": tuned, "cut": limit}
+        )
+        self.seconds.write()
+        return Result(
+            self.name, final, edited, self.rounds, psnr, counters, self.seconds.parts, limit
+        )
+
+    def _edit_psnr(self, final: Gaussians) -> dict[str, Any]:
+        """PSNR of renders against the edits; the mean is of MSE, and of the finite PSNRs."""
+        views = [view for view in self.latest if view not in self.method.psnr_leaves_out]
+        errors = []
+        for view in views:
+            target = self._training(view)
+            picture = render_picture(final, target.camera, self.work.near, self.work.backend)
+            errors.append(float(np.square(picture.astype(np.float64) - target.picture).mean()))
+        finite = [v for v in map(losses.psnr_of_mse, errors) if np.isfinite(v)]
+        pooled = losses.psnr_of_mse(sum(errors) / len(errors)) if errors else np.inf
+        return {
+            "pooled": pooled if np.isfinite(pooled) else None,
+            "mean": sum(finite) / len(finite) if finite else None,
+            "views": [self.names[view] for view in views],
+        }
+
+    def _write_segments(self) -> None:
+        for name, segment in zip(self.names, self.work.scene.segments or (), strict=False):
+            path = f"segments/{name}.png"
+            if not self.folder.has_picture(path):
+                self.folder.write_picture(path, mask_picture(torch.from_numpy(segment)))
+
+    def _sheet(self) -> Bytes:
+        """Rows: before, the edits (black where none), the edited scene. Columns: views."""
+        count = len(self.names)
+        views = (
+            [k * count // SHEET_VIEWS for k in range(SHEET_VIEWS)]
+            if count > SHEET_VIEWS
+            else [*range(count)]
+        )
+        h, w = self.work.scene.images[views[0]].shape[:2]
+
+        def tile(name: str) -> Bytes:
+            if not self.folder.has(name):
+                return np.zeros((h, w, 3), np.uint8)
+            pixels = self.folder.read_picture(name)
+            if pixels.shape[0] < h:
+                return enlarged(pixels, (h, w))
+            return to_bytes(resized(pixels.astype(np.float32) / np.float32(255), (h, w)))
+
+        rows = [
+            np.concatenate([tile(f"{part}/{self.names[view]}.png") for view in views], axis=1)
+            for part in ("renders/before", "views", "renders/after")
+        ]
+        return np.concatenate(rows)
+
+    # --- progress
+
+    def _tell(self, text: str, steps: int = 0, *, done: int | None = None) -> None:
+        self.done = self.done + steps if done is None else done
+        self.work.report.step(min(self.done, self.total), self.total, text)

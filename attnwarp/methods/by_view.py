@@ -1,0 +1,106 @@
+"""View by view: each view is edited alone. What every other method has to beat."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import groupby
+from typing import Any, Unpack
+
+import numpy.typing as npt
+
+from attnwarp.camera import Camera
+from attnwarp.editing.editor import Editor, edit
+from attnwarp.gaussians import Gaussians
+from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
+from attnwarp.methods.settings import ByViewSettings
+from attnwarp.methods.work import Work, chunks
+
+
+def by_view(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    images: Sequence[npt.NDArray[Any]] | None,
+    editor: Editor,
+    instruction: str,
+    settings: ByViewSettings | None = None,
+    **options: Unpack[Options],
+) -> Result:
+    """Edit every view alone, then tune the splats on all of them.
+
+    Args:
+        gaussians: the scene before the edit, N splats of either kind.
+        cameras: V views, at least one.
+        images: V pictures (H, W, 3), sRGB, uint8, uint16 or floating in [0, 1]: the views before
+            the edit. None takes renders of ``gaussians``.
+        editor: of either kind, see :mod:`attnwarp.editing`.
+        instruction: an instruction or a prompt, as the editor takes it.
+        settings: :class:`ByViewSettings`, its defaults if left out.
+        options: see :class:`Options`.
+
+    Raises:
+        ValueError: an argument of another size or type; the message names it.
+        InputError: the folder holds a run of other settings or inputs; the message names them.
+        RuntimeError: tuning diverged; the last checkpoint stays.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.methods import ByViewSettings, by_view
+        >>> from attnwarp.editing.small import load_editor
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = dict(width=32, height=32, fov_y=40, up=(0, 1, 0))
+        >>> cameras = [Camera.look_at((x, 0, 3), (0, 0, 0), **view) for x in (0, 1)]
+        >>> quick = ByViewSettings(steps=1, iterations=1)
+        >>> result = by_view(disc, cameras, None, load_editor("small-plain"), "red", quick)
+        >>> result.edited[1].shape, result.counters["edits"]
+        ((32, 32, 3), 2)
+    """
+    return run(
+        "by_view", ByView, ByViewSettings,
+        gaussians, cameras, images, editor, instruction, settings, **options,
+    )  # fmt: skip
+
+
+class ByView(Method):
+    """Every view is edited alone, and the splats are tuned on all of them."""
+
+    def __init__(self, work: Work, settings: ByViewSettings) -> None:
+        if settings.start is not None:
+            work.starts_at(settings.start[0], "start")
+        self.work, self.settings = work, settings
+
+    def run(self, loop: Loop) -> None:
+        """Edit all views, a batch after the other, then tune."""
+        work, s = self.work, self.settings
+        views = range(len(work.sizes))
+        # Each edit with a timestep of its own goes through the network alone.
+        alone = s.start is not None and s.noise == "fresh"
+        for _, same in groupby(views, key=lambda view: work.sizes[view]):
+            for batch in chunks(list(same), 1 if alone else s.batch):
+                rows = len(batch) * s.steps * work.branches()
+                loop.edit(0, batch, partial(self.edit, batch), rows=rows)
+        loop.tune(0, views, s.iterations)
+
+    def edit(
+        self, batch: Sequence[int], model: Gaussians, step: Callable[[], None]
+    ) -> list[ViewEdit]:
+        """Edit views by their guides alone."""
+        work, s = self.work, self.settings
+        start = None if s.start is None else work.timestep(0, batch[0], s.start)
+        with work.guided(s.text_guidance):
+            result = edit(
+                work.editor,
+                [work.guide(view, work.frozen) for view in batch],
+                work.instruction,
+                steps=s.steps,
+                start=start,
+                pictures=None if start is None else [work.picture(view) for view in batch],
+                noise=work.noise(0, batch),
+                watch=lambda *_: step(),
+            )
+        about: dict[str, Any] = {"start": start}
+        if start is not None:
+            about["timesteps"] = result.timesteps
+        return [ViewEdit(picture, about) for picture in result.images]

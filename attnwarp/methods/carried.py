@@ -1,0 +1,171 @@
+"""Ideas beyond the paper that are carried along with features: clean estimates, and noise that
+sticks to the surface (the preset ``extended``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from attnwarp.editing.editor import shared_noise
+from attnwarp.methods.noise import FRESH, carried, own_seed, unmoved
+from attnwarp.methods.settings import AttentionWarpingSettings
+from attnwarp.methods.sight import Sight, Size, SourceWarp
+
+
+class Estimates:
+    """The sources' estimates of their clean latents, which targets take along the warp.
+
+    Args:
+        editor: the model.
+        settings: weight, its end, and whether latents or pictures are warped.
+
+    Attributes:
+        sources: of each source, (C, h, w) at each step.
+    """
+
+    def __init__(self, editor: Any, settings: AttentionWarpingSettings) -> None:
+        self.editor, self.settings = editor, settings
+        self.sources: list[list[Tensor]] = []
+        self._pictures: dict[tuple[int, int], Tensor] = {}  # decoded once, by source and step
+
+    def change(
+        self, sights: Sequence[Sight | None], sources: int, keep: list[Tensor] | None = None
+    ) -> Callable[[int, Tensor], Tensor] | None:
+        """A function of a step and the predicted (B, C, h, w), which gives what to take instead;
+        None where nothing is.
+
+        Args:
+            sights: of the views.
+            sources: how many are taken.
+            keep: gets the result of a lone view at each step.
+        """
+        s = self.settings
+        if s.estimate == 0:
+            return None
+        pictures = s.estimate_in == "picture"
+        warps = [
+            [] if sight is None else [sight.warp(k, picture=True) for k in range(sources)]
+            for sight in sights
+        ]
+        carry = self._carry_picture if pictures else _carry
+
+        def change(number: int, x0: Tensor) -> Tensor:
+            weight, result = self.weight(number), x0
+            if weight > 0 and sources:
+                maps = [
+                    self._picture(k, number, x0) if pictures else self.sources[k][number].to(x0)
+                    for k in range(sources)
+                ]
+                rows = [carry(own, maps, ws, weight) for own, ws in zip(x0, warps, strict=True)]
+                result = torch.stack(rows)
+            if keep is not None:
+                keep.append(result[0].clone())
+            return result
+
+        return change
+
+    def weight(self, number: int) -> float:
+        """Weight of a source's estimate at a step, from 0; not above 0 where it is not taken."""
+        s = self.settings
+        return s.estimate * (1 - number / max(1, s.estimate_until * s.steps))
+
+    def memory(self, sizes: Sequence[Size]) -> str | None:
+        """A line on the memory of the sources' pictures of (h, w); None where none is kept."""
+        s = self.settings
+        if s.estimate_in != "picture" or s.estimate == 0:
+            return None
+        kept = sum(self.weight(number) > 0 for number in range(s.steps))
+        pixels = sum(h * w for h, w in sizes)
+        return (
+            f"estimates of {len(sizes)} source{'s' * (len(sizes) > 1)}, as pictures of"
+            f" {kept} steps: up to {12 * kept * pixels / 2**20:.1f} MiB in main memory"
+        )
+
+    def _picture(self, source: int, number: int, like: Tensor) -> Tensor:
+        """(3, H, W) of a source's estimate at a step."""
+        key = source, number
+        if key not in self._pictures:
+            latents = self.sources[source][number].to(like)
+            self._pictures[key] = self.editor.pixels(latents[None])[0].cpu()
+        return self._pictures[key].to(like.device)
+
+    def _carry_picture(
+        self, own: Tensor, pictures: Sequence[Tensor], warps: Sequence[SourceWarp], weight: float
+    ) -> Tensor:
+        """(C, h, w) latents of a target whose picture takes the sources' (3, H, W), warped."""
+        before = self.editor.pixels(own[None])
+        after = _carry(before[0], pictures, warps, weight)[None]
+        # What an autoencoder loses of a picture is lost in both, so that nothing changes where
+        # nothing is carried.
+        change = self.editor.latents(after) - self.editor.latents(before)
+        return own + change[0].to(own)
+
+
+def _carry(
+    own: Tensor, maps: Sequence[Tensor], warps: Sequence[SourceWarp], weight: float
+) -> Tensor:
+    """(C, h, w) of a target that takes the sources' (C, h', w') maps, warped.
+
+    Args:
+        own: (C, h, w) the target's.
+        maps: of the sources.
+        warps: from the sources.
+        weight: of the sources', in [0, 1].
+    """
+    tokens = own.flatten(1).T[None].contiguous()
+    for warp, map_ in zip(warps, maps, strict=False):
+        h, w = own.shape[1:]
+        layer = warp.at((h, w), source_size=(map_.shape[1], map_.shape[2]))
+        tokens = layer.blend_tokens(map_.flatten(1).T[None].contiguous(), tokens, weight)
+    return tokens[0].T.reshape(own.shape)
+
+
+class Noise:
+    """Noise that views start from: one for all of a size, one of each view's own, or one that
+    sticks to the surface.
+
+    Args:
+        settings: which, and the seed.
+
+    Attributes:
+        orders: of each source, (h, w) order of its noise where noise sticks to the surface.
+    """
+
+    def __init__(self, settings: AttentionWarpingSettings) -> None:
+        self.settings = settings
+        self.orders: list[Tensor] = []
+
+    def of(
+        self, views: Sequence[int], shape: tuple[int, int, int], sights: Sequence[Sight | None]
+    ) -> Tensor:
+        """(B, C, h, w) noise of views whose latents have (C, h, w)."""
+        s = self.settings
+        if s.noise == "fresh":
+            return torch.cat(
+                [shared_noise((1, *shape), own_seed(s.seed, FRESH, view)) for view in views]
+            )
+        noise = shared_noise((len(views), *shape), s.seed)
+        if s.noise == "shared":
+            return noise
+        rows = []
+        for row, sight in zip(noise.flatten(2), sights, strict=True):
+            order = self.order(sight, shape[1:])
+            rows.append(row[:, order.flatten()].unflatten(1, tuple(order.shape)))
+        return torch.stack(rows)
+
+    def order(self, sight: Sight | None, size: tuple[int, ...]) -> Tensor:
+        """(h, w) int64: the order of a view's noise; sources of another size have none to give."""
+        h, w = size
+        if sight is None:
+            return unmoved((h, w))
+        taken, positions = [], []
+        for order, view in zip(self.orders, sight.views, strict=False):
+            if tuple(order.shape) != (h, w):
+                return unmoved((h, w))
+            taken.append(order)
+            positions.append(view.at((h, w), source_size=(h, w)).correspondence.xy)
+        return carried(taken, positions, sight.choice((h, w)))

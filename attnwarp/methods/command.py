@@ -1,0 +1,401 @@
+"""The work of the commands attnwarp edit and baseline: from photographs to an edited scene."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp.camera import Camera
+from attnwarp.editing.editor import own_size
+from attnwarp.editing.segment import load_segmenter
+from attnwarp.editing.small import check_instruction, load_editor, thread_count
+from attnwarp.errors import InputError, suggest
+from attnwarp.fit import (
+    FitSettings,
+    Views,
+    compile_kernels,
+    first_splats,
+    fit,
+    load_views,
+    progress,
+)
+from attnwarp.gaussians import Gaussians
+from attnwarp.io import THIRD_SCALE, Dataset, read_image, write_ply
+from attnwarp.io.names import file_stems
+from attnwarp.methods import METHODS, Budget, MethodSettings, Result
+from attnwarp.methods.attention_warping import attention_warping
+from attnwarp.methods.base import VIEWER_PLY, workdir_of
+from attnwarp.methods.features import Features
+from attnwarp.methods.page import write_page
+from attnwarp.methods.pictures import check_view_aspect
+from attnwarp.methods.scene import images_of
+from attnwarp.methods.settings import AttentionWarpingSettings
+from attnwarp.methods.tuning import perceptual_net
+from attnwarp.methods.view_edits import check_editor
+from attnwarp.methods.words import masks_by_words, words_folder
+from attnwarp.process import asked_to_stop
+from attnwarp.reporting import reporter
+
+FIT_FOLDER = "fit"
+
+MOST_NAMES = 5
+"""Names of views in one line."""
+
+COLORED = 0.1
+"""Spread of a pixel's channels that no grey picture has: a photograph, or a mask of two colours,
+named as a mask by mistake."""
+
+
+@dataclass(frozen=True)
+class FitPlan:
+    """How a scene is fitted before it is edited. ``reports/editing/time.md`` has what the defaults
+    take, and what half and twice as much time buys.
+
+    Args:
+        iterations: of the fit.
+        kind: "2d" or "3d".
+        max_splats: no more than these.
+    """
+
+    iterations: int = 3_000
+    kind: str = "2d"
+    max_splats: int = 30_000
+
+
+def edit_dataset(
+    dataset: Dataset,
+    splats: Gaussians | None,
+    editor_name: str,
+    instruction: str,
+    settings: AttentionWarpingSettings,
+    out: Path,
+    *,
+    fit_plan: FitPlan,
+    source: str | None,
+    source_picture: Path | None,
+    masks: Path | None,
+    words: str | None,
+    segmenter: str,
+    max_size: int | None,
+    store: Any,
+    device: str,
+    threads: int | None,
+    say: Callable[[str], None],
+) -> tuple[Result, Path]:
+    """Fit where no splats are given, edit, and write the page and a PLY for other viewers.
+
+    Args:
+        dataset: cameras and pictures.
+        splats: the scene before the edit, or None.
+        editor_name: see :func:`attnwarp.editing.small.load_editor`.
+        instruction: in words.
+        settings: of the edit. Without a size, the editor's own is taken.
+        out: folder of all results.
+        fit_plan: of the fit.
+        source: name or number of the source view; the first if None.
+        source_picture: file of the source view edited elsewhere.
+        masks: folder with a mask picture for each view.
+        words: of what is edited, instead of masks.
+        segmenter: makes them; see :func:`attnwarp.editing.segment.load_segmenter`.
+        max_size: larger pictures are averaged down to it.
+        store, device: see :func:`attnwarp.methods.attention_warping` and ``load_editor``.
+        threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
+        say: shows a line to the user.
+
+    Returns:
+        The edit and the path of its page.
+
+    Raises:
+        InputError: no such view, mask, editor or segmenter; masks and words; words without a
+            detection in a view; files of something else where results go.
+    """
+    if masks is not None and words is not None:
+        raise InputError("--where: got --masks too, expected one of the two")
+    if words is not None and not words.strip():
+        raise InputError(f"--where: got {words!r}, expected words such as 'bear'")
+    workdir_of(out).check_unclaimed()  # again in the edit, but here before a fit
+    views = load_views(dataset, max_size=max_size)
+    index = _view_of(views.cameras, source, dataset)
+    images = images_of(views)
+    by_hand = None
+    if source_picture is not None:
+        pixels, top = read_over_black(source_picture)
+        by_hand = (pixels / top).astype(np.float32)
+        h, w, _ = by_hand.shape
+        # Again in the edit, but here before an editor is loaded and a fit spends its minutes.
+        check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
+    segments = None if masks is None else _masks(masks, views.cameras, say)
+    editor = load_editor(editor_name, device=device)
+    check_instruction(editor_name, editor, instruction)
+    if words is not None:
+        segments = _by_words(words, segmenter, device, views.cameras, images, out, say)
+    if settings.size is None:
+        settings = replace(settings, size=own_size(editor))
+    if splats is None:
+        # So are settings that the editor or the tuning cannot use.
+        check_editor(editor, settings)
+        Features(editor, settings, "cpu")
+        perceptual_net(settings)
+        splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, say)
+    torch.set_num_threads(thread_count(editor, threads))
+    compile_kernels(splats.kind, say)
+    with reporter(title=out.name, log=say) as report:
+        result = attention_warping(
+            splats,
+            views.cameras,
+            images,
+            editor,
+            instruction,
+            settings,
+            source=index,
+            source_picture=by_hand,
+            segments=segments,
+            folder=out,
+            store=store,
+            report=report,
+        )
+    if result.gaussians.kind == "2d":
+        # Other programs take no splats of two scales.
+        write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
+    return result, write_page(workdir_of(out), views.cameras, images)
+
+
+def run_baseline(
+    method: str,
+    dataset: Dataset,
+    splats: Gaussians,
+    editor_name: str,
+    instruction: str,
+    settings: MethodSettings,
+    out: Path,
+    *,
+    budget: Budget,
+    max_size: int | None,
+    device: str,
+    threads: int | None,
+    say: Callable[[str], None],
+) -> Result:
+    """Run a method on the views of a data set.
+
+    Args:
+        method: see :data:`attnwarp.methods.METHODS`.
+        dataset: cameras and pictures.
+        splats: the scene before the edit.
+        editor_name: see :func:`attnwarp.editing.small.load_editor`.
+        instruction: in words.
+        settings: of the method. Without a size, the editor's own is taken.
+        out: folder of all results.
+        budget: limits of the run.
+        max_size: larger pictures are averaged down to it.
+        device: of the editor.
+        threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
+        say: shows a line to the user.
+
+    Raises:
+        InputError: no such editor; a folder of another run.
+    """
+    views = load_views(dataset, max_size=max_size)
+    images = images_of(views)
+    editor = load_editor(editor_name, device=device)
+    check_instruction(editor_name, editor, instruction)
+    torch.set_num_threads(thread_count(editor, threads))
+    if settings.size is None:
+        settings = settings.changed(size=own_size(editor))
+    compile_kernels(splats.kind, say)
+    with reporter(title=out.name, log=say) as report:
+        return METHODS[method](
+            splats,
+            views.cameras,
+            images,
+            editor,
+            instruction,
+            settings,
+            folder=out,
+            budget=budget,
+            report=report,
+        )
+
+
+def _by_words(
+    words: str,
+    name: str,
+    device: str,
+    cameras: Sequence[Camera],
+    images: Sequence[npt.NDArray[Any]],
+    out: Path,
+    say: Callable[[str], None],
+) -> list[npt.NDArray[np.bool_]]:
+    """Masks by a segmenter, whose networks do not stay beside the editor's."""
+    segmenter = load_segmenter(name, device=device)
+    folder = words_folder(out, segmenter, words)
+    say(f"masks of {words!r} by {name}: {folder}")
+    with reporter(title="masks") as report:
+        masks, kept = masks_by_words(segmenter, words, cameras, images, folder, report)
+    if kept:
+        say(f"{kept} of {len(masks)} masks are those of an earlier run")
+    say(_coverage(masks, cameras))
+    # Words may hold braces, so no template of them.
+    _say_empty(masks, cameras, lambda n: f"--where: no {words!r} was detected in {n} views", say)
+    return masks
+
+
+def _fitted(
+    dataset: Dataset,
+    views: Views,
+    plan: FitPlan,
+    seed: int,
+    folder: Path,
+    say: Callable[[str], None],
+) -> Gaussians:
+    """Splats fitted to all views; a fit in the folder is resumed."""
+    settings = FitSettings.from_dict(
+        {
+            "kind": plan.kind,
+            "iterations": plan.iterations,
+            "max_splats": plan.max_splats,
+            "seed": seed,
+        }
+    )
+    start = first_splats(dataset, views.cameras, settings, say)
+    say(f"no --ply: fitting splats to {len(views)} views first: {folder}")
+    if len(start) > plan.max_splats:
+        say(progress.more_points(len(start), plan.max_splats))
+    folder.mkdir(parents=True, exist_ok=True)
+    compile_kernels(settings.kind, say)
+    with asked_to_stop(say) as stop, progress.progress_display(title="fit") as watch:
+        result = fit(start, views, settings, folder=folder, watch=watch, stop=stop)
+    if result.stopped == "asked":
+        raise KeyboardInterrupt
+    return result.gaussians
+
+
+def _view_of(cameras: Any, name: str | None, dataset: Dataset) -> int:
+    """The number of a view by its name, its file's name with or without suffix, or its number."""
+    if name is None:
+        return 0
+    names = [camera.name for camera in cameras]
+    for candidates in _spellings(names):
+        if candidates.count(name) == 1:
+            return candidates.index(name)
+    if name.isdecimal() and int(name) < len(names):
+        return int(name)
+    pairs = zip(dataset.cameras, dataset.image_paths, strict=True)
+    left_out = [camera.name for camera, image in pairs if image is None]
+    if any(name in candidates for candidates in _spellings(left_out)):
+        raise InputError(f"--source: the picture of {name!r} is missing; name another view")
+    raise InputError(
+        f"--source: got {name!r}, expected a view's name or a number below {len(names)}"
+        f"{suggest(name, names)}"
+    )
+
+
+def _spellings(names: list[str]) -> list[list[str]]:
+    """The names, their files' names with suffix, and without."""
+    return [names, [Path(name).name for name in names], [Path(name).stem for name in names]]
+
+
+def _masks(folder: Path, cameras: Any, say: Callable[[str], None]) -> list[npt.NDArray[np.bool_]]:
+    """(H, W) bool of each view from NAME.png: white is edited."""
+    if not folder.is_dir():
+        raise InputError(f"--masks: {folder} is no folder; name one with a PNG for each view")
+    paths = mask_files(folder, cameras)
+    masks = [read_mask(path, camera) for path, camera in zip(paths, cameras, strict=True)]
+    if not any(mask.any() for mask in masks):
+        raise InputError(
+            f"--masks: every mask in {folder} is black, so nothing may change; white is edited"
+        )
+    _say_empty(masks, cameras, lambda n: f"--masks: {n} are black", say)
+    return masks
+
+
+def _say_empty(
+    masks: list[npt.NDArray[np.bool_]],
+    cameras: Any,
+    text: Callable[[str], str],
+    say: Callable[[str], None],
+) -> None:
+    """Name the views whose masks are empty; ``text`` begins the line, with a "2 of 9"."""
+    empty = [camera.name for mask, camera in zip(masks, cameras, strict=True) if not mask.any()]
+    if empty:
+        more = f" and {len(empty) - MOST_NAMES} more" if len(empty) > MOST_NAMES else ""
+        say(
+            f"{text(f'{len(empty)} of {len(masks)}')}, so nothing is edited in"
+            f" {', '.join(empty[:MOST_NAMES])}{more}"
+        )
+
+
+def mask_files(folder: Path, cameras: Any) -> list[Path]:
+    """The file of each view's mask: by the view's name and folders, or by its name alone where no
+    other view has it, or numbered as an edit writes it."""
+    names = [Path(*(p for p in PurePath(c.name).parts if p not in ("..", "/"))) for c in cameras]
+    plain = [name.parent / name.stem for name in names]
+    counts, stems = Counter(plain), Counter(name.stem for name in names)
+    paths = []
+    for name, short, numbered in zip(names, plain, file_stems(cameras), strict=True):
+        own = [f"{name}.png", *([f"{short}.png"] if counts[short] == 1 else ())]
+        found = [folder / file for file in (*own, f"{numbered}.png") if (folder / file).is_file()]
+        if not found:
+            alone = stems[name.stem] == 1
+            path = folder / (f"{numbered}.png" if alone else own[-1])
+            shared = folder / f"{name.stem}.png"
+            if not alone and shared.is_file():
+                first, second = [n for n in names if n.stem == name.stem][:2]
+                raise InputError(
+                    f"--masks: {shared} could be that of {first} or of {second}; expected {path}"
+                )
+            raise InputError(f"--masks: {path} is missing; expected one PNG for each view")
+        paths.append(found[0])
+    return paths
+
+
+def _coverage(masks: list[npt.NDArray[np.bool_]], cameras: Any) -> str:
+    """One line: of which views masks cover the least and the most."""
+    shares = [float(mask.mean()) for mask in masks]
+    least, most = int(np.argmin(shares)), int(np.argmax(shares))
+    return (
+        f"masks cover {shares[least]:.1%} of {cameras[least].name} (least)"
+        f" to {shares[most]:.1%} of {cameras[most].name} (most)"
+    )
+
+
+def read_mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:
+    """(H, W) bool of a picture: what is white and opaque.
+
+    Raises:
+        InputError: it is coloured.
+        ValueError: another aspect ratio than the camera's.
+    """
+    import cv2
+
+    pixels, top = read_over_black(path)
+    if np.ptp(pixels, axis=-1).max() > COLORED * top:
+        raise InputError(
+            f"--masks: {path} is coloured, expected a grey picture: white is edited, black is not"
+        )
+    if pixels.max() == 1:
+        raise InputError(
+            f"--masks: {path} has no value above 1 of {top}, so all of it is black; multiply its"
+            f" values by {top}"
+        )
+    bright = pixels.mean(axis=-1) / top
+    size = (camera.width, camera.height)
+    check_view_aspect(bright.shape, camera, f"--masks: {path}")
+    if bright.shape != size[::-1]:
+        bright = cv2.resize(bright, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(bright > 0.5)
+
+
+def read_over_black(path: Path) -> tuple[npt.NDArray[Any], int]:
+    """(H, W, 3) of a picture over black where it is transparent, and the value of white."""
+    pixels = read_image(path)
+    top = int(np.iinfo(pixels.dtype).max)
+    if pixels.shape[2] == 3:
+        return pixels, top
+    return pixels[..., :3] * (pixels[..., 3:] / top), top

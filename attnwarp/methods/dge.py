@@ -1,0 +1,196 @@
+"""Direct Gaussian Editor (Chen et al. 2024): views are edited together, as frames of a film whose
+tokens are matched along epipolar lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, Unpack
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp.camera import Camera
+from attnwarp.editing.editor import Editor
+from attnwarp.editing.schedule import following, steps_as_published, steps_from
+from attnwarp.gaussians import Gaussians
+from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
+from attnwarp.methods.matching import key_views
+from attnwarp.methods.settings import DGESettings
+from attnwarp.methods.work import KEYS, VIEWS, Work, chunks, parts_of
+
+
+def dge(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    images: Sequence[npt.NDArray[Any]] | None,
+    editor: Editor,
+    instruction: str,
+    settings: DGESettings | None = None,
+    **options: Unpack[Options],
+) -> Result:
+    """Edit views together through key views, tune the splats on them, and begin again with others.
+
+    The views of a round are sorted by their angle and cut into batches. At every step one view of
+    each batch is drawn as key view. The key views look at each other's tokens; every view then
+    takes the attention's output of the key tokens that match its own, near the epipolar line. Each
+    round noises renders of the current splats and is guided by renders of those before the edit.
+
+    The authors' code also grows the splats; their number stays here.
+
+    Args:
+        gaussians, cameras, instruction, options: see :func:`by_view`. The views' edits have one
+            size.
+        images: see :func:`by_view`; they serve the segments and the detail that an edit at a
+            smaller size lacks. Guides are renders.
+        editor: an InstructPix2Pix.
+        settings: :class:`DGESettings`, its defaults if left out.
+
+    Raises:
+        ValueError, InputError, RuntimeError: see :func:`by_view`.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.methods import DGESettings, dge
+        >>> from attnwarp.editing.small import load_editor
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = dict(width=32, height=32, fov_y=40, up=(0, 1, 0))
+        >>> cameras = [Camera.look_at((x, 0, 3), (0, 0, 0), **view) for x in (0, 1)]
+        >>> quick = DGESettings(steps=1, iterations=1, perceptual=0)
+        >>> result = dge(disc, cameras, None, load_editor("small-plain"), "red", quick)
+        >>> result.counters["network_rows"]  # one key view and two views, two branches each
+        6
+    """
+    return run(
+        "dge", DGE, DGESettings,
+        gaussians, cameras, images, editor, instruction, settings, **options,
+    )  # fmt: skip
+
+
+class DGE(Method):
+    """Views of a round are edited together, through key views."""
+
+    def __init__(self, work: Work, settings: DGESettings) -> None:
+        work.takes("dge", "picture")
+        work.one_size("dge")
+        self.work, self.settings = work, settings
+        rounds = range(len(parts_of(settings.iterations, settings.every)))
+        work.starts_at(min(self._start(number) for number in rounds), "starts")
+
+    def run(self, loop: Loop) -> None:
+        """Draw views, edit them together, tune on them, and begin again with others."""
+        work, s = self.work, self.settings
+        for number, iterations in enumerate(parts_of(s.iterations, s.every)):
+            order = torch.randperm(len(work.sizes), generator=work.generator(VIEWS, number))
+            views = by_angle(work.scene.cameras, sorted(order[: s.views].tolist()))
+            keys = sum(self._with_keys(number)) * len(chunks(views, s.batch))
+            rows = (s.steps * len(views) + keys) * work.branches()
+            loop.edit(number, views, partial(self.edit, number, views), rows=rows)
+            loop.tune(number, views, iterations)
+
+    def edit(
+        self, number: int, group: Sequence[int], model: Gaussians, step: Callable[[], None]
+    ) -> list[ViewEdit]:
+        """Edit the views of a round, from their noised renders."""
+        work, s = self.work, self.settings
+        editor: Any = work.editor
+        timesteps = steps_as_published(editor.schedule, self._start(number), s.steps)
+        cameras = [work.scene.cameras[view] for view in group]
+        batches = chunks(range(len(group)), s.batch)
+        generator = work.generator(KEYS, number)
+        drawn: list[list[str]] = []
+        with work.guided(s.text_guidance), torch.no_grad():
+            guides = [work.render(view, work.frozen) for view in group]
+            task = editor.task(guides, work.instruction)
+            before = editor.encode([work.render(view, model) for view in group])
+            noise = work.noise(number, group).to(before)
+            x = editor.schedule.add_noise(before, noise, timesteps[0])
+            with key_views(
+                editor.unet, task.branches, (x.shape[2], x.shape[3]), s.epipolar
+            ) as attention:
+                for (now, then), with_keys in zip(
+                    following(timesteps), self._with_keys(number), strict=True
+                ):
+                    outputs = []
+                    if with_keys:
+                        keys = [_drawn(batch, generator) for batch in batches]
+                        drawn.append([cameras[key].name for key in keys])
+                        key_cameras = [cameras[key] for key in keys]
+                        with attention.key_pass():
+                            _part(task, keys).predict(x[keys], now)
+                    for place, batch in enumerate(batches):
+                        views, part = list(batch), _part(task, batch)
+                        if not with_keys:
+                            outputs.append(part.predict(x[views], now))
+                            continue
+                        nearest = 1 if place == 0 else s.nearest
+                        of_batch = [cameras[view] for view in views]
+                        with attention.view_pass(of_batch, key_cameras, nearest):
+                            outputs.append(part.predict(x[views], now))
+                    x = editor.schedule.step(torch.cat(outputs), x, now, then)
+                    step()
+            pictures = editor.decode(x)
+        about = {"start": self._start(number), "timesteps": timesteps, "keys": drawn}
+        return [ViewEdit(picture, about) for picture in pictures]
+
+    def _start(self, number: int) -> int:
+        """Stable Diffusion's timestep that a round starts from."""
+        starts = self.settings.starts
+        return starts[min(number, len(starts) - 1)]
+
+    def _with_keys(self, number: int) -> list[bool]:
+        """Of each step of a round, whether views take the outputs of key views there."""
+        published = steps_from(self._start(number), self.settings.steps)
+        return [timestep >= self.settings.plain_below for timestep in published]
+
+
+def by_angle(cameras: Sequence[Camera], views: Sequence[int]) -> list[int]:
+    """Views by the angle of their direction from that of the leftmost camera (the smallest x).
+
+    Angles go all round, toward that camera's nearest neighbour.
+
+    Args:
+        cameras: all of them.
+        views: numbers of those to sort.
+
+    Example:
+        >>> import math
+        >>> from attnwarp import Camera
+        >>> from attnwarp.methods.dge import by_angle
+        >>> places = [(-3 * math.cos(a), 3 * math.sin(a), 0) for a in (0, 3, 0.5, 5, 1)]
+        >>> view = dict(width=8, height=8, fov_y=60)
+        >>> by_angle([Camera.look_at(place, (0, 0, 0), **view) for place in places], range(5))
+        [0, 2, 4, 1, 3]
+    """
+    forwards = {view: cameras[view].forward for view in views}
+    first = min(views, key=lambda view: float(cameras[view].position[0]))
+
+    def angle(view: int) -> float:
+        sine = np.linalg.norm(np.cross(forwards[first], forwards[view]))
+        return float(np.arctan2(sine, forwards[first] @ forwards[view]))
+
+    apart = [view for view in views if 1e-9 < angle(view) < np.pi - 1e-9]
+    if not apart:
+        return sorted(views, key=angle)
+    axis = np.cross(forwards[first], forwards[min(apart, key=angle)])
+
+    def signed(view: int) -> float:
+        ahead = axis @ np.cross(forwards[first], forwards[view]) >= 0
+        return angle(view) if ahead else 2 * np.pi - angle(view)
+
+    return sorted(views, key=signed)
+
+
+def _drawn(batch: Sequence[int], generator: torch.Generator) -> int:
+    return batch[int(torch.randint(len(batch), (1,), generator=generator))]
+
+
+def _part(task: Any, views: Sequence[int]) -> Any:
+    """The edit of some of the views of an InstructPix2Pix task."""
+    rows = [branch * task.views + view for branch in range(len(task.branches)) for view in views]
+    return replace(task, text=task.text[rows], before=task.before[rows], views=len(views))

@@ -1,0 +1,137 @@
+"""Recorded features of an edit: which layers and guidance branches, and the memory they take."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from attnwarp.editing.attention import Layer, RecordingPlan, choose_layers
+from attnwarp.editing.editor import Editor, guided
+from attnwarp.methods.settings import AttentionWarpingSettings
+from attnwarp.methods.sight import Size
+
+BRANCHES = ("text", "image")
+"""Branches of InstructPix2Pix that get features in the released code: not the unconditional one."""
+
+
+class Features:
+    """The choice of what is recorded.
+
+    Args:
+        editor: the model.
+        settings: see there.
+        store: "device", "cpu", or a folder.
+
+    Attributes:
+        layers: to record; none where every view is edited alone.
+
+    Raises:
+        ValueError: layers or branches that the editor lacks.
+    """
+
+    def __init__(
+        self, editor: Editor, settings: AttentionWarpingSettings, store: str | Path
+    ) -> None:
+        self.editor, self.settings, self.store = editor, settings, store
+        self.layers: tuple[Layer, ...] = ()
+        if settings.method == "warp":
+            self.layers = choose_layers(
+                editor.unet,
+                fractions=settings.fractions,
+                kinds=settings.kinds,
+                blocks=settings.blocks,
+            )
+            self._check_branches()
+
+    def source_guidance(self, *, further: bool) -> float | None:
+        """Text guidance of a source; None for the editor's own. Further ones have stage 0's."""
+        s = self.settings
+        own = None if further else s.source_text_guidance
+        return s.guidance(0) if own is None else own
+
+    def plan(self, view: int, size: Size, *, further: bool) -> RecordingPlan:
+        """The recording of a source.
+
+        Args:
+            view: its number.
+            size: (h, w) of its latents.
+            further: for a source after the first.
+        """
+        s = self.settings
+        branches = self.branches(self.source_guidance(further=further))
+        return RecordingPlan(
+            self.layers,
+            size,
+            branches,
+            self._kept(branches),
+            s.steps,
+            dtype=torch.float16 if s.feature_type == "float16" else torch.float32,
+            store=self.store / str(view) if isinstance(self.store, Path) else self.store,  # type: ignore[arg-type]
+            chosen=s.feature_range(),
+        )
+
+    def branches(self, guidance: float | None) -> tuple[str, ...]:
+        """Guidance branches of a batch with a text guidance."""
+        with guided(self.editor, guidance):
+            return self.editor.branches
+
+    def _kept(self, branches: tuple[str, ...]) -> tuple[str, ...]:
+        """Branches to record, of a source that has these."""
+        if self.settings.branches is not None:
+            return self.settings.branches
+        if self.editor.guide == "picture":
+            return tuple(branch for branch in BRANCHES if branch in branches)
+        return branches
+
+    def _check_branches(self) -> None:
+        guidance = self.source_guidance(further=False)
+        available = self.branches(guidance)
+        if self.settings.branches == ():
+            raise ValueError(f"branches: got none, expected some of {', '.join(available)}")
+        for branch in self.settings.branches or ():
+            if branch not in available:
+                raise ValueError(
+                    f"branches: got {branch!r}, expected one of"
+                    f" {', '.join(map(repr, available))}, which the source has at"
+                    f" {_in_words(guidance)}"
+                )
+
+    def check_batches(self, stages: Sequence[int], *, further: bool) -> None:
+        """Refuse, before any work, branches of the source that a later batch does not have.
+
+        Args:
+            stages: numbers of the stages that edit views, from 0.
+            further: for several sources.
+
+        Raises:
+            ValueError: a batch takes none of the recorded branches, or cannot record all that the
+                settings name.
+        """
+        if not self.layers:
+            return
+        s = self.settings
+        guidances = {"a further source": s.guidance(0)} if further else {}
+        recorded = [
+            self._kept(self.branches(guidance))
+            for guidance in (self.source_guidance(further=False), *guidances.values())
+        ]
+        guidances |= {f"stage {number + 1}": s.guidance(number) for number in stages}
+        for name, guidance in guidances.items():
+            branches = self.branches(guidance)
+            # A further source records what the settings name, too.
+            needs_all = name == "a further source" and s.branches is not None
+            for keep in recorded:
+                shared = set(keep) & set(branches)
+                if not shared or (needs_all and len(shared) < len(set(keep))):
+                    raise ValueError(
+                        f"branches: {', '.join(keep) or 'none'} would be recorded, but at"
+                        f" {_in_words(guidance)} {name} has {', '.join(branches)}; choose other"
+                        " branches, text_guidance, source_text_guidance or guidance_drop"
+                    )
+
+
+def _in_words(guidance: float | None) -> str:
+    own = "the editor's own text guidance"
+    return own if guidance is None else f"text guidance {guidance:g}"

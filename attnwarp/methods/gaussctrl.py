@@ -1,0 +1,183 @@
+"""GaussCtrl (Wu et al. 2024): views by their depth, with attention to reference views, from the
+inverted noise of their renders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from typing import Any, Unpack
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from attnwarp.camera import Camera
+from attnwarp.editing.editor import Editor, edit
+from attnwarp.editing.inversion import inversion_steps, invert_view
+from attnwarp.gaussians import Gaussians
+from attnwarp.methods.attention import aligned, self_attention
+from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
+from attnwarp.methods.settings import GaussCtrlSettings
+from attnwarp.methods.work import VIEWS, Guide, Work, chunks
+
+
+def gaussctrl(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    images: Sequence[npt.NDArray[Any]] | None,
+    editor: Editor,
+    instruction: str,
+    settings: GaussCtrlSettings | None = None,
+    **options: Unpack[Options],
+) -> Result:
+    """Edit views by their depth with attention to reference views, then tune the splats on them.
+
+    Each edit starts from the DDIM inversion of the view's render, without guidance, or from random
+    latents. The reference views go through the network with every batch.
+
+    Args:
+        gaussians, cameras, images, options: see :func:`by_view`. ``images`` serve the segments and
+            the detail that an edit at a smaller size lacks; guides are of the splats.
+        editor: a :class:`~attnwarp.editing.controlnet.DepthControlNet`. Where its network predicts
+            the picture, which says nothing of a clean picture's noise, inversion begins at the
+            lowest timestep, to which all views are noised alike.
+        instruction: a prompt.
+        settings: :class:`GaussCtrlSettings`, its defaults if left out.
+
+    Raises:
+        ValueError, InputError, RuntimeError: see :func:`by_view`.
+
+    Example:
+        >>> from attnwarp.methods import gaussctrl
+        >>> from attnwarp.editing.small import load_editor
+        >>> from attnwarp import Camera
+        >>> camera = Camera.look_at((0, 0, 3), (0, 0, 0), width=32, height=32, fov_y=40,
+        ...                         up=(0, 1, 0))
+        >>> import torch
+        >>> from attnwarp import Gaussians
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> gaussctrl(disc, [camera], None, load_editor("small-plain"), "red")
+        Traceback (most recent call last):
+        ValueError: editor: gaussctrl is made for a depth ControlNet, got InstructPix2Pix, which
+        takes pictures; choose another editor or method
+    """
+    return run(
+        "gaussctrl", GaussCtrl, GaussCtrlSettings,
+        gaussians, cameras, images, editor, instruction, settings, **options,
+    )  # fmt: skip
+
+
+class GaussCtrl(Method):
+    """Views are edited with attention to reference views."""
+
+    def __init__(self, work: Work, settings: GaussCtrlSettings) -> None:
+        work.takes("gaussctrl", "depth")
+        work.one_size("gaussctrl")
+        self.work, self.settings = work, settings
+        generator = work.generator(VIEWS)
+        count = settings.references
+        self.views = _spread_draw(range(len(work.sizes)), count, settings.views, generator)
+        self.references = [_choice(part, 1, generator)[0] for part in _quarters(self.views, count)]
+        self._latents: dict[int, Tensor] = {}
+
+    def run(self, loop: Loop) -> None:
+        """Edit all drawn views, a batch after the other, then tune."""
+        inverted: set[int] = set()
+        for batch in chunks(self.views, self.settings.batch):
+            together = {*self.references, *batch}
+            rows = self._rows(len(batch), len(together - inverted))
+            inverted |= together
+            loop.edit(0, batch, partial(self.edit, batch), rows=rows)
+        loop.tune(0, self.views, self.settings.iterations)
+
+    def _rows(self, views: int, inversions: int) -> int:
+        """Rows through the network for a batch, of which so many views are inverted first."""
+        s = self.settings
+        edits = (len(self.references) + views) * s.steps * self.work.branches()
+        if s.latents == "random":
+            return edits
+        return edits + inversions * len(inversion_steps(self.work.editor, s.steps)[0])
+
+    def edit(
+        self, group: Sequence[int], model: Gaussians, step: Callable[[], None]
+    ) -> list[ViewEdit]:
+        """Edit views together with the reference views."""
+        work, s = self.work, self.settings
+        editor: Any = work.editor
+        views = [*self.references, *group]
+        guides = {view: work.depth(view, work.frozen) for view in set(views)}
+        latents = torch.cat([self.latents(view, guides[view]) for view in views])
+        with ExitStack() as stack:
+            stack.enter_context(work.guided(s.text_guidance))
+            if s.negative_prompt is not None:
+                stack.enter_context(_negative(editor, s.negative_prompt))
+            count, branches = len(self.references), len(editor.branches)
+            rule = aligned(count, s.self_share, branches)
+            stack.enter_context(self_attention(editor.unet, rule))
+            if s.control_share is not None:
+                rule = aligned(count, s.control_share, branches)
+                stack.enter_context(self_attention(editor.controlnet, rule))
+            result = edit(
+                editor,
+                [guides[view] for view in views],
+                work.instruction + s.suffix,
+                steps=s.steps,
+                latents=latents,
+                watch=lambda *_: step(),
+            )
+        about = {"references": [work.scene.cameras[view].name for view in self.references]}
+        return [ViewEdit(picture, about) for picture in result.images[count:]]
+
+    def latents(self, view: int, depth: Guide) -> Tensor:
+        """(1, C, h, w) that the edit of a view starts from, computed once a sitting."""
+        work, s = self.work, self.settings
+        if s.latents == "random":
+            return work.noise(0, [view]).to(work.editor.unet.device, work.editor.unet.dtype)
+        if view not in self._latents:
+            prompt = work.instruction + s.suffix if s.source_prompt is None else s.source_prompt
+            self._latents[view] = invert_view(
+                work.editor, depth, work.render(view, work.frozen), prompt,
+                steps=s.steps, seed=s.seed,
+            )  # fmt: skip
+        return self._latents[view]
+
+
+@contextmanager
+def _negative(editor: Any, prompt: str) -> Iterator[None]:
+    """Use another negative prompt while the block runs."""
+    before = editor.negative_prompt
+    editor.negative_prompt = prompt
+    try:
+        yield
+    finally:
+        editor.negative_prompt = before
+
+
+def _quarters(views: Sequence[int], count: int) -> list[list[int]]:
+    """Contiguous parts of views, as equal as can be; fewer where there are fewer views."""
+    count = min(count, len(views))
+    return [list(part) for part in np.array_split(np.asarray(views), count)]
+
+
+def _choice(views: Sequence[int], count: int, generator: torch.Generator) -> list[int]:
+    """So many different ones at random, in their order."""
+    order = torch.randperm(len(views), generator=generator)[:count].tolist()
+    return [int(views[k]) for k in sorted(order)]
+
+
+def _spread_draw(
+    views: Sequence[int], parts: int, most: int, generator: torch.Generator
+) -> list[int]:
+    """At most so many views: an equal share of each contiguous part, at random."""
+    if len(views) <= most:
+        return list(views)
+    shares = [len(part) for part in np.array_split(np.arange(most), min(parts, len(views)))]
+    return [
+        view
+        for part, share in zip(_quarters(views, parts), shares, strict=True)
+        for view in _choice(part, share, generator)
+    ]

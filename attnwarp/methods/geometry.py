@@ -1,0 +1,178 @@
+"""Geometry of an edit: the warps between its views, and which views are its sources."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp import check
+from attnwarp.digest import digest_each
+from attnwarp.gaussians import Gaussians
+from attnwarp.methods.pictures import Mask
+from attnwarp.methods.settings import AttentionWarpingSettings
+from attnwarp.methods.sight import Sight
+from attnwarp.methods.work import Work
+from attnwarp.warp import Surface, WarpedView, render_surface, warp_view
+
+Warps = Callable[[int, int], WarpedView]
+"""The warp from a source view to a target view, by their numbers."""
+
+
+class Geometry:
+    """Warps along the scene's geometry.
+
+    Args:
+        work: the scene.
+        settings: of its edit.
+        warps: from outside, such as along exact depth; None for those along the splats' depth.
+    """
+
+    def __init__(self, work: Work, settings: AttentionWarpingSettings, warps: Warps | None) -> None:
+        self.work, self.settings, self.outside = work, settings, warps
+        self._frozen: dict[int, Surface] = {}
+
+    def sight(self, sources: Sequence[int], view: int, model: Gaussians) -> Sight:
+        """The sources' warps to a view, and which of them each pixel takes."""
+        s = self.settings
+        warps = [self.warp(source, view, model) for source in sources]
+        scales = [self._edit_share(source) / self._edit_share(view) for source in sources]
+        margins = [self._margin(source) for source in sources] if s.estimate_margin > 0 else None
+        return Sight(warps, s.confidence, scales, margins)
+
+    def warp(self, source: int, target: int, model: Gaussians) -> WarpedView:
+        """The warp from one view to another along the model before the edit, or the current one."""
+        s, scene = self.settings, self.work.scene
+        if self.outside is not None:
+            return self._masked(self.outside(source, target))
+        before = self.work.frozen if s.depth_from == "frozen" else model
+        reads: dict[str, Any] = {}
+        if s.warp.photometric is not None:
+            reads["source_image"] = scene.picture(source)
+            reads["target_image"] = scene.picture(target)
+        if s.warp.segment and scene.segments is not None:
+            reads["target_segment"] = scene.segments[target]
+        warp = warp_view(
+            before,
+            scene.cameras[source],
+            scene.cameras[target],
+            s.warp,
+            **reads,
+            source_surface=self._surface(source, before),
+            near=self.work.near,
+            backend=self.work.backend,
+            warn_empty=False,
+        )
+        return self._masked(warp)
+
+    def _masked(self, warp: WarpedView) -> WarpedView:
+        if self.settings.mask:
+            return warp
+        return replace(warp, mask=warp.rules["defined"].clone(), _at={})
+
+    def _surface(self, view: int, model: Gaussians) -> Surface:
+        if model is self.work.frozen and view in self._frozen:
+            return self._frozen[view]
+        surface = render_surface(
+            model, self.work.scene.cameras[view], self.settings.warp,
+            near=self.work.near, backend=self.work.backend,
+        )  # fmt: skip
+        if model is self.work.frozen:
+            self._frozen[view] = surface
+        return surface
+
+    def _margin(self, source: int) -> int:
+        """Pixels of a source's depth map at a depth edge whose picture is not warped."""
+        camera = self.work.scene.cameras[source]
+        return round(self.settings.estimate_margin * min(camera.height, camera.width))
+
+    def _edit_share(self, view: int) -> float:
+        """Pixels of a view's edit for each of its picture."""
+        camera, (h, w) = self.work.scene.cameras[view], self.work.sizes[view]
+        return h * w / (camera.height * camera.width)
+
+    def digest(self, sources: Sequence[int], targets: Sequence[int]) -> str:
+        """SHA-256 of the warps from outside between views: a function has no other identity."""
+        outside, cameras = self.outside, self.work.scene.cameras
+        assert outside is not None
+
+        def parts() -> Iterator[npt.NDArray[Any]]:
+            # A warp is large, so none is kept; its mask is a hundredth of it.
+            masks = []
+            for source in sources:
+                for target in targets:
+                    if target == source:
+                        continue
+                    warp, camera = outside(source, target), cameras[target]
+                    name = f"warps({source}, {target}).mask"
+                    check.shape(warp.mask, (camera.height, camera.width), name)
+                    masks.append(warp.mask.numpy())
+                    yield warp.correspondence.xy.numpy()
+            yield from masks
+
+        return digest_each(parts())
+
+    def chain(self, source: int) -> tuple[int, ...]:
+        """Further sources by the settings' number and coverage; see :func:`choose_chain`."""
+        s, scene = self.settings, self.work.scene
+
+        def seen(first: int, target: int) -> tuple[Mask, Mask]:
+            warp = self.warp(first, target, self.work.frozen)
+            surface = warp.rules["defined"].numpy()
+            if scene.segments is not None:
+                surface = surface & scene.segments[target]
+            return warp.mask.numpy(), surface
+
+        return choose_chain(len(scene.cameras), source, s.sources, s.chain_coverage, seen)
+
+
+def choose_chain(
+    views: int,
+    source: int,
+    count: int,
+    coverage: float,
+    seen: Callable[[int, int], tuple[Mask, Mask]],
+) -> tuple[int, ...]:
+    """Further sources, outward from the first.
+
+    The next source is the least covered view among those with a share of at least ``coverage``. The
+    share is that of the view's surface that the sources so far see. If there is no such view, it is
+    the most covered one. Of equal views it is the first.
+
+    Args:
+        views: their number.
+        source: number of the first source.
+        count: of sources, the first included; fewer if there are fewer views.
+        coverage: see there.
+        seen: (H, W) bool of two views, a source and a target: pixels of the target that the source
+            sees, and those that show surface.
+
+    Example:
+        >>> import numpy as np
+        >>> def seen(source, target):  # a ring of six views; each sees half of its neighbours
+        ...     steps = abs((target - source + 3) % 6 - 3)
+        ...     pixels = np.arange(4) < {0: 4, 1: 2}.get(steps, 0)
+        ...     return pixels[None], np.ones((1, 4), bool)
+        >>> choose_chain(6, 0, 4, 0.5, seen)
+        (1, 2, 3)
+    """
+    chain: list[int] = []
+    seen_by_some: dict[int, Mask] = {}
+    last = source
+    while len(chain) < min(count, views) - 1:
+        shares = {}
+        for view in range(views):
+            if view in (source, *chain):
+                continue
+            pixels, surface = seen(last, view)
+            seen_by_some[view] = seen_by_some.get(view, np.zeros_like(pixels)) | (pixels & surface)
+            shares[view] = float(seen_by_some[view].sum() / max(1, surface.sum()))
+        enough = {view: share for view, share in shares.items() if share >= coverage}
+        last = (
+            min(enough, key=enough.__getitem__) if enough else max(shares, key=shares.__getitem__)
+        )
+        chain.append(last)
+    return tuple(chain)

@@ -1,0 +1,199 @@
+"""DGE's attention: key views look at each other, other views take the output of the key views'
+tokens that match theirs (Chen et al. 2024).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from attnwarp.camera import Camera
+from attnwarp.editing.attention import all_layers
+from attnwarp.methods.attention import Attend, joint, self_attention
+from attnwarp.methods.epipolar import line_distances
+from attnwarp.methods.pictures import Size
+
+MATCHED = "image"
+"""Branch whose tokens are matched: that of the original picture."""
+
+
+def matches(tokens: Tensor, key_tokens: Tensor, excluded: Tensor | None = None) -> Tensor:
+    """(L,) index of the key token with the largest cosine to each token.
+
+    Args:
+        tokens: (L, C).
+        key_tokens: (M, C).
+        excluded: (L, M) bool of pairs that do not count. A token all of whose pairs are excluded
+            is matched among all.
+
+    Example:
+        >>> import torch
+        >>> keys = torch.tensor([[1.0, 0], [0, 1], [1, 1]])
+        >>> matches(torch.tensor([[2.0, 1.9]]), keys).tolist()
+        [2]
+        >>> matches(torch.tensor([[2.0, 1.9]]), keys, torch.tensor([[False, False, True]])).tolist()
+        [0]
+    """
+    cosine = _unit(tokens) @ _unit(key_tokens).T
+    if excluded is not None:
+        excluded = excluded & ~excluded.all(dim=1, keepdim=True)
+        cosine = cosine.masked_fill(excluded, -torch.inf)
+    return cosine.argmax(dim=1)
+
+
+def nearest_keys(view: Camera, keys: Sequence[Camera], count: int) -> list[tuple[int, float]]:
+    """The nearest key cameras and the weights of their tokens, at most two.
+
+    Of two at distances d1 <= d2 the first weighs sigmoid(d2 / (d1 + d2)), and the other the rest.
+
+    Args:
+        view: camera.
+        keys: cameras, at least one.
+        count: 1 or 2.
+
+    Example:
+        >>> from attnwarp import Camera
+        >>> size = dict(width=8, height=8, fov_y=60, up=(0, 1, 0))
+        >>> row = [Camera.look_at((x, 0, 3), (x, 0, 0), **size) for x in (0, 1, 4)]
+        >>> [(k, round(weight, 3)) for k, weight in nearest_keys(row[1], [row[2], row[0]], 2)]
+        [(1, 0.679), (0, 0.321)]
+    """
+    distances = [float(np.linalg.norm(view.position - key.position)) for key in keys]
+    order = sorted(range(len(keys)), key=lambda k: distances[k])[:count]
+    if len(order) == 1:
+        return [(order[0], 1.0)]
+    first, second = (distances[k] for k in order)
+    ratio = second / (first + second) if second > 0 else 0.5
+    weight = 1 / (1 + float(np.exp(-ratio)))
+    return [(order[0], weight), (order[1], 1 - weight)]
+
+
+@dataclass(eq=False)
+class KeyViews:
+    """Tokens of the key views at one step, by layer, and how other views take them.
+
+    Args:
+        branches: of guidance, in the order of the batch.
+        layers: of self-attention: (h, w) by name.
+        epipolar: distance in cells beyond which a match is excluded; None excludes none.
+    """
+
+    branches: tuple[str, ...]
+    layers: dict[str, Size]
+    epipolar: float | None
+    _pass: _KeyPass | _ViewPass | None = None
+    _tokens: dict[str, Tensor] = field(default_factory=dict)
+    _outputs: dict[str, Tensor] = field(default_factory=dict)
+
+    @contextmanager
+    def key_pass(self) -> Iterator[None]:
+        """The network gets the key views, whose tokens are stored, while the block runs."""
+        self._tokens.clear()
+        self._outputs.clear()
+        self._pass = _KeyPass()
+        try:
+            yield
+        finally:
+            self._pass = None
+
+    @contextmanager
+    def view_pass(
+        self, views: Sequence[Camera], keys: Sequence[Camera], nearest: int
+    ) -> Iterator[None]:
+        """The network gets views that take the key views' tokens while the block runs.
+
+        Args:
+            views: cameras of the pictures of the batch.
+            keys: cameras of the key pass.
+            nearest: key views that each view takes tokens of, 1 or 2.
+        """
+        self._pass = _ViewPass(
+            list(views), list(keys), [nearest_keys(view, keys, nearest) for view in views]
+        )
+        try:
+            yield
+        finally:
+            self._pass = None
+
+    def rule(self, name: str, tokens: Tensor, attend: Attend) -> Tensor:
+        """The output of a layer: see :data:`attnwarp.methods.attention.Rule`."""
+        if self._pass is None:
+            return attend(tokens, None)
+        if isinstance(self._pass, _KeyPass):
+            output = attend(tokens, joint(tokens, len(self.branches)))
+            self._tokens[name], self._outputs[name] = tokens, output
+            return output
+        return self._matched(name, tokens, self._pass)
+
+    def _matched(self, name: str, tokens: Tensor, now: _ViewPass) -> Tensor:
+        count = len(self.branches)
+        branch = self.branches.index(MATCHED) if MATCHED in self.branches else 0
+        own, key_tokens, outputs = (
+            values.reshape(count, -1, *values.shape[1:])
+            for values in (tokens, self._tokens[name], self._outputs[name])
+        )
+        result = torch.zeros_like(own)
+        for k in range(len(now.views)):
+            for key, weight in now.nearest[k]:
+                excluded = self._excluded(now, k, key, self.layers[name], tokens.device)
+                index = matches(own[branch, k], key_tokens[branch, key], excluded)
+                result[:, k] += weight * outputs[:, key, index]
+        return result.reshape(tokens.shape)
+
+    def _excluded(
+        self, now: _ViewPass, view: int, key: int, size: Size, device: torch.device
+    ) -> Tensor | None:
+        if self.epipolar is None:
+            return None
+        place = view, key, size
+        if place not in now.excluded:
+            distances = line_distances(now.views[view], now.keys[key], size)
+            far = None if distances is None else (distances > self.epipolar).to(device)
+            now.excluded[place] = far
+        return now.excluded[place]
+
+
+@dataclass(frozen=True)
+class _KeyPass:
+    pass
+
+
+@dataclass(frozen=True)
+class _ViewPass:
+    views: list[Camera]
+    keys: list[Camera]
+    nearest: list[list[tuple[int, float]]]
+    # By view, key and size: layers of one size share what is as large as their attention. Kept for
+    # one pass, since those of all views at once would fill the memory.
+    excluded: dict[tuple[int, int, Size], Tensor | None] = field(default_factory=dict)
+
+
+@contextmanager
+def key_views(
+    unet: Any, branches: tuple[str, ...], latent_size: Size, epipolar: float | None
+) -> Iterator[KeyViews]:
+    """Replace a UNet's self-attention while the block runs; outside of the two kinds of passes it
+    is as before.
+
+    Args:
+        unet: a diffusers UNet.
+        branches: of guidance, in the order of the batch.
+        latent_size: (h, w).
+        epipolar: see :class:`KeyViews`.
+    """
+    layers = {layer.name: layer.size(latent_size) for layer in all_layers(unet)}
+    keys = KeyViews(branches, layers, epipolar)
+    with self_attention(unet, keys.rule):
+        yield keys
+
+
+def _unit(tokens: Tensor) -> Tensor:
+    # Half precision would decide between close matches by its rounding.
+    tokens = tokens.to(torch.promote_types(tokens.dtype, torch.float32))
+    return tokens / tokens.norm(dim=-1, keepdim=True).clamp_min(1e-12)

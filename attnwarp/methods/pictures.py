@@ -1,0 +1,265 @@
+"""Pictures of views: sizes, segments, and feature maps as colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from attnwarp import check
+from attnwarp.camera import Camera
+from attnwarp.editing.attention import Layer, Recording
+from attnwarp.methods.sight import Sight
+
+Image = npt.NDArray[np.float32]
+Bytes = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+Size = tuple[int, int]
+
+
+def edit_size(height: int, width: int, longest: int | None, multiple: int) -> Size:
+    """(h, w) at which a picture is edited: its longest side, with sides that are multiples.
+
+    Example:
+        >>> edit_size(1080, 1920, 512, 32)
+        (288, 512)
+        >>> edit_size(64, 64, None, 16)
+        (64, 64)
+    """
+    scale = 1.0 if longest is None else longest / max(height, width)
+    h, w = (max(multiple, round(n * scale / multiple) * multiple) for n in (height, width))
+    return h, w
+
+
+MULTIPLES = (8, 16, 32, 64)
+"""Editors round the sides of a picture to multiples of these."""
+
+
+def check_view_aspect(size: Size, camera: Camera, name: str) -> None:
+    """Refuse a picture or mask of a view that would be stretched to the view's shape.
+
+    Args:
+        size: (h, w) of the picture: the view's aspect ratio, or what an editor makes of it by
+            rounding its sides to multiples.
+        camera: of the view.
+        name: of the argument.
+
+    Raises:
+        ValueError: another aspect ratio.
+    """
+    full = (camera.height, camera.width)
+    if all(edit_size(*full, max(size), multiple) != size for multiple in MULTIPLES):
+        check.same_aspect(size, full, name, f"crop or pad it to the view {camera.name!r}")
+
+
+def resized(image: Image, size: Size) -> Image:
+    """(h, w, 3) of an (H, W, 3) picture in [0, 1]: averaged where it shrinks, cubic elsewhere."""
+    import cv2
+
+    if image.shape[:2] == size:
+        return image
+    shrinks = size[0] * size[1] < image.shape[0] * image.shape[1]
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+    result = cv2.resize(np.ascontiguousarray(image), size[::-1], interpolation=how)
+    return np.clip(result, 0, 1).astype(np.float32)
+
+
+def enlarged_change(original: Image, edited: Image) -> Image:
+    """The full-size picture plus the change of an edit of another size.
+
+    The change is enlarged linearly; that of an edit larger than the picture is averaged.
+
+    Args:
+        original: (H, W, 3) in [0, 1].
+        edited: (h, w, 3) in [0, 1].
+
+    Example:
+        >>> original = np.full((8, 8, 3), 0.5, np.float32)
+        >>> edited = np.full((4, 4, 3), 0.75, np.float32)
+        >>> float(enlarged_change(original, edited).mean())
+        0.75
+    """
+    import cv2
+
+    h, w = original.shape[:2]
+    if edited.shape[:2] == (h, w):
+        return edited
+    change = edited - resized(original, (edited.shape[0], edited.shape[1]))
+    # Linear weights read 2 x 2 px of a change, however many fall on one pixel.
+    shrinks = edited.shape[0] >= h and edited.shape[1] >= w
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    fitted = cv2.resize(change, (w, h), interpolation=how)
+    return np.clip(original + fitted, 0, 1).astype(np.float32)
+
+
+def composite(edited: Image, original: Image, segment: Mask, how: str, blur: float) -> Image:
+    """The edit inside a segment; the original or black outside.
+
+    Args:
+        edited, original: (h, w, 3) in [0, 1].
+        segment: (H, W) bool at any size.
+        how: "none", "black" or "original".
+        blur: sigma in px of the edit's picture.
+    """
+    if how == "none":
+        return edited
+    import cv2
+
+    h, w = edited.shape[:2]
+    share: npt.NDArray[Any] = segment.astype(np.float32)
+    if share.shape != (h, w):
+        share = cv2.resize(share, (w, h), interpolation=cv2.INTER_AREA)
+    if blur > 0:
+        share = cv2.GaussianBlur(share, (0, 0), blur)
+    behind = original if how == "original" else np.zeros_like(original)
+    share = share[..., None]
+    return np.clip(share * edited + (1 - share) * behind, 0, 1).astype(np.float32)
+
+
+def full_size(original: Image, edited: Image, segment: Mask | None, how: str, blur: float) -> Image:
+    """:func:`enlarged_change` of an edit that was composited, held to its segment.
+
+    An enlarged change reaches beyond the pixels of the edit that it comes from, and brings back the
+    original's detail where :func:`composite` left black.
+
+    Args:
+        original: (H, W, 3) in [0, 1].
+        edited: (h, w, 3) in [0, 1], of :func:`composite`.
+        segment: (H, W) bool; None where all is edited.
+        how, blur: of :func:`composite`.
+    """
+    picture = enlarged_change(original, edited)
+    if segment is None or how == "none" or edited.shape == original.shape:
+        return picture
+    reached = segment
+    if blur > 0:
+        import cv2
+
+        sigma = blur * original.shape[1] / edited.shape[1]
+        reached = cv2.GaussianBlur(segment.astype(np.float32), (0, 0), sigma) > 0
+    behind = original if how == "original" else np.zeros_like(original)
+    return np.where(reached[..., None], picture, behind)
+
+
+def to_bytes(image: npt.NDArray[Any]) -> Bytes:
+    """(H, W, 3) uint8 of a picture in [0, 1]."""
+    return np.asarray(np.rint(255 * np.clip(image, 0, 1)), dtype=np.uint8)
+
+
+def mask_picture(mask: Tensor) -> Bytes:
+    """(H, W, 3) uint8: white where the mask is True."""
+    pixels = 255 * mask.to(torch.uint8).cpu().numpy()
+    return np.repeat(pixels[..., None], 3, axis=2)
+
+
+SOURCE_COLORS = (
+    (255, 255, 255), (240, 180, 60), (80, 170, 240), (90, 200, 110), (220, 110, 190), (200, 90, 70),
+)  # fmt: skip
+"""Of the sources in a picture of masks, the first white; they repeat."""
+
+
+def sight_picture(sight: Sight) -> Bytes:
+    """(H, W, 3) uint8: the colour of the source that a pixel takes, times the weight of its
+    features; black where there is none.
+    """
+    choice = sight.choice((sight.mask.shape[0], sight.mask.shape[1]))
+    colors = torch.tensor(SOURCE_COLORS, dtype=torch.float64)
+    pixels = colors[choice.clamp_min(0) % len(colors)] * sight.weight[..., None].double()
+    return np.asarray(pixels.round().to(torch.uint8).cpu().numpy())
+
+
+class Principal:
+    """Three principal components of a source's feature map, as colours.
+
+    Args:
+        features: (N, C) of the source; the basis and the range of the colours come from them, so
+            that equal features of other views have equal colours.
+
+    Example:
+        >>> import torch
+        >>> line = torch.arange(5.0)[:, None] * torch.tensor([[3.0, 4.0]])
+        >>> colors = Principal(line).colors(line)
+        >>> colors[:, 0].tolist() == sorted(colors[:, 0].tolist())
+        True
+    """
+
+    def __init__(self, features: Tensor) -> None:
+        values = features.detach().cpu().double()
+        self.mean = values.mean(dim=0)
+        centered = values - self.mean
+        _, vectors = torch.linalg.eigh(centered.T @ centered)
+        basis = vectors.flip(-1)[:, :3]
+        # An eigenvector's sign is arbitrary.
+        largest = basis.abs().argmax(dim=0)
+        basis = basis * basis.gather(0, largest[None]).sign()
+        self.basis = torch.nn.functional.pad(basis, (0, 3 - basis.shape[1]))
+        projected = centered @ self.basis
+        self.low, self.high = projected.quantile(0.01, dim=0), projected.quantile(0.99, dim=0)
+
+    def colors(self, features: Tensor) -> Tensor:
+        """(N, 3) float64 in [0, 1] of (N, C) features."""
+        projected = (features.detach().cpu().double() - self.mean) @ self.basis
+        return ((projected - self.low) / (self.high - self.low).clamp_min(1e-12)).clamp(0, 1)
+
+    def picture(self, features: Tensor, size: Size, mask: Tensor | None = None) -> Bytes:
+        """(h, w, 3) uint8 of (h w, C) features; black where the mask is False."""
+        colors = self.colors(features)
+        if mask is not None:
+            colors = torch.where(mask.reshape(-1, 1).cpu(), colors, 0.0)
+        return to_bytes(colors.reshape(*size, 3).numpy())
+
+
+class FeaturePictures:
+    """Recorded features as colours: those of one layer, half-way through the recorded steps.
+
+    Args:
+        first: the recording of the first source, which the colours come from.
+    """
+
+    def __init__(self, first: Recording) -> None:
+        self._principal = Principal(self._of(first)[1])
+
+    def of_source(self, recording: Recording, shape: tuple[int, ...]) -> Bytes:
+        """(H, W, 3) uint8 of a source's features, at the size of its view."""
+        layer, features = self._of(recording)
+        size = layer.size(recording.plan.latent_size)
+        return enlarged(self._principal.picture(features, size), (shape[0], shape[1]))
+
+    def of_target(
+        self,
+        recordings: Sequence[Recording],
+        sight: Sight,
+        latent_size: Size,
+        shape: tuple[int, ...],
+    ) -> Bytes:
+        """(H, W, 3) uint8 of the sources' features, warped to a target; black where none are."""
+        parts = []
+        for number, recording in enumerate(recordings):
+            layer, features = self._of(recording)
+            size = layer.size(latent_size)
+            source_size = layer.size(recording.plan.latent_size)
+            grid = sight.warp(number).at(size, source_size=source_size)
+            warped = grid.warp_tokens(features[None].cpu())[0]
+            parts.append(self._principal.picture(warped, size, grid.mask))
+        # A pixel takes one source at most, and is black in the others' pictures.
+        return enlarged(np.maximum.reduce(parts), (shape[0], shape[1]))
+
+    def _of(self, recording: Recording) -> tuple[Layer, Tensor]:
+        """The layer that is shown, and its (h w, C) features."""
+        plan = recording.plan
+        layer = min(plan.layers, key=lambda layer: (layer.level, layer.kind != "self"))
+        numbers = sorted(plan.recorded)
+        timestep = recording.timesteps[numbers[len(numbers) // 2]]
+        return layer, recording.features(timestep, layer, plan.keep[0])[0].float()
+
+
+def enlarged(pixels: Bytes, size: Size) -> Bytes:
+    """Each pixel as a block, for looking at."""
+    import cv2
+
+    blocks = cv2.resize(pixels, size[::-1], interpolation=cv2.INTER_NEAREST)
+    return np.asarray(blocks, dtype=np.uint8)

@@ -1,0 +1,214 @@
+"""What an edit is given: cameras, pictures before the edit, and segments."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp import check
+from attnwarp.camera import Camera
+from attnwarp.digest import digest, digest_each
+from attnwarp.fit import FitSettings, Views, extent_of
+from attnwarp.gaussians import Gaussians
+from attnwarp.methods.pictures import Image, Mask
+from attnwarp.render import render
+
+Segments: TypeAlias = Sequence[npt.NDArray[Any]] | Callable[[int, Image], npt.NDArray[Any]]
+"""(H, W) bool masks of what is edited: one for each view, or a function of a view's number and its
+picture."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Views before the edit.
+
+    Attributes:
+        cameras: one for each view.
+        images: (H, W, 3) sRGB, uint8, uint16 or float32 in [0, 1]. Photographs keep their type in
+            memory; :meth:`picture` converts one.
+        segments: (H, W) bool, or None where all is edited.
+    """
+
+    cameras: list[Camera]
+    images: list[npt.NDArray[Any]]
+    segments: list[Mask] | None
+
+    @classmethod
+    def checked(
+        cls,
+        cameras: Sequence[Camera],
+        images: Sequence[npt.NDArray[Any]],
+        segments: Segments | None,
+    ) -> Scene:
+        """Validate what came from outside.
+
+        Raises:
+            ValueError: lists of different lengths, a picture or segment of another size or type, or
+                segments that are all empty; the message names it.
+        """
+        if len(images) != len(cameras):
+            raise ValueError(f"images: got {len(images)}, expected {len(cameras)}, as cameras")
+        stored = []
+        for k, (image, camera) in enumerate(zip(images, cameras, strict=True)):
+            name = f"images[{k}] ({camera.name})"
+            check.shape(np.asarray(image), (camera.height, camera.width, 3), name)
+            stored.append(checked_image(image, name))
+        if segments is None:
+            return cls(list(cameras), stored, None)
+        given = (
+            [segments(k, to_float(image)) for k, image in enumerate(stored)]
+            if callable(segments)
+            else segments
+        )
+        if len(given) != len(cameras):
+            raise ValueError(f"segments: got {len(given)}, expected {len(cameras)}, as cameras")
+        masks = []
+        for k, (segment, camera) in enumerate(zip(given, cameras, strict=True)):
+            name = f"segments[{k}] ({camera.name})"
+            mask = np.asarray(segment)
+            check.shape(mask, (camera.height, camera.width), name)
+            if mask.dtype != np.bool_:
+                raise ValueError(f"{name}: got {mask.dtype}, expected bool")
+            masks.append(mask)
+        if not any(mask.any() for mask in masks):
+            raise ValueError("segments: every one is empty, so nothing may change; True is edited")
+        return cls(list(cameras), stored, masks)
+
+    def picture(self, view: int) -> Image:
+        """(H, W, 3) float32 in [0, 1] of a view."""
+        return to_float(self.images[view])
+
+    def digest(self) -> dict[str, str | None]:
+        """SHA-256 of cameras, pictures and segments."""
+        cameras = [{**camera.to_dict(), "name": camera.name} for camera in self.cameras]
+        return {
+            "cameras": digest(cameras),
+            "images": digest_each(map(to_float, self.images)),
+            "segments": None if self.segments is None else digest(*self.segments),
+        }
+
+
+def checked_image(image: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
+    """A picture of 8 or 16 bits as it is, one of floating values as float32.
+
+    Raises:
+        ValueError: another type, or values beyond [0, 1]; the message has the name.
+    """
+    array = np.asarray(image)
+    if array.dtype in (np.uint8, np.uint16):
+        return array
+    if array.dtype.kind != "f":
+        raise ValueError(f"{name}: got {array.dtype}, expected uint8, uint16 or floating")
+    check.finite(array, name)
+    if array.min() < 0 or array.max() > 1:
+        raise ValueError(f"{name}: got values in [{array.min()}, {array.max()}], expected [0, 1]")
+    # What is float32 already is not copied, unless torch could not share it.
+    return np.require(array, np.float32, ["C", "W"])
+
+
+def to_float(image: npt.NDArray[Any]) -> Image:
+    """(H, W, 3) float32 in [0, 1] of a checked image."""
+    if image.dtype.kind == "f":
+        return image
+    return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
+
+
+def images_of(views: Views) -> list[npt.NDArray[Any]]:
+    """(H, W, 3) of each view as it is stored; transparent ones over black, as float32."""
+    black = torch.zeros(3)
+    return [
+        image if image.shape[2] == 3 else views.target(k, black).numpy()
+        for k, image in enumerate(views.images)
+    ]
+
+
+def check_cameras(cameras: Any) -> list[Camera]:
+    """The cameras as a list.
+
+    Raises:
+        TypeError: something else than cameras one after another.
+        ValueError: there are none.
+    """
+    if isinstance(cameras, Camera) or not isinstance(cameras, Iterable):
+        raise TypeError(f"cameras: got {type(cameras).__name__}, expected a list of cameras")
+    listed = list(cameras)
+    if not listed:
+        raise ValueError("cameras: got none, expected at least one")
+    for camera in listed:
+        check.instance(camera, Camera, "cameras", "attnwarp.Camera")
+    return listed
+
+
+def check_loaded(editor: Any) -> None:
+    """Raise TypeError if an editor is a name or a path."""
+    if isinstance(editor, str | Path):
+        raise TypeError(
+            f"editor: got {str(editor)!r}, expected an editor; load it with"
+            f" attnwarp.editing.small.load_editor({str(editor)!r})"
+        )
+
+
+def near_of(cameras: Sequence[Camera], gaussians: Gaussians) -> float:
+    """Nothing nearer is drawn, as in the tuning of these splats."""
+    return FitSettings().near * extent_of(cameras, gaussians.world_means())
+
+
+def render_picture(gaussians: Gaussians, camera: Camera, near: float, backend: str) -> Image:
+    """(H, W, 3) float32 in [0, 1], over black.
+
+    Raises:
+        RuntimeError: splats render as NaN, as they do after a tuning that diverged.
+    """
+    with torch.no_grad():
+        color = render(gaussians, camera, backend=backend, near=near).color
+    if bool(color.isnan().any()):
+        raise RuntimeError(f"view {camera.name!r} renders as NaN; lower the learning rates")
+    return np.asarray(color.clamp(0, 1).float().cpu().numpy())
+
+
+def editor_digest(editor: Any) -> str:
+    """SHA-256 of an editor's networks, schedule, guidance, and what it makes tokens of."""
+    settings = ("text_guidance", "image_guidance", "guidance", "control_scale", "negative_prompt")
+    # One list: numbers one after another could be read as others, 1.5 and 12 as 1.51 and 2.
+    values = [type(editor).__name__, *(getattr(editor, name, None) for name in settings)]
+    schedule = editor.schedule
+    # How the model's scheduler spaces its steps shows in a few numbers of them.
+    spacing = [editor.timesteps(n) for n in (1, 2, 7, 20) if n < len(schedule.alphas)]
+    values += [schedule.prediction, schedule.final_alpha, spacing, _tokens(editor)]
+    parts: list[Any] = [values, schedule.alphas.cpu().numpy()]
+    for name in ("unet", "vae", "text_encoder", "controlnet"):
+        network = getattr(editor, name, None)
+        parts.append(_configuration(network))
+        for key, value in sorted(network.state_dict().items()) if network is not None else ():
+            parts += [key, value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy()]
+    return digest(*parts)
+
+
+def _configuration(network: Any) -> list[tuple[str, str]]:
+    """What a network's configuration says beside where it came from and what wrote it."""
+    config = getattr(network, "config", {})
+    # transformers' configurations have hundreds of defaults, which its versions change.
+    said = config.to_diff_dict() if hasattr(config, "to_diff_dict") else dict(config)
+    about = ("architectures", "dtype", "torch_dtype", "transformers_version")
+    return sorted((k, repr(v)) for k, v in said.items() if k not in about and k[0] != "_")
+
+
+def _tokens(editor: Any) -> Any:
+    """What makes tokens of a text: vocabulary, merges, rules, what pads it, and to which length."""
+    tokenizer = getattr(editor, "tokenizer", None)
+    if tokenizer is None:
+        return None
+    padding = [tokenizer.pad_token_id, getattr(editor, "text_limit", None)]
+    backend = getattr(tokenizer, "backend_tokenizer", None)
+    if backend is None:
+        return [padding, sorted(tokenizer.get_vocab().items())]
+    said = json.loads(backend.to_str())
+    # What its last call padded and cut to stands there too.
+    return [padding, {k: v for k, v in said.items() if k not in ("padding", "truncation")}]

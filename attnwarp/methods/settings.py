@@ -1,0 +1,561 @@
+"""Choices that each method is made of, and presets: what was published, what measures right."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
+
+from attnwarp import check
+from attnwarp.editing.attention import Block, Kind
+from attnwarp.editing.schedule import PUBLISHED_STEPS
+from attnwarp.settings import Count, Number, Range, Seed, Settings, Share, Weight
+from attnwarp.warp.settings import PRESETS as WARPS
+from attnwarp.warp.settings import WarpSettings
+
+Noise = Literal["fresh", "shared"]
+Latents = Literal["inversion", "random"]
+Background = Literal["black", "white", "random"]
+Detail = Literal["change", "none"]
+Composite = Literal["none", "black", "original"]
+
+Steps = Annotated[int, Range(1, 1000)]
+
+MOST_VIEWS = 40
+"""Views of a stage in the paper."""
+
+
+@dataclass(frozen=True)
+class MethodSettings(Settings):
+    """What all methods have. Each has a class of its own with its published numbers.
+
+    Timesteps are Stable Diffusion's, in [0, 999]. On the editor's own schedule each becomes the
+    step that leaves as much of the picture
+    (:func:`attnwarp.editing.schedule.steps_as_published`).
+
+    Args:
+        seed: of everything random.
+        size: longest side in px at which the editor works; None for the cameras' own. Sides are
+            rounded to what the editor takes.
+        steps: of denoising.
+        noise: "fresh" for each edit, as published, or "shared" by all edits of a run. Shared noise
+            comes with one timestep to start from for all views of a round.
+        text_guidance: s_T of InstructPix2Pix, or the guidance of a ControlNet; None for the
+            editor's own.
+        image_guidance: s_I of InstructPix2Pix; None for the editor's own.
+        iterations: of tuning, one view each: in all, or in each stage of attention warping.
+        l1, ssim, perceptual, normal, distortion: weights of the losses; that of ssim counts
+            1 - SSIM.
+        perceptual_encoder: :func:`attnwarp.encoders.load_encoder`'s name of the perceptual loss.
+        color_rate, geometry_rate: factors of the published learning rates, of the colours and of
+            everything else.
+        background: behind the splats while tuning.
+        detail: where the editor works at a smaller size than the pictures', "change" adds the
+            edit's change, enlarged, to the full picture; "none" tunes at the editor's size.
+        composite: what stands outside the segments, where they are given: the edit ("none"),
+            "black", or the "original" picture.
+        composite_blur: sigma in px that the segments are blurred with before compositing.
+
+    Raises:
+        ValueError: an unknown choice or a number out of range; the message names the field.
+
+    Example:
+        >>> from attnwarp.methods import IGS2GSSettings
+        >>> IGS2GSSettings().changed(noise="shared", steps=10).to_dict()["noise"]
+        'shared'
+    """
+
+    seed: Seed = 0
+    size: Count | None = None
+    steps: Steps = 20
+    noise: Noise = "fresh"
+    text_guidance: Weight | None = None
+    image_guidance: Weight | None = None
+    iterations: Number = 1000
+    l1: Weight = 1.0
+    ssim: Weight = 0.2
+    perceptual: Weight = 0.0
+    normal: Weight = 0.0
+    distortion: Weight = 0.0
+    perceptual_encoder: str = "perceptual-small"
+    color_rate: Weight = 1.0
+    geometry_rate: Weight = 1.0
+    background: Background = "black"
+    detail: Detail = "change"
+    composite: Composite = "original"
+    composite_blur: Annotated[float, Range(0, 1000)] = 0.0
+
+
+LAST_STEP = PUBLISHED_STEPS - 1
+
+
+def checked_start(start: tuple[int, int] | None) -> tuple[int, int] | None:
+    """``start`` as (lowest, highest) timestep of Stable Diffusion.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    if start is None:
+        return None
+    right = len(start) == 2 and all(check.is_number(t, whole=True) for t in start)
+    if not right or not 0 <= start[0] <= start[1] <= LAST_STEP:
+        raise ValueError(
+            f"start: got {list(start)}, expected [lowest, highest] timestep of Stable Diffusion, in"
+            f" [0, {LAST_STEP}]"
+        )
+    return int(start[0]), int(start[1])
+
+
+def _checked_shares(shares: tuple[float, float]) -> tuple[float, float]:
+    right = len(shares) == 2 and all(check.is_number(share) for share in shares)
+    if not right or not 0 <= shares[0] < shares[1] <= 1:
+        raise ValueError(
+            f"feature_steps: got {list(shares)}, expected [from, until] shares of the steps, with"
+            " 0 <= from < until <= 1"
+        )
+    return float(shares[0]), float(shares[1])
+
+
+@dataclass(frozen=True)
+class AttentionWarpingSettings(MethodSettings):
+    """Settings of :func:`attnwarp.methods.attention_warping`; the defaults are ``corrected``.
+
+    Args:
+        method: "warp" carries the source's features into each view; "each view alone" edits each
+            view by itself, with all else equal: the control.
+        stages: of editing and tuning.
+        views_per_stage: new views that a stage edits. None: an equal share of the views, at most
+            40. A stage for which no view is left is dropped.
+        noise: "shared" by source and targets, pixel by pixel; "fresh" for each view; or "surface":
+            a point of the surface has the same noise in every view
+            (:mod:`attnwarp.methods.noise`).
+        latents: what a view's edit starts from: "random" ones, or the DDIM "inversion" of its
+            picture before the edit, without guidance, of an editor that is guided by depth. Each
+            view then has a start of its own, so ``noise`` stays "shared" and ``start`` None.
+        source_prompt: of the inversion: what the scene shows; None for the instruction.
+        start: (lowest, highest) timestep of Stable Diffusion, of which one is drawn for all views,
+            to start from in place of pure noise. On the editor's own schedule it becomes the step
+            that leaves as much of the picture
+            (:func:`attnwarp.editing.schedule.steps_as_published`).
+        start_picture: what is noised to ``start``: the current "render" (IGS2GS) or the "original".
+        text_guidance: s_T of the first stage; None for the editor's own.
+        guidance_drop: what each further stage takes off ``text_guidance``, which may fall to 0 and
+            not below.
+        source_text_guidance: s_T of the source; None for the first stage's.
+        batch: target views that go through the network together. Another batch gives other bits.
+        warp: correspondences and masks, :class:`attnwarp.warp.WarpSettings`.
+        mask: False injects wherever the target has a depth (the ablation "no M").
+        sources: views whose features are recorded and warped. Those after the first are edited in
+            a chain outward from it, each covered by those before; a target's pixel takes the source
+            that sees it best (:mod:`attnwarp.methods.sight`).
+        chain_coverage: share of its surface that the sources so far must see of the next one. The
+            view they see least of is taken among those.
+        confidence: weigh the features by how well the source sees the surface (foreshortening and
+            the margin of depth agreement) instead of by the mask alone.
+        estimate: weight at the first step of the source's warped estimate of the clean latents, in
+            the target's estimate. It falls to 0 at ``estimate_until``. 0 leaves it out.
+        estimate_until: share of the steps after which it is left out.
+        estimate_in: where it is warped: as "latents", whose cells keep the source's order of pixels
+            inside, or as a "picture", which is decoded, warped pixel by pixel and encoded again.
+            In each step of a view the editor then decodes the view and each source, and encodes
+            twice.
+        estimate_margin: what of the source on either side of a depth edge is not warped as its
+            estimate, since pixels there mix near and far; a share of its shorter side, rounded to
+            whole pixels.
+        depth_from: the model before the edit ("frozen") or as tuned so far ("current").
+        a0: weight of the injected features at the first step.
+        decay: "linear", a_t = a0 (T - t) / T, or "constant".
+        fractions, kinds, blocks: layers, :func:`attnwarp.editing.attention.choose_layers`.
+        feature_steps: (from, until) shares of the steps whose features are recorded and injected.
+            The others leave every view its own: [0, 0.5] halves the memory.
+        branches: guidance branches that get features. None: text and image of InstructPix2Pix,
+            both of a ControlNet.
+        feature_type: of the recorded features; float16 halves their memory and rounds.
+        training: views that a stage tunes on. "all": the source and everything edited so far.
+            "stage": the stage's views. "modulo": view ``step % n`` of the stage's n views, but the
+            source at every tenth step; of 40 views 4 are then never visited (the released code).
+        color_rate: factor of the published learning rates of colours. Adam moves a coefficient by
+            at most its rate in a step: at 1, 900 steps change a colour by at most 0.63.
+        psnr_views: views that Edit PSNR counts; "before_last_stage" as the released code has it.
+
+    Raises:
+        ValueError: an unknown choice or a number out of range; the message names the field.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> from attnwarp.methods import PRESETS, AttentionWarpingSettings
+        >>> AttentionWarpingSettings() == PRESETS["attention_warping"]["corrected"]
+        True
+        >>> replace(AttentionWarpingSettings(), a0=2)
+        Traceback (most recent call last):
+        ValueError: a0: got 2, expected a number in [0, 1]
+    """
+
+    noise: Literal["shared", "fresh", "surface"] = "shared"  # type: ignore[assignment]
+    iterations: Number = 300
+    ssim: Weight = 0.0
+    perceptual: Weight = 1.0
+    normal: Weight = 0.05
+    distortion: Weight = 0.01
+    color_rate: Weight = 4.0
+    method: Literal["warp", "each view alone"] = "warp"
+    stages: Count = 3
+    views_per_stage: Count | None = None
+    latents: Latents = "random"
+    source_prompt: str | None = ""
+    start: tuple[int, int] | None = None
+    start_picture: Literal["render", "original"] = "render"
+    guidance_drop: Weight = 0.0
+    source_text_guidance: Weight | None = None
+    batch: Count = 4
+    warp: WarpSettings = WARPS["corrected"]
+    mask: bool = True
+    sources: Count = 1
+    chain_coverage: Share = 0.5
+    confidence: bool = False
+    estimate: Share = 0.0
+    estimate_until: Weight = 0.5
+    estimate_in: Literal["latents", "picture"] = "latents"
+    estimate_margin: Share = 0.0
+    depth_from: Literal["frozen", "current"] = "frozen"
+    a0: Share = 0.9
+    decay: Literal["linear", "constant"] = "linear"
+    fractions: tuple[float, ...] = (1.0, 0.5)
+    kinds: tuple[Kind, ...] = ("self", "cross")
+    blocks: tuple[Block, ...] = ("up",)
+    feature_steps: tuple[float, float] = (0.0, 1.0)
+    branches: tuple[str, ...] | None = None
+    feature_type: Literal["float32", "float16"] = "float32"
+    training: Literal["all", "stage", "modulo"] = "all"
+    psnr_views: Literal["all", "before_last_stage"] = "all"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_latents()
+        object.__setattr__(self, "start", checked_start(self.start))
+        object.__setattr__(self, "feature_steps", _checked_shares(self.feature_steps))
+        if not self.feature_range():
+            raise ValueError(
+                f"feature_steps: got {list(self.feature_steps)}, in which none of {self.steps}"
+                " steps begins; widen it, or take more steps"
+            )
+        if self.guidance_drop > 0 and self.text_guidance is None:
+            raise ValueError(
+                f"guidance_drop: got {self.guidance_drop:g} without text_guidance, which it is"
+                " taken off; give text_guidance too, or set guidance_drop to 0"
+            )
+        last = self.guidance(self.stages - 1)
+        if last is not None and last < -1e-9:  # 0.3 - 3 * 0.1 is not below 0
+            raise ValueError(
+                f"text_guidance, guidance_drop: got {self.text_guidance:g} and"
+                f" {self.guidance_drop:g}, so stage {self.stages} has {last:g}, expected at least 0"
+            )
+
+    def _check_latents(self) -> None:
+        if self.latents == "random":
+            if self.source_prompt != "":
+                raise ValueError(
+                    f"source_prompt: got {self.source_prompt!r} with random latents; set latents to"
+                    " 'inversion', which reads it, or leave it out"
+                )
+            return
+        for name, value, plain in (("noise", self.noise, "shared"), ("start", self.start, None)):
+            if value != plain:
+                raise ValueError(
+                    f"{name}: got {value!r} with latents 'inversion', from which each view has its"
+                    f" own start; set {name} to {plain!r}, or latents to 'random'"
+                )
+
+    def guidance(self, stage: int) -> float | None:
+        """s_T of a stage, counted from 0; None for the editor's own.
+
+        Example:
+            >>> from attnwarp.methods import PRESETS
+            >>> [PRESETS["attention_warping"]["released"].guidance(stage) for stage in range(3)]
+            [12.5, 11.0, 9.5]
+        """
+        if self.text_guidance is None:
+            return None
+        return self.text_guidance - self.guidance_drop * stage
+
+    def feature_range(self) -> range:
+        """Numbers of the steps whose features are recorded and injected, from 0.
+
+        Example:
+            >>> from attnwarp.methods import preset
+            >>> preset("attention_warping", steps=20, feature_steps=(0.0, 0.3)).feature_range()
+            range(0, 6)
+        """
+        # 0.1 * 30 is above 3 in floats: a share that names a step exactly means that step.
+        first, end = (math.ceil(share * self.steps - 1e-9) for share in self.feature_steps)
+        return range(first, end)
+
+
+@dataclass(frozen=True)
+class ByViewSettings(MethodSettings):
+    """Settings of :func:`attnwarp.methods.by_view`.
+
+    The losses, rates and iterations are those of
+    :class:`attnwarp.methods.AttentionWarpingSettings`, so that the two differ in the edits alone.
+
+    Args:
+        start: (lowest, highest) timestep, of which each edit draws one to start from; None for pure
+            noise.
+        batch: views that go through the network together; 1 where ``start`` is given and the noise
+            is fresh. Another batch gives other bits.
+
+    Example:
+        >>> from attnwarp.methods import ByViewSettings
+        >>> ByViewSettings(batch=0)
+        Traceback (most recent call last):
+        ValueError: batch: got 0, expected a whole number >= 1
+    """
+
+    iterations: Number = 900
+    ssim: Weight = 0.0
+    perceptual: Weight = 1.0
+    normal: Weight = 0.05
+    distortion: Weight = 0.01
+    color_rate: Weight = 4.0
+    start: tuple[int, int] | None = None
+    batch: Count = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "start", checked_start(self.start))
+
+
+@dataclass(frozen=True)
+class IGS2GSSettings(MethodSettings):
+    """Settings of :func:`attnwarp.methods.igs2gs`.
+
+    Args:
+        every: iterations of tuning after which all views are edited again.
+        start: (lowest, highest) timestep, of which each edit draws one to start from.
+
+    Example:
+        >>> from attnwarp.methods import IGS2GSSettings
+        >>> settings = IGS2GSSettings(iterations=3000)
+        >>> settings.start, settings.iterations / settings.every  # a full round and a part
+        ((700, 980), 1.2)
+    """
+
+    iterations: Number = 7500
+    every: Count = 2500
+    start: tuple[int, int] = (700, 980)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "start", checked_start(self.start))
+
+
+@dataclass(frozen=True)
+class DGESettings(MethodSettings):
+    """Settings of :func:`attnwarp.methods.dge`.
+
+    Args:
+        every: iterations of tuning after which other views are drawn and edited.
+        views: that a round edits; all where there are fewer.
+        batch: neighbouring views that share a key view.
+        starts: timestep that a round starts from; the last also serves all further rounds.
+        plain_below: timestep below which every view has its own attention.
+        nearest: key views that a token is matched in; one for the first batch.
+        epipolar: distance in px of the layer from the epipolar line beyond which matches are
+            excluded; None excludes none.
+
+    Example:
+        >>> from attnwarp.methods import DGESettings
+        >>> DGESettings().starts  # nearly pure noise first, small changes after
+        (998, 299)
+    """
+
+    iterations: Number = 1500
+    l1: Weight = 10.0
+    ssim: Weight = 0.0
+    perceptual: Weight = 10.0
+    every: Count = 500
+    views: Count = 20
+    batch: Count = 5
+    starts: tuple[int, ...] = (998, 299)
+    plain_below: Annotated[int, Range(0, 1000)] = 100
+    nearest: Annotated[int, Range(1, 2)] = 2
+    epipolar: Weight | None = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        right = all(check.is_number(t, whole=True) and 0 <= t <= LAST_STEP for t in self.starts)
+        if not self.starts or not right:
+            raise ValueError(
+                f"starts: got {self.starts!r}, expected timesteps of Stable Diffusion, in"
+                f" [0, {LAST_STEP}], at least one"
+            )
+
+
+@dataclass(frozen=True)
+class GaussCtrlSettings(MethodSettings):
+    """Settings of :func:`attnwarp.methods.gaussctrl`.
+
+    Args:
+        views: that are edited: an equal share of each contiguous part of the views, at random; all
+            where there are fewer.
+        references: parts of the views, and reference views, one a part.
+        self_share: weight of a view's own keys in the UNet's self-attention; the rest is shared
+            equally by the reference views.
+        control_share: the same in the ControlNet; None leaves its attention alone.
+        latents: what an edit starts from: the DDIM "inversion" of the render, or "random" ones.
+        source_prompt: of the inversion; None for the instruction.
+        suffix: of the instruction.
+        negative_prompt: of the unconditional branch; None for the editor's own.
+        batch: views that go through the network together, besides the reference views.
+
+    Example:
+        >>> from attnwarp.methods import GaussCtrlSettings
+        >>> GaussCtrlSettings().self_share
+        0.6
+    """
+
+    views: Count = 40
+    references: Count = 4
+    self_share: Share = 0.6
+    control_share: Share | None = None
+    latents: Latents = "inversion"
+    source_prompt: str | None = ""
+    suffix: str = ""
+    negative_prompt: str | None = None
+    batch: Count = 5
+
+
+_STABLE_DIFFUSION: dict[str, Any] = {
+    "suffix": ", best quality, extremely detailed",
+    "negative_prompt": (
+        "longbody, lowres, bad anatomy, bad hands, missing fingers, extra digit, fewer digits,"
+        " cropped, worst quality, low quality"
+    ),
+    "text_guidance": 5.0,
+}
+
+_IGS2GS = IGS2GSSettings(text_guidance=12.5, image_guidance=1.5)
+
+_RELEASED = AttentionWarpingSettings(
+    views_per_stage=MOST_VIEWS,
+    start=(700, 980),
+    text_guidance=12.5,
+    guidance_drop=1.5,
+    warp=WARPS["released"],
+    depth_from="current",
+    composite_blur=1.5,
+    training="modulo",
+    color_rate=1.0,
+    background="random",
+    psnr_views="before_last_stage",
+)
+
+PRESETS: dict[str, dict[str, MethodSettings]] = {
+    "attention_warping": {
+        "corrected": AttentionWarpingSettings(),
+        "paper": AttentionWarpingSettings(
+            views_per_stage=MOST_VIEWS,
+            warp=WARPS["paper"],
+            depth_from="current",
+            composite="black",
+            training="stage",
+            color_rate=1.0,
+        ),
+        "released": _RELEASED,
+        "released-controlnet": replace(
+            _RELEASED,
+            noise="fresh",
+            start=None,
+            text_guidance=12.5,
+            guidance_drop=0.0,
+            source_text_guidance=7.5,
+        ),
+        "extended": AttentionWarpingSettings(
+            sources=4,
+            noise="surface",
+            estimate=1.0,
+            estimate_until=2.0,
+            estimate_in="picture",
+            estimate_margin=1 / 64,
+        ),
+    },
+    "by_view": {"default": ByViewSettings()},
+    "igs2gs": {
+        "default": IGS2GSSettings(),
+        "released": _IGS2GS,
+        "improved": replace(_IGS2GS, iterations=3000),
+    },
+    "dge": {
+        "default": DGESettings(),
+        "released": DGESettings(text_guidance=7.5, image_guidance=1.5),
+    },
+    "gaussctrl": {
+        "default": GaussCtrlSettings(),
+        "paper": GaussCtrlSettings(**_STABLE_DIFFUSION),
+        "released": GaussCtrlSettings(control_share=0.0, source_prompt=None, **_STABLE_DIFFUSION),
+        "random": GaussCtrlSettings(latents="random", **_STABLE_DIFFUSION),
+    },
+}
+"""Settings by the method's name and their own; the first of a method is its default.
+
+Those of ``attention_warping`` have the warp of their name (:data:`attnwarp.warp.PRESETS`).
+
+``paper``: the text. Each stage draws 40 views and tunes on these alone, depth comes from the scene
+as it stands, and pictures are black outside the segments. What the text leaves open is as in
+``corrected``.
+
+``released``: the authors' code with InstructPix2Pix. One timestep in [700, 980] and one noise for
+all views, s_T = 12.5 - 1.5 stage, depth of the current model, tuning by the step's number modulo
+the stage's views, segments blurred with sigma 1.5. ``released-controlnet``: the same with a
+ControlNet, where each view draws fresh noise, and the source has s_T 7.5 and the targets 12.5.
+
+``corrected``: the default. Noise is shared, depth is that of the model before the edit, and a stage
+tunes on everything edited so far, with larger steps of the colours.
+
+``extended``: ``corrected`` with ideas beyond the paper: further sources, noise that sticks to the
+surface, and the sources' clean pictures, with a weight that falls from 1 to a half, but for their
+depth edges. The study ``beyond`` has each alone and all together.
+
+``default`` of the others: the method, with the guidance and prompts of the editor at hand. Further
+ones have the guidance and prompts published for Stable Diffusion.
+
+``improved`` of ``igs2gs``: 3000 iterations in place of 7500. ``released`` of ``gaussctrl``: the
+authors' code, which also aligns the ControlNet's attention, without a share of the view's own, and
+inverts with the instruction. ``random``: GaussCtrl without its inversion.
+"""
+
+
+def preset(method: str, name: str | None = None, /, **changes: Any) -> Any:
+    """Settings of a method by name, with some fields changed.
+
+    Args:
+        method: a key of :data:`attnwarp.methods.METHODS`.
+        name: of a preset of that method; its default if left out.
+        changes: fields of the method's settings; ``warp.NAME`` is a field of its warp.
+
+    Raises:
+        ValueError: an unknown method, preset or field, or a value out of range; the message names
+            it.
+
+    Example:
+        >>> from attnwarp.methods import preset
+        >>> preset("igs2gs", "improved", seed=3).iterations
+        3000
+        >>> preset("attention_warping", stages=1, **{"warp.opaque": 0.9}).warp.opaque
+        0.9
+    """
+    check.one_of(method, list(PRESETS), "method")
+    named = next(iter(PRESETS[method])) if name is None else name
+    check.one_of(named, list(PRESETS[method]), "preset")
+    settings = PRESETS[method][named]
+    values: dict[str, Any] = {}
+    for key, value in changes.items():
+        group, _, field = key.rpartition(".")
+        if group != "warp":
+            values[key] = value
+            continue
+        before = values.get("warp", getattr(settings, "warp", None))
+        if not isinstance(before, WarpSettings):
+            raise ValueError(f"warp: got {before!r}, expected its fields by name")
+        values["warp"] = before.changed(**{field: value})
+    return settings.changed(**values)

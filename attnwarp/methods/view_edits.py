@@ -1,0 +1,391 @@
+"""Edits of single views, as attention warping asks for them: guides, starts, sources recorded."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from attnwarp import check
+from attnwarp.digest import digest
+from attnwarp.editing.attention import Recording, in_words
+from attnwarp.editing.editor import edit, side_multiple
+from attnwarp.editing.inversion import NoiseMaps, inversion_steps, invert_view, noise_maps, replay
+from attnwarp.editing.schedule import steps_as_published
+from attnwarp.gaussians import Gaussians
+from attnwarp.io.names import file_stems
+from attnwarp.methods.base import ViewEdit, edit_file
+from attnwarp.methods.carried import Estimates, Noise
+from attnwarp.methods.features import Features
+from attnwarp.methods.geometry import Geometry, Warps
+from attnwarp.methods.pictures import (
+    FeaturePictures,
+    Image,
+    check_view_aspect,
+    resized,
+    sight_picture,
+    to_bytes,
+)
+from attnwarp.methods.scene import checked_image, to_float
+from attnwarp.methods.settings import AttentionWarpingSettings
+from attnwarp.methods.sight import Sight, Size
+from attnwarp.methods.work import Guide, Work
+from attnwarp.workdir import MANIFEST
+
+RECORDING = ".recording"
+"""Folder of the recorded features while an edit with ``store="disk"`` is in progress."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSource:
+    """A source's edit in this sitting.
+
+    Attributes:
+        picture: (h, w, 3) in [0, 1].
+        recording: its features; None where every view is edited alone.
+        estimates: (C, h, w) clean latents that were predicted at each step.
+        sight: of the sources before; None for the first.
+    """
+
+    picture: Image
+    recording: Recording | None
+    estimates: list[Tensor] = field(default_factory=list)
+    sight: Sight | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What edits of views start from.
+
+    Attributes:
+        views: their numbers.
+        guides: as the editor takes them.
+        pictures: that are noised to the first timestep; none for pure noise.
+        latents: (B, C, h, w) of an inversion, or None.
+        replayed: the picture of an edit made by hand and its noise, or None.
+    """
+
+    views: Sequence[int]
+    guides: Sequence[Guide]
+    pictures: Sequence[Image] = ()
+    latents: Tensor | None = None
+    replayed: tuple[Image, Any, NoiseMaps] | None = None
+
+
+def check_editor(editor: Any, settings: AttentionWarpingSettings) -> int | None:
+    """Draw Stable Diffusion's timestep that all edits start from; None for pure noise.
+
+    Raises:
+        ValueError: the settings ask for an inversion of an editor that changes pictures, for a
+            prompt that is too long, or for a start too low for the steps.
+    """
+    s = settings
+    if s.latents == "inversion":
+        if s.source_prompt and hasattr(editor, "check_text"):
+            editor.check_text(s.source_prompt)
+        if editor.guide != "depth":
+            raise ValueError(
+                "latents: 'inversion' is made for a depth ControlNet, got InstructPix2Pix, which"
+                " takes pictures; choose another editor, or 'random'"
+            )
+    if s.start is None:
+        return None
+    low, high = s.start
+    generator = torch.Generator().manual_seed(s.seed)
+    timestep = int(torch.randint(low, high + 1, (1,), generator=generator))
+    # Refuses more steps than there are timesteps.
+    steps_as_published(editor.schedule, timestep, s.steps)
+    return timestep
+
+
+class ViewEdits:
+    """An editor at work on single views, and its sources.
+
+    Args:
+        work: the scene and the editor.
+        settings: see there.
+        source: number of the source view.
+        by_hand: its edit made elsewhere, or None.
+        warps: from outside, or None.
+        store: "device", "cpu" or "disk".
+        edit_source: edits a source by its place, for a sitting that found the edit done.
+
+    Attributes:
+        sources: numbers of the source views, in the order of editing.
+        features, geometry: what is recorded, and along what it is warped.
+        about, inputs: what the run's manifest says of them.
+
+    Raises:
+        ValueError: an argument or a setting that does not fit the editor or the views.
+    """
+
+    def __init__(
+        self,
+        work: Work,
+        settings: AttentionWarpingSettings,
+        source: int,
+        by_hand: npt.NDArray[Any] | None,
+        warps: Warps | None,
+        store: str,
+        edit_source: Callable[..., list[ViewEdit]],
+    ) -> None:
+        self.work, self.settings, self.edit_source = work, settings, edit_source
+        self.names = file_stems(work.scene.cameras)
+        check.instance(source, Integral, "source", "a number of a view")
+        if not 0 <= source < len(self.names):
+            raise ValueError(
+                f"source: got {source}, expected a number of a view below {len(self.names)}"
+            )
+        self.by_hand = None if by_hand is None else self._checked_by_hand(by_hand, source)
+        self.timestep = check_editor(work.editor, settings)
+        self.folder = work.folder.path / RECORDING
+        self.features = Features(work.editor, settings, self.folder if store == "disk" else store)
+        self.geometry = Geometry(work, settings, warps)
+        self.estimates, self.noise = Estimates(work.editor, settings), Noise(settings)
+        self.sources = (source, *self._further_sources(source))
+        self._recorded: list[RecordedSource] = []
+        names = [self.names[view] for view in self.sources]
+        self.about = {"source": names[0], "sources": names}
+        self.inputs = {"source_picture": None if self.by_hand is None else digest(self.by_hand)}
+
+    def _checked_by_hand(self, picture: npt.NDArray[Any], source: int) -> Image:
+        """An edit made elsewhere, at the size of the source's edit."""
+        check.shape(np.asarray(picture), ("H", "W", 3), "source_picture")
+        image = to_float(checked_image(picture, "source_picture"))
+        size = (image.shape[0], image.shape[1])
+        check_view_aspect(size, self.work.scene.cameras[source], "source_picture")
+        if self.settings.latents == "inversion":
+            raise ValueError(
+                "source_picture: got one with latents 'inversion', but its own noise is replayed;"
+                " leave it out, or set latents to 'random'"
+            )
+        return resized(image, self.work.sizes[source])
+
+    def _further_sources(self, source: int) -> tuple[int, ...]:
+        """Sources after the first; those of the folder's edit are not chosen again."""
+        if self.settings.sources == 1:
+            return ()
+        if self.work.folder.has(MANIFEST):
+            names = self.work.folder.read_json(MANIFEST).get("sources", [])[1:]
+            if set(names) <= set(self.names):  # else the claim refuses the folder
+                return tuple(self.names.index(name) for name in names)
+        with self.work.folder.seconds.part("warp"):
+            return self.geometry.chain(source)
+
+    def check_stages(self, stages: int) -> None:
+        """Refuse, before any work, branches that a stage does not have."""
+        self.features.check_batches(range(stages), further=len(self.sources) > 1)
+
+    def notes(self, stages: int) -> list[str]:
+        """Lines on what the views or the editor leave of the settings."""
+        asked, views = self.settings, len(self.names)
+        longest, lines = max(self.work.sizes[self.sources[0]]), []
+        if asked.size is not None and longest != asked.size:
+            lines.append(
+                f"size: {longest} px in place of {asked.size}, as this editor's sides are multiples"
+                f" of {side_multiple(self.work.editor)}"
+            )
+        if len(self.sources) < asked.sources:
+            lines.append(
+                f"sources: {len(self.sources)} in place of {asked.sources}, as there are {views}"
+                " views"
+            )
+        if stages < asked.stages:
+            on_sources = "" if views > len(self.sources) else " that tunes on the sources alone"
+            lines.append(
+                f"stages: {stages}{on_sources} in place of {asked.stages}, as {views} views leave"
+                " no more to edit"
+            )
+        if self.features.layers:
+            plans = [
+                self.features.plan(view, self.latent_size(view), further=number > 0)
+                for number, view in enumerate(self.sources)
+            ]
+            lines.append(in_words(plans))
+            memory = self.estimates.memory([self.work.sizes[view] for view in self.sources])
+            lines += [] if memory is None else [memory]
+        return lines
+
+    # --- sources
+
+    def recorded(self, count: int) -> list[RecordedSource]:
+        """The first sources with their features; edited anew, to the same bytes, in a sitting that
+        found them done.
+        """
+        while len(self._recorded) < count:
+            number = len(self._recorded)
+            view = self.sources[number]
+            self.work.report.log(f"recording the features of {self.names[view]} again")
+            (again,) = self.edit_source(number, self.work.frozen, lambda: None)
+            pixels = to_bytes(self.work.composite(view, again.picture))
+            self.work.folder.check_same(edit_file(0, self.names[view]), pixels)
+        return self._recorded[:count]
+
+    def keep(self, number: int, source: RecordedSource) -> None:
+        """Keep a source's edit for those that take its features."""
+        del self._recorded[number:], self.estimates.sources[number:], self.noise.orders[number:]
+        self._recorded.append(source)
+        self.estimates.sources.append(source.estimates)
+        size = self.latent_size(self.sources[number])
+        self.noise.orders.append(self.noise.order(source.sight, size))
+
+    def sight(self, sources: int, view: int, model: Gaussians) -> Sight | None:
+        """The view as the first sources see it; None where nothing is warped."""
+        s = self.settings
+        alone = s.method != "warp" and s.noise != "surface" and s.estimate == 0
+        if alone or not sources:
+            return None
+        return self.geometry.sight(self.sources[:sources], view, model)
+
+    # --- an edit
+
+    def start(self, views: Sequence[int], model: Gaussians, *, by_hand: bool = False) -> Start:
+        """What edits of views start from, before features are recorded or injected.
+
+        Args:
+            views: their numbers.
+            model: the splats as they stand.
+            by_hand: replay the edit made elsewhere, if there is one.
+        """
+        work, s = self.work, self.settings
+        before = work.frozen if s.depth_from == "frozen" else model
+        guides = [work.guide(view, before, s.warp) for view in views]
+        if by_hand and self.by_hand is not None:
+            editor: Any = work.editor
+            task = editor.task(guides, work.instruction)
+            maps = noise_maps(editor, task, self.by_hand, self._timesteps(), s.seed)
+            return Start(views, guides, replayed=(self.by_hand, task, maps))
+        if s.latents == "random" and self.timestep is None:
+            return Start(views, guides)
+        pictures = [self._start_picture(view, model) for view in views]
+        if s.latents == "random":
+            return Start(views, guides, pictures)
+        prompt = work.instruction if s.source_prompt is None else s.source_prompt
+        latents = torch.cat(
+            [
+                invert_view(work.editor, guide, picture, prompt, steps=s.steps, seed=s.seed)
+                for guide, picture in zip(guides, pictures, strict=True)
+            ]
+        )
+        return Start(views, guides, latents=latents)
+
+    def denoise(
+        self, start: Start, sights: Sequence[Sight | None], step: Callable[[], None]
+    ) -> tuple[list[Image], list[Tensor]]:
+        """Edit views from their start.
+
+        Args:
+            start: of the views.
+            sights: of each, for noise and estimates that are carried along.
+            step: called after each step.
+
+        Returns:
+            (h, w, 3) pictures in [0, 1], and the estimates of a lone view where they are carried.
+        """
+        work, s = self.work, self.settings
+        if start.replayed is not None:
+            picture, task, maps = start.replayed
+            replay(work.editor.schedule, task.predict, maps, watch=lambda *_: step())
+            return [picture], [work.editor.encode([picture])[0]] * s.steps
+        kept: list[Tensor] = []
+        shape = (work.editor.unet.config.out_channels, *self.latent_size(start.views[0]))
+        sources = 0 if sights[0] is None else len(sights[0].views)
+        result = edit(
+            work.editor,
+            start.guides,
+            work.instruction,
+            steps=s.steps,
+            start=self.timestep,
+            pictures=start.pictures or None,
+            noise=self.noise.of(start.views, shape, sights) if start.latents is None else None,
+            latents=start.latents,
+            watch=lambda *_: step(),
+            estimate=self.estimates.change(sights, sources, kept if len(sights) == 1 else None),
+        )
+        return result.images, kept
+
+    def _start_picture(self, view: int, model: Gaussians) -> Image:
+        """(h, w, 3) of a view that is noised or inverted."""
+        original = self.settings.latents == "inversion" or self.settings.start_picture == "original"
+        return self.work.picture(view) if original else self.work.render(view, model)
+
+    def _timesteps(self) -> list[int]:
+        editor: Any = self.work.editor
+        if self.timestep is None:
+            return list(editor.timesteps(self.settings.steps))
+        return steps_as_published(editor.schedule, self.timestep, self.settings.steps)
+
+    def latent_size(self, view: int) -> Size:
+        """(h, w) of a view's latents."""
+        h, w = self.work.sizes[view]
+        return h // self.work.editor.factor, w // self.work.editor.factor
+
+    def rows_of_source(self, number: int) -> int:
+        """Rows through the UNet for the edit of a source; one made by hand is inverted first."""
+        guidance = self.features.source_guidance(further=number > 0)
+        by_hand = number == 0 and self.by_hand is not None
+        return self.rows(1, guidance) * (2 if by_hand else 1)
+
+    def rows(self, views: int, guidance: float | None) -> int:
+        """Rows through the UNet for the edits of views with a text guidance."""
+        s = self.settings
+        rows = views * s.steps * len(self.features.branches(guidance))
+        if s.latents == "inversion":
+            rows += views * len(inversion_steps(self.work.editor, s.steps)[0])
+        return rows
+
+    # --- what is left for people
+
+    def result(self, view: int, picture: Image, sight: Sight | None, sources: int) -> ViewEdit:
+        """A view's edit with its record and pictures.
+
+        Args:
+            view: its number.
+            picture: (h, w, 3) in [0, 1].
+            sight: as the sources see it.
+            sources: how many it could take features of; of a source, its own place.
+        """
+        about: dict[str, Any] = {"injected": 0.0}
+        pictures = {}
+        own = self._recorded[sources] if self.sources.count(view) else None
+        if own is not None:
+            plan = None if own.recording is None else own.recording.plan
+            about["feature_bytes"] = 0 if plan is None else plan.bytes
+        recordings = [s.recording for s in self._recorded[:sources] if s.recording is not None]
+        shape = self.work.scene.images[view].shape[:2]
+        if sight is not None and recordings:
+            about["injected"] = float(sight.weight.mean())
+            rules = sight.views[0].rules
+            about["rules"] = {k: float(rule.float().mean()) for k, rule in rules.items()}
+            if sources > 1:
+                choice = sight.choice((sight.mask.shape[0], sight.mask.shape[1]))
+                about["sources"] = {
+                    self.names[source]: float((choice == number).float().mean())
+                    for number, source in enumerate(self.sources[:sources])
+                }
+            pictures["masks"] = sight_picture(sight)
+            pictures["features"] = self._shown.of_target(
+                recordings, sight, self.latent_size(view), shape
+            )
+        elif own is not None and own.recording is not None:
+            pictures["features"] = self._shown.of_source(own.recording, shape)
+        return ViewEdit(picture, about, pictures)
+
+    @property
+    def _shown(self) -> FeaturePictures:
+        """Colours of features, of the first source's."""
+        first = self._recorded[0].recording
+        assert first is not None
+        return FeaturePictures(first)
+
+    def clear(self) -> None:
+        """Remove recordings on disk: those of a sitting that was killed are never read."""
+        if self.folder.is_dir():
+            shutil.rmtree(self.folder)

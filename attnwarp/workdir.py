@@ -1,0 +1,442 @@
+"""A run's folder: whose it is, its records, checkpoints and seconds; how a stopped run goes on.
+
+Every file is whole or absent. What is done stands in the folder and nothing else is remembered, so
+a run that was killed goes on from its files. Fits and all methods keep theirs here:
+
+manifest.json       what the run was asked for, with hashes of its inputs
+NAME.png NAME.json  a picture, and the record by which it counts as made
+*.pt                a checkpoint
+times.json          seconds by part, over all sittings
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.digest import digest
+from attnwarp.errors import InputError, InputWarning
+from attnwarp.io.file import FileFormatError, write_atomically
+from attnwarp.io.images import encode_png, read_image
+from attnwarp.io.lock import alone_in
+from attnwarp.io.ply import read_ply
+from attnwarp.settings import Number, Settings, Weight
+
+FORMAT = 3
+"""Raised when files of a run's folder, or what a run does, change meaning; folders of another
+format are then refused."""
+
+MANIFEST = "manifest.json"
+TIMES = "times.json"
+
+CHECKPOINT_SHARE = 0.05
+"""Share of the time that checkpoints may take."""
+
+
+@dataclass(frozen=True)
+class Budget(Settings):
+    """Limits of a run. No batch of edits and no iteration of tuning begins beyond them.
+
+    Args:
+        seconds: of editing and tuning, over all sittings; None for no limit. A run that was cut
+            short by seconds depends on the machine. A method that tunes after all of its edits may
+            end before it has tuned.
+        network_rows: rows through the UNet; None for no limit. A batch of edits that would go
+            beyond does not begin, and the round's tuning is the last.
+
+    Raises:
+        ValueError: no number, a negative one, or one that is not finite; rows that are not whole.
+
+    Example:
+        >>> from attnwarp.workdir import Budget
+        >>> Budget(network_rows=600)
+        Budget(seconds=None, network_rows=600)
+    """
+
+    seconds: Weight | None = None
+    network_rows: Number | None = None
+
+
+@contextmanager
+def results_in(folder: Path | str | None) -> Iterator[Path]:
+    """Hold a folder that no other run writes to meanwhile; a temporary one for None.
+
+    Raises:
+        InputError: another run writes to it.
+    """
+    if folder:
+        with alone_in(folder):
+            yield Path(folder)
+    else:
+        with tempfile.TemporaryDirectory() as place:
+            yield Path(place)
+
+
+class Workdir:
+    """The folder of one run.
+
+    Args:
+        path: made by :meth:`claim` if need be.
+        what: the run, for messages: "a fit", "an edit".
+        folders: inside it, made likewise.
+        results: files where results go, besides those in ``folders``.
+
+    Attributes:
+        path, what: see there.
+        seconds: by part.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        what: str,
+        folders: Sequence[str] = (),
+        results: Sequence[str] = (),
+    ) -> None:
+        self.path, self.what = path, what
+        self.folders, self.results = folders, results
+        self.seconds = Seconds(self)
+        self._again: set[str] = set()  # pictures that are made again
+
+    # --- whose it is
+
+    def claim(self, manifest: dict[str, Any]) -> None:
+        """Write the manifest, or hold the one that is there against it; make the folders.
+
+        Raises:
+            InputError: the folder holds a run of other settings or inputs, by name; or files where
+                results go, and no manifest that says whose they are.
+        """
+        self.check_unclaimed()
+        manifest = json.loads(json.dumps({"format": FORMAT, **manifest}))
+        stored = self.read_json(MANIFEST) if self.has(MANIFEST) else manifest
+        if stored.get("format") != FORMAT:
+            raise InputError(
+                f"{self.path}: holds {self.what} made by an older version; run it again in another"
+                " folder"
+            )
+        differing = list(_differences(stored, manifest))
+        if differing:
+            raise InputError(
+                f"{self.path}: holds {self.what} of other {'; '.join(differing[:3])}"
+                f"{'; ...' if len(differing) > 3 else ''}. Go on with the same ones, or name"
+                " another folder"
+            )
+        for name in self.folders:
+            (self.path / name).mkdir(parents=True, exist_ok=True)
+        if not self.has(MANIFEST):
+            self.write_json(MANIFEST, manifest)
+
+    def check_unclaimed(self) -> None:
+        """Refuse files where results go, in a folder without a manifest: they would be written
+        over, or taken for results of this run.
+
+        Raises:
+            InputError: there is such a file.
+        """
+        if self.has(MANIFEST):
+            return
+        places = [self.path / name for name in (*self.results, *self.folders)]
+        files = (
+            file for place in places for file in (place.iterdir() if place.is_dir() else [place])
+        )
+        first = next((file for file in files if file.is_file()), None)
+        if first is not None:
+            raise InputError(
+                f"{self.path}: has no {MANIFEST}, so it can't be told what {first} is of; name"
+                f" another folder, or remove what {self.what} left in this one"
+            )
+
+    # --- files
+
+    def has(self, name: str) -> bool:
+        """True for a file that is there, and so whole."""
+        return (self.path / name).is_file()
+
+    def write_json(self, name: str, value: Any) -> None:
+        """Write JSON atomically."""
+        text = json.dumps(value, indent=2, allow_nan=False) + "\n"
+        write_atomically(self.path / name, lambda stream: stream.write(text.encode()))
+
+    def read_json(self, name: str) -> Any:
+        """Read the object of a JSON file.
+
+        Raises:
+            FileFormatError: it is damaged.
+        """
+        path = self.path / name
+        # Without its manifest, a folder's results are of no known settings.
+        remedy = "name another folder" if name == MANIFEST else "remove it, it is made anew"
+        try:
+            value = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise FileFormatError(path, f"not JSON ({error}); {remedy}") from None
+        if not isinstance(value, dict):
+            raise FileFormatError(path, f"holds no JSON object; {remedy}")
+        return value
+
+    def write_picture(self, name: str, pixels: npt.NDArray[np.uint8]) -> None:
+        """Write an (H, W, 3) uint8 PNG atomically."""
+        data = encode_png(pixels)
+        write_atomically(self.path / name, lambda stream: stream.write(data))
+
+    def read_picture(self, name: str) -> npt.NDArray[np.uint8]:
+        """(H, W, 3) uint8 of a PNG that :meth:`write_picture` wrote."""
+        return read_image(self.path / name)
+
+    def has_picture(self, name: str) -> bool:
+        """True for a picture that can be read: a disk or a person may have damaged it."""
+        try:
+            self.read_picture(name)
+        except (FileFormatError, FileNotFoundError):
+            return False
+        return True
+
+    def has_splats(self, name: str) -> bool:
+        """True for splats that can be read, as :meth:`has_picture`."""
+        try:
+            read_ply(self.path / name)
+        except (FileFormatError, FileNotFoundError):
+            return False
+        return True
+
+    # --- pictures that are made once
+
+    def write_record(
+        self, picture: str, pixels: npt.NDArray[np.uint8], about: dict[str, Any]
+    ) -> None:
+        """Write a picture, then its record: by the record, which has its hash, it counts as made.
+        A picture that is made again has to be the same: what came after rests on the former one.
+
+        Raises:
+            InputError: it is another one.
+        """
+        self.check_same(picture, pixels)
+        self.write_picture(picture, pixels)
+        self.write_json(record_of(picture), {**about, "sha256": digest(pixels)})
+        self._again.discard(picture)
+
+    def check_same(self, picture: str, pixels: npt.NDArray[np.uint8]) -> None:
+        """Hold a picture that is made again against its record, if there is one.
+
+        Raises:
+            InputError: it is another one.
+        """
+        if self.has(record_of(picture)) and self.record(picture)["sha256"] != digest(pixels):
+            raise InputError(
+                f"{self.path}: the edit is not the one that {picture} was; go on with the same"
+                " device, number of threads and versions, or name another folder"
+            )
+
+    def record(self, picture: str, *keys: str) -> dict[str, Any]:
+        """The record of a picture.
+
+        Raises:
+            FileFormatError: it is damaged, or lacks one of the keys.
+        """
+        record: dict[str, Any] = self.read_json(record_of(picture))
+        for key in ("sha256", *keys):
+            if key not in record:
+                raise FileFormatError(
+                    self.path / record_of(picture), f"lacks {key!r}; remove it, it is made anew"
+                )
+        return record
+
+    def made(self, picture: str) -> bool:
+        """True for a picture with a record. The record's "pictures" are files that were written
+        with it.
+
+        A picture that is missing, damaged or another one all the same is made again, and its record
+        says what has to come out.
+
+        Raises:
+            FileFormatError: the record is damaged.
+
+        Warns:
+            InputWarning: a picture is made again; once for each.
+        """
+        if not self.has(record_of(picture)) or picture in self._again:
+            return False
+        record = self.record(picture)
+        names = (picture, *record.get("pictures", ()))
+        damaged = next((name for name in names if not self.has_picture(name)), None)
+        what = "missing or damaged"
+        if damaged is None and record["sha256"] != digest(self.read_picture(picture)):
+            damaged, what = picture, "not the picture that the edit made"
+        if damaged is None:
+            return True
+        self._again.add(picture)
+        message = f"{self.path / damaged}: {what}; the view is edited again"
+        warnings.warn(message, InputWarning, stacklevel=2)
+        return False
+
+    # --- checkpoints
+
+    def save(self, name: str, state: dict[str, Any]) -> None:
+        """Write a checkpoint: tensors and plain values, by a line with the SHA-256 of the rest."""
+        import torch
+
+        buffer = io.BytesIO()
+        torch.save(state, buffer)
+        data = buffer.getbuffer()
+        head = b"%s %s\n" % (_MAGIC, hashlib.sha256(data).hexdigest().encode())
+
+        def write(stream: Any) -> None:
+            stream.write(head)
+            stream.write(data)
+
+        write_atomically(self.path / name, write)
+
+    def load(self, name: str, remedy: str = "remove it to begin again") -> dict[str, Any]:
+        """What :meth:`save` wrote. Only tensors and plain values are read; a file cannot run code.
+
+        Args:
+            name: of the file.
+            remedy: the end of a message.
+
+        Raises:
+            FileFormatError: it is damaged, or no checkpoint.
+        """
+        import torch
+
+        path = self.path / name
+        head, _, data = path.read_bytes().partition(b"\n")
+        words = head.split()
+        if words[:2] != _MAGIC.split() or len(words) != 3:
+            raise FileFormatError(path, f"not a checkpoint of this version; {remedy}")
+        if words[2] != hashlib.sha256(data).hexdigest().encode():
+            raise FileFormatError(path, f"its checksum does not match, so it is damaged; {remedy}")
+        try:
+            state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        # A checksum that matches leaves a file made on purpose. torch's message advises to load it
+        # all the same, which runs its code, and is not passed on.
+        except Exception as error:
+            raise FileFormatError(
+                path,
+                f"holds something other than tensors and plain values ({type(error).__name__}); do"
+                f" not use it, {remedy}",
+            ) from None
+        if not isinstance(state, dict):
+            raise FileFormatError(path, f"holds {type(state).__name__}, expected a dict; {remedy}")
+        return state
+
+
+_MAGIC = b"attnwarp checkpoint"
+
+
+class CheckpointClock:
+    """When the next checkpoint is due: ``seconds`` after the last, and later where one takes long,
+    so that checkpoints take at most :data:`CHECKPOINT_SHARE` of the time.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds, self._last, self._cost = seconds, time.perf_counter(), 0.0
+
+    @property
+    def due(self) -> bool:
+        """True once a checkpoint should be written."""
+        wait = max(self.seconds, self._cost * (1 / CHECKPOINT_SHARE - 1))
+        return time.perf_counter() - self._last >= wait
+
+    @contextmanager
+    def saving(self) -> Iterator[None]:
+        """Count a block as the writing of a checkpoint."""
+        began = time.perf_counter()
+        yield
+        self._last = time.perf_counter()
+        self._cost = self._last - began
+
+
+class Seconds:
+    """Seconds by part of a run's work, in a file of its folder; former sittings' are read from it.
+
+    Args:
+        folder: of the run.
+    """
+
+    def __init__(self, folder: Workdir) -> None:
+        self.folder = folder
+        stored = folder.read_json(TIMES) if folder.has(TIMES) else {}
+        for name, value in stored.items():
+            if not isinstance(value, int | float):
+                raise FileFormatError(
+                    folder.path / TIMES,
+                    f"got {value!r}, expected seconds; remove it, it is made anew", field=name,
+                )  # fmt: skip
+        self._ended: dict[str, float] = dict(stored)
+        self._part, self._since = "", 0.0
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Count a block's seconds as those of a part, and not of one that it lies in."""
+        outer = self._begin(name)
+        try:
+            yield
+        finally:
+            self._begin(outer)
+
+    def _begin(self, name: str) -> str:
+        """Count from now on for a part; return the one before."""
+        before, self._ended = self._part, self._exact()
+        self._part, self._since = name, time.perf_counter()
+        return before
+
+    def write(self) -> None:
+        """Write the file; the part at work counts up to now."""
+        self.folder.write_json(TIMES, self.parts)
+
+    @property
+    def parts(self) -> dict[str, float]:
+        """Seconds by part, the part at work up to now, as the file has them: a limit in the seconds
+        of a finished run is then the same in every sitting.
+        """
+        return {part: round(seconds, 3) for part, seconds in self._exact().items()}
+
+    def _exact(self) -> dict[str, float]:
+        seconds = dict(self._ended)
+        if self._part:
+            running = time.perf_counter() - self._since
+            seconds[self._part] = seconds.get(self._part, 0.0) + running
+        return seconds
+
+
+def record_of(picture: str) -> str:
+    """The record's file, of the file of its picture.
+
+    Example:
+        >>> record_of("views/a.1.png")
+        'views/a.1.json'
+    """
+    return str(Path(picture).with_suffix(".json").as_posix())
+
+
+def _differences(stored: Any, now: Any, name: str = "") -> list[str]:
+    """What differs between two JSON values, by the path of its key."""
+    if isinstance(stored, dict) and isinstance(now, dict):
+        return [
+            line
+            for key in {**stored, **now}
+            for line in _differences(stored.get(key), now.get(key), f"{name}.{key}".lstrip("."))
+        ]
+    if stored == now:
+        return []
+    # A hash tells a person nothing.
+    hashes = name.startswith("inputs.")
+    return [name if hashes else f"{name} ({_short(stored)}, now {_short(now)})"]
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

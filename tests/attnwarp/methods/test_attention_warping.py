@@ -1,0 +1,1427 @@
+"""Oracles: the editor's own loop, a float64 pass written out with its geometry, counts by hooks, bytes of files."""
+
+import copy
+import hashlib
+import json
+import re
+import shutil
+import time
+import weakref
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import held_pictures
+import numpy as np
+import pytest
+import tiny_models
+import torch
+from edit_folders import Killed, Watched, events, files
+from PIL import Image
+from tiny_editors import nearest_steps
+from tiny_methods import rows_of
+from tiny_scenes import cameras, pictures, splats
+
+import attnwarp.warp
+from attnwarp import Camera, Gaussians
+from attnwarp.digest import digest
+from attnwarp.editing.editor import edit, shared_noise
+from attnwarp.editing.schedule import Schedule
+from attnwarp.editing.small import load_editor
+from attnwarp.errors import InputError, InputWarning
+from attnwarp.io import FileFormatError, read_image, read_ply
+from attnwarp.io.images import encode_png
+from attnwarp.methods import attention_warping, geometry, preset
+from attnwarp.methods import base as run_module
+from attnwarp.methods.pictures import to_bytes
+from attnwarp.methods.tuning import Tuning
+from attnwarp.warp import Surface, warp_surfaces
+
+QUICK = preset("attention_warping", stages=2, views_per_stage=2, steps=2, iterations=3)
+
+
+def plan(result):
+    """Who was edited when, by the result's rounds: the sources are the first of the first."""
+    sources = result.counters["sources"]
+    first, *others = [part.views for part in result.rounds]
+    stages = [first[sources:], *others]
+    return SimpleNamespace(
+        source=first[0],
+        chain=first[1:sources],
+        stages=stages,
+        targets=[*first[1:], *(view for part in others for view in part)],
+        edited=[*first, *(view for part in others for view in part)],
+    )
+
+
+def record(folder, name):
+    """The record of a view's edit."""
+    (path,) = folder.glob(f"rounds/*/{name}.json")
+    return json.loads(path.read_text())
+
+
+def run(scene, editor, folder=None, settings=QUICK, words="a bear", **more):
+    model, views, images = scene
+    return attention_warping(model, views, images, editor, words, settings, folder=folder, **more)
+
+
+@pytest.fixture(scope="module")
+def finished(scene, editor, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("finished")
+    return run(scene, editor, folder), folder
+
+
+def test_the_source_is_edited_as_the_editor_alone_does(finished, scene, editor):
+    result, folder = finished
+    alone = edit(editor, [scene[2][0]], "a bear", steps=2, seed=0).images[0]
+    assert np.array_equal(result.edited[0], to_bytes(alone))
+    assert np.array_equal(read_image(folder / "rounds/1/v0.png"), to_bytes(alone))
+
+
+def test_a_view_at_the_sources_place_gets_the_sources_edit(scene, editor):
+    model, views, images = scene
+    twin = Camera(views[0].K, views[0].world_to_camera, 32, 32, "twin")
+    settings = replace(QUICK, stages=1, iterations=0, a0=1.0, decay="constant")
+    result = attention_warping(
+        model, [views[0], twin], [images[0], images[0]], editor, "a bear", settings
+    )
+    assert np.array_equal(result.edited[0], result.edited[1])
+
+
+def test_a_warp_from_outside_takes_the_place_of_the_splats_own(scene, editor, tmp_path):
+    model, views, images = scene
+    # The identity, which no geometry gives for two cameras apart.
+    flat = Surface(np.full((32, 32), 2.0), np.broadcast_to([0.0, 0, -1], (32, 32, 3)))
+    identity = warp_surfaces(views[0], views[0], flat, flat)
+    pair = (model, views[:2], [images[0], images[0]])
+    settings = replace(QUICK, stages=1, iterations=0, a0=1.0, decay="constant")
+    given = run(pair, editor, tmp_path, settings, warps=lambda source, target: identity)
+    own = run(pair, editor, settings=settings)
+    assert np.array_equal(given.edited[0], given.edited[1])
+    assert not np.array_equal(own.edited[0], own.edited[1])
+    with pytest.raises(InputError, match=r"inputs\.warps"):
+        run(pair, editor, tmp_path, settings)
+    small = warp_surfaces(
+        views[0],
+        views[0].resize(16, 16),
+        Surface(flat.depth[:16, :16], flat.normal[:16, :16]),
+        flat,
+    )
+    with pytest.raises(ValueError, match=r"warps\(0, 1\)\.mask: got shape \(16, 16\)"):
+        run(pair, editor, settings=settings, warps=lambda source, target: small)
+
+
+def test_of_warps_from_outside_one_is_held_at_a_time_while_they_are_hashed(scene, editor, tmp_path):
+    """Oracles: references that do not hold their objects, hashlib."""
+    views = scene[1]
+    flat = Surface(np.full((32, 32), 2.0), np.broadcast_to([0.0, 0, -1], (32, 32, 3)))
+    alive, most, made = weakref.WeakSet(), 0, {}
+
+    def warps(source, target):
+        nonlocal most
+        most = max(most, len(alive))
+        warp = warp_surfaces(views[source], views[target], flat, flat)
+        alive.add(warp)
+        made[target] = warp.correspondence.xy.numpy().copy(), warp.mask.numpy().copy()
+        return warp
+
+    result = run(scene, editor, tmp_path, replace(QUICK, iterations=0, batch=1), warps=warps)
+    assert most <= 1
+    expected = hashlib.sha256()
+    for part, shape in ((0, "float64(32, 32, 2)"), (1, "bool(32, 32)")):
+        for view in plan(result).targets:
+            expected.update(shape.encode() + made[view][part].tobytes())
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    assert manifest["inputs"]["warps"] == expected.hexdigest()
+
+
+def test_without_a_mask_features_go_where_the_target_has_a_depth(scene, editor, tmp_path):
+    views = scene[1]
+    depth = np.full((32, 32), 2.0)
+    depth[:, 8:] = np.nan
+    part = Surface(depth, np.broadcast_to([0.0, 0, -1], (32, 32, 3)))
+    # The segment leaves no pixel, so by its mask the view would get no features.
+    rules = attnwarp.warp.preset("corrected", segment=True)
+    nothing = np.zeros((32, 32), bool)
+    warp = warp_surfaces(views[0], views[0], part, part, rules, target_segment=nothing)
+    settings = replace(QUICK, stages=1, iterations=0, mask=False, a0=1.0)
+    result = run(scene, editor, tmp_path, settings, warps=lambda source, target: warp)
+    assert result.counters["injected"] == 0.25
+    for view in plan(result).targets:
+        mask = read_image(tmp_path / "masks" / f"v{view}.png")
+        assert (mask[:, :8] == 255).all() and (mask[:, 8:] == 0).all()
+
+
+def test_a_splat_that_no_picture_shows_changes_no_edit(scene, editor):
+    """Oracle: the edit of the scene without it."""
+    model, views, images = scene
+    # Twenty times as large: 0.1 is nearer than any picture shows, and beyond the renderer's 0.01.
+    large = replace(model, means=20 * model.means, scales=20 * model.scales)
+    poses = [camera.world_to_camera.copy() for camera in views]
+    for pose in poses:
+        pose[:3, 3] *= 20
+    far = [Camera(c.K, p, 32, 32, c.name) for c, p in zip(views, poses, strict=True)]
+    before = torch.tensor(np.array([c.position + 0.1 * c.rotation[2] for c in far])).float()
+    floaters = replace(large.select(torch.arange(5)), means=before, scales=torch.full((5, 2), 0.02))
+    parts = ("means", "quats", "scales", "opacities", "sh")
+    joined = replace(
+        large, **{p: torch.cat([getattr(large, p), getattr(floaters, p)]) for p in parts}
+    )
+    settings = replace(QUICK, stages=1, iterations=0)
+    one, other = (
+        run((splats, far, images), editor, settings=settings) for splats in (large, joined)
+    )
+    assert one.counters["injected"] == other.counters["injected"] > 0.5
+    for view, picture in one.edited.items():
+        assert np.array_equal(picture, other.edited[view])
+
+
+def test_weight_zero_is_each_view_alone_bit_for_bit(scene, editor, tmp_path):
+    run(scene, editor, tmp_path / "zero", replace(QUICK, a0=0.0))
+    run(scene, editor, tmp_path / "alone", replace(QUICK, method="each view alone"))
+    zero, alone = files(tmp_path / "zero"), files(tmp_path / "alone")
+    same = [name for name in alone if name.startswith(("views/", "rounds/", "edited"))]
+    assert sum(name.endswith(".png") for name in same) == 10
+    assert "edited.ply" in same
+    for name in same:
+        if not name.endswith(".json"):
+            assert zero[name] == alone[name], name
+    # Injection does change the views, or the test above would show nothing.
+    full = run(scene, editor, settings=replace(QUICK, a0=1.0))
+    for view in plan(full).stages[0]:
+        name = Path(scene[1][view].name).stem
+        picture = read_image(tmp_path / "alone" / "views" / f"{name}.png")
+        assert not np.array_equal(full.edited[view], picture)
+
+
+def wall():
+    """One disc so large that both cameras see it alone, in the plane z = 0."""
+    color = Gaussians.sh_from_rgb(torch.tensor([[0.8, 0.4, 0.2]]))
+    return Gaussians(
+        "2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 2), 50.0), torch.ones(1), color,
+    )  # fmt: skip
+
+
+def positions(source, target, h, w):
+    """(h, w, 2) where the source sees what the target's (h, w) grid sees, on the plane z = 0."""
+    grid, onto = target.resize(w, h), source.resize(w, h)
+    rays = grid.directions() @ grid.rotation
+    points = grid.position - rays * (grid.position[2] / rays[..., 2])[..., None]
+    return onto.project(points)[0]
+
+
+def blended(own, source, xy, a):
+    """(h w, C) float64: bilinear, the border repeated, pixel by pixel."""
+    h, w = xy.shape[:2]
+    grid, result = source.reshape(h, w, -1), own.clone()
+    for y in range(h):
+        for x in range(w):
+            u = min(max(xy[y, x, 0] - 0.5, 0.0), w - 1.0)
+            v = min(max(xy[y, x, 1] - 0.5, 0.0), h - 1.0)
+            left, top = int(u), int(v)
+            right, below = min(left + 1, w - 1), min(top + 1, h - 1)
+            du, dv = u - left, v - top
+            warped = (1 - dv) * ((1 - du) * grid[top, left] + du * grid[top, right]) + dv * (
+                (1 - du) * grid[below, left] + du * grid[below, right]
+            )
+            result[y * w + x] = a * warped + (1 - a) * own[y * w + x]
+    return result
+
+
+def test_one_step_is_the_written_out_injection_in_float64(editor, monkeypatch):
+    from attnwarp.methods import view_edits
+
+    edits = []
+    monkeypatch.setattr(
+        view_edits, "edit", lambda *a, **k: edits.append(edit(*a, **k)) or edits[-1]
+    )
+    model, views = wall(), cameras(2)
+    random = np.random.default_rng(0)
+    images = [random.random((32, 32, 3)).astype(np.float32) for _ in views]
+    settings = replace(
+        QUICK, steps=1, stages=1, iterations=0, a0=0.7, mask=False, warp=attnwarp.warp.preset("corrected", normal_test="none"),
+    )  # fmt: skip
+    result = attention_warping(model, views, images, editor, "a bear", settings)
+
+    exact = copy.copy(editor)
+    exact.unet = copy.deepcopy(editor.unet).double()
+    exact.vae = copy.deepcopy(editor.vae).double()
+    timestep = editor.timesteps(1)[0]
+    texts = editor.embed(["a bear", ""]).double()[[0, 1, 1]]
+    noise = shared_noise((1, 4, 16, 16), 0).double()
+
+    def one_pass(image, hook):
+        pixels = torch.from_numpy(image.astype(np.float64)).permute(2, 0, 1)[None]
+        before = exact.vae.encode(2 * pixels - 1).latent_dist.mode()
+        x = torch.cat([torch.cat([noise] * 3), torch.cat([before, before, 0 * before])], dim=1)
+        handles = [
+            module.register_forward_hook(lambda m, args, out, name=name: hook(name, out))
+            for name, module in exact.unet.named_modules()
+            if name.startswith("up_blocks") and name.endswith((".attn1", ".attn2"))
+        ]
+        with torch.no_grad():
+            out = exact.unet(x, torch.tensor(timestep), encoder_hidden_states=texts).sample
+            for handle in handles:
+                handle.remove()
+            text, image_only, uncond = out
+            e = uncond + 3.0 * (text - image_only) + 1.5 * (image_only - uncond)
+            alpha = float(editor.schedule.alphas[timestep])
+            x0 = (noise - (1 - alpha) ** 0.5 * e) / alpha**0.5
+            last = editor.schedule.final_alpha
+            latents = last**0.5 * x0 + (1 - last) ** 0.5 * e
+            decoded = exact.vae.decode(latents / exact.vae.config.scaling_factor).sample[0]
+        return latents, (decoded / 2 + 0.5).clamp(0, 1).permute(1, 2, 0).numpy()
+
+    recorded = {}
+
+    def keep(name, out):
+        recorded[name] = out.clone()
+
+    def inject(name, out):
+        side = round(out.shape[1] ** 0.5)
+        xy = positions(views[0], views[1], side, side)
+        rows = [blended(out[k], recorded[name][k], xy, 0.7) for k in (0, 1)]
+        return torch.stack([*rows, out[2]])
+
+    expected = one_pass(images[0], keep), one_pass(images[1], inject)
+    assert len(recorded) == 8
+    for view, (latents, picture) in enumerate(expected):
+        # float32 through a network whose attention is made loud.
+        assert torch.allclose(edits[view].latents.double(), latents, rtol=0, atol=2e-4)
+        assert np.abs(result.edited[view] / 255 - picture).max() < 0.5 / 255 + 1e-4
+    alone, _ = one_pass(images[1], lambda name, out: None)
+    assert (alone - expected[1][0]).abs().max() > 0.02  # 100 times the tolerance
+
+
+def test_the_folder_holds_what_a_person_wants(finished, scene):
+    result, folder = finished
+    names = {Path(camera.name).stem for camera in scene[1]}
+    edited = {Path(scene[1][view].name).stem for view in plan(result).edited}
+    for part, expected in (
+        ("views", edited), ("masks", edited - {"v0"}), ("features", edited), ("renders/before", names), ("renders/after", names),
+    ):  # fmt: skip
+        assert {path.stem for path in (folder / part).glob("*.png")} == expected
+    assert (folder / "features/v0.png").is_file()
+    assert not (folder / ".recording").exists()
+    last = read_ply(folder / "rounds" / "2.ply")
+    assert torch.equal(read_ply(folder / "edited.ply").means, last.means)
+    assert torch.allclose(result.gaussians.means, last.means, rtol=0, atol=1e-6)
+    seconds = json.loads((folder / "times.json").read_text())
+    assert set(seconds) == {"source", "warp", "edit", "write", "tune", "render"}
+    assert all(value > 0 for value in seconds.values())
+
+
+def test_seconds_are_those_of_the_file(finished):
+    """A later sitting reads no others, and the limit of another method must not change with it."""
+    result, folder = finished
+    assert result.seconds == json.loads((folder / "times.json").read_text())
+
+
+def test_counters_are_what_was_done(scene, editor):
+    settings = replace(QUICK, batch=2)
+    rows, result = rows_of(editor.unet, lambda: run(scene, editor, settings=settings))
+    assert result.counters["network_rows"] == sum(rows) == 5 * 2 * 3
+    assert result.counters["iterations"] == 6
+    assert result.counters["views"] == 5
+    # Each view alone takes the same passes: carrying the edit asks nothing more of the network.
+    settings = replace(settings, method="each view alone", iterations=0)
+    alone, _ = rows_of(editor.unet, lambda: run(scene, editor, settings=settings))
+    assert alone == rows
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        None,  # a source made by hand: inverted and replayed
+        {"source_text_guidance": 1.5},  # s_T = s_I leaves no image branch
+        {"source_text_guidance": 7.0, "text_guidance": 2.5, "guidance_drop": 1.0},
+    ],
+)
+def test_network_rows_are_those_that_hooks_count(changes, scene, editor):
+    settings = replace(QUICK, steps=1, iterations=0, **(changes or {}))
+    by_hand = scene[2][0] if changes is None else None
+    rows, result = rows_of(
+        editor.unet, lambda: run(scene, editor, settings=settings, source_picture=by_hand)
+    )
+    assert result.counters["network_rows"] == sum(rows)
+
+
+def test_a_guidance_of_a_stage_that_does_not_come_hinders_nothing(scene, editor):
+    """Five views leave two stages; s_T = s_I would come in the third."""
+    settings = replace(
+        QUICK, stages=3, steps=1, iterations=0, branches=("image",),
+        text_guidance=4.5, guidance_drop=1.5,
+    )  # fmt: skip
+    assert run(scene, editor, settings=settings).counters["views"] == 5
+
+
+def test_edit_psnr_counts_the_views_that_the_settings_name(finished, scene, editor):
+    result, folder = finished
+    errors = {}
+    for view in plan(result).edited:
+        name = Path(scene[1][view].name).stem
+        picture = result.edited[view] / 255
+        render = read_image(folder / "renders" / "after" / f"{name}.png") / 255
+        errors[name] = np.square(picture - render).mean()
+    assert result.edit_psnr["views"] == list(errors)
+    pooled = -10 * np.log10(np.mean(list(errors.values())))
+    each = -10 * np.log10(list(errors.values()))
+    assert result.edit_psnr["pooled"] == pytest.approx(
+        pooled, abs=0.05
+    )  # renders rounded to 8 bits
+    assert result.edit_psnr["mean"] == pytest.approx(np.mean(each), abs=0.05)
+    released = run(scene, editor, settings=replace(QUICK, psnr_views="before_last_stage"))
+    assert released.edit_psnr["views"] == list(errors)[:3]
+
+
+def test_a_folder_of_another_format_is_refused(scene, editor, tmp_path):
+    settings = replace(QUICK, stages=1, iterations=0)
+    run(scene, editor, tmp_path, settings)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    (tmp_path / "manifest.json").write_text(json.dumps({**manifest, "format": 1}))
+    with pytest.raises(InputError, match="holds an edit made by an older version; run it again"):
+        run(scene, editor, tmp_path, settings)
+
+
+def test_a_view_that_renders_as_nan_is_no_picture(finished, scene, editor, monkeypatch):
+    """Of an edit that is complete but for what its folder says of the end."""
+    render = attnwarp.methods.scene.render
+
+    def broken(*args, **options):
+        view = render(*args, **options)
+        return replace(view, color=np.nan * view.color)
+
+    monkeypatch.setattr(attnwarp.methods.scene, "render", broken)
+    with pytest.raises(RuntimeError, match="view '.*' renders as NaN"):
+        run(scene, editor, finished[1])
+
+
+def test_a_recording_on_disk_gives_the_same_bytes_and_goes_away(finished, scene, editor, tmp_path):
+    run(scene, editor, tmp_path, store="disk")
+    assert files(tmp_path) == files(finished[1])
+    assert not (tmp_path / ".recording").exists()
+
+
+def test_a_recording_on_disk_that_a_kill_left_goes_away_in_the_next_sitting(
+    scene, editor, tmp_path
+):
+    """Oracle: the files of the first sitting."""
+    recorded = []
+    for _ in range(2):
+        with pytest.MonkeyPatch.context() as patch:
+            watch, _ = events(patch, 7)
+            with pytest.raises(Killed):
+                run(scene, editor, tmp_path, store="disk", report=Watched(watch))
+        paths = (tmp_path / ".recording").rglob("*")
+        recorded.append(sorted(path.stat().st_size for path in paths if path.is_file()))
+    assert recorded[0] == recorded[1] != []
+
+
+def test_files_of_a_finished_edit_that_are_damaged_are_written_again(scene, editor, tmp_path):
+    """Oracle: the bytes before the damage."""
+    settings = replace(QUICK, stages=1, steps=1, iterations=1, perceptual=0.0)
+    everything = [np.ones((32, 32), dtype=bool)] * 5
+    run(scene, editor, tmp_path, settings, segments=everything)
+    before = files(tmp_path)
+    for name in (
+        "renders/before/v0.png",
+        "renders/after/v1.png",
+        "segments/v2.png",
+        "rounds/1.ply",
+    ):
+        (tmp_path / name).write_bytes(before[name][: len(before[name]) // 2])
+    run(scene, editor, tmp_path, settings, segments=everything)
+    assert files(tmp_path) == before
+    written = (tmp_path / "rounds/1.ply").stat().st_mtime_ns
+    run(scene, editor, tmp_path, settings, segments=everything)
+    # What is whole is not written once more.
+    assert (tmp_path / "rounds/1.ply").stat().st_mtime_ns == written
+
+
+def killed_and_resumed(scene, editor, folder, moments):
+    """Kill a run at one moment after another, each counted from where the last sitting began."""
+    for moment in moments:
+        with pytest.MonkeyPatch.context() as patch:
+            watch, _ = events(patch, moment)
+            try:
+                run(scene, editor, folder, report=Watched(watch), checkpoint_seconds=0)
+                return
+            except Killed:
+                pass
+    run(scene, editor, folder)
+
+
+def all_events(scene, editor, folder):
+    with pytest.MonkeyPatch.context() as patch:
+        watch, count = events(patch, None)
+        run(scene, editor, folder, report=Watched(watch), checkpoint_seconds=0)
+    return count()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_killed_at_a_random_moment_and_resumed_it_gives_the_same_bytes(
+    seed, finished, scene, editor, tmp_path
+):
+    moment = int(np.random.default_rng(seed).integers(1, 60))
+    killed_and_resumed(scene, editor, tmp_path, [moment])
+    assert files(tmp_path) == files(finished[1])
+
+
+def test_the_seconds_of_a_sitting_that_was_killed_are_counted_up_to_its_last_checkpoint(
+    scene, editor, tmp_path, monkeypatch
+):
+    """Oracle: a clock on which each iteration takes one second, and all else none."""
+    now, iterations = 0, 0
+
+    def watch(done, total, text):
+        nonlocal now, iterations
+        if "tuning" in text:
+            now, iterations = now + 1, iterations + 1
+        if iterations == 5:
+            raise Killed
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    settings = replace(QUICK, stages=1, iterations=6, perceptual=0.0)
+    options = {"checkpoint_seconds": 0, "report": Watched(watch)}
+    with pytest.raises(Killed):
+        run(scene, editor, tmp_path, settings, **options)
+    assert json.loads((tmp_path / "times.json").read_text())["tune"] == 4
+    iterations = 10
+    assert run(scene, editor, tmp_path, settings, **options).seconds["tune"] == 4 + 2
+
+
+@pytest.mark.slow
+def test_killed_at_20_random_moments_it_gives_the_same_bytes(finished, scene, editor, tmp_path):
+    total = all_events(scene, editor, tmp_path / "all")
+    assert files(tmp_path / "all") == files(finished[1])
+    random = np.random.default_rng(0)
+    for k, moment in enumerate(random.integers(1, total, 20)):
+        killed_and_resumed(scene, editor, tmp_path / str(k), [int(moment)])
+        assert files(tmp_path / str(k)) == files(finished[1]), moment
+    killed_and_resumed(scene, editor, tmp_path / "often", random.integers(1, 12, 20).tolist())
+    assert files(tmp_path / "often") == files(finished[1])
+
+
+@pytest.mark.parametrize(
+    ("settings", "words", "message"),
+    [
+        ({"steps": 3}, "a bear", r"settings\.steps \(2, now 3\)"),
+        ({"warp": attnwarp.warp.preset("corrected", opaque=0.9)}, "a bear", r"settings\.warp\.opaque \(0\.5, now 0\.9\)"),
+        ({}, "a robot", r'instruction \("a bear", now "a robot"\)'),
+    ],
+)  # fmt: skip
+def test_a_folder_of_another_edit_is_refused_by_name(
+    settings, words, message, finished, scene, editor
+):
+    before = files(finished[1])
+    with pytest.raises(InputError, match=message):
+        run(scene, editor, finished[1], replace(QUICK, **settings), words)
+    assert files(finished[1]) == before
+
+
+def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(scene, editor, tmp_path):
+    refusals = []
+
+    def again(*_):
+        with pytest.raises(InputError, match="another run writes to this folder") as caught:
+            run(scene, editor, tmp_path)
+        refusals.append(caught)
+
+    result = run(scene, editor, tmp_path, report=Watched(again))
+    assert refusals
+    # Nothing of the first is lost, and the folder is free again.
+    assert run(scene, editor, tmp_path).edited.keys() == result.edited.keys()
+
+
+def test_a_folder_that_was_tuned_by_other_weights_is_refused(scene, editor, tmp_path):
+    """The same folder of LPIPS weights, with another network in it."""
+    weights = tmp_path / "lpips"
+    weights.mkdir()
+    (weights / "alex.pth").write_bytes((tiny_models.linear_layers() / "alex.pth").read_bytes())
+    settings = replace(QUICK, stages=1, perceptual_encoder=f"lpips:{weights}")
+    refused = pytest.raises(InputError, match=r"holds an edit of other inputs\.perceptual")
+    for seed, expected in ((0, nullcontext()), (0, nullcontext()), (1, refused)):
+        tiny_models.save_backbone(weights / "alexnet-owt-7be5be79.pth", "alex", seed)
+        with expected:
+            run(scene, editor, tmp_path / "edit", settings)
+    # A view too small for it is named before any is edited, if it is one to tune on.
+    model, views, _ = scene
+    edited = set(run(scene, editor, None, settings).edited)
+    assert 0 in edited and len(edited) < len(views)
+    tuned, other = max(edited), min(set(range(len(views))) - edited)
+    named = f"views: '{views[tuned].name}' has 16 x 24 px, the perceptual distance lpips:.* needs"
+    for small, expected in (
+        (other, nullcontext()),
+        (tuned, pytest.raises(ValueError, match=named)),
+    ):
+        cameras = [view.resize(16, 24) if k == small else view for k, view in enumerate(views)]
+        with expected:
+            attention_warping(model, cameras, None, editor, "a bear", settings)
+    named = (
+        "is edited at 16 x 16 px, the perceptual distance lpips:.*; raise size, or set perceptual"
+    )
+    with pytest.raises(ValueError, match=named):
+        run(scene, editor, None, replace(settings, size=16, detail="none"))
+
+
+@pytest.mark.parametrize(
+    ("record", "key"),
+    [("rounds/1/v0", "sha256"), ("rounds/2/{}", "sha256")],
+)
+def test_a_record_that_lacks_something_is_named_and_made_anew_once_it_is_gone(
+    finished, scene, editor, tmp_path, record, key
+):
+    folder = finished[1]
+    name = record.format(min((folder / "rounds/2").glob("*.png")).stem)
+    shutil.copytree(folder, tmp_path / "edit")
+    path = tmp_path / "edit" / f"{name}.json"
+    path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != key}))
+    lacks = f"{re.escape(str(path))}: lacks '{key}'; remove it"
+    with pytest.raises(FileFormatError, match=lacks):
+        run(scene, editor, tmp_path / "edit")
+    path.unlink()
+    run(scene, editor, tmp_path / "edit")
+    assert files(tmp_path / "edit") == files(folder)
+
+
+def test_seconds_that_are_none_are_named(finished, scene, editor, tmp_path):
+    shutil.copytree(finished[1], tmp_path / "edit")
+    (tmp_path / "edit" / "times.json").write_text('{"edit": "x"}')
+    with pytest.raises(FileFormatError, match="times.json: edit: got 'x', expected seconds"):
+        run(scene, editor, tmp_path / "edit")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"gaussians": "a.ply"}, "gaussians: got str, expected attnwarp.Gaussians"),
+        ({"cameras": cameras()[0]}, "cameras: got Camera, expected a list of cameras"),
+        ({"cameras": ["a"]}, "cameras: got str, expected attnwarp.Camera"),
+        ({"editor": "small"}, r"editor: got 'small', .*load_editor\('small'\)"),
+        (
+            {"settings": "corrected"},
+            "settings: got str, expected attnwarp.methods.AttentionWarpingSettings",
+        ),
+        ({"source": "0"}, "source: got str, expected a number"),
+    ],
+)
+def test_an_argument_of_another_type_is_named(scene, editor, changes, message):
+    model, views, images = scene
+    given = {"gaussians": model, "cameras": views, "images": images, "editor": editor}
+    with pytest.raises(TypeError, match=message):
+        attention_warping(**{**given, "instruction": "a bear", "settings": QUICK, **changes})
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"), [("times.json", "remove it"), ("manifest.json", "name another folder")]
+)
+@pytest.mark.parametrize(
+    ("text", "problem"), [("[1]", "holds no JSON object"), ("{", "not JSON .*")]
+)
+def test_json_that_is_no_object_is_refused_by_its_file(
+    name, remedy, text, problem, scene, editor, tmp_path
+):
+    (tmp_path / name).write_text(text)
+    settings = replace(QUICK, sources=2)  # which the manifest is asked for first
+    with pytest.raises(FileFormatError, match=f"{name}: {problem}; {remedy}"):
+        run(scene, editor, tmp_path, settings)
+
+
+@pytest.mark.parametrize("words", ["a bear", "a robot"])
+def test_results_without_a_manifest_are_taken_for_no_edit_and_stay(
+    words, finished, scene, editor, tmp_path
+):
+    """Oracle: the bytes of the files before the call."""
+    folder = tmp_path / "folder"
+    shutil.copytree(finished[1], folder)
+    (folder / "manifest.json").unlink()
+    before = files(folder)
+    with pytest.raises(InputError, match=r"has no manifest\.json, so it can't be told what"):
+        run(scene, editor, folder, words=words)
+    assert files(folder) == before
+
+
+def test_pictures_of_another_program_where_results_go_are_refused_and_stay(scene, editor, tmp_path):
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "v1.png").write_bytes(b"a person's own")
+    with pytest.raises(InputError, match=r"what .*masks/v1\.png is of; name another folder"):
+        run(scene, editor, tmp_path)
+    assert files(tmp_path) == {"masks/v1.png": b"a person's own"}
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(b"cut")])
+@pytest.mark.parametrize("part", ["masks", "features", "features/v0.png"])
+def test_pictures_of_where_features_went_are_drawn_again(
+    part, damage, finished, scene, editor, tmp_path
+):
+    """Oracle: the bytes of the edit that nobody damaged."""
+    folder = tmp_path / "folder"
+    shutil.copytree(finished[1], folder)
+    path = folder / part if part.endswith(".png") else next((folder / part).glob("*.png"))
+    damage(path)
+    with pytest.warns(InputWarning, match=f"{path.name}: missing or damaged"):
+        run(scene, editor, folder)
+    assert files(folder) == files(finished[1])
+
+
+def test_an_edit_made_again_for_a_picture_beside_it_has_to_be_the_same(
+    finished, scene, editor, tmp_path
+):
+    """As with other threads or on another device: the tuned scene rests on the former edit."""
+    folder = tmp_path / "folder"
+    shutil.copytree(finished[1], folder)
+    other = np.zeros_like(read_image(folder / "rounds/1/v0.png"))
+    for part, place in (
+        ("features/v0.png", "rounds/1/v0.png"),
+        ("masks/v{}.png", "rounds/2/v{}.png"),
+    ):
+        copy, view = tmp_path / part[:5], plan(finished[0]).stages[1][0]
+        shutil.copytree(folder, copy)
+        (copy / part.format(view)).unlink()
+        path = copy / place.format(view)
+        path.write_bytes(encode_png(other))
+        record = path.with_suffix(".json")
+        sha256 = digest(other)
+        record.write_text(json.dumps(json.loads(record.read_text()) | {"sha256": sha256}))
+        for _ in range(2):  # the second sitting knows as much as the first
+            with (
+                pytest.warns(InputWarning, match="missing or damaged"),
+                pytest.raises(InputError, match="edit is not the one that"),
+            ):
+                run(scene, editor, copy)
+            assert np.array_equal(read_image(path), other)
+
+
+@pytest.mark.parametrize("place", ["rounds/1/v0.png", "rounds/2/*.png"])
+def test_the_same_picture_in_other_bytes_is_the_edit(place, finished, scene, editor, tmp_path):
+    folder = tmp_path / "folder"
+    shutil.copytree(finished[1], folder)
+    path = next(folder.glob(place))
+    Image.fromarray(read_image(path)).save(path, compress_level=0)
+    before = files(folder)
+    assert before != files(finished[1])
+    run(scene, editor, folder)  # warnings are errors
+    assert files(folder) == before
+
+
+@pytest.mark.parametrize("place", ["rounds/1/v0.png", "rounds/2/*.png"])
+def test_another_picture_in_place_of_an_edit_is_not_taken_for_it(
+    place, finished, scene, editor, tmp_path
+):
+    """Oracle: the bytes of the edit that nobody touched."""
+    folder = tmp_path / "folder"
+    shutil.copytree(finished[1], folder)
+    path = next(folder.glob(place))
+    path.write_bytes(encode_png(255 - read_image(path)))
+    with pytest.warns(InputWarning, match=f"{path.name}: not the picture that the edit made"):
+        run(scene, editor, folder)
+    assert files(folder) == files(finished[1])
+
+
+@pytest.mark.parametrize(
+    "name", ["features/v0.png", "edited.ply", "segments/x.png", "views/x.json"]
+)
+def test_a_persons_files_where_results_go_are_left_alone(name, scene, editor, tmp_path):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"mine")
+    with pytest.raises(InputError, match=r"has no manifest\.json"):
+        run(scene, editor, tmp_path)
+    assert path.read_bytes() == b"mine"
+
+
+def test_a_folder_of_another_scene_is_refused_by_name(finished, scene, editor):
+    model, views, images = scene
+    with pytest.raises(InputError, match=r"inputs\.images"):
+        run((model, views, [1 - image for image in images]), editor, finished[1])
+    moved = replace(model, means=model.means + 0.01)
+    with pytest.raises(InputError, match=r"inputs\.splats"):
+        run((moved, views, images), editor, finished[1])
+
+
+def test_segments_leave_the_original_or_black_outside(scene, editor):
+    images = scene[2]
+    left = np.zeros((32, 32), dtype=bool)
+    left[:, :16] = True
+    settings = replace(QUICK, iterations=0)
+    whole = run(scene, editor, settings=settings)
+    kept = run(scene, editor, settings=settings, segments=lambda view, picture: left)
+    black = run(scene, editor, settings=replace(settings, composite="black"), segments=[left] * 5)
+    for view in plan(whole).edited:
+        assert np.array_equal(kept.edited[view][:, :16], whole.edited[view][:, :16])
+        assert np.array_equal(kept.edited[view][:, 16:], to_bytes(images[view])[:, 16:])
+        assert (black.edited[view][:, 16:] == 0).all()
+    with pytest.raises(ValueError, match=r"segments\[0\] \(v0.png\): got float64, expected bool"):
+        run(scene, editor, settings=settings, segments=[left * 1.0] * 5)
+    with pytest.raises(ValueError, match="segments: every one is empty"):
+        run(scene, editor, settings=settings, segments=[left & False] * 5)
+
+
+@pytest.mark.parametrize("how", ["black", "original"])
+def test_splats_are_tuned_on_pictures_that_a_small_edit_changes_in_the_segments_alone(
+    how, scene, editor, monkeypatch
+):
+    tuned, advance = [], Tuning.advance
+
+    def watched(tuning, begin, end, views, *more, **options):
+        tuned.extend(views)
+        advance(tuning, begin, end, views, *more, **options)
+
+    monkeypatch.setattr(Tuning, "advance", watched)
+    left = np.zeros((32, 32), dtype=bool)
+    left[:, :15] = True  # ends within a pixel of the edit
+    settings = replace(QUICK, stages=1, steps=1, iterations=0, size=16, composite=how)
+    result = run(scene, editor, settings=settings, segments=[left] * 5)
+    assert {view.number for view in tuned} == {*plan(result).edited}
+    for view in tuned:
+        before = scene[2][view.number]
+        outside = before if how == "original" else 0 * before
+        assert np.array_equal(view.picture[:, 15:], outside[:, 15:])
+        assert np.abs(view.picture - before)[:, :15].max() > 0.1
+
+
+def test_a_picture_edited_by_hand_is_the_source(scene, editor):
+    picture = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    settings = replace(QUICK, iterations=0)
+    by_hand = run(scene, editor, settings=settings, source_picture=picture)
+    assert np.array_equal(by_hand.edited[0], picture)
+    plain = run(scene, editor, settings=settings)
+    for view in plan(plain).stages[0]:
+        assert not np.array_equal(by_hand.edited[view], plain.edited[view])
+
+
+def test_a_picture_by_hand_may_have_any_type_that_images_have(scene, editor):
+    """Oracle: a depth of 16 bits holds a depth of 8 bits exactly, as 257 of its steps."""
+    picture = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    settings = replace(QUICK, iterations=0, stages=1, views_per_stage=1)
+    deep = picture.astype(np.uint16) * np.uint16(257)
+    one, other = (run(scene, editor, settings=settings, source_picture=p) for p in (picture, deep))
+    for view, pixels in one.edited.items():
+        assert np.array_equal(pixels, other.edited[view])
+    with pytest.raises(ValueError, match="source_picture: got int64, expected uint8, uint16 or"):
+        run(scene, editor, settings=settings, source_picture=picture.astype(np.int64))
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_where_all_views_are_sources_the_splats_are_tuned_on_them(views, scene, editor, tmp_path):
+    model, cameras, images = scene
+    part = model, cameras[:views], images[:views]
+    settings = replace(QUICK, steps=1, sources=views)
+    lines = []
+    result = run(part, editor, tmp_path, settings, report=Watched(log=lines.append))
+    assert sorted(result.edited) == list(range(views))
+    tuned = json.loads((tmp_path / "result.json").read_text())["tuned"]
+    assert tuned == {f"v{view}": 3 // views for view in range(views)}
+    assert result.counters["iterations"] == 3
+    assert not torch.equal(result.gaussians.sh, model.sh)
+    (line,) = [line for line in lines if line.startswith("stages")]
+    assert line.startswith("stages: 1 that tunes on the sources alone in place of 2, as ")
+
+
+def noise(settings, views):
+    from attnwarp.methods.carried import Noise
+
+    return Noise(settings).of(views, (4, 16, 16), [None] * len(views))
+
+
+def test_fresh_noise_is_each_views_own_and_shared_noise_is_one():
+    shared = noise(QUICK, [1, 2])
+    assert torch.equal(shared[0], shared[1])
+    fresh = replace(QUICK, noise="fresh")
+    first = noise(fresh, [1, 2])
+    assert not torch.equal(first[0], first[1])
+    # A view's noise does not depend on who is edited beside it.
+    assert torch.equal(first[1], noise(fresh, [2])[0])
+
+
+def test_no_two_seeds_and_views_have_the_same_fresh_noise_nor_the_shared_one_of_any():
+    draws = []
+    for seed in range(3):
+        fresh = noise(replace(QUICK, noise="fresh", seed=seed), range(8))
+        draws.extend(one.numpy().tobytes() for one in fresh)
+    draws.extend(shared_noise((1, 4, 16, 16), seed).numpy().tobytes() for seed in range(16))
+    assert len(set(draws)) == 3 * 8 + 16
+
+
+def test_the_released_start_is_one_timestep_in_the_range(scene, editor):
+    from attnwarp.methods.view_edits import check_editor
+
+    drawn = {
+        check_editor(editor, replace(QUICK, start=(700, 980), seed=seed)) for seed in range(50)
+    }
+    assert min(drawn) >= 700
+    assert max(drawn) <= 980
+    assert len(drawn) > 30
+    result = run(scene, editor, settings=replace(QUICK, start=(700, 700), start_picture="original"))
+    noised = edit(editor, [scene[2][0]], "a bear", steps=2, seed=0, start=700).images[0]
+    assert np.array_equal(result.edited[0], to_bytes(noised))
+
+
+def test_the_released_start_is_a_share_of_signal(scene, editor, monkeypatch):
+    # At every step twice the signal that Stable Diffusion has for the same noise.
+    alphas = 4 * editor.schedule.alphas / (1 + 3 * editor.schedule.alphas)
+    monkeypatch.setattr(editor, "schedule", Schedule(alphas, "epsilon", 1.0))
+    steps = []
+    handle = editor.unet.register_forward_pre_hook(lambda module, args: steps.append(int(args[1])))
+    settings = replace(QUICK, stages=1, iterations=0, steps=4, start=(700, 700))
+    by_hand = scene[2][0][::-1].copy()
+    try:
+        run(scene, editor, settings=settings)
+        # An edit made by hand is inverted along the same steps.
+        run(scene, editor, settings=settings, source_picture=by_hand)
+    finally:
+        handle.remove()
+    assert set(steps) == set(nearest_steps(alphas, [700, 525, 349, 174]))
+
+
+def test_depth_of_the_frozen_model_does_not_follow_the_tuning(scene, editor, tmp_path):
+    rough = replace(QUICK, geometry_rate=200.0, kinds=("self",))
+    still = run(scene, editor, tmp_path / "still", replace(rough, iterations=0))
+    last = [Path(scene[1][view].name).stem for view in plan(still).stages[1]]
+
+    def pictures_of(name):
+        return [(tmp_path / name / "features" / f"{view}.png").read_bytes() for view in last]
+
+    run(scene, editor, tmp_path / "frozen", rough)
+    run(scene, editor, tmp_path / "current", replace(rough, depth_from="current"))
+    assert pictures_of("frozen") == pictures_of("still")
+    assert pictures_of("current") != pictures_of("still")
+
+
+def test_views_are_edited_at_the_editors_size_and_their_change_enlarged(scene, editor, tmp_path):
+    model, views = splats(), cameras(size=64)
+    images = pictures(model, views)
+    settings = replace(QUICK, size=32, iterations=0)
+    result = attention_warping(model, views, images, editor, "a bear", settings, folder=tmp_path)
+    assert {picture.shape for picture in result.edited.values()} == {(32, 32, 3)}
+    assert read_image(tmp_path / "masks" / "v1.png").shape == (64, 64, 3)
+
+
+def test_arguments_that_do_not_fit_are_named(scene, editor):
+    model, views, images = scene
+    with pytest.raises(ValueError, match="images: got 4, expected 5"):
+        attention_warping(model, views, images[:4], editor, "a bear", QUICK)
+    with pytest.raises(ValueError, match="source: got 5"):
+        attention_warping(model, views, images, editor, "a bear", QUICK, source=5)
+    with pytest.raises(ValueError, match="instruction: is empty"):
+        attention_warping(model, views, images, editor, "  ", QUICK)
+    with pytest.raises(ValueError, match="checkpoint_seconds: got None"):
+        run((model, views, images), editor, checkpoint_seconds=None)
+    inverted = replace(QUICK, latents="inversion")
+    with pytest.raises(ValueError, match="source_picture: got one with latents 'inversion', but"):
+        run((model, views, images), editor, settings=inverted, source_picture=images[0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"perceptual_encoder": "bogus"}, "encoder 'bogus': unknown"),
+        ({"latents": "inversion"}, "latents: 'inversion' is made for a depth .*InstructPix2Pix"),
+        ({"branches": ("bogus",)}, "branches: got 'bogus', expected one of 'text', 'image', "),
+        (
+            {"branches": ("image",), "source_text_guidance": 1.5},  # s_T = s_I
+            "branches: got 'image', expected one of 'text', 'uncond', .* at text guidance 1.5",
+        ),
+        (
+            {"branches": ("image",), "source_text_guidance": 7.0, "text_guidance": 1.5},
+            "branches: image would be .* text guidance 1.5 stage 1 has text, uncond; choose",
+        ),
+        (
+            {"branches": ("image",), "text_guidance": 3.0, "guidance_drop": 1.5},
+            "branches: image would be .* text guidance 1.5 stage 2 has text, uncond; choose",
+        ),
+        (
+            {
+                "branches": ("image", "text"),
+                "source_text_guidance": 7.0,
+                "text_guidance": 1.5,
+                "sources": 2,
+            },
+            "text guidance 1.5 a further source has text, uncond; choose",
+        ),
+    ],
+)
+def test_settings_that_an_edit_cannot_have_are_refused_before_any_work(
+    changes, message, scene, editor, tmp_path
+):
+    def refused():
+        with pytest.raises(ValueError, match=message):
+            run(scene, editor, tmp_path, replace(QUICK, **changes))
+
+    rows, _ = rows_of(editor.unet, refused)
+    assert not rows
+    assert not any(tmp_path.iterdir())  # a manifest would hold the folder to the wrong setting
+
+
+def guidance_of_passes(editor, name, call):
+    """The text guidance that each pass of the UNet has, without repetitions; and the result."""
+    values = []
+
+    def note(*_):
+        value = getattr(editor, name)
+        if not values or values[-1] != value:
+            values.append(value)
+
+    handle = editor.unet.register_forward_pre_hook(note)
+    try:
+        return values, call()
+    finally:
+        handle.remove()
+
+
+def quick(name, **more):
+    return preset(
+        "attention_warping",
+        name,
+        **{"stages": 2, "views_per_stage": 2, "steps": 2, "iterations": 12, **more},
+    )
+
+
+def test_released_guidance_falls_by_stage_and_the_editors_own_comes_back(scene, editor):
+    values, _ = guidance_of_passes(
+        editor, "text_guidance", lambda: run(scene, editor, settings=quick("released"))
+    )
+    assert values == [12.5, 11.0]  # source and first stage, second stage
+    assert editor.text_guidance == 3.0
+    values, _ = guidance_of_passes(
+        editor, "text_guidance", lambda: run(scene, editor, settings=quick("corrected"))
+    )
+    assert values == [3.0]
+
+
+@pytest.fixture
+def depth_editor():
+    """A ControlNet whose own guidance, which has one branch, runs in no pass of an edit."""
+    from tiny_editors import controlnet
+
+    from attnwarp.editing.controlnet import DepthControlNet
+
+    pipe = controlnet()
+    names = ("unet", "vae", "text_encoder", "tokenizer", "scheduler", "controlnet")
+    return DepthControlNet(*(getattr(pipe, name) for name in names), guidance=1.0)
+
+
+def test_a_controlnet_is_guided_by_depth_with_both_branches_and_its_released_guidance(
+    scene, depth_editor, tmp_path
+):
+    settings = quick("released-controlnet")
+    values, result = guidance_of_passes(
+        depth_editor, "guidance", lambda: run(scene, depth_editor, tmp_path, settings)
+    )
+    assert values == [7.5, 12.5]
+    source = record(tmp_path, "v0")
+    assert result.counters["network_rows"] == 5 * 2 * 2
+    # 4 layers of 16 channels at 16 x 16 and 4 of 32 at 8 x 8, two branches, two steps, float32.
+    assert source["feature_bytes"] == (4 * 256 * 16 + 4 * 64 * 32) * 2 * 2 * 4
+    assert len(result.edited) == 5
+
+
+def inverted_by_diffusers(net, depth, picture, prompt, steps):
+    """(1, C, h, w) at the noisiest step, by diffusers' own inverse scheduler and models."""
+    from diffusers import DDIMInverseScheduler
+
+    from attnwarp.editing.controlnet import control_image
+
+    inverse = DDIMInverseScheduler.from_config(net.scheduler.config)
+    inverse.set_timesteps(steps)
+    with torch.no_grad():
+        text = net.embed([prompt])
+        control = torch.from_numpy(control_image(depth)).permute(2, 0, 1)[None]
+        pixels = torch.from_numpy(picture).permute(2, 0, 1)[None]
+        x = net.vae.encode(2 * pixels - 1).latent_dist.mode() * net.vae.config.scaling_factor
+        for t in inverse.timesteps:
+            down, middle = net.controlnet(x, t, text, control, return_dict=False)
+            noise = net.unet(
+                x, t, text,
+                down_block_additional_residuals=down, mid_block_additional_residual=middle,
+            ).sample  # fmt: skip
+            x = inverse.step(noise, int(t), x).prev_sample
+    return x
+
+
+def test_inverted_latents_are_those_of_diffusers_with_the_source_prompt(
+    scene, depth_editor, monkeypatch
+):
+    guides, task = [], depth_editor.task
+    monkeypatch.setattr(
+        depth_editor, "task", lambda g, words: guides.append((words, g)) or task(g, words)
+    )
+    settings = quick(
+        "corrected", method="each view alone", text_guidance=3.0, iterations=0,
+        latents="inversion", source_prompt="a bear",
+    )  # fmt: skip
+    rows, result = rows_of(
+        depth_editor.unet, lambda: run(scene, depth_editor, None, settings, "a red bear")
+    )
+    assert result.counters["network_rows"] == sum(rows)
+    assert (rows.count(1), depth_editor.guidance) == (5 * 2, 1.0)  # views are inverted unguided
+    assert [words for words, _ in guides].count("a bear") == 5
+    _, first = guides[0]
+    monkeypatch.setattr(depth_editor, "guidance", 3.0)
+    x = inverted_by_diffusers(depth_editor, first[0], scene[2][0], "a bear", 2)
+    expected = edit(depth_editor, first, "a red bear", steps=2, latents=x).images[0]
+    assert np.abs(result.edited[0] - 255 * expected).max() < 1
+    # It is no noise that views share, nor what an edit without inversion gives.
+    alone = run(scene, depth_editor, None, replace(settings, latents="random", source_prompt=""))
+    assert np.abs(result.edited[0].astype(int) - alone.edited[0]).max() > 8
+
+
+def test_features_are_carried_between_inverted_views(scene, depth_editor, tmp_path):
+    """A view at the source's place, of the same picture, gets the source's edit."""
+    model, views, images = scene
+    twins = model, [views[0], views[0], views[2]], [images[0], images[0], images[2]]
+    settings = quick("corrected", stages=1, latents="inversion", a0=1.0, decay="constant")
+    result = run(twins, depth_editor, tmp_path / "whole", settings)
+    assert np.abs(result.edited[0].astype(int) - result.edited[1]).max() <= 1
+    other = run(
+        twins, depth_editor, tmp_path / "alone", replace(settings, method="each view alone")
+    )
+    assert not np.array_equal(other.edited[2], result.edited[2])
+
+
+def visits(folder):
+    return set(json.loads((folder / "result.json").read_text())["tuned"])
+
+
+def test_a_stage_tunes_on_the_views_that_the_settings_name(scene, editor, tmp_path):
+    for choice in ("all", "stage"):
+        settings = quick("corrected", training=choice, stages=1)
+        run(scene, editor, tmp_path / choice, settings)
+    drawn = {path.stem for path in (tmp_path / "all" / "views").glob("*.png")}
+    assert visits(tmp_path / "stage") == drawn - {"v0"}
+    assert visits(tmp_path / "all") == drawn
+
+
+@pytest.mark.parametrize(("held", "expected"), [(0, 1), (2**20, 5)])
+def test_of_the_pictures_a_stage_tunes_on_as_many_are_kept_as_fit(
+    scene, editor, monkeypatch, held, expected
+):
+    """Oracle: references that do not hold their objects."""
+    counts = held_pictures.watch(monkeypatch, run_module, held)
+    settings = replace(QUICK, stages=1, views_per_stage=4, steps=1, iterations=5, perceptual=0)
+    result = run(scene, editor, settings=settings)
+    assert len(plan(result).edited) == 5
+    assert len(counts) == 5 + 5  # Edit PSNR makes them again
+    assert max(counts[:5]) == expected  # the iteration's, or all five
+
+
+def test_progress_ends_at_its_total_and_never_falls(scene, editor, tmp_path):
+    steps = []
+    run(scene, editor, tmp_path, report=Watched(lambda *step: steps.append(step)))
+    # Five views of two steps, two stages of three iterations.
+    assert {step[1] for step in steps} == {5 * 2 + 2 * 3}
+    done = [step[0] for step in steps]
+    assert done == sorted(done)
+    # The last is the word that all is done.
+    assert done[-2] == done[-1] == 16
+    assert steps[-1][2] == "done"
+
+
+def recorded(scene, editor, tmp_path, settings):
+    """The features of the source of an edit."""
+    from attnwarp.editing.attention import record as keep
+    from attnwarp.methods.features import Features
+
+    plan = Features(editor, settings, "cpu").plan(0, (16, 16), further=False)
+    with keep(editor.unet, plan) as recording:
+        edit(editor, [scene[2][0]], "a bear", steps=settings.steps)
+    return recording
+
+
+def test_half_precision_halves_the_features_and_rounds_them_once(scene, editor, tmp_path):
+    whole, half = (
+        recorded(scene, editor, tmp_path, replace(QUICK, feature_type=name))
+        for name in ("float32", "float16")
+    )
+    assert whole.bytes == 2 * half.bytes
+    for layer in whole.plan.layers:
+        for timestep in whole.timesteps:
+            exact = whole.features(timestep, layer, "text")
+            assert torch.equal(half.features(timestep, layer, "text"), exact.half())
+
+
+def test_features_of_chosen_steps_alone_reach_a_target(scene, editor, tmp_path):
+    """Oracle: a recording of all steps, with the first steps' weights alone, and no warp."""
+    from attnwarp.editing.attention import decay, inject
+
+    settings = replace(QUICK, feature_steps=(0.0, 0.5), stages=1, iterations=0, batch=1)
+    everything = recorded(scene, editor, tmp_path, QUICK)
+    first = settings.feature_range()
+    assert len(first) == QUICK.steps // 2
+    # A view at the source's place takes all of its features.
+    model, views, images = scene
+    twin = Camera(views[0].K, views[0].world_to_camera, 32, 32, "twin")
+    flat = Surface(np.full((32, 32), 2.0), np.broadcast_to([0.0, 0, -1], (32, 32, 3)))
+    identity = warp_surfaces(views[0], views[0], flat, flat)
+    pair = model, [views[0], twin], [images[0], images[1]]
+    some = run(pair, editor, settings=settings, warps=lambda source, target: identity)
+    with inject(
+        editor.unet,
+        everything,
+        branches=editor.branches,
+        weight=lambda step, steps: decay()(step, steps) if step in first else 0.0,
+    ):
+        expected = edit(editor, [images[1]], "a bear", steps=QUICK.steps).images[0]
+    assert np.abs(some.edited[1] / 255 - expected).max() < 0.5 / 255 + 1e-4
+
+
+def test_an_edit_with_features_of_chosen_steps_is_written_and_resumed(scene, editor, tmp_path):
+    """Oracles: half of the bytes, and the same pictures from what is kept."""
+    settings = replace(QUICK, iterations=0, feature_steps=(0.0, 0.5))
+    first = run(scene, editor, tmp_path / "some", settings)
+    run(scene, editor, tmp_path / "all", replace(QUICK, iterations=0))
+    some, everything = (
+        json.loads((tmp_path / name / "rounds/1/v0.json").read_text())["feature_bytes"]
+        for name in ("some", "all")
+    )
+    assert 2 * some == everything
+    (tmp_path / "some" / "features/v0.png").stat()
+    again = run(scene, editor, tmp_path / "some", settings)
+    for view, picture in first.edited.items():
+        assert (again.edited[view] == picture).all()
+
+
+IDEAS = {
+    "sources": {"sources": 3},
+    "surface noise": {"noise": "surface"},
+    "confidence": {"confidence": True},
+    "estimate": {"estimate": 0.9},
+}
+ALL_IDEAS = {name: value for idea in IDEAS.values() for name, value in idea.items()}
+
+
+def pictures_in(folder):
+    return {name: data for name, data in files(folder).items() if name.startswith("views/")}
+
+
+@pytest.mark.parametrize("idea", IDEAS)
+def test_each_idea_alone_changes_the_views(idea, finished, scene, editor, tmp_path):
+    run(scene, editor, tmp_path, replace(QUICK, iterations=0, **IDEAS[idea]))
+    before, after = pictures_in(finished[1]), pictures_in(tmp_path)
+    assert set(before) == set(after) or idea == "sources"
+    # The first stage's views are edited before any tuning, so tuning is no part of the difference.
+    first = [f"views/{Path(scene[1][view].name).stem}.png" for view in plan(finished[0]).stages[0]]
+    assert any(after.get(name) != before[name] for name in first)
+
+
+def test_confidence_counts_pixels_of_edits_and_not_of_photographs(scene, editor, tmp_path):
+    """Oracle: one place photographed at two sizes and edited at one is an identity warp."""
+    model, view = scene[0], scene[1][0]
+    settings = replace(QUICK, stages=1, iterations=0, steps=1, size=32, confidence=True)
+    for factor in (1, 3):
+        views = [view, view.resize(32 * factor, 32 * factor)]
+        folder = tmp_path / str(factor)
+        attention_warping(
+            model, views, pictures(model, views), editor, "red", settings, folder=folder
+        )
+    one, other = (
+        json.loads(sorted((tmp_path / f / "rounds/1").glob("*.json"))[-1].read_text()) for f in "13"
+    )
+    assert one["injected"] > 0.8
+    assert other["injected"] == pytest.approx(one["injected"], abs=0.05)
+
+
+@pytest.fixture(scope="module")
+def extended(scene, editor, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("extended")
+    return run(scene, editor, folder, replace(QUICK, **ALL_IDEAS)), folder
+
+
+@pytest.mark.parametrize("store", ["cpu", "disk"])
+def test_the_memory_of_all_recordings_is_told_once_before_the_first(store, scene, editor, tmp_path):
+    """Oracle: features counted by hand, of two views of 32 px and one of twice as many pixels."""
+    model, views, images = scene
+    wide = views[1].resize(64, 32)
+    part = model, [views[0], wide, views[2]], [images[0], pictures(model, [wide])[0], images[2]]
+    told = []
+    settings = replace(QUICK, sources=3, steps=2, iterations=0, size=None)
+    run(part, editor, tmp_path, settings, store=store,
+        report=Watched(lambda *_: told.append("work"), told.append))  # fmt: skip
+    (line,) = [text for text in told if text.startswith("recording")]
+    assert "work" not in told[: told.index(line)]
+    # 4 layers of 16 channels at 16 x 16 and 4 of 32 at 8 x 8, two branches, two steps, float32.
+    one = (4 * 256 * 16 + 4 * 64 * 32) * 2 * 2 * 4
+    place = tmp_path / ".recording" if store == "disk" else "main memory"
+    assert line == (
+        f"recording 3 sources, 8 layers, 2 branches (text, image), 2 steps in float32:"
+        f" {4 * one / 2**20:.1f} MiB in {place}"
+    )
+
+
+def test_further_sources_are_edited_first_and_counted(extended, scene):
+    result, folder = extended
+    assert len(plan(result).chain) == 2
+    manifest = json.loads((folder / "manifest.json").read_text())
+    names = [Path(camera.name).stem for camera in scene[1]]
+    chain = [names[view] for view in plan(result).chain]
+    assert manifest["sources"][1:] == chain
+    assert set(chain).isdisjoint(name for part in manifest["rounds"][1:] for name in part["views"])
+    for number, name in enumerate(chain):
+        about = record(folder, name)
+        assert about["round"] == 1
+        if number:
+            assert list(about["sources"]) == [names[0], *chain[:number]]
+    assert result.counters["sources"] == 3
+    assert result.counters["views"] == 5
+    assert result.counters["network_rows"] == 5 * 2 * 3
+    # 4 layers of 16 channels at 16 x 16 and 4 of 32 at 8 x 8, two branches, two steps, float32.
+    assert result.counters["feature_bytes"] == 3 * (4 * 256 * 16 + 4 * 64 * 32) * 2 * 2 * 4
+
+
+def test_one_more_pass_of_the_network_is_run_for_no_further_source(scene, editor):
+    rows = 0
+
+    def count(module, args, kwargs):
+        nonlocal rows
+        rows += (args[0] if args else kwargs["sample"]).shape[0]
+
+    handle = editor.unet.register_forward_pre_hook(count, with_kwargs=True)
+    settings = replace(QUICK, stages=1, views_per_stage=4, iterations=0, **ALL_IDEAS)
+    result = run(scene, editor, settings=settings)
+    handle.remove()
+    assert rows == result.counters["network_rows"] == 5 * 2 * 3
+
+
+def test_an_estimate_of_a_source_is_decoded_once_for_all_that_take_it(scene, editor, monkeypatch):
+    decoded = 0
+    decode = editor.vae.decode
+
+    def count(latents, **more):
+        nonlocal decoded
+        decoded += len(latents)
+        return decode(latents, **more)
+
+    monkeypatch.setattr(editor.vae, "decode", count)
+    told = []
+    settings = replace(
+        QUICK, stages=1, views_per_stage=4, iterations=0, **ALL_IDEAS, estimate_in="picture"
+    )
+    assert (settings.steps, settings.sources, len(scene[1])) == (2, 3, 5)
+    run(scene, editor, settings=settings, report=Watched(log=told.append))
+    steps = sum(1 - k / (settings.estimate_until * settings.steps) > 0 for k in range(2))
+    # Each of three sources once a step, each view but the first once a step, and five pictures.
+    assert decoded == steps * (3 + 4) + 5
+    # Three sources of 32 x 32 px, three channels in float32.
+    amount = 3 * steps * 32 * 32 * 3 * 4 / 2**20
+    (line,) = [text for text in told if text.startswith("estimates")]
+    assert line == (
+        f"estimates of 3 sources, as pictures of {steps} steps: up to {amount:.1f} MiB in main memory"
+    )
+
+
+def test_a_source_prompt_that_is_too_long_is_refused_before_any_work(
+    scene, depth_editor, monkeypatch
+):
+    settings = quick("corrected", latents="inversion", source_prompt="a bear " * 40)
+    for work in ("task", "raw_latents", "embed"):
+        monkeypatch.setattr(depth_editor, work, lambda *_: pytest.fail("work was done"))
+    with pytest.raises(ValueError, match="tokens, the text encoder takes .*; shorten it"):
+        run(scene, depth_editor, None, settings)
+
+
+def test_with_every_idea_a_killed_run_gives_the_same_bytes(extended, scene, editor, tmp_path):
+    settings = replace(QUICK, **ALL_IDEAS)
+    moment = int(np.random.default_rng(0).integers(5, 60))
+    with pytest.MonkeyPatch.context() as patch:
+        watch, _ = events(patch, moment)
+        with pytest.raises(Killed):
+            run(scene, editor, tmp_path, settings, report=Watched(watch), checkpoint_seconds=0)
+    run(scene, editor, tmp_path, settings)
+    assert files(tmp_path) == files(extended[1])
+
+
+def test_a_view_at_a_further_sources_place_gets_that_sources_edit(scene, editor):
+    """With one more camera at the place of a further source and all features taken over, its edit
+    is that source's, not the first one's."""
+    model, views, images = scene
+    first = plan(run(scene, editor, settings=replace(QUICK, sources=2, iterations=0))).chain[0]
+    twin = Camera(views[first].K, views[first].world_to_camera, 32, 32, "twin")
+    settings = replace(
+        QUICK, stages=1, views_per_stage=9, iterations=0, a0=1.0, decay="constant", sources=2, batch=1
+    )  # fmt: skip
+    result = attention_warping(
+        model, [*views, twin], [*images, images[first]], editor, "a bear", settings
+    )
+    assert plan(result).chain == (first,)
+    assert np.array_equal(result.edited[first], result.edited[5])
+    assert not np.array_equal(result.edited[0], result.edited[5])
+
+
+def test_the_estimate_of_a_twin_is_the_sources(scene, editor):
+    """At weight 1 in every step the clean latents of a view at the source's place are the source's."""
+    _, views, images = scene
+    twin = Camera(views[0].K, views[0].world_to_camera, 32, 32, "twin")
+    other = 1 - images[0]  # guided by another picture, it would become another
+    settings = replace(
+        QUICK, method="each view alone", stages=1, iterations=0, estimate=1.0, estimate_until=1e9
+    )
+
+    def difference(settings):
+        pair = [views[0], twin], [images[0], other]
+        result = attention_warping(wall(), *pair, editor, "a bear", settings)
+        return np.abs(result.edited[0].astype(int) - result.edited[1]).max()
+
+    assert difference(settings) <= 1
+    assert difference(replace(settings, estimate=0.0)) > 50
+
+
+def test_an_estimate_warped_as_a_picture_lands_on_its_pixel_within_a_cell():
+    """Two views of a wall are 3 px apart, and a cell of the latents is 4 px wide."""
+    shift, size = 3, 32
+    K = np.array([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]])
+    poses = [np.diag([1.0, -1, -1, 1]) for _ in range(2)]
+    for pose, x in zip(poses, (0, shift * 4 / size), strict=True):
+        pose[:3, 3] = (x, 0, 4)  # the wall lies at depth 4
+    views = [Camera(K, pose, size, size, name) for name, pose in zip("ab", poses, strict=True)]
+    images = [np.random.default_rng(k).random((size, size, 3), np.float32) for k in range(2)]
+    settings = replace(
+        QUICK, method="each view alone", stages=1, iterations=0, estimate=1.0, estimate_until=1e9
+    )
+
+    def difference(**changes):
+        result = attention_warping(
+            wall(), views, images, load_editor("small-plain"), "make it red",
+            replace(settings, **changes),
+        )  # fmt: skip
+        source, target = (result.edited[k].astype(int) for k in range(2))
+        # The border's pixels have taps outside the source.
+        inside = slice(4, -4)
+        return np.abs(np.roll(source, shift, axis=1) - target)[inside, inside].max()
+
+    assert difference(estimate_in="picture") <= 2
+    assert difference() > 50
+
+
+def test_an_estimate_warped_as_a_picture_changes_nothing_that_no_source_sees(scene, editor):
+    """Though this autoencoder does not give back the picture that it is given."""
+    _, views, images = scene
+    away = Camera.look_at((0, 0, 8), (0, 0, 9), width=32, height=32, fov_y=40, up=(0, 1, 0))
+    settings = replace(QUICK, method="each view alone", stages=1, iterations=0)
+    pair = [views[0], replace(away, name="away")], images[:2]
+
+    def edited(weight):
+        changed = replace(settings, estimate=weight, estimate_in="picture")
+        return attention_warping(wall(), *pair, editor, "a bear", changed).edited[1]
+
+    assert np.array_equal(edited(0.0), edited(1.0))
+
+
+@pytest.mark.parametrize("size", [64, 32])
+def test_the_estimates_margin_is_a_share_of_the_photograph_whatever_the_size_of_the_edit(
+    editor, monkeypatch, size
+):
+    """Depth has the photographs' 64 px, of which 3/64 are 3."""
+    model, views = splats(), cameras(size=64)
+    margins, sight = [], geometry.Sight
+
+    def watched(*arguments):
+        margins.append(arguments[3])
+        return sight(*arguments)
+
+    monkeypatch.setattr(geometry, "Sight", watched)
+    settings = replace(
+        QUICK, stages=1, steps=1, iterations=0, size=size, estimate=1.0, estimate_margin=3 / 64
+    )
+    attention_warping(model, views[:2], pictures(model, views)[:2], editor, "a bear", settings)
+    assert margins == [[3]]

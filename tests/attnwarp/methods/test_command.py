@@ -1,0 +1,706 @@
+"""The command as a person runs it, on a small random editor in a folder; the oracle is the library and the files."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from base64 import b64decode
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from edit_folders import Watched
+from tiny_editors import pix2pix
+from tiny_scenes import cameras, pictures, splats
+from tiny_segmenters import save_dino, save_sam
+from typer.testing import CliRunner
+
+from attnwarp import Camera
+from attnwarp.cli.main import app
+from attnwarp.editing.segment import GroundedSam, NoDetectionError, load_segmenter
+from attnwarp.errors import InputError
+from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
+from attnwarp.io.images import encode_png
+from attnwarp.io.lock import alone_in
+from attnwarp.io.names import file_stems
+from attnwarp.methods import PRESETS, command
+from attnwarp.methods import page as page_of_edits
+from attnwarp.methods.base import workdir_of
+from attnwarp.methods.command import mask_files, read_mask, read_over_black
+from attnwarp.methods.scene import to_float
+from attnwarp.methods.words import masks_by_words, words_folder
+from attnwarp.render import render
+from attnwarp.reporting import SILENT
+
+runner = CliRunner()
+QUICK = (
+    "--steps",
+    2,
+    "--iterations",
+    3,
+    "--stages",
+    2,
+    "--views-per-stage",
+    1,
+    "--size",
+    32,
+    "--threads",
+    1,
+)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A data set, its splats, and an editor."""
+    folder = tmp_path_factory.mktemp("edit")
+    model, views = splats(), cameras()
+    (folder / "data" / "images").mkdir(parents=True)
+    paths = []
+    for camera, image in zip(views, pictures(model, views), strict=True):
+        paths.append(folder / "data" / "images" / camera.name)
+        paths[-1].write_bytes(encode_png(np.rint(255 * image).astype(np.uint8)))
+    points = model.world_means()
+    write_transforms(
+        folder / "data", Dataset(views, paths, points, np.full(points.shape, 99, np.uint8))
+    )
+    write_ply(folder / "splats.ply", model)
+    pix2pix().save_pretrained(folder / "editor")
+    for name, value in (("black", 0), ("ones", 1)):
+        (folder / name).mkdir()
+        for camera in views:
+            grey = np.full((32, 32, 3), value, np.uint8)
+            (folder / name / camera.name).write_bytes(encode_png(grey))
+    (folder / "wide.png").write_bytes(encode_png(np.zeros((32, 48, 3), np.uint8)))
+    return folder
+
+
+def run(place, out, *more, instruction="a bear"):
+    arguments = [
+        "edit",
+        place / "data",
+        "--instruction",
+        instruction,
+        "--editor",
+        place / "editor",
+        "--out",
+        out,
+    ]
+    return runner.invoke(app, [*map(str, arguments), *map(str, QUICK), *map(str, more)])
+
+
+class Page(HTMLParser):
+    """Pictures and links of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.pictures, self.other = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        if tag == "img":
+            self.pictures.append(b64decode(values["src"].removeprefix("data:image/png;base64,")))
+        elif "src" in values or "href" in values:
+            self.other.append(values)
+
+
+def test_it_leaves_an_edited_ply_and_a_page_that_needs_no_other_file(place, tmp_path, monkeypatch):
+    result = run(place, tmp_path, "--ply", place / "splats.ply", "--source", "v2.png")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines()[-1] == str(tmp_path / "index.html")
+    edited = read_ply(tmp_path / "edited.ply")
+    assert len(edited) == 60
+    other = read_ply(tmp_path / "edited-3dgs.ply", kind="3d")  # as another program reads it
+    assert np.array_equal(other.scales[:, :2], edited.scales)
+    assert np.allclose(other.scales[:, 2], 1e-6)
+    assert not np.array_equal(edited.sh, read_ply(place / "splats.ply").sh)
+    text = (tmp_path / "index.html").read_text()
+    page = Page(text)
+    assert page.other == []
+    files = {path.read_bytes() for path in tmp_path.rglob("*.png")}
+    assert set(page.pictures) <= files
+    # Source: 5 pictures; two edited views: 6 each; two views that were not edited: 2 each.
+    assert len(page.pictures) == 5 + 2 * 6 + 2 * 2
+    assert (tmp_path / "views/v2.png").read_bytes() in page.pictures
+    assert not (tmp_path / "fit").exists()
+    assert "the folder has all" not in text
+    # Photographs that are no renders are beside the source and the edited views, of whose size they are.
+    negatives = [255 - read_image(place / "data" / "images" / c.name) for c in cameras()]
+    monkeypatch.setattr(page_of_edits, "MOST_UNEDITED", 1)
+    text = page_of_edits.write_page(workdir_of(tmp_path), cameras(), negatives).read_text()
+    rounds = json.loads((tmp_path / "manifest.json").read_text())["rounds"]
+    shown = [name for part in rounds for name in part["views"]]
+    assert shown[0] == "v2"
+    pixels = [
+        cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR_RGB)
+        for png in Page(text).pictures
+        if png not in files
+    ]
+    expected = [negatives[file_stems(cameras()).index(name)] for name in shown]
+    assert len(pixels) == 3 and all(map(np.array_equal, pixels, expected))
+    rest = text[text.index("<h2>Views that were not edited") : text.index("<h2>Time")]
+    assert "<p>1 of 2; the folder has all.</p>" in rest and len(Page(rest).pictures) == 2
+
+
+def test_the_page_is_written_where_the_name_of_a_view_is_no_utf_8(place, tmp_path):
+    shutil.copytree(place, tmp_path / "place")
+    data, name = tmp_path / "place" / "data", "f\udcfcr.png"  # Latin-1, as Python hands it on
+    try:
+        (data / "images" / "v0.png").rename(data / "images" / name)
+    except OSError:
+        pytest.skip("this file system takes UTF-8 names alone")
+    scene = json.loads((data / "transforms.json").read_text())
+    for frame in scene["frames"]:
+        frame["file_path"] = frame["file_path"].replace("v0.png", name)
+    (data / "transforms.json").write_text(json.dumps(scene))
+    result = run(tmp_path / "place", tmp_path / "edit", "--ply", place / "splats.ply")
+    assert result.exit_code == 0, result.output
+    assert "f?r" in (tmp_path / "edit" / "index.html").read_text(encoding="utf-8")
+
+
+def test_the_page_shows_the_further_sources_in_their_order(place, tmp_path):
+    more = ("--ply", place / "splats.ply", "--set", "sources=3")
+    assert run(place, tmp_path, *more).exit_code == 0
+    chain = json.loads((tmp_path / "manifest.json").read_text())["sources"][1:]
+    text = (tmp_path / "index.html").read_text()
+    section = text[text.index("<h2>Further sources") : text.index("<h2>Edited views")]
+    assert re.findall("<h3>(v.):", section) == chain
+    pictures = Page(section).pictures
+    for part in ("views", "masks", "features"):
+        for name in chain:
+            assert (tmp_path / part / f"{name}.png").read_bytes() in pictures
+    # The mask's colours are the sources' of the legend, the first of which is white.
+    colors = re.findall(r"background:rgb\((\d+), (\d+), (\d+)\)", section)
+    assert len(colors) == 3
+    allowed = {(0, 0, 0), *(tuple(map(int, color)) for color in colors)}
+    mask = read_image(tmp_path / "masks" / f"{chain[1]}.png").reshape(-1, 3)
+    assert {tuple(pixel) for pixel in mask.tolist()} <= allowed
+
+
+def test_without_splats_it_fits_them_first(place, tmp_path):
+    result = run(place, tmp_path, "--fit-iterations", 5)
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "fit" / "splats.ply").is_file()
+    assert (tmp_path / "edited.ply").is_file()
+
+
+def test_a_captures_own_masks_are_not_written_over_and_no_fit_comes_first(place, tmp_path):
+    """Oracle: the bytes of the masks."""
+    masks = shutil.copytree(place / "black", tmp_path / "masks")
+    before = {path.name: path.read_bytes() for path in masks.iterdir()}
+    result = run(place, tmp_path, "--fit-iterations", 5)
+    assert result.exit_code == 2 and "has no manifest.json" in result.output
+    assert {path.name: path.read_bytes() for path in masks.iterdir()} == before
+    assert list(tmp_path.iterdir()) == [masks]
+
+
+def test_an_interrupt_while_it_fits_leaves_a_checkpoint(place, tmp_path):
+    ended = threading.Event()
+
+    def interrupt():
+        while not (tmp_path / "fit").is_dir() and not ended.wait(0.05):
+            pass
+        # Sent after the command's end, it would stop the tests.
+        if not ended.wait(0.3):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    result = run(place, tmp_path, "--fit-iterations", 100_000, "--store", "cpu")
+    ended.set()
+    thread.join()
+    assert result.exit_code == 130
+    # Far less than the 30 seconds between two checkpoints have passed.
+    assert (tmp_path / "fit" / "checkpoint.pt").is_file()
+    assert "the same command goes on from it" in result.output
+
+
+def test_a_mask_and_a_picture_by_hand_are_read_from_files(place, tmp_path):
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    half = np.zeros((32, 32, 3), np.uint8)
+    half[:, :16] = 255
+    for camera in cameras():
+        (masks / camera.name).write_bytes(encode_png(half))
+    hand = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    (tmp_path / "hand.png").write_bytes(encode_png(hand))
+    result = run(
+        place, tmp_path / "out", "--ply", place / "splats.ply", "--masks", masks, "--source-picture", tmp_path / "hand.png",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    source = read_image(tmp_path / "out" / "views/v0.png")
+    original = read_image(place / "data" / "images" / "v0.png")
+    assert np.array_equal(source[:, :16], hand[:, :16])
+    assert np.array_equal(source[:, 16:], original[:, 16:])
+
+
+def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
+    """Oracle: the same edit with ``--masks`` of the files that the words left."""
+    save_dino(tmp_path / "dino")
+    save_sam(tmp_path / "sam", seed=2)
+    ply = ("--ply", place / "splats.ply")
+    segmenter = ("--segmenter", f"{tmp_path / 'dino'},{tmp_path / 'sam'}")
+    result = run(place, tmp_path / "words", *ply, "--where", "bear", *segmenter)
+    assert result.exit_code == 0, result.output
+    assert "masks are those of an earlier run" not in result.stderr
+    again = run(place, tmp_path / "words", *ply, "--where", "bear", *segmenter)
+    assert again.exit_code == 0, again.output
+    assert f"{len(cameras())} of {len(cameras())} masks are those of an earlier run" in again.stderr
+    files = sorted((tmp_path / "words" / "segments").iterdir())
+    assert [path.name for path in files] == [camera.name for camera in cameras()]
+    shares = [(read_image(path) > 127).mean() for path in files]
+    assert min(shares) > 0 and max(shares) < 1
+    (line,) = [line for line in result.stderr.splitlines() if line.startswith("masks cover")]
+    percent = [float(number) for number in re.findall(r"([0-9.]+)%", line)]
+    assert percent == pytest.approx([100 * min(shares), 100 * max(shares)], abs=0.051)
+    names = re.findall(r"v\d\.png", line)
+    assert [shares[int(name[1])] for name in names] == [min(shares), max(shares)]
+    result = run(place, tmp_path / "files", *ply, "--masks", tmp_path / "words" / "segments")
+    assert result.exit_code == 0, result.output
+    for name in ("views/v0.png", "edited.ply"):
+        assert (tmp_path / "words" / name).read_bytes() == (tmp_path / "files" / name).read_bytes()
+
+
+MASKS = {
+    "with their folders": ("train/r_0", "test/r_0", "frame.001", "frame.002"),
+    "numbered": ("0000-r_0", "0001-r_0", "0002-frame", "0003-frame"),
+}
+"""Names of masks of the views below."""
+
+
+def views_of_one_name():
+    names = ("./train/r_0", "../test/r_0", "frame.001", "frame.002")
+    view = {"width": 32, "height": 32, "fov_y": 40}
+    return [Camera.look_at((3, 0, 0), (0, 0, 0), name=name, **view) for name in names]
+
+
+@pytest.mark.parametrize("how", MASKS)
+def test_views_of_one_name_have_masks_of_their_own(how, tmp_path):
+    """Oracle: each file has another number of white rows."""
+    for k, name in enumerate(MASKS[how]):
+        rows = np.zeros((32, 32, 3), np.uint8)
+        rows[: k + 1] = 255
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.png").write_bytes(encode_png(rows))
+    views = views_of_one_name()
+    files = mask_files(tmp_path, views)
+    masks = [read_mask(file, view) for file, view in zip(files, views, strict=True)]
+    assert [mask.sum() for mask in masks] == [32, 64, 96, 128]
+
+
+@pytest.mark.parametrize(
+    ("first", "message"),
+    [
+        (0, r"r_0\.png could be that of train/r_0 or of test/r_0; expected .*train/r_0\.png"),
+        (2, r"frame\.png could be that of frame.001 or of frame.002; expected .*frame\.001\.png"),
+    ],
+)
+def test_a_mask_that_could_be_that_of_two_views_is_refused_with_both(first, message, tmp_path):
+    for name in ("r_0", "frame"):
+        (tmp_path / f"{name}.png").write_bytes(encode_png(np.zeros((32, 32, 3), np.uint8)))
+    with pytest.raises(InputError, match=message):
+        mask_files(tmp_path, views_of_one_name()[first:])
+
+
+def test_a_mask_of_another_shape_is_refused_and_one_of_another_size_is_not(tmp_path):
+    view = Camera.look_at((3, 0, 0), (0, 0, 0), width=48, height=32, fov_y=40)
+    path = tmp_path / "mask.png"
+    upper = np.zeros((16, 24, 3), np.uint8)
+    upper[:8] = 255
+    path.write_bytes(encode_png(upper))
+    mask = read_mask(path, view)
+    assert mask.shape == (32, 48)
+    assert mask[:16].all() and not mask[16:].any()
+    path.write_bytes(encode_png(np.zeros((48, 32, 3), np.uint8)))  # turned
+    with pytest.raises(ValueError, match=r"--masks: .*mask\.png: got 48 x 32 .* ratio of 32 x 48"):
+        read_mask(path, view)
+
+
+def test_transparent_pixels_of_a_mask_or_a_picture_by_hand_are_black(tmp_path):
+    """Oracle: the alpha, in numbers that 8 bits hold exactly."""
+    colour = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    alpha = np.repeat(np.repeat(np.uint8([0, 51, 204, 255]), 8)[None], 32, axis=0)
+    (tmp_path / "hand.png").write_bytes(encode_png(np.dstack([colour, alpha])))
+    pixels, white = read_over_black(tmp_path / "hand.png")
+    share = np.repeat([0, 0.2, 0.8, 1], 8)[None, :, None]
+    assert np.allclose(pixels / white, colour / 255 * share, rtol=0, atol=1e-12)
+    # White everywhere, and opaque enough in its right half alone.
+    mask = np.dstack([np.full((32, 32, 3), 255, np.uint8), alpha])
+    (tmp_path / "mask.png").write_bytes(encode_png(mask))
+    edited = read_mask(tmp_path / "mask.png", cameras(1)[0])
+    assert edited[:, 16:].all() and not edited[:, :16].any()
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (("--source", "v9"), "--source: got 'v9', expected a view's name or a number below 5"),
+        (("--source", "²"), "--source: got '²', expected a view's name or a number below 5"),
+        (("--preset", "corected"), "preset: got 'corected', expected one of 'corrected', "),
+        (("--preset", "corected"), "; did you mean 'corrected'?"),
+        (("--editor", "smal"), "editor 'smal': neither bundled"),
+        (("--set", "opaqe=1"), "setting: got 'opaqe', expected one of"),
+        (("--set", "steps=3"), "--set: steps has an option of its own, --steps"),
+        (("--set", "a0=3"), "a0: got 3, expected a number in [0, 1]"),
+        (("--masks", "nowhere"), "--masks: nowhere is no folder"),
+        (("--masks", "editor"), "--masks: editor/v0.png is missing"),
+        (
+            ("--masks", "ones"),
+            "v0.png has no value above 1 of 255, so all of it is black; multiply",
+        ),
+        (("--masks", ".", "--where", "bear"), "--where: got --masks too, expected one of the two"),
+        (("--masks", "data/images"), "v0.png is coloured, expected a grey picture"),
+        (("--where", " "), "--where: got ' ', expected words such as 'bear'"),
+        (("--where", "bear", "--segmenter", "dino"), "segmenter 'dino': unknown, expected"),
+        (("--segmenter", "clip-parts"), "--segmenter: needs --where, the words that it looks for"),
+        (("--masks", "black"), "--masks: every mask in black is black, so nothing may change"),
+        (("--source-picture", "no.png"), "no.png: no such file"),
+        (
+            ("--source-picture", "wide.png"),
+            "--source-picture: wide.png: got 32 x 48 (height x width), expected the aspect ratio of 32 x 32;",
+        ),
+        (("--ply", "no.ply"), "no.ply: no such file"),
+    ],
+)
+def test_what_cannot_be_used_is_one_clear_line(more, message, place, tmp_path, monkeypatch):
+    ply = () if "--ply" in more else ("--ply", place / "splats.ply")
+    monkeypatch.chdir(place)
+    result = run(place, tmp_path / "out", *ply, *more)
+    assert result.exit_code == 2
+    assert message in result.output
+    assert len(result.output.strip().splitlines()) == 1
+
+
+def test_a_source_whose_picture_is_missing_is_said_to_be(place, tmp_path):
+    shutil.copytree(place, tmp_path / "copy")
+    (tmp_path / "copy/data/images/v2.png").unlink()
+    more = ("--ply", place / "splats.ply", "--missing-images", "none", "--source", "v2")
+    result = run(tmp_path / "copy", tmp_path / "out", *more)
+    assert result.exit_code == 2
+    assert "--source: the picture of 'v2' is missing; name another view" in result.output
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("perceptual_encoder=bogus", "encoder 'bogus': unknown"),
+        ("perceptual_encoder=clip-small", "is of kind 'clip', expected 'perceptual'"),
+        ('branches=["bogus"]', "branches: got 'bogus', expected one of 'text', 'image', 'uncond'"),
+        ("branches=[]", "branches: got none, expected some of text, image, uncond"),
+        ("start=[0, 0]", "start, steps: got 0, 2, expected at least one step and start"),
+    ],
+)
+def test_settings_that_an_edit_cannot_have_are_refused_before_the_fit(
+    setting, message, place, tmp_path
+):
+    result = run(place, tmp_path, "--set", setting)
+    assert result.exit_code == 2
+    assert message in result.output
+    assert not any(tmp_path.iterdir())
+
+
+def test_splats_that_no_camera_sees_are_refused_by_name_before_the_edit(place, tmp_path):
+    """Oracle: the cameras' own projection; all centres lie outside every picture."""
+    model = splats()
+    write_ply(tmp_path / "far.ply", replace(model, means=model.means + torch.tensor([50.0, 0, 0])))
+    for camera in cameras():
+        xy, _ = camera.project(read_ply(tmp_path / "far.ply").world_means())
+        assert not ((xy > 0) & (xy < 32)).all(axis=-1).any()
+    result = run(place, tmp_path / "out", "--ply", tmp_path / "far.ply")
+    assert result.exit_code == 2
+    assert f"{tmp_path / 'far.ply'}: its splats cover less than 0.2% of each view" in result.output
+    assert "same coordinates and the same units" in result.output
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("how", ["turned", "scaled", "as they are"])
+def test_splats_that_do_not_show_the_pictures_are_warned_about(how, place, tmp_path):
+    """Oracle: PSNR over what the splats cover, and that of one colour a view, in numpy."""
+    model, views = splats(), cameras()
+    c, s = np.cos(1.6), np.sin(1.6)
+    turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float32)
+    means = {"turned": model.means @ turn.T, "scaled": 0.4 * model.means}.get(how, model.means)
+    moved = replace(model, means=means)
+    write_ply(tmp_path / "moved.ply", moved)
+    errors, spreads = [], []
+    for camera, image in zip(views, pictures(model, views), strict=True):
+        view = render(read_ply(tmp_path / "moved.ply"), camera)
+        alpha = view.alpha.numpy()
+        true = (np.rint(255 * image) / 255)[alpha > 0.5]
+        errors.append((view.color.numpy()[alpha > 0.5] / alpha[alpha > 0.5, None] - true) ** 2)
+        spreads.append((true - true.mean(0)) ** 2)
+    psnr, plain = (-10 * np.log10(np.concatenate(x).mean()) for x in (errors, spreads))
+    assert (psnr < min(plain, 18)) == (how != "as they are")
+    result = run(place, tmp_path / "out", "--ply", tmp_path / "moved.ply", "--stages", 1)
+    assert result.exit_code == 0, result.output
+    said = f"are unlike them ({psnr:.1f} dB; one colour a view would have {plain:.1f})"
+    assert (said in result.stderr) == (how != "as they are")
+
+
+def test_the_kind_that_a_person_names_is_that_of_the_splats_that_are_given(place, tmp_path):
+    """Oracle: the PLY that the edit leaves; its splats have a third scale that no rule takes for
+    flat."""
+    flat = splats()
+    assert flat.kind == "2d"
+    write_ply(tmp_path / "thick.ply", flat, third_scale=float(flat.scales.max()) / 2)
+    text = (tmp_path / "thick.ply").read_bytes()
+    head, body = text.split(b"end_header\n", 1)
+    lines = [line for line in head.splitlines() if not line.startswith(b"comment")]
+    (tmp_path / "thick.ply").write_bytes(b"\n".join([*lines, b"end_header\n"]) + body)
+    for kind, ending in (("2dgs", "2d"), ("3dgs", "3d")):
+        out = tmp_path / kind
+        result = run(place, out, "--ply", tmp_path / "thick.ply", "--kind", kind, "--stages", 1)
+        assert result.exit_code == 0, result.output
+        assert read_ply(out / "edited.ply").kind == ending
+    for more, message in (
+        (("--ply", tmp_path / "thick.ply", "--max-splats", 9), "--max-splats: is of the fit"),
+        (("--no-antialiased",), "--antialiased: says how a PLY is read"),
+    ):
+        result = run(place, tmp_path / "none", *more)
+        assert result.exit_code == 2 and message in result.output
+
+
+def test_stages_sources_and_a_size_that_cannot_be_had_are_said_in_one_line_each(place, tmp_path):
+    """Oracle: the manifest and the pictures that the edit leaves."""
+    more = ("--ply", place / "splats.ply", "--stages", 9, "--views-per-stage", 2, "--size", 31)
+    result = run(place, tmp_path, *more)
+    assert result.exit_code == 0, result.output
+    stages = json.loads((tmp_path / "manifest.json").read_text())["rounds"]
+    longest = max(read_image(tmp_path / "views/v0.png").shape)
+    assert (len(stages), longest) == (2, 32)
+    assert "stages: 2 in place of 9, as 5 views leave no more to edit\n" in result.stderr
+    assert "size: 32 px in place of 31, as this editor's sides are multiples of" in result.stderr
+    more = ("--ply", place / "splats.ply", "--set", "sources=9", "--stages", 1)
+    result = run(place, tmp_path / "sources", *more)
+    assert result.exit_code == 0, result.output
+    assert "sources: 5 in place of 9, as there are 5 views\n" in result.stderr
+
+
+def test_an_edit_whose_targets_got_no_features_says_so(place, tmp_path):
+    """Oracle: the masks leave no pixel of a view but the source's to be edited."""
+    white = np.full((32, 32, 3), 255, np.uint8)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for k, camera in enumerate(cameras()):
+        (masks / camera.name).write_bytes(encode_png(white if k == 2 else 0 * white))
+    ply = ("--ply", place / "splats.ply", "--source", 2, "--set", "warp.segment=true")
+    result = run(place, tmp_path / "out", *ply, "--masks", masks)
+    assert result.exit_code == 0, result.output
+    names = ", ".join(f"images/v{k}.png" for k in (0, 1, 3, 4))
+    assert f"--masks: 4 of 5 are black, so nothing is edited in {names}\n" in result.stderr
+    assert "warning: each view was edited alone, as none got features" in result.stderr
+    assert f"perhaps {place / 'splats.ply'} does not fit the photographs" in result.stderr
+    result = run(place, tmp_path / "all", *ply)
+    assert result.exit_code == 0 and "edited alone" not in result.stderr
+    assert "in place of" not in result.stderr
+
+
+class Counted:
+    """A segmenter that notes what it is shown, and may be stopped before a view."""
+
+    def __init__(self, segmenter, stop_at=None):
+        self.segmenter, self.stop_at, self.shown = segmenter, stop_at, 0
+
+    def segment(self, image, words):
+        if self.shown == self.stop_at:
+            raise KeyboardInterrupt
+        self.shown += 1
+        return self.segmenter.segment(image, words)
+
+
+def test_masks_by_words_are_made_once(place, tmp_path):
+    """Stopped before the third view, begun anew, then damaged, and repainted."""
+    views = cameras()
+    images = [read_image(place / "data" / "images" / camera.name) for camera in views]
+    segmenter, text = tiny_segmenter(tmp_path), "bear"
+    folder = words_folder(tmp_path / "edit", segmenter, text)
+    alone = [segmenter.segment(to_float(image), text) for image in images]
+
+    def made(stop_at=None, views=views, images=images):
+        counted, steps = Counted(segmenter, stop_at), []
+        try:
+            masks, kept = masks_by_words(
+                counted, text, views, images, folder, Watched(lambda *step: steps.append(step))
+            )
+        except KeyboardInterrupt:
+            return counted.shown
+        assert [(done, total) for done, total, _ in steps] == [
+            (k + 1, len(views)) for k in range(len(views))
+        ]
+        assert kept == len(views) - counted.shown
+        if images is not flipped:
+            assert all(map(np.array_equal, masks, alone))
+        return counted.shown
+
+    flipped = [image[:, ::-1].copy() for image in images]
+    assert made(stop_at=2) == 2
+    assert made() == len(views) - 2
+    assert made() == 0
+    path = folder / "v1.png"
+    path.write_bytes(path.read_bytes()[:-20])
+    (folder / "v2.json").write_text("{")
+    assert made() == 2
+    assert made(images=flipped) == len(views)
+    assert made() == len(views)
+    path.write_bytes(encode_png(255 - read_image(path)))
+    painted = path.read_bytes()
+    with pytest.raises(InputError, match=r"v1.png: is not the mask that was made; .*--masks"):
+        made()
+    (folder / "v1.json").unlink()
+    with pytest.raises(InputError, match="v1.png: is there without v1.json"):
+        made()
+    assert path.read_bytes() == painted
+    with alone_in(folder), pytest.raises(InputError, match="another run writes to this folder"):
+        made()
+
+
+def test_masks_of_other_words_or_segmenters_write_over_none(place, tmp_path):
+    views = cameras()[:2]
+    images = [read_image(place / "data" / "images" / camera.name) for camera in views]
+    files = {}
+    segmenters = [
+        tiny_segmenter(tmp_path), tiny_segmenter(tmp_path, box_threshold=0.3),
+        tiny_segmenter(tmp_path, sam_seed=3), load_segmenter("clip-parts"),
+    ]  # fmt: skip
+    for segmenter in segmenters:
+        for text in ("bear", "Bear", "a bear / b"):
+            folder = words_folder(tmp_path / "edit", segmenter, text)
+            assert folder not in files
+            files[folder] = segmenter, text
+    assert len({folder.parent for folder in files}) == 1
+    for folder, (segmenter, text) in list(files.items())[:4]:
+        _, kept = masks_by_words(segmenter, text, views, images, folder, SILENT)
+        assert kept == 0
+    for folder, (segmenter, text) in list(files.items())[:4]:
+        _, kept = masks_by_words(segmenter, text, views, images, folder, SILENT)
+        assert kept == len(views)
+
+
+def tiny_segmenter(folder, *, sam_seed=2, **thresholds):
+    save_dino(folder / "dino")
+    save_sam(folder / f"sam{sam_seed}", seed=sam_seed)
+    return GroundedSam.from_folders(folder / "dino", folder / f"sam{sam_seed}", **thresholds)
+
+
+def test_words_that_no_view_shows_are_one_clear_line(place, tmp_path):
+    for _ in range(2):  # kept masks say no more
+        result = run(place, tmp_path, "--ply", place / "splats.ply", "--where", "snowman")
+        assert result.exit_code == 2
+        assert "no 'snowman' was detected in view images/v0.png or any other" in result.output
+    assert not (tmp_path / "edited.ply").exists()
+
+
+def test_a_view_that_does_not_show_the_words_is_named_and_has_an_empty_mask(tmp_path):
+    """Oracle: a segmenter that knows which picture shows something."""
+
+    class Bright:
+        def segment(self, image, words):
+            if image.max() < 0.5:
+                raise NoDetectionError(words)
+            return np.asarray(image[..., 0] > 0.5)
+
+    views = cameras()[:3]
+    images = [np.zeros((camera.height, camera.width, 3), np.float32) for camera in views]
+    images[1][4:9, 5:7] = 1
+    arguments = (Bright(), "bear", views, images, tmp_path, SILENT)
+    for kept in (0, 3):
+        masks, again = masks_by_words(*arguments)
+        assert again == kept
+        assert [int(mask.sum()) for mask in masks] == [0, 10, 0]
+    said = []
+    command._say_empty(masks, views, lambda n: f"{n} views", said.append)
+    assert said == [f"2 of 3 views, so nothing is edited in {views[0].name}, {views[2].name}"]
+
+
+def test_a_folder_of_another_edit_is_one_clear_line(place, tmp_path):
+    ply = ("--ply", place / "splats.ply")
+    assert run(place, tmp_path, *ply).exit_code == 0
+    result = run(place, tmp_path, *ply, instruction="a robot")
+    assert result.exit_code == 2
+    assert 'instruction ("a bear", now "a robot")' in result.output
+    assert "name another folder" in result.output
+
+
+def test_the_commands_help_names_every_preset():
+    text = runner.invoke(app, ["edit", "--help"], env={"COLUMNS": "300"}).output
+    joined = re.sub(r"[│\s]", "", text)
+    for name in PRESETS["attention_warping"]:
+        assert name in joined
+
+
+@pytest.mark.parametrize("which", ["source", "view"])
+def test_a_damaged_picture_of_a_cut_off_edit_is_made_again(which, place, tmp_path):
+    """Oracle: the bytes of the whole edit."""
+    ply = ("--ply", place / "splats.ply")
+    assert run(place, tmp_path, *ply).exit_code == 0
+    first = sorted((tmp_path / "rounds/2").glob("*.png"))[0]
+    picture = first if which == "view" else tmp_path / "rounds/1/v0.png"
+    names = (picture, picture.with_suffix(".json"), tmp_path / "edited.ply")
+    whole = [path.read_bytes() for path in names]
+    picture.write_bytes(whole[0][:40])
+    (tmp_path / "result.json").unlink()
+    result = run(place, tmp_path, *ply)
+    assert result.exit_code == 0
+    assert f"{picture.name}: missing or damaged; the view is edited again" in result.stderr
+    assert [path.read_bytes() for path in names] == whole
+
+
+def test_a_refused_edit_leaves_the_masks_of_the_edit_that_is_there(place, tmp_path):
+    ply = ("--ply", place / "splats.ply")
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    half = np.zeros((32, 32, 3), np.uint8)
+    half[:, :16] = 255
+    for camera in cameras():
+        (masks / camera.name).write_bytes(encode_png(half))
+    assert run(place, tmp_path / "out", *ply, "--masks", masks).exit_code == 0
+    stored = {p.name: p.read_bytes() for p in (tmp_path / "out" / "segments").iterdir()}
+    assert stored == {camera.name: encode_png(half) for camera in cameras()}
+    save_dino(tmp_path / "dino")
+    save_sam(tmp_path / "sam", seed=2)
+    segmenter = ("--segmenter", f"{tmp_path / 'dino'},{tmp_path / 'sam'}")
+    result = run(place, tmp_path / "out", *ply, "--where", "bear", *segmenter)
+    assert result.exit_code == 2
+    assert "holds an edit of other inputs.segments" in result.output
+    assert {p.name: p.read_bytes() for p in (tmp_path / "out" / "segments").iterdir()} == stored
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_and_started_again_leaves_the_same_bytes(place, tmp_path):
+    def command(out):
+        arguments = [
+            "edit", place / "data", "--instruction", "a bear", "--editor", place / "editor", "--out", out, "--ply",
+            place / "splats.ply", *QUICK, "--iterations", 60,
+        ]  # fmt: skip
+        return [sys.executable, "-m", "attnwarp.cli.main", *map(str, arguments)]
+
+    def files(out):
+        # The page shows the seconds.
+        skipped = {"times.json", "index.html"}
+        paths = [path for path in sorted(Path(out).rglob("*")) if path.is_file()]
+        return {str(p.relative_to(out)): p.read_bytes() for p in paths if p.name not in skipped}
+
+    subprocess.run(command(tmp_path / "whole"), check=True, capture_output=True)
+    expected = files(tmp_path / "whole")
+    marks = ["manifest.json", "rounds/1/v0.json", "rounds/1/.*json", "rounds/1.pt", "rounds/2.ply"]
+    for mark in marks:
+        process = subprocess.Popen(command(tmp_path / "killed"), stderr=subprocess.DEVNULL)
+        while process.poll() is None:
+            names = [
+                p.relative_to(tmp_path / "killed").as_posix()
+                for p in (tmp_path / "killed").rglob("*")
+            ]
+            if any(re.fullmatch(mark, name) for name in names):
+                os.kill(process.pid, signal.SIGKILL)
+            time.sleep(0.005)
+    subprocess.run(command(tmp_path / "killed"), check=True, capture_output=True)
+    assert files(tmp_path / "killed") == expected

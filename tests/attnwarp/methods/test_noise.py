@@ -1,0 +1,102 @@
+"""Oracles: a loop over pixels, and the standard normal."""
+
+import math
+
+import numpy as np
+import torch
+
+from attnwarp.methods.noise import carried, unmoved
+
+SIZE = 8
+
+
+def positions(seed):
+    """Random places, some outside and some undefined; a zoom, so that many fall into one pixel."""
+    random = np.random.default_rng(seed)
+    xy = random.uniform(-0.5, SIZE * 0.6, (SIZE, SIZE, 2))
+    xy[random.random((SIZE, SIZE)) < 0.1] = np.nan
+    return torch.from_numpy(xy)
+
+
+def setting():
+    """Two sources, the second with noise of the first, and a target's places and choice."""
+    first = unmoved((SIZE, SIZE))
+    second = carried([first], [positions(7)], torch.zeros_like(first))
+    choice = torch.from_numpy(np.random.default_rng(3).integers(-1, 2, (SIZE, SIZE)))
+    return [first, second], [positions(8), positions(9)], choice
+
+
+def test_each_pixel_takes_its_sources_value_unless_a_nearer_one_does_by_a_loop():
+    sources, places, choice = setting()
+    result = carried(sources, places, choice).tolist()
+    wanted = {}
+    for row in range(SIZE):
+        for column in range(SIZE):
+            k = int(choice[row, column])
+            if k < 0:
+                continue
+            x, y = (float(v) for v in places[k][row, column])
+            if not (0 <= x <= SIZE and 0 <= y <= SIZE):
+                continue
+            i, j = min(math.floor(y), SIZE - 1), min(math.floor(x), SIZE - 1)
+            distance = (x - j - 0.5) ** 2 + (y - i - 0.5) ** 2
+            value = int(sources[k][i, j])
+            if value not in wanted or distance < wanted[value][0]:
+                wanted[value] = distance, (row, column)
+    taken = {place: value for value, (_, place) in wanted.items()}
+    assert 10 < len(taken) < 50
+    rest = sorted(set(range(SIZE**2)) - set(taken.values()))
+    for row in range(SIZE):
+        for column in range(SIZE):
+            own = row * SIZE + column
+            if (row, column) in taken:
+                assert result[row][column] == taken[row, column]
+            elif own in rest:
+                assert result[row][column] == own
+                rest.remove(own)
+    others = [
+        result[p // SIZE][p % SIZE]
+        for p in range(SIZE**2)
+        if (p // SIZE, p % SIZE) not in taken and result[p // SIZE][p % SIZE] != p
+    ]
+    assert others == rest  # in their order
+    assert len(others) > 5
+
+
+def test_every_value_stands_once_in_a_view():
+    assert carried(*setting()).flatten().sort().values.tolist() == list(range(SIZE**2))
+
+
+def test_a_view_at_the_sources_place_has_the_sources_noise():
+    order = carried([unmoved((SIZE, SIZE))], [positions(7)], torch.zeros(SIZE, SIZE).long())
+    y, x = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
+    here = torch.stack([x, y], dim=-1).double()
+    assert torch.equal(carried([order], [here], torch.zeros(SIZE, SIZE).long()), order)
+
+
+def draws(count):
+    random = torch.Generator().manual_seed(0)
+    return torch.randn((count, SIZE**2), generator=random, dtype=torch.float64)
+
+
+def test_the_noise_of_a_view_is_white_with_unit_variance():
+    """400 draws of one geometry against the standard normal, at least 5 standard deviations wide."""
+    count = 400
+    rows = draws(count)[:, carried(*setting()).flatten()].numpy()
+    assert abs(rows.mean()) < 5 / math.sqrt(rows.size)
+    assert abs(rows.var() - 1) < 5 * math.sqrt(2 / rows.size)
+    # Pixel by pixel the sum of squares is chi-squared with ``count`` degrees of freedom.
+    assert np.abs((rows**2).sum(axis=0) - count).max() < 5.5 * math.sqrt(2 * count)
+    # Correlations between all pairs of pixels: mean 0, variance 1 / count each.
+    correlation = rows.T @ rows / count
+    off = correlation[~np.eye(len(correlation), dtype=bool)]
+    assert np.abs(off).max() < 6.5 / math.sqrt(count)
+    assert abs((off**2).mean() * count - 1) < 5 * math.sqrt(2 / (off.size / 2))
+
+
+def test_interpolated_noise_would_fail_that_test():
+    """The test's power: bilinear noise at half a pixel has a variance of 1/4 (closed form)."""
+    rows = draws(400).numpy().reshape(-1, SIZE, SIZE)
+    half = (rows[:, :-1, :-1] + rows[:, 1:, :-1] + rows[:, :-1, 1:] + rows[:, 1:, 1:]) / 4
+    assert abs(half.var() - 0.25) < 0.02
+    assert abs(half.var() - 1) > 5 * math.sqrt(2 / half.size)

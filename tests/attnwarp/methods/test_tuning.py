@@ -1,0 +1,213 @@
+"""Oracles: the order written out, finite differences, a picture's own loss."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tiny_scenes import cameras, pictures, splats
+
+from attnwarp import Camera
+from attnwarp.encoders import load_encoder
+from attnwarp.methods import preset
+from attnwarp.methods.attention_warping import released_order
+from attnwarp.methods.scene import near_of, render_picture
+from attnwarp.methods.tuning import DistanceToViews, TrainingView, Tuning
+from attnwarp.render import render
+from attnwarp.workdir import Workdir
+
+SETTINGS = preset("attention_warping", iterations=40)
+
+
+def views_of(count, size=32):
+    place = cameras(1)[0]
+    return [TrainingView(k, place, np.zeros((size, size, 3), np.float32)) for k in range(count)]
+
+
+def visited(count, order=None, iterations=400):
+    tuning = Tuning(splats(), cameras(), replace(SETTINGS, perceptual=0.0), iterations)
+    views, seen = views_of(count), []
+    tuning._iterate = lambda view: (
+        seen.append(view.number),
+        setattr(tuning, "iteration", len(seen)),
+    )
+    tuning.advance(0, iterations, views, order)
+    return seen
+
+
+def test_the_released_order_never_visits_four_of_forty_views():
+    # The source is view 0 of those that are tuned on.
+    order = visited(41, released_order(40))
+    assert order == [0 if step % 10 == 0 else 1 + step % 40 for step in range(400)]
+    assert set(range(1, 41)) - set(order) == {1, 11, 21, 31}
+
+
+def test_otherwise_every_view_is_visited_once_in_each_round():
+    order = visited(40)
+    for start in range(0, 400, 40):
+        assert sorted(order[start : start + 40]) == list(range(40))
+    assert order[:40] != order[40:80]
+
+
+def test_splats_that_lie_elsewhere_than_in_main_memory_are_refused():
+    start = splats()
+    object.__setattr__(start, "means", start.means.to("meta"))  # a device without a GPU
+    with pytest.raises(ValueError, match="lie on meta, but are fitted and tuned on the CPU"):
+        Tuning(start, cameras(), SETTINGS, 1)
+
+
+def test_tuning_recolours_the_scene_to_its_pictures():
+    start, views = splats(), cameras()
+    goal = replace(start, sh=start.sh.flip(-1))  # red and blue exchanged
+    training = [
+        TrainingView(k, camera, picture)
+        for k, (camera, picture) in enumerate(zip(views, pictures(goal, views), strict=True))
+    ]
+    tuning = Tuning(start, views, replace(SETTINGS, color_rate=20.0), 250)
+
+    def error():
+        return sum(
+            float((render(tuning.gaussians(), v.camera).color - torch.from_numpy(v.picture)).abs().mean())
+            for v in training
+        )  # fmt: skip
+
+    before = error()
+    tuning.advance(0, 250, training)
+    assert error() < 0.3 * before
+    assert sum(tuning.visits.values()) == 250
+
+
+def test_without_a_geometry_rate_only_colours_move():
+    start, views = splats(), cameras()
+    settings = replace(SETTINGS, geometry_rate=0.0)
+    tuning = Tuning(start, views, settings, 1)
+    tuning.advance(0, 5, views_of(3))
+    result = tuning.gaussians()
+    assert torch.equal(result.means, start.means)
+    assert torch.equal(result.quats, start.quats)
+    assert torch.allclose(result.scales, start.scales, rtol=1e-6, atol=0)  # through a logarithm
+    assert not torch.equal(result.sh, start.sh)
+
+
+def test_the_perceptual_loss_is_the_distance_and_its_gradient_is_the_slope():
+    net = load_encoder("perceptual-small", "perceptual")
+    random = torch.Generator().manual_seed(0)
+    image, target, way = (torch.rand((32, 24, 3), generator=random) for _ in range(3))
+    assert float(net.loss(image, target)) == pytest.approx(
+        net.distance([image.numpy()], [target.numpy()])[0], rel=1e-5
+    )
+    assert float(net.loss(target, target)) == 0
+    net.net.double()
+    try:
+        x = image.double().requires_grad_(True)
+        net.loss(x, target.double()).backward()
+        slope = float((x.grad * way).sum())
+        step = 1e-5
+        ahead, behind = (
+            float(net.loss(x.detach() + s * way, target.double())) for s in (step, -step)
+        )
+        # ReLU has kinks; along so short a step few are crossed.
+        assert slope == pytest.approx((ahead - behind) / (2 * step), rel=1e-3)
+    finally:
+        net.net.float()
+
+
+class Counting:
+    """A perceptual distance that counts the pictures that go through its network."""
+
+    def __init__(self):
+        self.net, self.pictures = load_encoder("perceptual-small", "perceptual"), 0
+
+    def features(self, picture):
+        self.pictures += 1
+        return self.net.features(picture)
+
+    def between(self, image, target):
+        return self.net.between(image, target)
+
+
+@pytest.mark.parametrize(("kept", "passes"), [(2**30, 3), (2**18, 9), (0, 12)])
+def test_a_views_picture_goes_through_the_network_once_while_it_fits(kept, passes):
+    net, random = Counting(), torch.Generator().manual_seed(1)
+    place = cameras(1)[0]
+    views = [
+        TrainingView(k, place, torch.rand((32, 32, 3), generator=random).numpy()) for k in range(3)
+    ]
+    distance = DistanceToViews(net, kept)
+    for _ in range(4):
+        for view in views:
+            render = torch.rand((32, 32, 3), generator=random).requires_grad_(True)
+            found = distance(render, view)
+            expected = net.net.loss(render, torch.from_numpy(view.picture))
+            assert torch.equal(found, expected)
+            slopes = [torch.autograd.grad(value, render)[0] for value in (found, expected)]
+            assert torch.equal(*slopes)
+    # Of 32 x 32 px features have 205 kB: one view's fit into the middle bound.
+    assert net.pictures == 12 + passes
+
+
+def test_features_of_a_view_go_with_it():
+    net = Counting()
+    distance = DistanceToViews(net)
+    picture = torch.zeros((32, 32, 3))
+    for number in range(3):
+        distance(picture, TrainingView(number, cameras(1)[0], picture.numpy()))
+        assert len(distance._kept) == 0
+    assert net.pictures == 6
+
+
+@pytest.mark.parametrize("unit", [2.0**-12, 2.0**12])
+def test_views_from_one_place_are_drawn_and_tuned_alike_in_any_unit(unit):
+    """Powers of two leave every digit as it is."""
+    position = cameras(1)[0].position
+
+    def tuned(k):
+        start = replace(splats(), means=k * splats().means, scales=k * splats().scales)
+        view = Camera.look_at(k * position, (0, 0, 0), width=32, height=32, fov_y=40, up=(0, 1, 0))
+        target = TrainingView(0, view, np.zeros((32, 32, 3), np.float32))
+        tuning = Tuning(start, [view], replace(SETTINGS, perceptual=0.0), 3)
+        tuning.advance(0, 3, [target])
+        return render_picture(start, view, near_of([view], start), "auto"), tuning.gaussians()
+
+    (drawn, one), (other_drawn, other) = tuned(1.0), tuned(unit)
+    assert drawn.max() > 0.2
+    np.testing.assert_allclose(other_drawn, drawn, atol=1e-5)
+    assert float((one.sh - splats().sh).abs().max()) > 1e-3
+    torch.testing.assert_close(other.sh, one.sh, rtol=0, atol=1e-5)
+    torch.testing.assert_close(other.means / unit, one.means, rtol=0, atol=1e-5)
+
+
+def test_geometry_of_rate_0_stays_however_large():
+    start, (view, *_) = replace(splats(), scales=splats().scales.clone()), views_of(1)
+    start.scales[0] = 1e7
+    settings = replace(SETTINGS, geometry_rate=0.0, perceptual=0.0)
+    tuning = Tuning(start, cameras(), settings, 2)
+    tuning.advance(0, 2, [view])
+    torch.testing.assert_close(tuning.gaussians().scales, start.scales, rtol=1e-5, atol=0)
+
+
+FAR = np.array([1e6, -2e6, 5e5])
+
+
+def test_a_checkpoint_gives_the_centres_that_it_was_written_with(tmp_path):
+    """Oracle: the start."""
+    start = splats().to(dtype=torch.float64)
+    start = replace(start, means=start.means + torch.from_numpy(FAR))
+    views = [camera.moved(FAR) for camera in cameras()]
+    folder = Workdir(tmp_path, "an edit")
+    folder.save("1.pt", Tuning(start, views, SETTINGS, 1).state())
+    tuning = Tuning(start, views, SETTINGS, 1)
+    tuning.restore(folder, "1.pt")
+    # float32 has a step of 0.125 at 2e6.
+    error = np.abs(tuning.gaussians().world_means() - start.world_means()).max()
+    assert error < 1e-6
+
+
+def test_a_checkpoint_of_another_origin_brings_its_own(tmp_path):
+    start = splats()
+    moved = replace(start, origin=FAR)
+    folder = Workdir(tmp_path, "an edit")
+    folder.save("1.pt", Tuning(moved, [c.moved(FAR) for c in cameras()], SETTINGS, 1).state())
+    tuning = Tuning(start, cameras(), SETTINGS, 1)
+    tuning.restore(folder, "1.pt")
+    assert np.array_equal(tuning.gaussians().world_means(), moved.world_means())
