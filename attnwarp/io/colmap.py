@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import struct
 import warnings
 from collections.abc import Iterator, Sequence
@@ -110,7 +111,8 @@ def read_colmap(
             the cameras are resized to its pictures.
 
     Warns:
-        InputWarning: another model beside ``sparse/0`` has more images.
+        InputWarning: another model beside ``sparse/0`` has more images; the head of a text file
+            counts other entries than it holds.
 
     Raises:
         FileNotFoundError: no model there.
@@ -435,6 +437,7 @@ def _text_cameras(path: Path) -> dict[int, _Intrinsics]:
             raise _damaged(path, number, line, f"{count} parameters for {model}")
         _once(path, intrinsics, camera)
         intrinsics[camera] = lens
+    _warn_of_count(path, "cameras", len(intrinsics))
     return intrinsics
 
 
@@ -450,15 +453,20 @@ def _text_images(path: Path) -> list[_Pose]:
             raise _damaged(
                 path, number, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
             ) from error
+        if _ends_in_keypoints(poses[-1].name):
+            raise _damaged(
+                path, number, line, "the keypoints on a line of their own; a line end is missing"
+            )
         # The line after it holds the keypoints and may be empty, or missing at the end.
         number, line = next(lines, (number, ""))
-        if _is_image(line):
+        if _is_image(line) or _holds_image(line):
             raise _damaged(
                 path,
                 number,
                 line,
                 "the keypoints X Y POINT3D_ID of the image before, or an empty line for none",
             )
+    _warn_of_count(path, "images", len(poses))
     return poses
 
 
@@ -482,6 +490,22 @@ def _is_image(line: str) -> bool:
     return len(others) < 2 or not (_is_number(first) and _is_number(name.rsplit(maxsplit=1)[-1]))
 
 
+def _holds_image(line: str) -> bool:
+    """Whether keypoints are followed by the next image, for want of a line end: numbers, more than
+    stand before an image's name, and then a name.
+    """
+    leading = len(list(itertools.takewhile(_is_number, line.split())))
+    return leading >= 8 and leading < len(line.split())
+
+
+def _ends_in_keypoints(name: str) -> bool:
+    """Whether keypoints follow an image's name, for want of a line end: X Y POINT3D_ID in threes,
+    the first X perhaps at one with the name.
+    """
+    _, *others = name.split()
+    return len(others) >= 2 and len(others) % 3 != 1 and all(map(_is_number, others))
+
+
 def _is_number(text: str) -> bool:
     try:
         float(text)
@@ -496,14 +520,39 @@ def _text_points(path: Path) -> tuple[Array, npt.NDArray[np.uint8]]:
         if not line:
             continue
         try:
-            _, x, y, z, red, green, blue, *_ = line.split()
+            _, x, y, z, red, green, blue, *rest = line.split()
+            _check_track(rest)
             points.append((float(x), float(y), float(z)))
             colors.append((int(red), int(green), int(blue)))
             if not all(0 <= value <= 255 for value in colors[-1]):
                 raise ValueError(colors[-1])
         except ValueError as error:
             raise _damaged(path, number, line, "POINT3D_ID X Y Z R G B ERROR TRACK[]") from error
+    _warn_of_count(path, "points", len(points))
     return _points(path, points, colors)
+
+
+def _check_track(fields: Sequence[str]) -> None:
+    """Refuse what is no ERROR and TRACK[], pairs of IMAGE_ID and POINT2D_IDX: where a line end is
+    missing, the next point stands there.
+    """
+    track = fields[1:]
+    if not all(map(_is_number, fields[:1])) or len(track) % 2 or not all(map(str.isdecimal, track)):
+        raise ValueError(fields)
+
+
+def _warn_of_count(path: Path, noun: str, count: int) -> None:
+    """Say where the head of a text file counts other entries than it holds."""
+    with path.open(encoding="utf-8", errors="surrogateescape") as lines:
+        head = "".join(itertools.takewhile(lambda line: line.startswith("#"), lines))
+    stated = re.search(rf"Number of {noun}: *(\d+)", head)
+    if stated and int(stated[1]) != count:
+        warnings.warn(
+            f"{path}: its head counts {stated[1]} {noun}, and {count} are there; unless entries"
+            " were removed on purpose, a line end is missing or the file breaks off",
+            InputWarning,
+            stacklevel=4,
+        )
 
 
 def _points(

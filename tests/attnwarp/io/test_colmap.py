@@ -278,6 +278,36 @@ def test_keypoints_of_any_form_are_skipped(tmp_path, keypoints):
     assert [camera.name for camera in cameras] == ["1.png", "2.png"]
 
 
+@pytest.mark.parametrize("joined", ["", " "])
+@pytest.mark.parametrize("head", [True, False], ids=["head", "bare"])
+@pytest.mark.parametrize("name", ["cameras.txt", "images.txt", "points3D.txt"])
+def test_no_line_end_is_lost_in_silence(tmp_path, name, head, joined):
+    """Oracle: the model before a line end was lost, with and without COLMAP's head."""
+    points = [*POINTS, (9, (1.5, 2, 3), (4, 5, 6), 0)]
+    expected = everything(read_colmap(write_text(tmp_path, points=points), missing_images="none"))
+    file = tmp_path / name
+    lines = [line for line in file.read_text().splitlines() if not line.startswith("#")]
+    if head:
+        noun = name.removesuffix("3D.txt").removesuffix(".txt")
+        count = {"cameras": len(CAMERAS), "images": len(poses()), "points": len(points)}[noun]
+        lines = ["# A list", f"# Number of {noun}: {count}, a mean of 1", *lines]
+    for i in range(1, len(lines)):
+        joint = [*lines[: i - 1], lines[i - 1] + joined + lines[i], *lines[i + 1 :]]
+        file.write_text("\n".join(joint) + "\n")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", InputWarning)
+            try:
+                result = everything(read_colmap(tmp_path, missing_images="none"))
+            except (FileFormatError, InputWarning) as error:
+                assert name in str(error) or name == "cameras.txt"
+                continue
+        assert result == expected, joint[i - 1]
+
+
+def everything(data):
+    return [camera.to_dict() for camera in data.cameras], data.points.tolist(), data.colors.tolist()
+
+
 def test_an_empty_text_file_of_points_holds_none_and_an_empty_binary_one_is_damaged(tmp_path):
     (write_text(tmp_path / "text") / "points3D.txt").write_bytes(b"")
     data = read_dataset(tmp_path / "text", missing_images="none")
