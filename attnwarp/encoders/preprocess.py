@@ -7,7 +7,6 @@ pipelines round to 8 bits before and after it, which would turn differences belo
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp import check
 from attnwarp.errors import InputError
 
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
@@ -24,6 +24,10 @@ _FILES = ("preprocessor_config.json", "processor_config.json")
 _FAMILIES = ("CLIPImageProcessor", "CLIPFeatureExtractor", "BitImageProcessor")
 _FILTERS = {0: "nearest", 1: "Lanczos", 2: "bilinear", 3: "bicubic", 4: "box", 5: "Hamming"}
 """Pillow's numbers of its filters, as the file stores them."""
+
+LEAST, MOST = 1e-4, 1e4
+"""Of deviations, and of any number here: those of published encoders are 0.2 to 1, or 255 times so
+much. Beyond, all pictures look alike in float32."""
 
 
 @dataclass(frozen=True)
@@ -157,31 +161,30 @@ def read_preprocessing(folder: Path) -> Preprocessing:
         raise InputError(
             f"{path}: image_processor_type is {family!r}, expected one of {', '.join(_FAMILIES)}"
         )
-    if config.get("do_pad"):
+    if config.get("do_pad") not in (None, False):
         raise InputError(
-            f"{path}: do_pad is true, which is not supported; encoders that pad are not known here"
+            f"{path}: do_pad is set, which is not supported; encoders that pad are not known here"
         )
-    normalise = config.get("do_normalize", True)
     try:
+        normalise = _flag(config, "do_normalize")
         rescale = 1.0
-        if config.get("do_rescale", True):
+        if _flag(config, "do_rescale"):
             factor = config.get("rescale_factor", 1 / 255)
-            number = isinstance(factor, int | float) and not isinstance(factor, bool)
-            if not number or not 0 < factor < math.inf:
-                raise ValueError(f"rescale_factor is {factor!r}, expected a number above 0")
+            if not check.is_number(factor) or not 0 < factor <= 1:
+                raise ValueError(
+                    f"rescale_factor is {factor!r}, expected a number above 0, up to 1"
+                )
             rescale = float(factor)
         return Preprocessing(
             resize=_size(config.get("size", 224), edge=True)
-            if config.get("do_resize", True)
+            if _flag(config, "do_resize")
             else None,
             resample=_resample(config.get("resample", 3)),
-            crop=_pair(config.get("crop_size", 224))
-            if config.get("do_center_crop", True)
-            else None,
+            crop=_pair(config.get("crop_size", 224)) if _flag(config, "do_center_crop") else None,
             # The file's factor is for values of 0 to 255. A rounded 1/255 must give exactly 1.
             scale=1.0 if abs(rescale * 255 - 1) < 1e-6 else rescale * 255,
-            mean=_three(config.get("image_mean", CLIP_MEAN)) if normalise else (0.0, 0.0, 0.0),
-            std=_three(config.get("image_std", CLIP_STD)) if normalise else (1.0, 1.0, 1.0),
+            mean=_three(config, "image_mean", CLIP_MEAN, -MOST) if normalise else (0.0, 0.0, 0.0),
+            std=_three(config, "image_std", CLIP_STD, LEAST) if normalise else (1.0, 1.0, 1.0),
         )
     except (TypeError, ValueError, KeyError) as error:
         raise InputError(
@@ -230,8 +233,20 @@ def _resample(value: Any) -> int:
     return int(value)
 
 
-def _three(values: Any) -> tuple[float, ...]:
-    three = tuple(float(value) for value in values)
-    if len(three) != 3 or not np.isfinite(three).all():
-        raise ValueError(f"{values} is not one number for each of three channels")
-    return three
+def _flag(config: dict[str, Any], key: str) -> bool:
+    """The value of a step's key; True where it is left out."""
+    value = config.get(key, True)
+    if not isinstance(value, bool):
+        raise ValueError(f"{key} is {value!r}, expected true or false")
+    return value
+
+
+def _three(
+    config: dict[str, Any], key: str, default: tuple[float, ...], least: float
+) -> tuple[float, ...]:
+    """One number for each channel."""
+    values = config.get(key, default)
+    entries = values if isinstance(values, list | tuple) else [values]
+    if len(entries) != 3 or not all(check.is_number(v) and least <= v <= MOST for v in entries):
+        raise ValueError(f"{key} is {values!r}, expected three numbers of {least:g} to {MOST:g}")
+    return tuple(map(float, entries))
