@@ -136,11 +136,15 @@ def step_report(cells: int, root: Path) -> int:
 
 
 def step_compare(cells: int, root: Path) -> int:
-    """Compare the run with itself, read twice."""
-    from attnwarp_eval.cli.compare import compare
+    """Compare the run with itself, read twice, as the command does for two runs."""
+    from attnwarp_eval.canonical_json import write_json
+    from attnwarp_eval.compare import compare, read_snapshot
+    from attnwarp_eval.compare.write import as_json
 
+    comparison = compare(read_snapshot(Store(root)), read_snapshot(Store(root)))
+    assert not comparison.regressed, comparison.faults[:1]
     result = root / "compare.json"
-    compare(root, root, json=result)
+    write_json(result, as_json(comparison))
     return result.stat().st_size
 
 
@@ -169,8 +173,14 @@ def one_step(name: str, cells: int, root: Path) -> dict[str, float]:
     }
 
 
-def measure(counts: Sequence[int], folder: Path) -> Iterator[tuple[int, str, dict[str, float]]]:
-    """Every step at every count, each in a process of its own."""
+Row = tuple[int, str, dict[str, float] | None]
+"""Cells, a step, and what it took; None where it failed."""
+
+
+def measure(counts: Sequence[int], folder: Path) -> Iterator[Row]:
+    """Every step at every count, each in a process of its own. One that fails ends none of the
+    others, and its error is on the terminal.
+    """
     for cells in counts:
         root = folder / f"run{cells}"
         for name in STEPS:
@@ -179,13 +189,13 @@ def measure(counts: Sequence[int], folder: Path) -> Iterator[tuple[int, str, dic
                 [*command, "--cells", str(cells), "--folder", str(root)],
                 stdout=subprocess.PIPE,
                 text=True,
-                check=True,
             )
-            yield cells, name, json.loads(done.stdout.splitlines()[-1])
-        shutil.rmtree(root)
+            values = None if done.returncode else json.loads(done.stdout.splitlines()[-1])
+            yield cells, name, values
+        shutil.rmtree(root, ignore_errors=True)  # no folder where the first step failed
 
 
-def table(rows: Sequence[tuple[int, str, dict[str, float]]]) -> str:
+def table(rows: Sequence[Row]) -> str:
     """A row a step; CPU seconds, wall seconds and MiB at each count."""
     counts = sorted({cells for cells, _, _ in rows})
     by_key = {(cells, name): values for cells, name, values in rows}
@@ -195,7 +205,9 @@ def table(rows: Sequence[tuple[int, str, dict[str, float]]]) -> str:
     ]
     for name in dict.fromkeys(name for _, name, _ in rows):
         entries = [
-            "{cpu:.1f} s, {wall:.1f} s, {mb:.0f} MiB".format(**by_key[cells, name])
+            "failed"
+            if (values := by_key[cells, name]) is None
+            else "{cpu:.1f} s, {wall:.1f} s, {mb:.0f} MiB".format(**values)
             for cells in counts
         ]
         lines.append(f"| {name} | " + " | ".join(entries) + " |")
@@ -305,10 +317,10 @@ def main() -> None:
         print(json.dumps(one_step(arguments.step, arguments.cells[0], arguments.folder)))
         return
     with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
+        rows: list[Row] = []
         if arguments.cluster:
             text = cluster(arguments.cluster, Path(folder), arguments.wait)
         else:
-            rows = []
             for row in measure(arguments.cells, Path(folder)):
                 print(*row, flush=True)
                 rows.append(row)
@@ -316,6 +328,9 @@ def main() -> None:
     print(text)
     if arguments.out:
         write_atomic(arguments.out, (text + "\n").encode())
+    failed = [f"{name} at {cells:,} cells" for cells, name, values in rows if values is None]
+    if failed:
+        sys.exit(f"benchmarks.scale: failed: {', '.join(failed)}; the errors stand above")
 
 
 if __name__ == "__main__":

@@ -9,12 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import small_capture
 import torch
-from few_splats import few_splats
-
-from attnwarp import Camera
-from attnwarp.io import Dataset, write_ply, write_transforms
-from attnwarp.render import render
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = {"attnwarp": ROOT / "attnwarp", "attnwarp_eval": ROOT / "eval" / "attnwarp_eval"}
@@ -96,29 +92,7 @@ def modules_with_examples():
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """The working folder of a user: splats, a capture of eight views with points, and pictures."""
-    import cv2
-
-    splats = few_splats()
-    (tmp_path / "fits/mine").mkdir(parents=True)
-    for name in ("scene.ply", "point_cloud.ply", "fits/mine/splats.ply"):
-        write_ply(tmp_path / name, splats)
-    cameras, paths = [], []
-    for index, angle in enumerate(np.linspace(-0.5, 0.5, 8)):
-        camera = Camera.look_at(
-            [3 * np.sin(angle), -3 * np.cos(angle), 0.5], [0, 0, 0], width=64, height=48, fov_y=40
-        )
-        path = tmp_path / "images" / f"{index}.png"
-        path.parent.mkdir(exist_ok=True)
-        picture = render(splats, camera).color.clamp(0, 1).numpy()
-        cv2.imwrite(str(path), np.round(255 * picture[..., ::-1]).astype(np.uint8))
-        cameras.append(camera)
-        paths.append(path)
-    colors = np.full((60, 3), 128, np.uint8)
-    data = Dataset(cameras, paths, points=splats.means.numpy(), colors=colors)
-    write_transforms(tmp_path / "transforms.json", data)
-    for name in ("my_capture", "my-capture", "DATA", "capture"):
-        (tmp_path / name).symlink_to(tmp_path, target_is_directory=True)
+    small_capture.write(tmp_path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

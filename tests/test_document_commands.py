@@ -1,0 +1,232 @@
+"""Every shell command that the README and the documents name can be called as they write it.
+
+Oracles: the parsers of the commands themselves, the Makefile, pyproject.toml, and the files that are there. The
+cheap ones run.
+"""
+
+import argparse
+import importlib
+import itertools
+import re
+import shlex
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import small_capture
+import typer
+from typer.testing import CliRunner
+
+import attnwarp.cli.main
+import attnwarp_eval.cli.main
+from attnwarp_eval.study.study import shipped_studies
+
+ROOT = Path(__file__).parents[1]
+PAGES = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
+APPS = {"attnwarp": attnwarp.cli.main.app, "attnwarp-eval": attnwarp_eval.cli.main.app}
+SHELLS = ("sh", "bash", "shell", "console")
+
+
+def blocks(page, languages):
+    """The fenced blocks of a page in one of the languages."""
+    language, lines = None, []
+    for line in (ROOT / page).read_text().splitlines():
+        if not line.lstrip().startswith("```"):
+            lines.append(line)
+        elif language is None:
+            language, lines = line.strip()[3:].strip(), []
+        else:
+            if language in languages:
+                yield "\n".join(lines)
+            language = None
+
+
+def split(block):
+    """The commands of a block, as a shell splits them."""
+    lines = block.replace("\\\n", " ").splitlines()
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def parse(app, words, name):
+    """Parse a command line down to its last subcommand, as the command does before it acts."""
+    command = typer.main.get_command(app) if isinstance(app, typer.Typer) else app
+    context = command.make_context(name, list(words), resilient_parsing=False)
+    while hasattr(command, "resolve_command"):  # a group; typer may bring a click of its own
+        rest = [*context._protected_args, *context.args]
+        name, command, rest = command.resolve_command(context, rest)
+        context = command.make_context(name, rest, parent=context)
+    return context
+
+
+def check_own(program, words):
+    context = parse(APPS[program], [word.strip("[].") for word in words], program)
+    path = context.command_path.split()[1:]
+    if path == ["run"]:
+        study = context.params["study"]
+        assert study in shipped_studies() or study.endswith(".yaml")
+    for scene in ["bear"] if "bear" in words else []:
+        assert (ROOT / "scenes" / f"{scene}.yaml").is_file()
+
+
+def check_python(words, folder):
+    assert words[0] == "-m"
+    module = words[1]
+    assert (folder / Path(*module.split("."))).with_suffix(".py").is_file()
+    sys.path.insert(0, str(folder))
+    try:
+        found = importlib.import_module(module)
+    finally:
+        sys.path.remove(str(folder))
+    if hasattr(found, "app"):
+        parse(found.app, words[2:], module)
+        return
+    parsed = []
+
+    class ParsedError(Exception):
+        """Ends the program when its arguments are known to be right."""
+
+    def parse_args(self, *given, **options):
+        parsed.append(read(self, *given, **options))
+        raise ParsedError
+
+    read = argparse.ArgumentParser.parse_args
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(argparse.ArgumentParser, "parse_args", parse_args)
+        patch.setattr(sys, "argv", [module, *words[2:]])
+        with pytest.raises(ParsedError):
+            found.main()
+    assert parsed
+
+
+def check_dask(words):
+    kind = importlib.import_module(f"distributed.cli.dask_{words[0]}")
+    parse(kind.main, words[1:], "dask")
+
+
+def check_pip(words):
+    assert words[0] == "install"
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    for before, word in itertools.pairwise(words):
+        if before == "-c":
+            assert (ROOT / word).is_file()
+        if word.startswith(".["):
+            assert set(word[2:-1].split(",")) <= extras.keys()
+
+
+def check_make(words):
+    targets = re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text(), re.M)
+    assert set(words) <= set(targets)
+
+
+def check(program, rest, folder):
+    if program in APPS:
+        check_own(program, rest)
+    elif program == "python":
+        check_python(rest, folder)
+    else:
+        {"dask": check_dask, "pip": check_pip, "make": check_make}[program](rest)
+
+
+def problems(page):
+    """Commands of a page that cannot be called. ``cd`` counts for those that follow in its block; a
+    line of options alone goes on with the command above it.
+    """
+    before = []
+    for block in blocks(page, SHELLS):
+        folder = ROOT
+        for words in split(block):
+            while re.match(r"[A-Z_]+=", words[0]):
+                name, _, value = words.pop(0).partition("=")
+                if name == "PYTHONPATH" and not (ROOT / value).is_dir():
+                    yield f"{page}: {value}: no such folder"
+            if words[0].startswith("--"):
+                words = [*before, *words]
+            before = words
+            try:
+                if words[0] == "cd":
+                    folder = folder / words[1]
+                    assert folder.is_dir()
+                else:
+                    check(words[0].removeprefix("../.venv/bin/"), words[1:], folder)
+            except (Exception, SystemExit) as error:
+                yield f"{page}: {shlex.join(words)}: {error!r}"
+
+
+WITH_COMMANDS = [page for page in PAGES if any(blocks(page, SHELLS))]
+
+
+@pytest.mark.parametrize("page", WITH_COMMANDS)
+def test_every_command_of_a_page_can_be_called_as_it_stands_there(page):
+    assert list(problems(page)) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "attnwarp fit DATA --kinds 2dgs --out fits/bear",
+        "attnwarp-eval scene list",
+        "attnwarp-eval run quik",
+        "python -m benchmarks.scales --cells 1000",
+        "python -m benchmarks.scale --cell 1000 --clusters 3",
+        "cd evals",
+        "make tests",
+        "pip install '.[edit,evaluation]'",
+        "dask worker tcp://HOST:8786 --threads 4",
+        "PYTHONPATH=tests/helper attnwarp-eval studies",
+        "some-program --option",
+    ],
+)
+def test_a_command_that_cannot_be_called_is_found(line, tmp_path, monkeypatch):
+    page = tmp_path / "page.md"
+    page.write_text(f"```sh\n{line}    # as documents have it\n```\n")
+    assert len(list(problems(page))) == 1
+
+
+CHEAP = {
+    "README.md": [
+        "attnwarp render fits/mine/splats.ply my_capture --out fits/views",
+        "attnwarp convert fits/mine/splats.ply mine.splat",
+        "attnwarp undistort my_capture undistorted",
+        "attnwarp-eval scenes list",
+        "attnwarp-eval scenes edits bear",
+        "attnwarp-eval encoders",
+    ],
+    "docs/hard-cases.md": ["attnwarp-eval stability --list"],
+    "docs/studies.md": ["attnwarp-eval studies", "attnwarp-eval run my.yaml --dry-run"],
+    "docs/gate.md": [
+        "attnwarp-eval run study.yaml --out runs/before",
+        "attnwarp-eval compare baseline.jsonl runs/before --update",
+        "attnwarp-eval run study.yaml --out runs/after",
+        "attnwarp-eval compare baseline.jsonl runs/after --html compare.html",
+    ],
+}
+"""Commands that take seconds, in the order of their page."""
+
+TINY = """name: tiny
+size: 16
+scenes: [spheres]
+views: [yaw030]
+spp: 1
+splats: {count: 100}
+variants: {a: {}}
+probes: {depth: [a]}
+"""
+
+
+@pytest.mark.usefixtures("coarse_textures")
+@pytest.mark.parametrize("page", CHEAP)
+def test_cheap_commands_of_a_page_run_in_their_order(page, tmp_path, monkeypatch):
+    small_capture.write(tmp_path)
+    (tmp_path / "study.yaml").write_text(TINY)
+    (tmp_path / "my.yaml").write_text("".join(blocks("docs/studies.md", ("yaml",))))
+    monkeypatch.chdir(tmp_path)
+    named = [shlex.join(words) for block in blocks(page, SHELLS) for words in split(block)]
+    places = [named.index(line) for line in CHEAP[page]]
+    assert places == sorted(places)
+    for line in CHEAP[page]:
+        program, *rest = shlex.split(line)
+        done = CliRunner().invoke(APPS[program], rest)
+        assert done.exit_code == 0, (line, done.output)
