@@ -201,7 +201,9 @@ def _fit(
     shown = [] if test is None else [f"held_out/{stem}.png" for stem in file_stems(test.cameras)]
     check_inputs_stay((out / name for name in (*RESULTS, *shown)), dataset.image_paths)
     views = attnwarp.fit.load_views(train, max_size=max_size)
-    held_out = attnwarp.fit.load_views(test, max_size=max_size) if test is not None else None
+    held_out = None
+    if test is not None:
+        held_out = attnwarp.fit.load_views(test, max_size=max_size, damaged="error")
     if first is not None and start is not None:
         check_seen(start, first, train.cameras)
         warn_of_misfit(start, first, train)

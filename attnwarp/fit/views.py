@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -113,13 +113,19 @@ def _top(image: npt.NDArray[Any]) -> float:
     return float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else 1.0
 
 
-def load_views(dataset: Dataset, *, max_size: int | None = None) -> Views:
+def load_views(
+    dataset: Dataset,
+    *,
+    max_size: int | None = None,
+    damaged: Literal["warn", "error"] = "warn",
+) -> Views:
     """Read the pictures of a data set; cameras without one are left out.
 
     Args:
         dataset: see :func:`attnwarp.io.read_dataset`.
         max_size: longest side in px; larger pictures are averaged down to it, and their cameras
             with them.
+        damaged: "error" for pictures to measure on; see :func:`attnwarp.io.read_image`.
 
     Raises:
         FileFormatError: a picture that cannot be read, or of another size than its camera.
@@ -149,7 +155,7 @@ def load_views(dataset: Dataset, *, max_size: int | None = None) -> Views:
             raise FileFormatError(
                 path, "was taken through a lens that distorts; undistort the data set first"
             )
-        image = read_image(path)
+        image = read_image(path, damaged=damaged)
         if image.shape[:2] != (camera.height, camera.width):
             raise FileFormatError(
                 path,

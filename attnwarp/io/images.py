@@ -8,17 +8,22 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import struct
+import tempfile
+import threading
 import warnings
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp import check
+from attnwarp.errors import InputWarning
 from attnwarp.io.file import FileFormatError, existing_file
 
 IMAGE_SUFFIXES = (
@@ -83,7 +88,9 @@ def is_turned(path: str | os.PathLike[str]) -> bool:
     return asked in (5, 6, 7, 8)
 
 
-def read_image(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
+def read_image(
+    path: str | os.PathLike[str], *, damaged: Literal["warn", "error"] = "warn"
+) -> npt.NDArray[Any]:
     """(H, W, 3) or (H, W, 4) sRGB of a picture, in the depth and the orientation of the file.
 
     Grey becomes three equal channels. A camera's pose belongs to the pixels as stored, so an EXIF
@@ -91,9 +98,14 @@ def read_image(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
 
     Args:
         path: a picture of 8 or 16 bits a channel: PNG, JPEG, TIFF, WebP.
+        damaged: "error" to refuse a JPEG of which the decoder complains, as doors that measure do.
+            A JPEG has no checksum: some damage shows in the picture alone.
 
     Returns:
         uint8 or uint16; a fourth channel is straight (not premultiplied) alpha.
+
+    Warns:
+        InputWarning: what the decoder complains of in a JPEG, with ``damaged="warn"``.
 
     Raises:
         FileNotFoundError: no such file.
@@ -118,7 +130,10 @@ def read_image(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
         return rgba
     flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
     # Never by its path: OpenCV crashes at a name that is no UTF-8.
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    bits = np.frombuffer(data, np.uint8)
+    image, complaint = _with_complaint(lambda: cv2.imdecode(bits, flags) if data else None)
+    if complaint:
+        _report(path, complaint, damaged)
     if image is None:
         raise FileFormatError(path, "cannot be read as an image; replace it or leave it out")
     if image.dtype not in (np.uint8, np.uint16):
@@ -201,6 +216,47 @@ def _with_pillow(path: Path, use: Callable[[Any], Any], data: bytes | None = Non
         raise FileFormatError(
             path, f"the picture is damaged ({first}); replace it or leave it out"
         ) from None
+
+
+_COMPLAINT = re.compile(rb"^(?:Corrupt JPEG|Premature end|Inconsistent prog|Invalid ).*\n", re.M)
+"""Warnings of libjpeg (jerror.h) after which pixels are made up."""
+
+_STDERR = threading.Lock()
+
+
+def _with_complaint(decode: Callable[[], Any]) -> tuple[Any, str]:
+    """The result of ``decode``, and what libjpeg writes of it to the standard error: OpenCV hands
+    its warnings on in no other way. All else that is written meanwhile goes there afterwards.
+    """
+    with _STDERR, tempfile.TemporaryFile() as caught:
+        try:
+            stderr = os.dup(2)
+        except OSError:  # closed
+            return decode(), ""
+        os.dup2(caught.fileno(), 2)
+        try:
+            result = decode()
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            caught.seek(0)
+            written = caught.read()
+            if other := _COMPLAINT.sub(b"", written):
+                os.write(2, other)
+    found = _COMPLAINT.search(written)
+    return result, found[0].decode(errors="replace").strip() if found else ""
+
+
+def _report(path: Path, complaint: str, damaged: Literal["warn", "error"]) -> None:
+    """Warn of a damaged JPEG, or refuse it."""
+    message = (
+        f"{path}: the picture is damaged (the decoder says: {complaint}), so parts of it may be"
+        " wrong; get it again whole or leave it out, or, if it looks right, save it anew"
+    )
+    check.one_of(damaged, ("warn", "error"), "damaged")
+    if damaged == "error":
+        raise FileFormatError(path, message.removeprefix(f"{path}: "))
+    warnings.warn(message, InputWarning, stacklevel=3)
 
 
 def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8 | np.uint16] | None:

@@ -162,7 +162,7 @@ def _run_on_capture(
             dataset = read_dataset(data, points=False, scale=scale)
         except (FileNotFoundError, ValueError) as error:
             raise InputError(f"--data: {error}") from None
-        views = load_views(dataset, max_size=size)
+        views = load_views(dataset, max_size=size, damaged="error")
         with progress(lines=True) as show, resumable(lambda: "finished edits are kept"):
             result = captured.compare(
                 loaded,

@@ -277,13 +277,13 @@ def read_picture(path: Path, background: Sequence[float] = (0.0, 0.0, 0.0)) -> P
     for a turned picture is not followed, since renders have none.
 
     Raises:
-        InputError: not a picture, one that breaks off, or one of other than 8 or 16 bits.
+        InputError: not a picture, one that is damaged, or one of other than 8 or 16 bits.
     """
     from attnwarp.io import read_image
 
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; check the path")
-    image = read_image(path)
+    image = read_image(path, damaged="error")
     values = image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
     if image.shape[2] == 3:
         return values

@@ -2,6 +2,7 @@
 
 import os
 import struct
+import threading
 import zlib
 
 import cv2
@@ -10,6 +11,7 @@ import pytest
 from PIL import Image
 
 from attnwarp import Camera
+from attnwarp.errors import InputWarning
 from attnwarp.fit import load_views
 from attnwarp.io import Dataset, FileFormatError, image_size, read_image
 
@@ -169,6 +171,60 @@ def test_a_fit_is_not_made_on_half_a_jpeg(tmp_path, capfd):
     with pytest.raises(FileFormatError, match=r"view\.jpg: the picture is damaged"):
         load_views(Dataset([camera], [path]))
     assert capfd.readouterr().err == ""  # no murmur of a decoder
+
+
+def spoilt(path, damage):
+    """A JPEG that reaches its end, with damage inside; the whole picture."""
+    options = {"tail": {}, "inserted": {}, "progressive": {"progressive": True}, "restart": {}}
+    restart = {"restart_marker_rows": 1} if damage == "restart" else {}
+    noise(path, quality=90, **options[damage], **restart)
+    pixels, whole = np.asarray(Image.open(path)), path.read_bytes()
+    half = len(whole) // 2
+    if damage == "tail":
+        whole = whole[:-602] + whole[-2:]
+    elif damage == "inserted":
+        whole = whole[:half] + b"\x12" * 400 + whole[half:]
+    elif damage == "progressive":
+        whole = whole[:half] + whole[half + 16 :]
+    else:
+        second = whole.index(b"\xff\xd1")
+        whole = whole[: whole.index(b"\xff\xd0")] + whole[second:]  # a row of blocks is gone
+    path.write_bytes(whole)
+    return pixels
+
+
+@pytest.mark.parametrize("damage", ["tail", "inserted", "progressive", "restart"])
+def test_damage_inside_a_jpeg_is_said_with_its_name_or_refused(tmp_path, capfd, damage):
+    """Oracle: the picture before the damage, read by Pillow."""
+    path = tmp_path / "view.jpg"
+    pixels = spoilt(path, damage)
+    # Pillow is silent.
+    assert np.abs(np.asarray(Image.open(path)) - pixels.astype(float)).mean() > 5
+    with pytest.warns(InputWarning, match=r"view\.jpg: the picture is damaged.*JPEG data"):
+        assert read_image(path).shape == pixels.shape
+    camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=64, height=48, fov_y=40)
+    with pytest.raises(FileFormatError, match=r"view\.jpg: the picture is damaged.*JPEG data"):
+        load_views(Dataset([camera], [path]), damaged="error")
+    assert capfd.readouterr().err == ""
+
+
+def test_a_whole_jpeg_is_read_in_silence_and_what_others_write_is_not_lost(tmp_path, capfd):
+    path = noise(tmp_path / "a.jpg")
+    stop = threading.Event()
+    lines = []
+
+    def chatter():
+        while not stop.is_set():
+            lines.append(f"line {len(lines)}\n")
+            os.write(2, lines[-1].encode())
+
+    other = threading.Thread(target=chatter)
+    other.start()
+    for _ in range(50):
+        read_image(path, damaged="error")
+    stop.set()
+    other.join()
+    assert sorted(capfd.readouterr().err.splitlines(True)) == sorted(lines)
 
 
 def test_every_flipped_bit_of_a_png_is_seen_or_changes_no_pixel(tmp_path):

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import re
 
 import cv2
 import numpy as np
@@ -519,6 +520,18 @@ def test_a_broken_jpeg_is_not_filled_up_with_grey(tmp_path):
     assert cv2.imread(str(path)) is not None  # OpenCV reads it, with a line on stderr
     with pytest.raises(InputError, match=r"x\.jpg: the picture is damaged"):
         read_picture(path)
+
+
+def test_a_jpeg_damaged_inside_is_not_measured(tmp_path):
+    """Its end is there, and the decoder fills what is missing of it."""
+    picture = write(tmp_path / "renders/a.jpg", random_picture(np.random.default_rng(0), (48, 64)))
+    write(tmp_path / "edited/a.jpg", random_picture(np.random.default_rng(1), (48, 64)))
+    whole = picture.read_bytes()
+    picture.write_bytes(whole[:-602] + whole[-2:])
+    folders = ("--renders", tmp_path / "renders", "--edited", tmp_path / "edited")
+    result = call("metrics", *folders, "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert re.search(r"renders/a\.jpg: the picture is damaged", " ".join(result.output.split()))
 
 
 def test_other_folders_and_flags_that_will_not_do(data, models):
