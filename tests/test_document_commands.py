@@ -9,10 +9,13 @@ import importlib
 import itertools
 import re
 import shlex
+import subprocess
 import sys
+import time
 import tomllib
 from pathlib import Path
 
+import psutil
 import pytest
 import small_capture
 import typer
@@ -230,3 +233,43 @@ def test_cheap_commands_of_a_page_run_in_their_order(page, tmp_path, monkeypatch
         program, *rest = shlex.split(line)
         done = CliRunner().invoke(APPS[program], rest)
         assert done.exit_code == 0, (line, done.output)
+
+
+def test_a_scheduler_as_the_documents_start_it_listens_at_one_address(tmp_path):
+    """Oracle: the kernel's table of the ports that the process listens at."""
+    page = "docs/scale.md"
+    named = [
+        words for block in blocks(page, SHELLS) for words in split(block) if words[0] == "dask"
+    ]
+    assert {words[1] for words in named} == {"scheduler", "worker"}
+    assert all("--host" in words for words in named)
+    text = " ".join((ROOT / page).read_text().split())
+    assert "dask's ports have no password" in text and "On a machine with several users" in text
+    (limit,) = re.findall(r"`(--dashboard-address \S+)`", text)
+    (words,) = [words[1:] for words in named if words[1] == "scheduler"]
+    options = [word.replace("HOST", "127.0.0.1") for word in words]
+    file = tmp_path / "scheduler.json"
+    scheduler = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "dask",
+            *options,
+            *limit.split(),
+            "--port",
+            "0",
+            "--scheduler-file",
+            str(file),
+        ],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        end = time.monotonic() + 60
+        while not file.is_file() and scheduler.poll() is None and time.monotonic() < end:
+            time.sleep(0.1)
+        connections = psutil.Process(scheduler.pid).net_connections()
+    finally:
+        scheduler.terminate()
+        scheduler.wait(30)
+    places = {each.laddr.ip for each in connections if each.status == psutil.CONN_LISTEN}
+    assert places == {"127.0.0.1"}

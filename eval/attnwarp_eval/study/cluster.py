@@ -237,6 +237,7 @@ def _connect(scheduler: str) -> Client:
         text = " ".join(str(error).split()) or type(error).__name__
         raise ClusterError(
             f"--scheduler: no scheduler at {address} ({text}); start one with: dask scheduler"
+            " --host HOST"
         ) from None
 
 

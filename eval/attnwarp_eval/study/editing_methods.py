@@ -258,8 +258,15 @@ def _true_pictures(job: Job) -> EditedScene:
 
 
 def _true_pictures_reads(settings: Mapping[str, Any]) -> Set[str]:
-    tuned = {"stages", "views_per_stage", "iterations", *_LOSSES}
-    return _options(settings, settings.keys() - tuned)
+    from attnwarp.warp import WarpSettings
+
+    read = {"stages", "views_per_stage", "iterations", "sources", *_LOSSES}
+    warp: set[str] = set()
+    if settings["sources"] > 1:  # what the sources see of each other orders them
+        read |= {"chain_coverage", "mask"}
+        warp = warp_reads(WarpSettings.from_dict(settings["warp"]))
+    options = {f"options.warp.{key[4:]}" for key in warp}
+    return warp | options | _options(settings, settings.keys() - read)
 
 
 def _baseline(name: str) -> Method:

@@ -313,6 +313,7 @@ QUICK = {"stages": 2, "views_per_stage": 2, "steps": 2, "iterations": 1}
         ("attention_warping", {"mask": False}),
         ("attention_warping", {"iterations": 0}),
         ("true pictures", {}),
+        ("true pictures", {"sources": 2}),
     ],
 )
 def test_options_that_are_not_read_change_no_byte_of_an_edit(method, own, tmp_path):
