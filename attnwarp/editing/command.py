@@ -165,42 +165,17 @@ def _stderr() -> Any:
     return sys.stderr
 
 
-FLIPS = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}
-"""Axes to flip by EXIF's orientation, after rows and columns have changed places from 5 on."""
-
-
 def _read(path: Path) -> Image:
     """(H, W, 3) sRGB in [0, 1], turned as its EXIF tag asks; transparent pixels are laid over
     black, as in a scene's edit.
     """
     import numpy as np
 
-    from attnwarp.io import read_image
+    from attnwarp.io import read_upright
 
-    stored = read_image(path)
-    turn = _orientation(path)
-    if turn >= 5:
-        stored = stored.swapaxes(0, 1)
-    stored = np.ascontiguousarray(np.flip(stored, FLIPS.get(turn, ())))
+    stored = read_upright(path)
     values = stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
     return values[..., :3] * values[..., 3:] if stored.shape[2] == 4 else values
-
-
-def _orientation(path: Path) -> int:
-    """EXIF's orientation of a picture that can be read, 1 to 8; 1 is as stored."""
-    import contextlib
-    import warnings
-
-    from PIL import Image as Pillow
-    from PIL.ExifTags import Base
-
-    # A tag that cannot be read turns nothing; Pillow raises whatever its damage leads to.
-    with contextlib.suppress(Exception), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with Pillow.open(path) as image:
-            turn = image.getexif().get(Base.Orientation, 1)
-            return turn if turn in range(1, 9) else 1
-    return 1
 
 
 def _fit(image: Image, longest: int, multiple: int) -> Image:

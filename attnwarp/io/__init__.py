@@ -5,7 +5,7 @@ from attnwarp.io.colmap import read_colmap
 from attnwarp.io.dataset import Dataset
 from attnwarp.io.file import FileFormatError
 from attnwarp.io.folder import read_dataset
-from attnwarp.io.images import image_size, read_image
+from attnwarp.io.images import image_size, read_image, read_upright
 from attnwarp.io.lens import Lens, undistorted_camera, undistorted_image
 from attnwarp.io.ply import THIRD_SCALE, read_ply, read_points, write_ply, write_points
 from attnwarp.io.splat import read_splat, write_splat
@@ -26,6 +26,7 @@ __all__ = [
     "read_points",
     "read_splat",
     "read_transforms",
+    "read_upright",
     "undistort",
     "undistorted_camera",
     "undistorted_image",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,8 +13,9 @@ import numpy.typing as npt
 
 from attnwarp import check
 from attnwarp.camera import EXACT_ROTATION, Camera, nearest_orthonormal
+from attnwarp.errors import InputWarning
 from attnwarp.io.file import FileFormatError, is_file
-from attnwarp.io.images import IMAGE_SUFFIXES, image_size, is_turned
+from attnwarp.io.images import IMAGE_SUFFIXES, image_size, orientation
 from attnwarp.io.lens import Lens
 
 Array = npt.NDArray[np.float64]
@@ -175,6 +177,9 @@ def with_images(
     Returns:
         the cameras (resized to their images where ``resize_cameras`` says so), and the paths, None
         where missing.
+
+    Warns:
+        InputWarning: images with an EXIF tag that asks for a turn.
     """
     check.one_of(missing_images, ("error", "none"), "missing_images")
     absent = [path for path in paths if not is_file(path)]
@@ -198,7 +203,7 @@ def with_images(
         camera, (width, height) = cameras[i], image_size(path)
         if (width, height) == (camera.width, camera.height):
             continue
-        if (width > height) != (camera.width > camera.height) and is_turned(path):
+        if (width > height) != (camera.width > camera.height) and orientation(path) >= 5:
             raise FileFormatError(
                 source,
                 f"{path} is stored as {width} x {height} with an EXIF tag that asks for a turn,"
@@ -218,7 +223,21 @@ def with_images(
         except ValueError as error:
             raise FileFormatError(source, str(error)) from None
         cameras[i] = camera.resize(width, height)
+    _warn_of_turns(source, [path for path in available if path is not None])
     return cameras, available
+
+
+def _warn_of_turns(source: Path, paths: Sequence[Path]) -> None:
+    """Say which pictures viewers show otherwise than their poses have them."""
+    turned = [path for path in paths if orientation(path) != 1]
+    if turned:
+        warnings.warn(
+            f"{source}: {len(turned)} of {len(paths)} images have an EXIF tag that asks for a turn"
+            f" (first: {turned[0]}); it is not followed, since a pose belongs to the pixels as they"
+            " are stored",
+            InputWarning,
+            stacklevel=4,
+        )
 
 
 def _of_another_suffix(path: Path) -> Path | None:

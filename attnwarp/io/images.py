@@ -6,6 +6,7 @@ returns a picture; Pillow, which refuses such a file, therefore decodes it first
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import re
@@ -72,8 +73,10 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     return size
 
 
-def is_turned(path: str | os.PathLike[str]) -> bool:
-    """Whether a picture has an EXIF tag that asks for a quarter turn, which no reader here follows.
+def orientation(path: str | os.PathLike[str]) -> int:
+    """EXIF's orientation of a picture, 1 to 8: the turn that viewers show it with; 1 is none.
+
+    A tag that cannot be read turns nothing.
 
     Example:
         >>> from PIL import Image
@@ -81,11 +84,62 @@ def is_turned(path: str | os.PathLike[str]) -> bool:
         >>> exif = picture.getexif()
         >>> exif[274] = 6
         >>> picture.save("turned.jpg", exif=exif)
-        >>> is_turned("turned.jpg"), image_size("turned.jpg")
-        (True, (4, 3))
+        >>> orientation("turned.jpg"), image_size("turned.jpg")
+        (6, (4, 3))
     """
-    asked = _with_pillow(Path(path), lambda image: image.getexif().get(_ORIENTATION, 1))
-    return asked in (5, 6, 7, 8)
+
+    def asked(image: Any) -> Any:
+        # Pillow raises whatever a damaged tag leads to.
+        with contextlib.suppress(Exception):
+            return image.getexif().get(_ORIENTATION, 1)
+        return 1
+
+    path = existing_file(path)
+    tiff = _tiff(path)  # Pillow does not open all of them
+    turn: Any = _with_pillow(path, asked) if tiff is None else tiff.short(_ORIENTATION)
+    return int(turn) if turn in range(1, 9) else 1
+
+
+def upright_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """(width, height) in px of what :func:`read_upright` reads."""
+    width, height = image_size(path)
+    return (height, width) if orientation(path) >= 5 else (width, height)
+
+
+def read_upright(
+    path: str | os.PathLike[str],
+    *,
+    beside: str | os.PathLike[str] | None = None,
+    damaged: Literal["warn", "error"] = "warn",
+) -> npt.NDArray[Any]:
+    """Read a picture as every viewer shows it: turned or mirrored as its EXIF tag asks.
+
+    Args:
+        path: see :func:`read_image`.
+        beside: the picture of a pose that this one belongs to. Its pixels are taken as stored, so
+            a tag that both have is followed in neither.
+        damaged: see :func:`read_image`.
+
+    Returns:
+        (H, W, 3) or (H, W, 4) as of :func:`read_image`.
+
+    Example:
+        >>> from PIL import Image
+        >>> from attnwarp.io import read_image, read_upright
+        >>> picture = Image.new("RGB", (4, 3))
+        >>> exif = picture.getexif()
+        >>> exif[274] = 6
+        >>> picture.save("turned.jpg", exif=exif)
+        >>> read_image("turned.jpg").shape, read_upright("turned.jpg").shape
+        ((3, 4, 3), (4, 3, 3))
+    """
+    stored = read_image(path, damaged=damaged)
+    turn = orientation(path)
+    if turn == 1 or (beside is not None and orientation(beside) == turn):
+        return stored
+    if turn >= 5:
+        stored = stored.swapaxes(0, 1)
+    return np.ascontiguousarray(np.flip(stored, _FLIPS.get(turn, ())))
 
 
 def read_image(
@@ -94,7 +148,7 @@ def read_image(
     """(H, W, 3) or (H, W, 4) sRGB of a picture, in the depth and the orientation of the file.
 
     Grey becomes three equal channels. A camera's pose belongs to the pixels as stored, so an EXIF
-    tag that asks for a turn is not followed.
+    tag that asks for a turn is not followed; :func:`read_upright` follows it.
 
     Args:
         path: a picture of 8 or 16 bits a channel: PNG, JPEG, TIFF, WebP.
@@ -278,6 +332,9 @@ def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8 | np.uint16] | Non
 
 _ORIENTATION, _BITS, _SAMPLES = 274, 258, 277
 """TIFF's tags that ask for a turn, that hold the bits of each channel, and their number."""
+
+_FLIPS = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}
+"""Axes to flip by EXIF's orientation, after rows and columns have changed places from 5 on."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from attnwarp.fit import (
     progress,
 )
 from attnwarp.gaussians import Gaussians
-from attnwarp.io import THIRD_SCALE, Dataset, read_image, write_ply
+from attnwarp.io import THIRD_SCALE, Dataset, read_upright, write_ply
 from attnwarp.io.names import file_stems
 from attnwarp.methods import METHODS, Budget, MethodSettings, Result
 from attnwarp.methods.attention_warping import attention_warping
@@ -124,14 +124,16 @@ def edit_dataset(
     views = load_views(dataset, max_size=max_size)
     index = _view_of(views.cameras, source, dataset)
     images = images_of(views)
+    # Views are the cameras with a picture.
+    pictures = [path for path in dataset.image_paths if path is not None]
     by_hand = None
     if source_picture is not None:
-        pixels, top = read_over_black(source_picture)
+        pixels, top = read_over_black(source_picture, beside=pictures[index])
         by_hand = (pixels / top).astype(np.float32)
         h, w, _ = by_hand.shape
         # Again in the edit, but here before an editor is loaded and a fit spends its minutes.
         check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
-    segments = None if masks is None else _masks(masks, views.cameras, say)
+    segments = None if masks is None else _masks(masks, views.cameras, pictures, say)
     editor = load_editor(editor_name, device=device)
     check_instruction(editor_name, editor, instruction)
     if words is not None:
@@ -301,12 +303,17 @@ def _spellings(names: list[str]) -> list[list[str]]:
     return [names, [Path(name).name for name in names], [Path(name).stem for name in names]]
 
 
-def _masks(folder: Path, cameras: Any, say: Callable[[str], None]) -> list[npt.NDArray[np.bool_]]:
+def _masks(
+    folder: Path, cameras: Any, pictures: Sequence[Path], say: Callable[[str], None]
+) -> list[npt.NDArray[np.bool_]]:
     """(H, W) bool of each view from NAME.png: white is edited."""
     if not folder.is_dir():
         raise InputError(f"--masks: {folder} is no folder; name one with a PNG for each view")
     paths = mask_files(folder, cameras)
-    masks = [read_mask(path, camera) for path, camera in zip(paths, cameras, strict=True)]
+    masks = [
+        read_mask(path, camera, beside=picture)
+        for path, camera, picture in zip(paths, cameras, pictures, strict=True)
+    ]
     if not any(mask.any() for mask in masks):
         raise InputError(
             f"--masks: every mask in {folder} is black, so nothing may change; white is edited"
@@ -365,8 +372,13 @@ def _coverage(masks: list[npt.NDArray[np.bool_]], cameras: Any) -> str:
     )
 
 
-def read_mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:
+def read_mask(path: Path, camera: Camera, beside: Path | None = None) -> npt.NDArray[np.bool_]:
     """(H, W) bool of a picture: what is white and opaque.
+
+    Args:
+        path: of the mask.
+        camera: of its view.
+        beside: the view's picture; see :func:`attnwarp.io.read_upright`.
 
     Raises:
         InputError: it is coloured.
@@ -374,7 +386,7 @@ def read_mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:
     """
     import cv2
 
-    pixels, top = read_over_black(path)
+    pixels, top = read_over_black(path, beside)
     if np.ptp(pixels, axis=-1).max() > COLORED * top:
         raise InputError(
             f"--masks: {path} is coloured, expected a grey picture: white is edited, black is not"
@@ -392,9 +404,12 @@ def read_mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:
     return np.asarray(bright > 0.5)
 
 
-def read_over_black(path: Path) -> tuple[npt.NDArray[Any], int]:
-    """(H, W, 3) of a picture over black where it is transparent, and the value of white."""
-    pixels = read_image(path)
+def read_over_black(path: Path, beside: Path | None = None) -> tuple[npt.NDArray[Any], int]:
+    """(H, W, 3) of a picture over black where it is transparent, and the value of white.
+
+    It is turned as its EXIF tag asks; see :func:`attnwarp.io.read_upright` for ``beside``.
+    """
+    pixels = read_upright(path, beside=beside)
     top = int(np.iinfo(pixels.dtype).max)
     if pixels.shape[2] == 3:
         return pixels, top

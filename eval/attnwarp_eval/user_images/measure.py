@@ -155,7 +155,7 @@ _EDIT, _CLIP, _DIRECTION, _DINO, _CLIP_IMAGE, _PERCEPTUAL = FIGURES = (
 _MASKED = (_EDIT, _PERCEPTUAL)
 """Figures that masks act on; the others are of whole pictures."""
 
-PROTOCOL = 3
+PROTOCOL = 4
 """Raised whenever the same pictures would give other figures."""
 
 
@@ -201,6 +201,12 @@ def measure(
             done.notes.append(
                 f"{_option(name)}: {len(maps)} normal maps beside pictures of the same name are no"
                 f" views and are left out, {maps[0]} first"
+            )
+        turned = [path for path in folders[name].values() if _is_turned(path)]
+        if turned:
+            done.notes.append(
+                f"{_option(name)}: {len(turned)} pictures are turned as their EXIF tags ask,"
+                f" {turned[0].name} first"
             )
     wanted = _possible(inputs, folders, encoders, done)
     # Also where bundled encoders alone are needed, which would leave it unread.
@@ -273,17 +279,16 @@ def read_picture(path: Path, background: Sequence[float] = (0.0, 0.0, 0.0)) -> P
     """(H, W, 3) float32 sRGB in [0, 1].
 
     8 and 16 bits are divided by their largest value; grey becomes three equal channels; transparent
-    pixels are laid over ``background``. Pixels are taken as they lie in the file: a tag that asks
-    for a turned picture is not followed, since renders have none.
+    pixels are laid over ``background``. A picture is turned as its EXIF tag asks, as in viewers.
 
     Raises:
         InputError: not a picture, one that is damaged, or one of other than 8 or 16 bits.
     """
-    from attnwarp.io import read_image
+    from attnwarp.io import read_upright
 
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; check the path")
-    image = read_image(path, damaged="error")
+    image = read_upright(path, damaged="error")
     values = image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
     if image.shape[2] == 3:
         return values
@@ -397,21 +402,29 @@ def _check_sizes(
     folders: Mapping[str, Mapping[str, Path]], views: Mapping[_Figure, Sequence[str]]
 ) -> None:
     """Check before anything is computed that both pictures of a pair have one size."""
-    from attnwarp.io import image_size
+    from attnwarp.io.images import upright_size
 
     for figure, names in views.items():
         for other in _groups(figure, folders):
             for name in names if other != "renders" else ():
                 one, two = folders["renders"][name], folders[other][name]
-                _same_size(one, image_size(one), two, image_size(two))
+                _same_size(one, upright_size(one), two, upright_size(two))
 
 
 def _same_size(one: Path, a: tuple[int, ...], two: Path, b: tuple[int, ...]) -> None:
     if a != b:
+        turned = next((path for path in (two, one) if _is_turned(path)), None)
+        hint = "" if turned is None else f" ({turned} is turned as its EXIF tag asks)"
         raise InputError(
-            f"{two} is {b[0]} x {b[1]} px, but {one} is {a[0]} x {a[1]}: a pair must have one size;"
-            " resize one of the two folders"
+            f"{two} is {b[0]} x {b[1]} px, but {one} is {a[0]} x {a[1]}{hint}: a pair must have one"
+            f" size; {'resize' if turned is None else 'turn or resize'} one of the two folders"
         )
+
+
+def _is_turned(path: Path) -> bool:
+    from attnwarp.io.images import orientation
+
+    return orientation(path) != 1
 
 
 @dataclass

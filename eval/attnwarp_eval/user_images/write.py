@@ -27,8 +27,7 @@ _INPUTS = ("renders", "edited", "originals", "source_edit", "masks", "prompt", "
 
 _READING = (
     "Pictures are read as sRGB in [0, 1]: 8 bits over 255, 16 bits over 65535, grey as three equal"
-    " channels, transparent pixels over the background; tags that ask for a turned picture are not"
-    " followed."
+    " channels, transparent pixels over the background; a picture is turned as its EXIF tag asks."
 )
 
 

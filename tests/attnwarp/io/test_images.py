@@ -8,12 +8,13 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from attnwarp import Camera
 from attnwarp.errors import InputWarning
 from attnwarp.fit import load_views
-from attnwarp.io import Dataset, FileFormatError, image_size, read_image
+from attnwarp.io import Dataset, FileFormatError, image_size, read_image, read_upright
+from attnwarp.io.images import upright_size
 
 
 def test_a_tag_that_asks_to_turn_a_picture_is_not_followed(tmp_path):
@@ -80,6 +81,28 @@ def test_a_tiff_that_asks_to_be_turned_comes_as_it_is_stored(
     np.testing.assert_array_equal(image, pixels)
     assert image.dtype == dtype
     assert image_size(path) == (shape[1], shape[0])
+
+
+@pytest.mark.parametrize("turn", range(1, 9))
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.webp", "deep.tif"])
+def test_an_upright_picture_is_what_viewers_show(tmp_path, turn, name):
+    """Oracle: Pillow's own turning; of 16 bits, which Pillow does not open, that of the 8 above."""
+    pixels = np.random.default_rng(turn).integers(0, 256, (4, 6, 3), dtype=np.uint8)
+    tags = Image.Exif()
+    tags[0x112] = turn
+    path = tmp_path / name
+    if name == "deep.tif":
+        path.write_bytes(tiff(pixels.astype(np.uint16) * 257, turn, ">", False))
+        Image.fromarray(pixels).save(tmp_path / "a.png", exif=tags)
+    else:
+        Image.fromarray(pixels).save(path, exif=tags)
+    with Image.open(path if name != "deep.tif" else tmp_path / "a.png") as stored:
+        seen = np.asarray(ImageOps.exif_transpose(stored).convert("RGB"))
+    upright = read_upright(path)
+    np.testing.assert_array_equal(upright // (257 if name == "deep.tif" else 1), seen)
+    assert upright_size(path) == seen.shape[1::-1]
+    # A tag that the picture of a pose has too turns neither.
+    np.testing.assert_array_equal(read_upright(path, beside=path), read_image(path))
 
 
 def test_a_bigtiff_whose_directory_lies_beyond_all_memory_is_refused_in_one_line(tmp_path):

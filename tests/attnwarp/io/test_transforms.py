@@ -1,5 +1,6 @@
 import json
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -305,9 +306,16 @@ def test_a_picture_whose_tag_asks_for_a_turn_is_told_from_one_of_another_size(
     for resize in (False, True) if turned else (False,):
         with pytest.raises(FileFormatError, match=message):
             read_transforms(path, resize_cameras=resize)
-    # Where sides fit as stored, the tag is nobody's business.
+    # Where sides fit as stored, the tag is said.
     upright = write(tmp_path, frames, **LENS)
-    assert len(read_transforms(upright).cameras) == 1
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        assert len(read_transforms(upright).cameras) == 1
+    assert [str(each.message) for each in said] == [
+        f"{upright}: 1 of 1 images have an EXIF tag that asks for a turn (first:"
+        f" {tmp_path / 'images/a.jpg'}); it is not followed, since a pose belongs to the pixels as"
+        " they are stored"
+    ] * (orientation != 1)
 
 
 def test_no_camera_is_resized_to_a_picture_of_another_shape(tmp_path):

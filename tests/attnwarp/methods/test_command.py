@@ -16,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.ImageOps
 import pytest
 import torch
 from edit_folders import Watched
@@ -323,6 +324,28 @@ def test_a_mask_of_another_shape_is_refused_and_one_of_another_size_is_not(tmp_p
     path.write_bytes(encode_png(np.zeros((48, 32, 3), np.uint8)))  # turned
     with pytest.raises(ValueError, match=r"--masks: .*mask\.png: got 48 x 32 .* ratio of 32 x 48"):
         read_mask(path, view)
+
+
+@pytest.mark.parametrize("turn", range(1, 9))
+def test_masks_and_pictures_by_hand_are_turned_as_viewers_turn_them(tmp_path, turn):
+    """Oracle: Pillow's own turning."""
+    random = np.random.default_rng(turn)
+    shown = 255 * random.integers(0, 2, (12, 20), dtype=np.uint8)
+    tags = PIL.Image.Exif()
+    tags[0x112] = turn
+    # Turning back what is shown gives what is stored.
+    back = {6: 8, 8: 6}.get(turn, turn)
+    undo = PIL.Image.Exif()
+    undo[0x112] = back
+    PIL.Image.fromarray(shown).save(tmp_path / "shown.png", exif=undo)
+    with PIL.Image.open(tmp_path / "shown.png") as picture:
+        stored = PIL.ImageOps.exif_transpose(picture)
+    stored.info.clear()
+    stored.save(tmp_path / "mask.png", exif=tags)
+    view = Camera.look_at((3, 0, 0), (0, 0, 0), width=20, height=12, fov_y=40)
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png", view), shown > 0)
+    pixels, _ = read_over_black(tmp_path / "mask.png")
+    np.testing.assert_array_equal(pixels[..., 0], shown)
 
 
 def test_transparent_pixels_of_a_mask_or_a_picture_by_hand_are_black(tmp_path):

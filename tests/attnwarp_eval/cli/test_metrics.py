@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import tiny_models
+from PIL import Image, ImageOps
 from torch_threads import on_one_thread
 from typer.testing import CliRunner
 
@@ -520,6 +521,33 @@ def test_a_broken_jpeg_is_not_filled_up_with_grey(tmp_path):
     assert cv2.imread(str(path)) is not None  # OpenCV reads it, with a line on stderr
     with pytest.raises(InputError, match=r"x\.jpg: the picture is damaged"):
         read_picture(path)
+
+
+@pytest.mark.parametrize("turn", [2, 3, 6, 7, 8])
+def test_a_picture_is_measured_as_viewers_turn_it(tmp_path, turn):
+    """Oracle: the PSNR of what Pillow's own turning gives, by hand."""
+    random = np.random.default_rng(turn)
+    stored = random_picture(random)
+    tags = Image.Exif()
+    tags[0x112] = turn
+    (tmp_path / "edited").mkdir()
+    Image.fromarray(stored).save(tmp_path / "edited/a.png", exif=tags)
+    with Image.open(tmp_path / "edited/a.png") as picture:
+        shown = np.asarray(ImageOps.exif_transpose(picture))
+    render = np.clip(shown + random.normal(0, 10, shown.shape), 0, 255).round().astype(np.uint8)
+    write(tmp_path / "renders/a.png", render)
+    folders = ("--renders", tmp_path / "renders", "--edited", tmp_path / "edited")
+    result = call("metrics", *folders, "--perceptual", "none", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    note = "1 pictures are turned as their EXIF tags ask, a.png first"
+    assert note in " ".join(result.output.split())
+    mse = (((render / 255) - (shown / 255)) ** 2).mean()
+    measured = saved(tmp_path)["metrics"]["edit.psnr_mean"]["value"]
+    assert measured == pytest.approx(-10 * math.log10(mse), abs=1e-4)
+    if turn >= 5:
+        write(tmp_path / "renders/a.png", stored)
+        refused = " ".join(call("metrics", *folders, "--out", tmp_path / "two").output.split())
+        assert "edited/a.png is turned as its EXIF tag asks): a pair must have" in refused
 
 
 def test_a_jpeg_damaged_inside_is_not_measured(tmp_path):
