@@ -25,6 +25,7 @@ from attnwarp.camera import Camera
 from attnwarp.errors import InputWarning
 from attnwarp.io.dataset import Dataset, Distorted, Missing, with_images
 from attnwarp.io.file import FileFormatError, existing_file
+from attnwarp.io.find import FileFinder
 from attnwarp.io.lens import Lens
 
 Array = npt.NDArray[np.float64]
@@ -165,12 +166,14 @@ def read_colmap(
     folder = _image_folder(path, model, images, "images" if scale == 1 else f"images_{scale}")
     if model != path:
         _warn_of_larger(model, len(poses), folder)
+    finder = FileFinder(folder)
     cameras, paths = with_images(
         source,
         cameras,
-        [folder / pose.name for pose in poses],
+        [finder.find(pose.name) for pose in poses],
         missing_images=missing_images,
         resize_cameras=resize_cameras or scale > 1,
+        finder=finder,
         elsewhere="images=FOLDER (--images FOLDER)",
     )
     cloud = model / f"points3D{suffix}"
@@ -240,7 +243,14 @@ def _image_folder(
     roots = [path, model.parent, model.parent.parent, model.parent.parent.parent]
     # The parent of "." is "." itself.
     roots += model.resolve().parents[:3]
-    return next((root / name for root in roots if (root / name).is_dir()), path / name)
+    exact = (root / name for root in roots if (root / name).is_dir())
+    found = next(exact, None) or next((f for root in roots[:4] for f in _named(root, name)), None)
+    return found or path / name
+
+
+def _named(root: Path, name: str) -> list[Path]:
+    """Folders of a name in another case."""
+    return [each for each in FileFinder(root).entries(name) if each.is_dir()]
 
 
 def _camera(
@@ -295,7 +305,8 @@ def _camera(
     world_to_camera[:3, 3] = pose.translation
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     try:
-        return Camera(K, world_to_camera, intrinsics.width, intrinsics.height, pose.name), lens
+        name = pose.name.replace("\\", "/")  # of Windows
+        return Camera(K, world_to_camera, intrinsics.width, intrinsics.height, name), lens
     except ValueError as error:
         raise FileFormatError(cameras_file, f"camera {pose.camera}: {error}") from error
 

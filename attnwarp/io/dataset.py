@@ -15,6 +15,7 @@ from attnwarp import check
 from attnwarp.camera import EXACT_ROTATION, Camera, nearest_orthonormal
 from attnwarp.errors import InputWarning
 from attnwarp.io.file import FileFormatError, is_file
+from attnwarp.io.find import FileFinder
 from attnwarp.io.images import IMAGE_SUFFIXES, image_size, orientation
 from attnwarp.io.lens import Lens
 
@@ -164,6 +165,7 @@ def with_images(
     *,
     missing_images: Missing,
     resize_cameras: bool,
+    finder: FileFinder,
     elsewhere: str = "",
 ) -> tuple[list[Camera], list[Path | None]]:
     """Check that each camera's image exists and has the camera's size.
@@ -172,6 +174,7 @@ def with_images(
         source: of the cameras, for messages.
         cameras, paths: one path for each camera.
         missing_images, resize_cameras: see :func:`attnwarp.io.read_dataset`.
+        finder: of the folder that the images' names are relative to.
         elsewhere: how a person names the images' folder, where that can be.
 
     Returns:
@@ -186,8 +189,8 @@ def with_images(
     if absent and missing_images == "error":
         first = ", ".join(str(path) for path in absent[:3])
         more = f" and {len(absent) - 3} more" if len(absent) > 3 else ""
-        near = _of_another_suffix(absent[0])
-        there = f"; {near.name} is there" if near is not None else ""
+        near = _near(absent[0], finder)
+        there = f"; {' and '.join(near)} {'are' if near[1:] else 'is'} there" if near else ""
         folder = f", or name their folder: {elsewhere}" if elsewhere else ""
         raise FileFormatError(
             source,
@@ -240,8 +243,11 @@ def _warn_of_turns(source: Path, paths: Sequence[Path]) -> None:
         )
 
 
-def _of_another_suffix(path: Path) -> Path | None:
-    """An image of the same name with another suffix."""
+def _near(path: Path, finder: FileFinder) -> list[str]:
+    """Names of files that a missing image may be: those of another suffix, or else those in a
+    folder of another name or on another machine.
+    """
     stem = path.with_suffix("")
     each = (Path(f"{stem}{suffix}") for suffix in IMAGE_SUFFIXES)
-    return next((image for image in each if image != path and is_file(image)), None)
+    first = next((image.name for image in each if image != path and is_file(image)), None)
+    return [str(found) for found in finder.tail(str(path))] if first is None else [first]

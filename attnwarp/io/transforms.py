@@ -26,6 +26,7 @@ from attnwarp.camera import Camera
 from attnwarp.errors import InputWarning, suggest
 from attnwarp.io.dataset import Dataset, Distorted, Missing, nearest_rotation, with_images
 from attnwarp.io.file import FileFormatError, existing_file, is_file, write_atomically
+from attnwarp.io.find import FileFinder, name_key
 from attnwarp.io.images import IMAGE_SUFFIXES, image_size
 from attnwarp.io.lens import Lens
 from attnwarp.io.ply import read_points, write_points
@@ -107,8 +108,10 @@ def read_transforms(
     Intrinsics stand in the frame or else at the top: ``fl_x``, ``fl_y`` (or ``camera_angle_x``,
     ``camera_angle_y`` in radians), ``cx``, ``cy`` (the middle of the image if left out), ``w``,
     ``h`` (the image's own size if left out). ``file_path`` is relative to the file, with or without
-    its extension. Rotations off by up to 1e-4 (float32, or printed numbers) are replaced by the
-    nearest rotation; beyond, they are refused. Frames keep their order.
+    its extension; a name that another system wrote (backslashes, other case, URL escapes, another
+    form of accents) finds the one file that it can mean. Rotations off by up to 1e-4 (float32, or
+    printed numbers) are replaced by the nearest rotation; beyond, they are refused. Frames keep
+    their order.
 
     Args:
         path: the file, or a folder with transforms.json or with transforms_train.json, _val.json,
@@ -275,12 +278,13 @@ def _relative(image: Path, folder: Path) -> str:
 def _scaled(path: Path, name: str, scale: int) -> str:
     """The name of a smaller copy of an image."""
     parts = list(Path(name).parts)
-    if "images" not in parts:
+    place = next((i for i, part in enumerate(parts) if part.casefold() == "images"), None)
+    if place is None:
         raise FileFormatError(
             path, f"got {name!r}, which is not in a folder images; read it without a scale",
             field="file_path",
         )  # fmt: skip
-    parts[parts.index("images")] = f"images_{scale}"
+    parts[place] = f"images_{scale}"
     return str(Path(*parts))
 
 
@@ -308,6 +312,7 @@ def _read_file(
     lenses: list[Lens | None] = []
     names: list[str] = []
     paths: list[Path] = []
+    finder = FileFinder(path.parent, IMAGE_SUFFIXES)
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise FileFormatError(
@@ -321,7 +326,9 @@ def _read_file(
                 field=f"frames[{i}].file_path",
                 row=i,
             )
-        image = _find_image(path.parent / name)
+        image = finder.find(name)
+        if not is_file(path.parent / name):
+            name = name.replace("\\", "/")  # of Windows
         values = _Values(path, i, name, frame, data)
         _check_keys(values, ignore_keys)
         lens = _lens(values)
@@ -331,7 +338,7 @@ def _read_file(
         lenses.append(lens)
         names.append(name)
         # The camera is that of the full picture; with_images resizes it.
-        paths.append(image if scale == 1 else _find_image(path.parent / _scaled(path, name, scale)))
+        paths.append(image if scale == 1 else finder.find(_scaled(path, name, scale)))
     keys = {key for level in (data, *frames) for key in level}
     unknown = sorted(keys - USED - UNUSED - CHANGES_THE_PICTURE.keys())
     if unknown:
@@ -342,26 +349,26 @@ def _read_file(
         )
     _warn_of_own_intrinsics(path, data, frames)
     _warn_of_doubles(path, names)
-    splits = _splits(path, data, names, paths, split)
+    splits = _splits(path, data, names, paths, split, finder)
     cameras, available = with_images(
         path,
         cameras,
         paths,
         missing_images=missing_images,
         resize_cameras=resize_cameras or scale > 1,
+        finder=finder,
     )
     points = colors = None
     ply = data.get("ply_file_path") if with_points else None
     if ply is not None:
         if not isinstance(ply, str):
             raise FileFormatError(path, f"got {brief(ply)}, expected a path", field="ply_file_path")
-        if not is_file(path.parent / ply):
+        cloud = FileFinder(path.parent).find(ply)
+        if not is_file(cloud):
             raise FileFormatError(
-                path,
-                f"{path.parent / ply} is missing; put it there or remove the key",
-                field="ply_file_path",
+                path, f"{cloud} is missing; put it there or remove the key", field="ply_file_path"
             )
-        points, colors = read_points(path.parent / ply)
+        points, colors = read_points(cloud)
     applied = None
     if "applied_transform" in data:
         applied = _matrix(path, "applied_transform", None, data["applied_transform"])[:3]
@@ -457,17 +464,31 @@ def _replaces(frame: dict[str, Any], data: dict[str, Any], key: str) -> bool:
 
 
 def _splits(
-    path: Path, data: dict[str, Any], names: list[str], images: list[Path], split: str | None
+    path: Path,
+    data: dict[str, Any],
+    names: list[str],
+    images: list[Path],
+    split: str | None,
+    finder: FileFinder,
 ) -> list[str | None]:
     """The split of each frame: what the lists of the file say, else ``split``.
 
-    Names are compared as paths, so "./a.png" is "a.png", with or without the image's suffix. A
-    frame in both test and val belongs to test.
+    Names are compared as paths, so "./a.png" is "a.png", with or without the image's suffix, and
+    where that names no frame, as other systems spell them. A frame in both test and val belongs to
+    test.
     """
     frames: dict[str, list[int]] = {}
+    loose: dict[str, list[int]] = {}
     for i, (name, image) in enumerate(zip(names, images, strict=True)):
         for key in {os.path.normpath(path.parent / name), os.path.normpath(image)}:
             frames.setdefault(key, []).append(i)
+            loose.setdefault(name_key(key), []).append(i)
+
+    def frames_of(name: str) -> list[int]:
+        keys = [os.path.normpath(each) for each in (path.parent / name, finder.find(name))]
+        plain = os.path.normpath(path.parent / name.replace("\\", "/"))
+        return frames.get(keys[0]) or frames.get(keys[1]) or loose.get(name_key(plain), [])
+
     result: list[str | None] = [split] * len(names)
     lists = [each for each in SPLITS if f"{each}_filenames" in data]
     for each in lists:
@@ -475,11 +496,7 @@ def _splits(
         listed = data[key]
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise FileFormatError(path, "expected a list of paths", field=key)
-        members = [
-            frames.get(os.path.normpath(path.parent / name))
-            or frames.get(os.path.normpath(_find_image(path.parent / name)), [])
-            for name in listed
-        ]
+        members = [frames_of(name) for name in listed]
         lost = [name for name, indices in zip(listed, members, strict=True) if not indices]
         if lost:
             raise FileFormatError(
@@ -505,17 +522,6 @@ def _splits(
             stacklevel=2,
         )
     return result
-
-
-def _find_image(path: Path) -> Path:
-    """``path``, or if there is no such file, ``path`` with the first image suffix that makes it
-    one.
-    """
-    if is_file(path):
-        return path
-    return next(
-        (each for suffix in IMAGE_SUFFIXES if is_file(each := Path(f"{path}{suffix}"))), path
-    )
 
 
 def number(value: Any) -> float | None:

@@ -28,6 +28,7 @@ from attnwarp.fit import (
 )
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import THIRD_SCALE, Dataset, read_upright, write_ply
+from attnwarp.io.find import FileFinder, name_key
 from attnwarp.io.names import file_stems
 from attnwarp.methods import METHODS, Budget, MethodSettings, Result
 from attnwarp.methods.attention_warping import attention_warping
@@ -286,6 +287,10 @@ def _view_of(cameras: Any, name: str | None, dataset: Dataset) -> int:
     for candidates in _spellings(names):
         if candidates.count(name) == 1:
             return candidates.index(name)
+    for candidates in _spellings(names):
+        keys = [name_key(candidate) for candidate in candidates]
+        if keys.count(name_key(name)) == 1:
+            return keys.index(name_key(name))
     if name.isdecimal() and int(name) < len(names):
         return int(name)
     pairs = zip(dataset.cameras, dataset.image_paths, strict=True)
@@ -344,10 +349,12 @@ def mask_files(folder: Path, cameras: Any) -> list[Path]:
     names = [Path(*(p for p in PurePath(c.name).parts if p not in ("..", "/"))) for c in cameras]
     plain = [name.parent / name.stem for name in names]
     counts, stems = Counter(plain), Counter(name.stem for name in names)
-    paths = []
+    paths: list[Path] = []
+    finder = FileFinder(folder)
     for name, short, numbered in zip(names, plain, file_stems(cameras), strict=True):
         own = [f"{name}.png", *([f"{short}.png"] if counts[short] == 1 else ())]
-        found = [folder / file for file in (*own, f"{numbered}.png") if (folder / file).is_file()]
+        files = (finder.find(file) for file in (*own, f"{numbered}.png"))
+        found = [file for file in files if file.is_file()]
         if not found:
             alone = stems[name.stem] == 1
             path = folder / (f"{numbered}.png" if alone else own[-1])
@@ -358,6 +365,12 @@ def mask_files(folder: Path, cameras: Any) -> list[Path]:
                     f"--masks: {shared} could be that of {first} or of {second}; expected {path}"
                 )
             raise InputError(f"--masks: {path} is missing; expected one PNG for each view")
+        if found[0] in paths:
+            other = names[paths.index(found[0])]
+            raise InputError(
+                f"--masks: {found[0]} could be that of {other} or of {name}; expected one PNG for"
+                " each view, spelled as the view"
+            )
         paths.append(found[0])
     return paths
 

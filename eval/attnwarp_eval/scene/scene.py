@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp.errors import InputError, suggest
+from attnwarp.io.find import FileFinder
 from attnwarp_eval.cache import content_key
 from attnwarp_eval.scene.base import FARTHEST, Vector
 from attnwarp_eval.scene.bodies import BodySpec
@@ -264,7 +265,7 @@ class Scene:
     def mesh_path(self, spec: MeshSpec) -> Path:
         """Where the mesh file of an object lies."""
         base = self.path.parent if self.path else Path()
-        return base / Path(spec.file).expanduser()
+        return FileFinder(base).find(str(Path(spec.file).expanduser()))
 
     @functools.cached_property
     def world_hash(self) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy.typing as npt
 from attnwarp.encoders import EncoderInfo, Kind, check_kind, load_encoder
 from attnwarp.encoders._weights import device_of
 from attnwarp.errors import InputError
+from attnwarp.io.find import name_key
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.progress import Progress, silent
@@ -196,6 +198,7 @@ def measure(
         if getattr(inputs, name) is not None
     }
     for name in folders:
+        folders[name] = _as_spelled(folders[name], folders.get("renders", {}))
         maps = normal_maps(getattr(inputs, name))
         if maps:
             done.notes.append(
@@ -265,6 +268,18 @@ def pictures_in(folder: Path, option: str) -> dict[str, Path]:
             f"{option}: {folder} holds no picture, expected files ending in {', '.join(SUFFIXES)}"
         )
     return pictures
+
+
+def _as_spelled(pictures: dict[str, Path], renders: Mapping[str, Path]) -> dict[str, Path]:
+    """Pictures of a folder under the names of renders where these alone differ in case, in the form
+    of accents or as URLs, as other systems write them.
+    """
+    one, two = (Counter(map(name_key, names)) for names in (pictures, renders))
+    spelled = {name_key(name): name for name in renders}
+    return {
+        spelled[key] if one[key := name_key(name)] == two[key] == 1 else name: path
+        for name, path in pictures.items()
+    }
 
 
 def normal_maps(folder: Path) -> list[str]:
