@@ -90,7 +90,7 @@ def test_an_edit_shows_its_own_files_and_settings(edited, folders):
 def test_disagreement_is_the_difference_of_the_edits_along_the_warp(edited, folders):
     name = edited.targets[0]
     pair = edited.pair(subject.EDIT_VARIANT, name)
-    place = folders / f"edit/views/{edited.source}.png"
+    place = folders / f"edit/views/{edited.edit.source}.png"
     source = torch.as_tensor(read_image(place) / 255).permute(2, 0, 1)
     target = read_image(folders / f"edit/views/{name}.png") / 255
     warped = sample(source, pair.view.correspondence)[0].permute(1, 2, 0).numpy()
