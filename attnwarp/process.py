@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 RETRY_SECONDS = 0.01
@@ -33,6 +34,19 @@ def core_count() -> int:
     """
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def cache_dir() -> Path:
+    """The folder of derived files: ``$ATTNWARP_CACHE``, else ``$XDG_CACHE_HOME/attnwarp``, else
+    ``~/.cache/attnwarp``.
+
+    Everything in it can be recomputed and may be deleted at any time.
+    """
+    if folder := os.environ.get("ATTNWARP_CACHE"):
+        return Path(folder).expanduser()
+    # Not Path.home(), which raises where a container's user has none.
+    home = os.path.expanduser("~/.cache")  # noqa: PTH111
+    return Path(os.environ.get("XDG_CACHE_HOME") or home) / "attnwarp"
 
 
 def resend_lost_interrupts() -> None:

@@ -17,20 +17,8 @@ import numpy.typing as npt
 
 from attnwarp.errors import InputError
 from attnwarp.io.file import remove_abandoned, write_atomically
+from attnwarp.process import cache_dir
 from attnwarp_eval.canonical_json import digest
-
-
-def cache_dir() -> Path:
-    """The folder of derived files: ``$ATTNWARP_CACHE``, else ``$XDG_CACHE_HOME/attnwarp``, else
-    ``~/.cache/attnwarp``.
-
-    Everything in it can be recomputed and may be deleted at any time.
-    """
-    folder = os.environ.get("ATTNWARP_CACHE")
-    if folder:
-        return Path(folder).expanduser()
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "attnwarp"
 
 
 def content_key(*parts: Any) -> str:

@@ -15,6 +15,8 @@ from numba.core import cgutils
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
+from attnwarp.numba_cache import CACHE
+
 try:
     import fcntl
 except ImportError:  # Windows
@@ -74,7 +76,7 @@ def _compiled(**options: Any) -> Any:
 
     def decorate(function: Any) -> Any:
         dispatcher = numba.njit(
-            nogil=True, cache=True, error_model="numpy", fastmath=FAST, **options
+            nogil=True, cache=CACHE, error_model="numpy", fastmath=FAST, **options
         )(function)
         # There is no cache where numba is told to compile nothing.
         file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
@@ -105,7 +107,7 @@ def exact_inlined(function: Any) -> Any:
     return by_one_process(numba.njit(forceinline=True, **_EXACT)(function))
 
 
-_EXACT: Any = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
+_EXACT: Any = {"nogil": True, "cache": CACHE, "error_model": "numpy", "_nrt": False}
 
 
 # Without numba's reference counts: LLVM cannot remove those of arrays passed to inlined functions,

@@ -14,6 +14,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.numba_cache import CACHE
 from attnwarp_eval.cache import content_key, read_arrays, write_arrays
 from attnwarp_eval.scene.shapes import Mesh, MeshNotice
 from attnwarp_eval.scene.textures import fractal_noise
@@ -207,7 +208,7 @@ class Relief:
     seed: int = 0
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=CACHE, nogil=True)
 def _part_distance(x: float, y: float, z: float, part: Array) -> float:
     x, y, z = x - part[3], y - part[4], z - part[5]
     if part[0] == 1.0:
@@ -238,7 +239,7 @@ def _part_distance(x: float, y: float, z: float, part: Array) -> float:
     return math.sqrt(max(dr, 0.0) ** 2 + max(dz, 0.0) ** 2) + min(max(dr, dz), 0.0) - part[15]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=CACHE, nogil=True)
 def _body_distance(points: Array, parts: Array, blend: float) -> Array:
     out = np.empty(points.shape[0])
     for i in range(points.shape[0]):
@@ -264,7 +265,7 @@ def _body_distance(points: Array, parts: Array, blend: float) -> Array:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=CACHE, nogil=True)
 def _part_distances(points: Array, parts: Array) -> Array:
     out = np.empty((parts.shape[0], points.shape[0]))
     for k in range(parts.shape[0]):

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from attnwarp.numba_cache import CACHE
 from attnwarp_eval.scene.base import Color, Coordinate, Direction, Positive, Spec, linear_rgb
 
 Array = npt.NDArray[np.float64]
@@ -158,7 +159,7 @@ def _palette(colors: tuple[str, ...]) -> Array:
     return np.array([linear_rgb(color) for color in colors])
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=CACHE, nogil=True, inline="always")
 def _lattice(ix: Any, iy: Any, iz: Any, seed: Any) -> Any:
     # An integer hash (the finaliser of splitmix64): the same value on every machine, no table, no
     # random state.
@@ -176,7 +177,7 @@ def _lattice(ix: Any, iy: Any, iz: Any, seed: Any) -> Any:
     return float(h >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=CACHE, nogil=True)
 def lattice_noise(points: Array, seed: int) -> Array:
     """(N,) white noise in [0, 1): one value for each integer cell that the (N, 3) ``points`` fall
     into.
@@ -188,7 +189,7 @@ def lattice_noise(points: Array, seed: int) -> Array:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=CACHE, nogil=True)
 def fractal_noise(points: Array, octaves: int, seed: int) -> Array:
     """Value noise summed over octaves (each twice as fine, half as strong), scaled to [0, 1].
 

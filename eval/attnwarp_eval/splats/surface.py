@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.errors import InputError
+from attnwarp.numba_cache import CACHE
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.truth.raycast import Geometry
 from attnwarp_eval.truth.shading import buried, emitted, frames, irradiance, object_albedo
@@ -368,7 +369,7 @@ def _eliminate(points: Array, normals: Array, spacing: Array, count: int) -> npt
     return np.flatnonzero(alive)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=CACHE)
 def _crowds(distance, near, radius, normals):  # type: ignore[no-untyped-def]
     """Who crowds whom, as the rows of a sparse matrix: (n + 1,) starts, others, and closeness.
 
@@ -393,7 +394,7 @@ def _crowds(distance, near, radius, normals):  # type: ignore[no-untyped-def]
     return start, other[:count], closeness[:count]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=CACHE)
 def _sink(heap, place, weight, k, size):  # type: ignore[no-untyped-def]
     while True:
         child = 2 * k + 1
@@ -408,7 +409,7 @@ def _sink(heap, place, weight, k, size):  # type: ignore[no-untyped-def]
         k = child
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=CACHE)
 def _remove(start, other, closeness, removals):  # type: ignore[no-untyped-def]
     """Remove the heaviest node ``removals`` times, each time lightening its neighbours; a binary
     heap with places.

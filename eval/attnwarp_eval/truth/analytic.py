@@ -8,10 +8,12 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.numba_cache import CACHE
+
 Array = npt.NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=CACHE, nogil=True, error_model="numpy")
 def nearest_hit(
     origins: Array, directions: Array, spheres: Array, rectangles: Array
 ) -> tuple[Array, npt.NDArray[np.int64]]:
@@ -85,7 +87,7 @@ NO_TRIANGLE = 0xFFFFFFFF
 """Open3D's INVALID_ID."""
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=CACHE, nogil=True, error_model="numpy")
 def meet_triangles(
     t: Array,
     index: npt.NDArray[np.int64],

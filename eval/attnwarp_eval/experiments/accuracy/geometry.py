@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.errors import InputError
+from attnwarp.numba_cache import CACHE
 from attnwarp_eval.cost import in_turn
 from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
 from attnwarp_eval.progress import Tell, untold
@@ -22,7 +23,7 @@ WRONG = 1e-3
 """Relative errors of depth above this are those of another surface; they are counted apart."""
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=CACHE, nogil=True, error_model="numpy")
 def every_triangle(origins: Array, directions: Array, corners: Array, limit: Array) -> Array:
     """First hit of each ray with any of the triangles, all of them tried in float64 (Moeller &
     Trumbore 1997).

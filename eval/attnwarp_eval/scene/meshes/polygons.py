@@ -6,6 +6,8 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.numba_cache import CACHE
+
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
@@ -104,14 +106,14 @@ def _flat(points: Array, normal: Array) -> Array:
     return np.ascontiguousarray(flat / max(float(flat.max()), 1e-300))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=CACHE, nogil=True)
 def _area(points: Array, a: int, b: int, c: int) -> float:
     return (points[b, 0] - points[a, 0]) * (points[c, 1] - points[a, 1]) - (
         points[c, 0] - points[a, 0]
     ) * (points[b, 1] - points[a, 1])
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=CACHE, nogil=True)
 def _ears(points: Array) -> Indices:
     """(n - 2, 3) triangles of a counterclockwise polygon; (0, 3) where no ear can be cut."""
     n = len(points)

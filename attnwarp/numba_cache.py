@@ -1,0 +1,52 @@
+"""Where compiled kernels are kept: beside their modules, or where this user can write."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from attnwarp.process import cache_dir
+
+HERE = Path(__file__).parent
+
+
+def kernel_folder() -> Path | None:
+    """The folder of compiled kernels; None for numba's own choice, beside each module.
+
+    In a container or an installation of another user nothing can be written there, and numba then
+    refuses to compile at all.
+    """
+    if os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(os.environ["NUMBA_CACHE_DIR"])
+    if os.access(HERE, os.W_OK):
+        return None
+    return next(_writable(), None)
+
+
+def _writable() -> Iterator[Path]:
+    folders = [cache_dir() / "numba"]
+    with suppress(FileNotFoundError):  # no temporary folder either
+        folders.append(Path(tempfile.gettempdir()) / f"attnwarp-{os.getuid()}" / "numba")
+    for folder in folders:
+        with suppress(OSError):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            # What lies there is run: in a shared folder another user may have made it.
+            if os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid():
+                yield folder
+
+
+def _chosen() -> bool:
+    """Tell numba the folder; False where nothing can be kept."""
+    import numba
+
+    folder = kernel_folder()
+    if folder is not None:
+        numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
+    return folder is not None or os.access(HERE, os.W_OK)
+
+
+CACHE = _chosen()
+"""numba's option ``cache`` for every kernel."""
