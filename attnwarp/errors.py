@@ -7,28 +7,41 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Extra:
+    """An extra of pyproject.toml.
+
+    Attributes:
+        modules: that it brings and the plain package lacks.
+        lack: what its lack costs.
+    """
+
+    modules: tuple[str, ...]
+    lack: str
+
 
 EXTRAS = {
-    "edit": ("diffusers", "tokenizers", "transformers"),
-    "eval": (
-        "dask",
-        "distributed",
-        "drjit",
-        "jinja2",
-        "markupsafe",
-        "matplotlib",
-        "mitsuba",
-        "mpmath",
-        "open3d",
-        "pydantic",
-        "skimage",
-        "yaml",
+    "edit": Extra(
+        ("diffusers", "tokenizers", "transformers"),
+        "no diffusion editor and no mask by words; warps, masks and depth are measured",
     ),
-    "inspect": ("pyvista",),
-    "web": ("trame", "trame_vtk", "trame_vuetify"),
-    "gpu": ("gsplat",),
-}
-"""The extras of pyproject.toml -> the modules that each brings and the plain package lacks."""
+    "eval": Extra(
+        (
+            "dask", "distributed", "drjit", "jinja2", "markupsafe", "matplotlib", "mitsuba",
+            "mpmath", "open3d", "pydantic", "skimage", "yaml",
+        ),
+        "nothing of attnwarp-eval runs",
+    ),
+    "inspect": Extra(
+        ("pyvista",), "no window of a warp in 3D; reports have their pictures"
+    ),
+    "web": Extra(("trame", "trame_vtk", "trame_vuetify"), "no warp in 3D in a browser"),
+    "gpu": Extra(("gsplat",), "splats are rendered on the processor"),
+}  # fmt: skip
+"""Every extra that a user may lack, by its name in pyproject.toml."""
 
 
 def install_command(*extras: str) -> str:
@@ -73,7 +86,7 @@ def missing_extra(error: ImportError) -> MissingExtraError | None:
         needs the package diffusers, which comes with the extra 'edit'
     """
     module = (error.name or "").partition(".")[0]
-    extra = next((extra for extra, modules in EXTRAS.items() if module in modules), None)
+    extra = next((name for name, extra in EXTRAS.items() if module in extra.modules), None)
     if extra is None or not isinstance(error, ModuleNotFoundError):
         return None
     return MissingExtraError(module, extra)

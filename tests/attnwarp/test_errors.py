@@ -33,8 +33,8 @@ def requirements(extra):
 def test_the_extras_of_the_errors_are_those_of_the_package(extra):
     modules = {PACKAGES.get(name, name) for name in requirements(extra)}
     # tokenizers is in two extras, so that neither needs the other; the error names the first.
-    modules -= {name for other in EXTRAS if other != extra for name in EXTRAS[other]}
-    assert set(EXTRAS[extra]) - set(BROUGHT_ALONG) == modules
+    modules -= {name for other in EXTRAS if other != extra for name in EXTRAS[other].modules}
+    assert set(EXTRAS[extra].modules) - set(BROUGHT_ALONG) == modules
 
 
 def test_a_missing_package_is_an_input_error_that_names_its_extra():
@@ -90,7 +90,7 @@ def run_without(modules, package, argv, cwd):
     ],
 )
 def test_a_command_without_its_extra_ends_in_one_line_and_code_2(argv, module, extra, tmp_path):
-    every = [name for names in EXTRAS.values() for name in names]
+    every = [name for one in EXTRAS.values() for name in one.modules]
     done = run_without(every, "attnwarp_eval.cli.main", argv, tmp_path)
     assert done.returncode == 2, done.stderr
     assert done.stderr == (
@@ -100,7 +100,7 @@ def test_a_command_without_its_extra_ends_in_one_line_and_code_2(argv, module, e
 
 
 def test_help_of_both_commands_needs_no_extra(tmp_path):
-    every = [name for names in EXTRAS.values() for name in names]
+    every = [name for one in EXTRAS.values() for name in one.modules]
     for package, name in (
         ("attnwarp.cli.main", "attnwarp"),
         ("attnwarp_eval.cli.main", "attnwarp-eval"),

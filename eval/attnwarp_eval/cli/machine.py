@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 from attnwarp.errors import EXTRAS, install_command
+from attnwarp.numba_cache import kernel_folder
 from attnwarp.process import core_count
 
 State = Literal["ok", "lack", "broken"]
@@ -79,20 +80,11 @@ def versions() -> Check:
     )
 
 
-LACKS = {
-    "eval": "nothing of attnwarp-eval runs",
-    "edit": "no diffusion editor and no mask by words; warps, masks and depth are measured",
-    "inspect": "no window of a warp in 3D; reports have their pictures",
-    "gpu": "splats are rendered on the processor",
-}
-"""What the lack of an extra costs."""
-
-
 def extras() -> Check:
     """The optional packages."""
     missing = {
-        extra: [module for module in modules if util.find_spec(module) is None]
-        for extra, modules in EXTRAS.items()
+        name: [module for module in extra.modules if util.find_spec(module) is None]
+        for name, extra in EXTRAS.items()
     }
     lacking = [extra for extra, modules in missing.items() if modules]
     if not lacking:
@@ -102,7 +94,7 @@ def extras() -> Check:
         "packages",
         "broken" if "eval" in lacking else "lack",
         f"extras that are not installed: {named}",
-        "; ".join(f"{extra}: {LACKS[extra]}" for extra in lacking),
+        "; ".join(f"{extra}: {EXTRAS[extra].lack}" for extra in lacking),
         install_command(*lacking),
     )
 
@@ -137,8 +129,7 @@ def kernels() -> Check:
     spec = util.find_spec("attnwarp")
     assert spec is not None and spec.submodule_search_locations
     folder = Path(next(iter(spec.submodule_search_locations))) / "render" / "_kernels"
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    place = Path(chosen) if chosen else folder / "__pycache__"
+    place = kernel_folder() or folder / "__pycache__"
     if next(place.rglob("*.nbi"), None) is not None:
         return Check("compiled kernels", "ok", f"in {place}")
     return Check(

@@ -30,6 +30,8 @@ def require_gl(*, display: bool) -> None:
     Raises:
         InputError: no display, or no OpenGL.
     """
+    import pyvista  # noqa: F401, so that a missing extra is named before what it could draw
+
     if display and not has_display():
         raise InputError(
             "inspect: this machine has no display; draw a picture with --screenshot FILE, serve a"
