@@ -1,5 +1,12 @@
-"""`python -m attnwarp` is the command attnwarp."""
+"""`python -m attnwarp` is the command attnwarp, and its entry point."""
 
-from attnwarp.cli.main import main
+from attnwarp.cli.entry import enter
 
-main()
+
+def main() -> None:
+    """Run the command attnwarp."""
+    enter("attnwarp", "attnwarp.cli.main")
+
+
+if __name__ == "__main__":
+    main()

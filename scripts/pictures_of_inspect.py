@@ -25,7 +25,7 @@ WIDTH = 1200
 
 def draw(folder: Path, name: str) -> None:
     """Make one picture, reduced to the width of a page."""
-    command = [sys.executable, "-m", "attnwarp_eval.cli.main", "inspect"]
+    command = [sys.executable, "-m", "attnwarp_eval", "inspect"]
     with tempfile.TemporaryDirectory() as place:
         path = Path(place) / "window.png"
         subprocess.run([*command, *shlex.split(COMMANDS[name]), "--screenshot", path], check=True)

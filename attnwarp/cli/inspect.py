@@ -27,5 +27,5 @@ def inspect(
     if find_spec("attnwarp_eval") is None:
         raise fail(f"inspect: needs the package attnwarp_eval; {install_command('inspect')}")
     # The library does not import the instrument: this process becomes its command.
-    command = [sys.executable, "-m", "attnwarp_eval.cli.main", "inspect", str(splats)]
+    command = [sys.executable, "-m", "attnwarp_eval", "inspect", str(splats)]
     os.execv(sys.executable, [*command, "--data", str(data), *context.args])

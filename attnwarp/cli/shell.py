@@ -13,15 +13,12 @@ from typing import Any
 
 import typer
 
+from attnwarp.cli.entry import STOPPED
 from attnwarp.errors import InputWarning
 from attnwarp.process import core_count, stops_interrupt
 
 USAGE = 2
 """Exit code of everything that a person can mend: arguments, files, folders."""
-
-
-STOPPED = 130
-"""Exit code after Ctrl-C, a polite kill or the terminal's end, as shells have it for Ctrl-C."""
 
 
 CLOSED_PIPE = 141
@@ -87,6 +84,9 @@ def clear_errors(stopped: str = NOTHING, out: Path | None = None) -> Iterator[No
 def file_error(error: OSError) -> str:
     """One line about a file that the system refused."""
     name = f"{error.filename}: " if error.filename else ""
+    if isinstance(error, FileExistsError) and Path(error.filename or "").is_symlink():
+        target = Path(error.filename).readlink()
+        return f"{name}is a link to {target}, which is not there; make that, or remove the link"
     return f"{name}{error.strerror}; check the path, the space on its disk and its permissions"
 
 

@@ -28,7 +28,7 @@ from attnwarp.io import Dataset, read_dataset, read_ply, write_ply, write_transf
 from attnwarp.render import render
 from attnwarp.render.threads import set_thread_count
 
-ATTNWARP = [sys.executable, "-m", "attnwarp.cli.main"]
+ATTNWARP = [sys.executable, "-m", "attnwarp"]
 
 
 @pytest.fixture(autouse=True)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from attnwarp.cli import shell
 from attnwarp.cli.shell import STOPPED, USAGE, closed_pipe
 from attnwarp.process import stops_interrupt
 from attnwarp.reporting import LINE_SECONDS, Pace
@@ -99,6 +100,10 @@ def clear_errors() -> Iterator[None]:
             yield
     except InputError as error:
         raise fail(str(error)) from None
+    except RuntimeError as error:
+        if "Symlink loop" not in str(error):  # of Path.resolve() before Python 3.13
+            raise
+        raise fail(f"{error}; name another path") from None
     except KeyboardInterrupt:
         raise fail("interrupted", STOPPED) from None
     except BrokenPipeError:
@@ -115,11 +120,7 @@ def file_error(error: OSError) -> str:
     elif error.errno is None:  # such as dask's timeouts, which have no text: no file is at fault
         text = f"{type(error).__name__}: {error}".removesuffix(": ")
         return f"a connection between processes failed ({text}); run the same command again"
-    path = f"{error.filename}: " if error.filename else ""
-    return (
-        f"{path}{error.strerror or error}; check the path, the space on its disk and its"
-        " permissions"
-    )
+    return shell.file_error(error)
 
 
 @contextmanager

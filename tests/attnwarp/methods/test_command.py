@@ -704,7 +704,7 @@ def test_a_process_that_is_killed_and_started_again_leaves_the_same_bytes(place,
             "edit", place / "data", "--instruction", "a bear", "--editor", place / "editor", "--out", out, "--ply",
             place / "splats.ply", *QUICK, "--iterations", 60,
         ]  # fmt: skip
-        return [sys.executable, "-m", "attnwarp.cli.main", *map(str, arguments)]
+        return [sys.executable, "-m", "attnwarp", *map(str, arguments)]
 
     def files(out):
         # The page shows the seconds.

@@ -14,7 +14,7 @@ from attnwarp_eval.cli.machine import Check
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.truth import llvm
 
-COMMAND = [sys.executable, "-m", "attnwarp_eval.cli.main"]
+COMMAND = [sys.executable, "-m", "attnwarp_eval"]
 
 
 @pytest.mark.slow

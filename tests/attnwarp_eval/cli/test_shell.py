@@ -13,7 +13,7 @@ from rich.console import Console
 
 from attnwarp_eval.cli.shell import file_error, progress
 
-PRINTS = [sys.executable, "-m", "attnwarp_eval.cli.main", "cache", "info"]
+PRINTS = [sys.executable, "-m", "attnwarp_eval", "cache", "info"]
 
 INTERRUPTED = """
 import os, signal
@@ -76,7 +76,7 @@ def test_a_regression_is_told_from_a_closed_pipe(reader, expected, tmp_path):
     command = [*PRINTS[:-2], "compare", str(tmp_path / "baseline.jsonl"), str(store.root)]
     if reader == "listens":
         done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-        assert "missing  spheres / depth / a" in done.stdout
+        assert "unmeasured  scene spheres" in done.stdout
     else:
         reading, writing = os.pipe()
         os.close(reading)

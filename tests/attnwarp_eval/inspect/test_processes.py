@@ -19,7 +19,7 @@ from benchmarks import inspecting
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[3]
-COMMAND = [sys.executable, "-m", "attnwarp_eval.cli.main", "inspect"]
+COMMAND = [sys.executable, "-m", "attnwarp_eval", "inspect"]
 
 
 def environment(**changes):
@@ -269,7 +269,7 @@ def test_without_opengl_the_error_names_the_remedy_and_files_are_written(tmp_pat
 def test_the_librarys_command_becomes_the_instruments(folders, tmp_path):
     out = tmp_path / "a.glb"
     done = subprocess.run(
-        [sys.executable, "-m", "attnwarp.cli.main", "inspect", folders / "scene.ply", folders,
+        [sys.executable, "-m", "attnwarp", "inspect", folders / "scene.ply", folders,
          "--pixel", "16,16", "--export", out],
         env=environment(), capture_output=True, text=True,
     )  # fmt: skip

@@ -128,7 +128,7 @@ def cluster(tmp_path, home):
 
 def run(home, out, *options):
     """The command, in a process of its own."""
-    command = [sys.executable, "-m", "attnwarp_eval.cli.main", "run", "study.yaml", "--out", out]
+    command = [sys.executable, "-m", "attnwarp_eval", "run", "study.yaml", "--out", out]
     # A commit made while the test runs would change the revision that records name.
     environment = {
         **os.environ,

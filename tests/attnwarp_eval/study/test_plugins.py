@@ -89,7 +89,7 @@ def test_a_plugin_of_the_environment_has_its_probe_and_method_in_every_worker(tm
         "PYTHONPATH": os.pathsep.join(paths),
         "ATTNWARP_PLUGINS": " my_plugin, ",
     }
-    command = [sys.executable, "-m", "attnwarp_eval.cli.main", "run", "own.yaml", "--jobs", "2"]
+    command = [sys.executable, "-m", "attnwarp_eval", "run", "own.yaml", "--jobs", "2"]
     done = subprocess.run(
         [*command, "--out", "run"], cwd=tmp_path, env=environment, capture_output=True, text=True
     )
@@ -102,7 +102,7 @@ def test_a_plugin_of_the_environment_has_its_probe_and_method_in_every_worker(tm
     assert length == {"plain": pytest.approx(chord), "double": pytest.approx(2 * chord)}
     without = {key: value for key, value in environment.items() if key != "ATTNWARP_PLUGINS"}
     for name in ("report", "verify"):
-        command = [sys.executable, "-m", "attnwarp_eval.cli.main", name, "run"]
+        command = [sys.executable, "-m", "attnwarp_eval", name, "run"]
         done = subprocess.run(command, cwd=tmp_path, env=without, capture_output=True, text=True)
         assert done.returncode == 2 and "set ATTNWARP_PLUGINS=my_plugin" in done.stderr
 
@@ -126,7 +126,7 @@ def test_a_plugin_that_cannot_be_imported_is_no_damage_of_a_run(tmp_path):
     content = {"name": "own", "scenes": ["spheres"], "variants": {"a": {}}}
     store.write_study(expected(plan(parse_study(content | {"probes": {"depth": ["a"]}}), store)))
     done = subprocess.run(
-        [sys.executable, "-m", "attnwarp_eval.cli.main", "verify", "run"], cwd=tmp_path,
+        [sys.executable, "-m", "attnwarp_eval", "verify", "run"], cwd=tmp_path,
         env={**os.environ, "ATTNWARP_PLUGINS": "nope"}, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 2 and "the plugin 'nope' cannot be imported" in done.stderr
@@ -153,7 +153,7 @@ def test_the_list_of_studies_ends_with_one_line_where_a_plugin_cannot_be_importe
     (tmp_path / "my_broken.py").write_text("1 / 0")
     environment = {"PYTHONPATH": str(tmp_path), "ATTNWARP_PLUGINS": "my_broken"}
     done = subprocess.run(
-        [sys.executable, "-m", "attnwarp_eval.cli.main", "studies"],
+        [sys.executable, "-m", "attnwarp_eval", "studies"],
         env={**os.environ, **environment}, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 2 and done.stderr.count("\n") == 1

@@ -35,7 +35,7 @@ WITHOUT_GIT = {**os.environ, "GIT_DIR": "/nonexistent"}
 
 
 def command(run):
-    program = [sys.executable, "-m", "attnwarp_eval.cli.main", "run", "study.yaml"]
+    program = [sys.executable, "-m", "attnwarp_eval", "run", "study.yaml"]
     return [*program, "--out", str(run), "--jobs", "2"]
 
 

@@ -1,0 +1,61 @@
+"""Beginning and end of both commands: Ctrl-C is one line from the first moment to the last."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+from typing import Any
+
+STOPPED = 130
+"""Exit code after Ctrl-C, a polite kill or the terminal's end, as shells have it for Ctrl-C."""
+
+
+def enter(name: str, module: str) -> None:
+    """Import a command and run its ``main``.
+
+    Args:
+        name: of the command, for its messages.
+        module: where its ``main`` is.
+    """
+
+    def leave(*_: Any) -> None:
+        # Not by an exception: where an import, a destructor or the interpreter's end runs, one
+        # becomes pages of others.
+        os.write(2, f"{name}: stopped; nothing was written\n".encode())
+        os._exit(STOPPED)
+
+    before = signal.getsignal(signal.SIGINT)
+    heeds = before is signal.default_int_handler  # a shell's background job ignores Ctrl-C
+    if heeds:
+        signal.signal(signal.SIGINT, leave)
+    sys.argv[1:] = [expanded(argument) for argument in sys.argv[1:]]
+    main = importlib.import_module(module).main
+    if heeds:
+        signal.signal(signal.SIGINT, before)
+    try:
+        main()
+    except KeyboardInterrupt:
+        leave()
+    finally:
+        if heeds:
+            signal.signal(signal.SIGINT, lambda *_: os._exit(STOPPED))
+
+
+def expanded(argument: str) -> str:
+    """An argument with the home folder that it begins with: a shell leaves ``--out=~/x`` alone.
+
+    Example:
+        >>> import os
+        >>> expanded("--out=~/x") == "--out=" + os.path.expanduser("~/x")
+        True
+        >>> expanded("--instruction=a ~ bear")
+        '--instruction=a ~ bear'
+    """
+    option, equals, value = "", "", argument
+    if argument.startswith("--"):
+        option, equals, value = argument.rpartition("=")
+    if not value.startswith("~"):
+        return argument
+    return option + equals + os.path.expanduser(value)  # noqa: PTH111  (keeps a last slash)

@@ -1,0 +1,87 @@
+"""Oracles: exit codes of shells, lines counted, the file system."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from attnwarp.cli.entry import expanded
+
+BIN = Path(sys.executable).parent
+
+
+@pytest.mark.parametrize(
+    ("argument", "expected"),
+    [
+        ("--out=~/x/", "/home/me/x/"),
+        ("~/x", "/home/me/x"),
+        ("--out=~", "/home/me"),
+        ("--out=a~b", "a~b"),
+        ("--set=a=~/x", "/home/me/x"),
+        ("make it ~ red", "make it ~ red"),
+    ],
+)
+def test_a_home_folder_is_expanded_as_a_shell_would(argument, expected, monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    assert expanded(argument).rpartition("=")[2] == expected
+
+
+def test_a_path_that_no_shell_expanded_is_in_the_home_folder(tmp_path):
+    environment = {**os.environ, "HOME": str(tmp_path)}
+    convert = [BIN / "attnwarp", "convert", "~/none.ply", "~/a.splat"]
+    done = subprocess.run(
+        convert, capture_output=True, text=True, env=environment, cwd=tmp_path, check=False
+    )
+    assert str(tmp_path / "none.ply") in done.stderr
+    assert not (tmp_path / "~").exists()
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.3])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["attnwarp-eval", "inspect", "tiny", "--export", "a.vtp"],
+        ["attnwarp-eval", "cache", "info"],
+        ["attnwarp-eval", "doctor"],
+        ["attnwarp", "fit", "nowhere", "--out", "out"],
+    ],
+)
+def test_an_early_interrupt_ends_in_at_most_one_line(command, seconds, tmp_path):
+    process = subprocess.Popen(
+        [BIN / command[0], *command[1:]], stderr=subprocess.PIPE, stdout=subprocess.PIPE,
+        text=True, cwd=tmp_path,
+    )  # fmt: skip
+    time.sleep(seconds)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    if process.returncode == 130:
+        assert said.count("\n") <= 1, said
+    # It was done before, or its interpreter had not begun.
+    assert process.returncode in (130, 0, 2, -signal.SIGINT)
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["attnwarp-eval", "run", "gate", "--out", "{}"],
+        ["attnwarp-eval", "scenes", "export", "tiny", "{}"],
+        ["attnwarp-eval", "stability", "--out", "{}"],
+        ["attnwarp-eval", "scenes", "render", "tiny", "--out", "{}"],
+        ["attnwarp", "convert", "splats.ply", "{}/a.splat"],
+    ],
+)
+@pytest.mark.parametrize("target", ["itself", "nowhere/there"])
+def test_a_link_that_leads_nowhere_is_named_in_one_line(command, target, tmp_path):
+    link = tmp_path / "out"
+    link.symlink_to(link if target == "itself" else tmp_path / target)
+    words = [BIN / command[0], *(word.format(link) for word in command[1:])]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path, check=False)
+    lines = [line for line in done.stderr.splitlines() if line.startswith(command[0])]
+    assert done.returncode == 2, done.stderr
+    assert len(lines) == 1 and "Traceback" not in done.stderr
+    assert str(link) in lines[0] or "splats.ply" in lines[0]
