@@ -19,7 +19,7 @@ from attnwarp.fit.densify import Density
 from attnwarp.fit.model import Model, check_on_cpu
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.start import extent_of
-from attnwarp.fit.views import Views
+from attnwarp.fit.views import Views, warn_of_twins
 from attnwarp.fit.warm import compile_kernels
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError, write_ply
@@ -188,7 +188,8 @@ def fit(
             message says what to try. The last checkpoint stays.
 
     Warns:
-        InputWarning: float32 world coordinates would not do for ``splats.ply``.
+        InputWarning: held-out pictures that are fitted on; float32 world coordinates would not do
+            for ``splats.ply``.
 
     Example:
         >>> import numpy as np
@@ -204,6 +205,7 @@ def fit(
     check.instance(views, Views, "views", "attnwarp.fit.Views")
     if held_out is not None:
         check.instance(held_out, Views, "held_out", "attnwarp.fit.Views")
+        warn_of_twins(views, held_out)
     if settings is not None:
         check.instance(settings, FitSettings, "settings", "attnwarp.fit.FitSettings")
     settings = (

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+import os
+import warnings
+from collections import Counter
+from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -15,11 +19,17 @@ import torch
 
 from attnwarp import check
 from attnwarp.camera import Camera
+from attnwarp.errors import InputWarning
 from attnwarp.io import Dataset, FileFormatError, read_image
+from attnwarp.io.file import is_file
 from attnwarp.io.images import weighted_by_alpha
 
 HELD_OUT_EVERY = 8
 """One image of so many is held out where a data set names no split (LLFF's habit)."""
+
+SAME_POSE = 1e-6
+"""Largest difference of rotations, of places in extents of the cameras, and of focal lengths and
+principal points in sides of the picture, by which two views are one: rounding of printed poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,10 +208,14 @@ def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Da
             beginning with the first; 0 holds out none.
 
     Returns:
-        The part to fit on, and the held-out part or None.
+        The part to fit on, and the held-out part or None. A view that is fitted on is not held
+        out: neither under another name or by a link, nor as a copy, nor at the same pose.
 
     Raises:
         ValueError: the data set's splits leave nothing to fit on, or ``every`` is 1 or negative.
+
+    Warns:
+        InputWarning: held-out views that are fitted on, which are left out.
 
     Example:
         >>> from attnwarp import Camera
@@ -224,10 +238,110 @@ def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Da
                 f"dataset: its splits are {', '.join(sorted(named))}; none is 'train' to fit on"
             )
         rest = next((name for name in ("test", "val") if name in named), None)
-        return dataset.split("train"), dataset.split(rest) if rest else None
+        train = dataset.split("train")
+        return train, _apart(train, dataset.split(rest)) if rest else None
     order = sorted(range(len(dataset)), key=lambda i: dataset.cameras[i].name)
     out = set(order[::every]) if every else set()
     if not out or len(out) == len(dataset):
         return dataset, None
-    train = [i for i in range(len(dataset)) if i not in out]
-    return dataset.select(train), dataset.select(sorted(out))
+    train = dataset.select([i for i in range(len(dataset)) if i not in out])
+    return train, _apart(train, dataset.select(sorted(out)))
+
+
+def _apart(train: Dataset, test: Dataset) -> Dataset | None:
+    """The held-out part without views that are fitted on; None where none is left."""
+    files = _file_keys([*train.image_paths, *test.image_paths])
+    again = twins(train.cameras, test.cameras, files[: len(train)], files[len(train) :])
+    if not again:
+        return test
+    rest = [i for i in range(len(test)) if i not in again]
+    warnings.warn(
+        f"dataset: {_named(again, train.cameras, test.cameras)}; they are not held out"
+        f"{'' if rest else ', which leaves none to measure on'}",
+        InputWarning,
+        stacklevel=3,
+    )
+    return test.select(rest) if rest else None
+
+
+def twins(
+    fitted: Sequence[Camera],
+    held_out: Sequence[Camera],
+    fitted_keys: Sequence[Collection[Hashable]],
+    held_out_keys: Sequence[Collection[Hashable]],
+) -> dict[int, int]:
+    """The held-out views that are fitted on too, and as which: those with a key in common, or at
+    the same pose.
+
+    Args:
+        fitted, held_out: cameras of either part.
+        fitted_keys, held_out_keys: what tells the picture of each.
+    """
+    of_key = {key: j for j, keys in enumerate(fitted_keys) for key in keys}
+    both = [*fitted, *held_out]
+    centers = np.array([camera.position for camera in both])
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0))) or 1.0
+    poses = np.array(
+        [
+            [
+                *camera.rotation.flat,
+                *(camera.position - centers[0]) / extent,
+                *(camera.K[:2] / [[camera.width], [camera.height]]).flat,
+            ]
+            for camera in both
+        ]
+    )
+    known, result = poses[: len(fitted)], {}
+    for i, (pose, keys) in enumerate(zip(poses[len(fitted) :], held_out_keys, strict=True)):
+        same = np.abs(known - pose).max(axis=1) <= SAME_POSE
+        own = next((of_key[key] for key in keys if key in of_key), None)
+        if own is not None or same.any():
+            result[i] = int(same.argmax()) if own is None else own
+    return result
+
+
+def warn_of_twins(views: Views, held_out: Views) -> None:
+    """Say which held-out pictures are those of views to fit on, by their pixels or pose."""
+    keys = [[_pixel_keys(image) for image in each.images] for each in (views, held_out)]
+    again = twins(views.cameras, held_out.cameras, *keys)
+    if again:
+        warnings.warn(
+            f"held_out: {_named(again, views.cameras, held_out.cameras)}, so that their PSNR is not"
+            " one of held-out views; leave them out of one of the two",
+            InputWarning,
+            stacklevel=3,
+        )
+
+
+def _named(again: dict[int, int], fitted: Sequence[Camera], held_out: Sequence[Camera]) -> str:
+    first, twin = next(iter(again.items()))
+    return (
+        f"{len(again)} of {len(held_out)} held-out views are fitted on too (first:"
+        f" {held_out[first].name!r}, which is {fitted[twin].name!r})"
+    )
+
+
+def _file_keys(paths: Sequence[Path | None]) -> list[set[Hashable]]:
+    """What tells the file of each picture: the file itself, under whatever name, and its content,
+    which is read where another file has the same size.
+    """
+    stats = [path.stat() if path is not None and is_file(path) else None for path in paths]
+    sizes = Counter({(s.st_dev, s.st_ino): s.st_size for s in stats if s is not None}.values())
+    result: list[set[Hashable]] = []
+    for path, stat in zip(paths, stats, strict=True):
+        keys: set[Hashable] = set()
+        if path is not None:
+            keys.add(os.path.realpath(path))
+        if path is not None and stat is not None:
+            keys.add((stat.st_dev, stat.st_ino))
+            if sizes[stat.st_size] > 1:
+                keys.add(hashlib.sha256(path.read_bytes()).hexdigest())
+        result.append(keys)
+    return result
+
+
+def _pixel_keys(image: npt.NDArray[Any]) -> set[Hashable]:
+    """What tells a picture by its pixels; nothing where it has one colour, as blank views have."""
+    if (image == image[0, 0]).all():
+        return set()
+    return {hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()}

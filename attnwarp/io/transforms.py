@@ -348,7 +348,7 @@ def _read_file(
             stacklevel=2,
         )
     _warn_of_own_intrinsics(path, data, frames)
-    _warn_of_doubles(path, names)
+    _warn_of_doubles(path, names, paths)
     splits = _splits(path, data, names, paths, split, finder)
     cameras, available = with_images(
         path,
@@ -422,14 +422,16 @@ def _check_keys(values: _Values, ignore_keys: Sequence[str]) -> None:
         )
 
 
-def _warn_of_doubles(path: Path, names: Sequence[str]) -> None:
-    """Say which images several frames name: one may be held out, and fitted all the same."""
-    doubles = [name for name, count in Counter(names).items() if count > 1]
+def _warn_of_doubles(path: Path, names: Sequence[str], images: Sequence[Path]) -> None:
+    """Say which images several frames name, by whatever names and links."""
+    real = [os.path.realpath(image) for image in images]
+    counts = Counter(real)
+    doubles = [name for name, file in zip(names, real, strict=True) if counts[file] > 1]
     if doubles:
         warnings.warn(
-            f"{path}: {len(doubles)} of {len(set(names))} images are named by several frames, such"
-            f" as {brief(doubles[0])}; leave one frame of each, or a view may be held out and"
-            " fitted too",
+            f"{path}: {sum(count > 1 for count in counts.values())} of {len(counts)} images are"
+            f" named by several frames, such as {brief(doubles[0])}; leave one frame of each, or it"
+            " counts several times",
             InputWarning,
             stacklevel=3,
         )

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from attnwarp import Camera, Gaussians
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, InputWarning
 from attnwarp.fit import FitSettings, Views, fit, from_points
 from attnwarp.fit.loop import CHECKPOINT, SPLATS
 from attnwarp.io import read_ply
@@ -192,6 +192,17 @@ def test_a_world_far_from_its_origin_is_fitted_as_well():
     np.testing.assert_allclose(figures[0], figures[1], atol=0.05)
 
 
+def test_held_out_pictures_that_are_fitted_on_are_said(tmp_path):
+    """By their pixels, whatever their files and poses are; a blank picture says nothing."""
+    truth, cameras = blobs(), ring()
+    views = pictures(truth, cameras[:3])
+    settings = FitSettings(kind="3d", iterations=1, sh_degree=0)
+    moved = Views([cameras[3], cameras[4]], [views.images[1], np.zeros_like(views.images[0])])
+    blank = Views([*views.cameras, cameras[5]], [*views.images, np.zeros_like(views.images[0])])
+    with pytest.warns(InputWarning, match="1 of 2 held-out views are fitted on too"):
+        fit(truth, blank, settings, held_out=moved)
+
+
 def test_float64_splats_far_from_zero_stay_where_they_are():
     # No learning rate, so no splat may move. float32 resolves 1e6 to 0.06; relative to the splats'
     # own middle it resolves 1e-7.
@@ -205,7 +216,8 @@ def test_float64_splats_far_from_zero_stay_where_they_are():
     means = near.means + torch.tensor(offset, dtype=torch.float64)
     far = dataclasses.replace(near, means=means, origin=np.zeros(3))
     views = pictures(far, ring(offset=np.array(offset))[:2])
-    result = fit(far, views, settings, held_out=views)
+    with pytest.warns(InputWarning, match="2 of 2 held-out views are fitted on too"):
+        result = fit(far, views, settings, held_out=views)
     assert np.abs(result.gaussians.world_means() - means.numpy()).max() < 1e-6
     assert result.history[0].psnr > 100
 

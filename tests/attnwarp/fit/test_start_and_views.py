@@ -1,11 +1,14 @@
 """What a fit begins with: first splats, pictures from files, and which of them are held out."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from attnwarp import Camera
+from attnwarp.errors import InputWarning
 from attnwarp.fit import (
     FitSettings,
     Views,
@@ -16,7 +19,7 @@ from attnwarp.fit import (
     load_views,
     random_points,
 )
-from attnwarp.io import Dataset
+from attnwarp.io import Dataset, read_dataset
 
 from .conftest import ring
 
@@ -191,7 +194,7 @@ def test_colour_of_transparent_pixels_does_not_bleed_when_shrunk(tmp_path):
 
 
 def named(count, splits=None):
-    cameras = [camera(name=f"{k:02d}.png") for k in range(count)]
+    cameras = [camera(name=f"{k:02d}.png").moved([k, 0, 0]) for k in range(count)]
     return Dataset(cameras[::-1], [None] * count, splits=splits or [])
 
 
@@ -210,6 +213,91 @@ def test_a_data_sets_own_splits_are_kept_to():
     assert len(test) == 1
     with pytest.raises(ValueError, match="none is 'train'"):
         hold_out(named(2, ["val", "test"]))
+
+
+def posed(x):
+    """A camera-to-world matrix of transforms.json."""
+    return [[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+def write_split(folder, split, frames):
+    lens = {"w": 8, "h": 6, "fl_x": 9.0}
+    data = {**lens, "frames": [{"file_path": n, "transform_matrix": posed(x)} for n, x in frames]}
+    (folder / f"transforms_{split}.json").write_text(json.dumps(data))
+
+
+def copied(source, target):
+    target.write_bytes(source.read_bytes())
+
+
+def saved_anew(source, target):
+    with Image.open(source) as picture:
+        picture.save(target.with_suffix(".tif"))
+
+
+AGAIN = {
+    "the same frame": (None, "a.png", 0.0),
+    "spelled otherwise": (None, "./images/../a.png", 0.0),
+    "spelled by Windows": (None, ".\\A.PNG", 0.0),
+    "the same picture at another pose": (None, "a.png", 0.3),
+    "a link": (lambda a, b: b.symlink_to(a), "b.png", 0.3),
+    "a hard link": (lambda a, b: b.hardlink_to(a), "b.png", 0.3),
+    "a copy": (copied, "b.png", 0.3),
+    "a copy at the rounded pose": (copied, "b.png", 1e-9),
+    "another picture of the same pose": (saved_anew, "b", 0.0),
+}
+
+
+@pytest.mark.parametrize("split", ["test", "val"])
+@pytest.mark.parametrize("how", AGAIN)
+def test_a_picture_that_is_fitted_on_is_not_held_out(tmp_path, how, split):
+    """Oracle: the frames, of which one is that of the fitted picture a.png and one is not."""
+    make, again, x = AGAIN[how]
+    (tmp_path / "images").mkdir()
+    random = np.random.default_rng(0)
+    for name in ("a.png", "c.png", "d.png"):
+        pixels = random.integers(0, 256, (6, 8, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(tmp_path / name)
+    if make is not None:
+        make(tmp_path / "a.png", tmp_path / again)
+    write_split(tmp_path, "train", [("a.png", 0.0), ("c.png", 1.0)])
+    write_split(tmp_path, split, [("d.png", 2.0), (again, x)])
+    with pytest.warns(InputWarning, match=r"1 of 2 held-out views are fitted on .* which is 'a.pn"):
+        train, test = hold_out(read_dataset(tmp_path))
+    assert [c.name for c in train.cameras] == ["a.png", "c.png"]
+    assert [c.name for c in test.cameras] == ["d.png"]
+    write_split(tmp_path, split, [(again, x)])
+    with pytest.warns(InputWarning, match="which leaves none to measure on"):
+        train, test = hold_out(read_dataset(tmp_path))
+    assert len(train) == 2 and test is None
+
+
+def test_views_that_are_alike_and_others_stay_held_out(tmp_path, recwarn):
+    """The same place with another lens, and a small step aside; all files have one size."""
+    for name in ("a.png", "b.png", "c.png", "d.png"):
+        pixels = np.random.default_rng(ord(name[0])).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(tmp_path / name.replace("png", "bmp"))
+    first = camera(8, 6, name="a.png")
+    longer = Camera(first.K * [[2], [2], [1]], first.world_to_camera, 8, 6, "b.png")
+    aside = first.moved([0, 1e-3, 0])
+    away = first.moved([5, 0, 0])
+    cameras = [first, away, longer, aside]
+    paths = [tmp_path / f"{name}.bmp" for name in "abcd"]
+    _, test = hold_out(Dataset(cameras, paths, splits=["train", "train", "test", "test"]))
+    assert len(test) == 2 and not recwarn.list
+
+
+def test_copies_among_pictures_without_splits_are_not_held_out(tmp_path):
+    """Of 9 pictures the first and the last are held out, and the last is the second once more."""
+    paths = [tmp_path / f"{k}.png" for k in range(9)]
+    for k, path in enumerate(paths):
+        seed = 1 if k == 8 else k
+        pixels = np.random.default_rng(seed).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(path)
+    cameras = [camera(8, 6, name=path.name).moved([k, 0, 0]) for k, path in enumerate(paths)]
+    with pytest.warns(InputWarning, match=r"'8\.png', which is '1\.png'"):
+        train, test = hold_out(Dataset(cameras, paths))
+    assert len(train) == 7 and [c.name for c in test.cameras] == ["0.png"]
 
 
 def test_a_single_picture_is_fitted_on_and_not_held_out():
