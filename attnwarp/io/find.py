@@ -37,10 +37,10 @@ class FileFinder:
     Example:
         >>> from pathlib import Path
         >>> from attnwarp.io.find import FileFinder
-        >>> Path("images").mkdir()
-        >>> Path("images/a.png").touch()
-        >>> FileFinder(Path("."), [".png"]).find(".\\\\Images\\\\A").as_posix()
-        'images/a.png'
+        >>> Path("views").mkdir()
+        >>> Path("views/a.png").touch()
+        >>> FileFinder(Path("."), [".png"]).find(".\\\\Views\\\\A").as_posix()
+        'views/a.png'
     """
 
     def __init__(self, folder: Path, suffixes: Sequence[str] = ()) -> None:
