@@ -220,14 +220,12 @@ class GroundedSam:
         import torch
 
         from attnwarp.editing.folder import load_network, readable
-        from attnwarp.encoders.pretrained import check_config
 
         parts = []
         for folder, network, processor in (
             (Path(dino), GroundingDinoForObjectDetection, AutoProcessor),
             (Path(sam), SamModel, SamProcessor),
         ):
-            check_config(folder / "config.json", network.config_class().to_dict())
             loaded = load_network(network, folder, torch_device, torch.float32)
             parts.append(loaded.eval().requires_grad_(False))
             with readable(folder):
