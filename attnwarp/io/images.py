@@ -41,7 +41,7 @@ IMAGE_SUFFIXES = (
 )
 """Of images, in the order in which they are looked for."""
 
-_PNG = b"\x89PNG\r\n\x1a\n"
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
@@ -185,7 +185,11 @@ def read_image(
     flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
     # Never by its path: OpenCV crashes at a name that is no UTF-8.
     bits = np.frombuffer(data, np.uint8)
-    image, complaint = _with_complaint(lambda: cv2.imdecode(bits, flags) if data else None)
+
+    def decode() -> Any:
+        return cv2.imdecode(bits, flags) if data else None
+
+    image, complaint = _with_complaint(decode) if data.startswith(_JPEG) else (decode(), "")
     if complaint:
         _report(path, complaint, damaged)
     if image is None:

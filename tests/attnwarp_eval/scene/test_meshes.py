@@ -491,6 +491,16 @@ def test_a_scene_names_the_object_that_reaches_too_far(tmp_path):
         load_scene(path)
 
 
+@pytest.mark.parametrize("spelled", [r"Parts\Ball.PLY", "PARTS/ball%2Eply", r".\parts/ball.ply"])
+def test_a_mesh_is_found_by_the_name_that_another_system_wrote(tmp_path, spelled):
+    (tmp_path / "parts").mkdir()
+    trimesh.creation.icosphere(1).export(tmp_path / "parts/ball.ply")
+    path = tmp_path / "thing.yaml"
+    path.write_text(SCENE.format(file=f"'{spelled}'", scale=1))
+    scene = load_scene(path)
+    assert scene.mesh_path(scene.spec.objects[0].shape).samefile(tmp_path / "parts/ball.ply")
+
+
 def test_a_stray_triangle_is_told_by_a_scene_and_its_truth(tmp_path):
     from attnwarp_eval.scene.extent import ExtentNotice, extent
     from attnwarp_eval.truth import Geometry
