@@ -328,14 +328,16 @@ def _file_keys(paths: Sequence[Path | None]) -> list[set[Hashable]]:
     stats = [path.stat() if path is not None and is_file(path) else None for path in paths]
     sizes = Counter({(s.st_dev, s.st_ino): s.st_size for s in stats if s is not None}.values())
     result: list[set[Hashable]] = []
+    first: dict[str, Path] = {}
     for path, stat in zip(paths, stats, strict=True):
-        keys: set[Hashable] = set()
-        if path is not None:
-            keys.add(os.path.realpath(path))
+        keys: set[Hashable] = set() if path is None else {os.path.realpath(path)}
         if path is not None and stat is not None:
             keys.add((stat.st_dev, stat.st_ino))
             if sizes[stat.st_size] > 1:
-                keys.add(hashlib.sha256(path.read_bytes()).hexdigest())
+                content = hashlib.sha256(path.read_bytes()).hexdigest()
+                # Blank views are equal and no copies.
+                if first.setdefault(content, path) is path or _pixel_keys(read_image(path)):
+                    keys.add(content)
         result.append(keys)
     return result
 

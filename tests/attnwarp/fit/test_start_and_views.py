@@ -273,7 +273,9 @@ def test_a_picture_that_is_fitted_on_is_not_held_out(tmp_path, how, split):
 
 
 def test_views_that_are_alike_and_others_stay_held_out(tmp_path, recwarn):
-    """The same place with another lens, and a small step aside; all files have one size."""
+    """The same place with another lens, and a small step aside; all files have one size. A blank
+    view at another place than a blank one that is fitted.
+    """
     for name in ("a.png", "b.png", "c.png", "d.png"):
         pixels = np.random.default_rng(ord(name[0])).integers(0, 256, (6, 8, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(tmp_path / name.replace("png", "bmp"))
@@ -281,10 +283,14 @@ def test_views_that_are_alike_and_others_stay_held_out(tmp_path, recwarn):
     longer = Camera(first.K * [[2], [2], [1]], first.world_to_camera, 8, 6, "b.png")
     aside = first.moved([0, 1e-3, 0])
     away = first.moved([5, 0, 0])
-    cameras = [first, away, longer, aside]
-    paths = [tmp_path / f"{name}.bmp" for name in "abcd"]
-    _, test = hold_out(Dataset(cameras, paths, splits=["train", "train", "test", "test"]))
-    assert len(test) == 2 and not recwarn.list
+    for name in ("e.bmp", "f.bmp"):
+        Image.new("RGB", (8, 6), "white").save(tmp_path / name)
+    blank = [first.moved([6, 0, 0]), first.moved([7, 0, 0])]
+    cameras = [first, away, longer, aside, *blank]
+    paths = [tmp_path / f"{name}.bmp" for name in "abcdef"]
+    splits = ["train", "train", "test", "test", "train", "test"]
+    _, test = hold_out(Dataset(cameras, paths, splits=splits))
+    assert len(test) == 3 and not recwarn.list
 
 
 def test_copies_among_pictures_without_splits_are_not_held_out(tmp_path):

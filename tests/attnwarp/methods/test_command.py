@@ -36,7 +36,7 @@ from attnwarp.io.names import file_stems
 from attnwarp.methods import PRESETS, command
 from attnwarp.methods import page as page_of_edits
 from attnwarp.methods.base import workdir_of
-from attnwarp.methods.command import mask_files, read_mask, read_over_black
+from attnwarp.methods.command import _masks, mask_files, read_mask, read_over_black
 from attnwarp.methods.scene import to_float
 from attnwarp.methods.words import masks_by_words, words_folder
 from attnwarp.render import render
@@ -346,6 +346,24 @@ def test_masks_and_pictures_by_hand_are_turned_as_viewers_turn_them(tmp_path, tu
     np.testing.assert_array_equal(read_mask(tmp_path / "mask.png", view), shown > 0)
     pixels, _ = read_over_black(tmp_path / "mask.png")
     np.testing.assert_array_equal(pixels[..., 0], shown)
+
+
+@pytest.mark.parametrize(("of_view", "of_mask"), [(1, 3), (3, 3), (3, 1), (6, 6), (1, 2), (6, 3)])
+def test_a_mask_with_the_tag_of_its_view_lies_as_the_view_does(tmp_path, of_view, of_mask):
+    """Oracle: the stored pixels where both have the tag, and else Pillow's own turning."""
+    stored = np.zeros((12, 20), np.uint8)
+    stored[:3, :5] = 255
+    for name, turn in (("photo.png", of_view), ("photo.mask.png", of_mask)):
+        tags = PIL.Image.Exif()
+        tags[0x112] = turn
+        PIL.Image.fromarray(stored).save(tmp_path / name, exif=tags)
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "photo.mask.png").rename(tmp_path / "masks/photo.png")
+    with PIL.Image.open(tmp_path / "masks/photo.png") as picture:
+        shown = np.asarray(PIL.ImageOps.exif_transpose(picture))
+    view = Camera.look_at((3, 0, 0), (0, 0, 0), width=20, height=12, fov_y=40, name="photo.png")
+    (mask,) = _masks(tmp_path / "masks", [view], [tmp_path / "photo.png"], print)
+    np.testing.assert_array_equal(mask, (stored if of_view == of_mask else shown) > 0)
 
 
 def test_transparent_pixels_of_a_mask_or_a_picture_by_hand_are_black(tmp_path):
