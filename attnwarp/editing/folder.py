@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from attnwarp.encoders._weights import device_of
+from attnwarp.encoders._weights import check_archive, device_of, reason_of
 from attnwarp.encoders.pretrained import check_config
 from attnwarp.errors import InputError, install_command
 
@@ -122,6 +122,8 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
     how: dict[str, Any] = {} if issubclass(kind, PreTrainedModel) else {"low_cpu_mem_usage": False}
     if _variants(folder) == ["fp16"]:
         how["variant"] = "fp16"
+    for path in folder.glob("*.bin"):
+        check_archive(path)
     try:
         with readable(folder):
             # Quietly filling what a file lacks with random numbers would look like a bad editor.
@@ -203,8 +205,9 @@ def readable(folder: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(f"{folder}: cannot be read ({lines[0]}); fetch the model again") from None
+        raise InputError(
+            f"{folder}: cannot be read ({reason_of(error)}); fetch the model again"
+        ) from None
 
 
 def _missing(folder: Path) -> list[str]:

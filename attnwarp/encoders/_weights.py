@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,24 +29,50 @@ def state_of(path: Path) -> dict[str, torch.Tensor]:
     Raises:
         InputError: the file cannot be read, or holds anything but tensors by name.
     """
+    check_archive(path)
     try:
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
 
             return load_file(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError:
-        raise
     except Exception as error:  # the two readers raise many kinds
-        first = str(error).strip().splitlines()[:1]
+        if isinstance(error, OSError) and error.filename is not None:
+            raise
         raise InputError(
-            f"{path}: cannot be read as weights ({''.join(first)}); fetch the file again"
+            f"{path}: cannot be read as weights ({reason_of(error)}); fetch the file again"
         ) from None
     if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
         state = state["state_dict"]
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
         raise InputError(f"{path}: holds no dictionary of tensors, expected a state dict")
     return {str(key): value for key, value in state.items()}
+
+
+def check_archive(path: Path) -> None:
+    """Refuse an archive of torch whose parts are compressed: torch compresses none, and a small one
+    could fill the memory.
+
+    Raises:
+        InputError: it is one.
+    """
+    if not path.is_file() or not zipfile.is_zipfile(path):
+        return
+    with zipfile.ZipFile(path) as archive:
+        if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
+            raise InputError(
+                f"{path}: its parts are compressed, as torch writes none; fetch the file again"
+            )
+
+
+def reason_of(error: Exception) -> str:
+    """The first line of what a reader of weights says. torch's advice to load a file that may run
+    code is not passed on.
+    """
+    text = str(error).strip()
+    if "weights_only" in text or "Unsupported operand" in text:
+        return "it holds other objects than tensors, which could run code"
+    return (text.splitlines() or [type(error).__name__])[0]
 
 
 def device_of(name: str) -> torch.device:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp import check
-from attnwarp.encoders._weights import device_of, full_float32, sha256_of
+from attnwarp.encoders._weights import check_archive, device_of, full_float32, reason_of, sha256_of
 from attnwarp.encoders.base import EncoderInfo, Image, Kind, checked_image, checked_texts
 from attnwarp.encoders.preprocess import Preprocessing, read_json, read_preprocessing
 from attnwarp.errors import InputError, optional_imports
@@ -361,6 +361,8 @@ def _load(
 ) -> tuple[Any, list[Path]]:
     files = _weight_files(folder, name, kind)
     check_config(folder / "config.json", model_class.config_class().to_dict())
+    for file in files:
+        check_archive(file)
     try:
         with _silent():
             model, loading_info = model_class.from_pretrained(
@@ -372,11 +374,9 @@ def _load(
     except (
         Exception
     ) as error:  # transformers raises many kinds for files that do not fit each other
-        first = next(
-            (line for line in str(error).splitlines() if line.strip()), type(error).__name__
-        )
         raise InputError(
-            f"{name}: the weights in {folder} cannot be loaded: {first}; fetch its files again"
+            f"{name}: the weights in {folder} cannot be loaded: {reason_of(error)}; fetch its files"
+            " again"
         ) from None
     missing = sorted(str(key) for key in loading_info["missing_keys"])
     if missing:
