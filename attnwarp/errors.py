@@ -8,6 +8,9 @@ import difflib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any, TypeVar
+
+V = TypeVar("V")
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,21 @@ class InputWarning(UserWarning):
     """An input that is used, though perhaps not as it was meant. The message names the file, and
     what was left out or changed.
     """
+
+
+class Named(dict[str, V]):
+    """A dictionary whose error for an unknown name lists the known ones, and the nearest.
+
+    Example:
+        >>> Named(corrected=1, paper=2)["correct"]
+        Traceback (most recent call last):
+        KeyError: "got 'correct', expected one of 'corrected', 'paper'; did you mean 'corrected'?"
+    """
+
+    def __missing__(self, name: Any) -> V:
+        listed = ", ".join(map(repr, self))
+        hint = suggest(str(name), list(self))
+        raise KeyError(f"got {name!r}, expected one of {listed}{hint}")
 
 
 def suggest(word: str, allowed: Sequence[str]) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from attnwarp.errors import Named
 from attnwarp.methods.attention_warping import attention_warping
 from attnwarp.methods.base import Options, Result, Round
 from attnwarp.methods.by_view import by_view
@@ -26,13 +27,13 @@ from attnwarp.methods.settings import (
 )
 from attnwarp.workdir import Budget
 
-METHODS: dict[str, Callable[..., Result]] = {
-    "attention_warping": attention_warping,
-    "by_view": by_view,
-    "igs2gs": igs2gs,
-    "dge": dge,
-    "gaussctrl": gaussctrl,
-}
+METHODS: Named[Callable[..., Result]] = Named(
+    attention_warping=attention_warping,
+    by_view=by_view,
+    igs2gs=igs2gs,
+    dge=dge,
+    gaussctrl=gaussctrl,
+)
 """The methods by name."""
 
 __all__ = [

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from attnwarp import check
+from attnwarp.errors import Named
 from attnwarp.settings import Range, Settings, Share, Weight
 
 PixelCenters = Literal["half", "integer"]
@@ -95,8 +96,8 @@ class WarpSettings(Settings):
     mask_resize: MaskResize = "area"
 
 
-PRESETS: dict[str, WarpSettings] = {
-    "paper": WarpSettings(
+PRESETS: Named[WarpSettings] = Named(
+    paper=WarpSettings(
         bounds="target",
         in_front=False,
         opaque=None,
@@ -105,7 +106,7 @@ PRESETS: dict[str, WarpSettings] = {
         gaussian_filter="printed",
         depth_statistic="expected",
     ),
-    "released": WarpSettings(
+    released=WarpSettings(
         pixel_centers="integer",
         bounds="source",
         in_front=False,
@@ -121,8 +122,8 @@ PRESETS: dict[str, WarpSettings] = {
         depth_spread=None,
         mask_resize="bilinear",
     ),
-    "corrected": WarpSettings(),
-}
+    corrected=WarpSettings(),
+)
 """Three sets of choices.
 
 ``paper``: the text. The mask is "inside the image", with the target's size; nothing asks whether a

@@ -120,3 +120,17 @@ def test_a_wrong_setting_is_refused_by_name(change, message):
         preset("corrected", **change)
     with pytest.raises(ValueError, match=r"preset: got 'releases'.*did you mean 'released'"):
         preset("releases")
+
+
+def test_an_unknown_name_of_any_table_lists_the_known_ones_and_the_nearest():
+    from attnwarp import methods
+
+    for table, wrong, right in (
+        (PRESETS, "correct", "corrected"),
+        (methods.PRESETS, "attention_warp", "attention_warping"),
+        (methods.PRESETS["igs2gs"], "improve", "improved"),
+        (methods.METHODS, "gausctrl", "gaussctrl"),
+    ):
+        with pytest.raises(KeyError, match=f"got '{wrong}', expected one of .*'{right}'"):
+            table[wrong]
+        assert table.get(wrong) is None and right in table
