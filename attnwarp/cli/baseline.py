@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from attnwarp.cli.edit_image import DeviceOption, EditorOption, InstructionOption, ThreadsOption
 from attnwarp.cli.files import (
     check_inputs_stay,
     check_seen,
@@ -24,7 +25,6 @@ from attnwarp.cli.options import (
     reading_options,
 )
 from attnwarp.cli.shell import assignments, check_out, clear_errors, echo, use_threads
-from attnwarp.editing.command import DeviceOption, EditorOption, InstructionOption, ThreadsOption
 from attnwarp.editing.small import check_words, guide_of
 
 

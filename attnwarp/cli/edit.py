@@ -8,6 +8,17 @@ from typing import Annotated, Any
 
 import typer
 
+from attnwarp.cli.edit_image import (
+    MOST_PIXELS,
+    SEGMENTER,
+    DeviceOption,
+    EditorOption,
+    InstructionOption,
+    SegmenterOption,
+    ThreadsOption,
+    WhereOption,
+    check_segmenter,
+)
 from attnwarp.cli.files import (
     check_inputs_stay,
     check_seen,
@@ -25,17 +36,6 @@ from attnwarp.cli.options import (
     reading_options,
 )
 from attnwarp.cli.shell import assignments, check_out, clear_errors, echo, use_threads
-from attnwarp.editing.command import (
-    MOST_PIXELS,
-    SEGMENTER,
-    DeviceOption,
-    EditorOption,
-    InstructionOption,
-    SegmenterOption,
-    ThreadsOption,
-    WhereOption,
-    check_segmenter,
-)
 from attnwarp.editing.small import check_words, guide_of
 from attnwarp.errors import InputWarning
 

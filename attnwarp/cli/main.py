@@ -9,12 +9,12 @@ import typer
 from attnwarp.cli.baseline import baseline
 from attnwarp.cli.convert import convert, undistort
 from attnwarp.cli.edit import edit
+from attnwarp.cli.edit_image import edit_image
 from attnwarp.cli.fit import fit
 from attnwarp.cli.inspect import inspect
 from attnwarp.cli.options import program_options
 from attnwarp.cli.render import render
 from attnwarp.cli.shell import CLOSED_PIPE, clear_errors, closed_pipe, fail, file_error
-from attnwarp.editing.command import edit_image
 from attnwarp.process import resend_lost_interrupts, skip_last_collection
 
 app = typer.Typer(

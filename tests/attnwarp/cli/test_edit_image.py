@@ -8,8 +8,8 @@ from tiny_editors import pix2pix
 from tiny_segmenters import save_dino, save_sam
 from typer.testing import CliRunner
 
+from attnwarp.cli.edit_image import _read
 from attnwarp.cli.main import app
-from attnwarp.editing.command import _read
 from attnwarp.editing.editor import edit
 from attnwarp.editing.segment import GroundedSam
 from attnwarp.editing.small import load_editor
@@ -71,8 +71,23 @@ def test_the_picture_is_worked_on_at_the_size_asked_for(folder, photo, tmp_path)
         48,
     )
     assert result.exit_code == 0, result.output
-    assert cv2.imread(str(out)).shape == (32, 48, 3)  # 30 px rounded to a multiple of 8
     assert "edited as 48 x 32" in result.output and "7% too high" in result.output  # 1.6 to 1.5
+
+
+def test_a_photograph_keeps_its_size_and_gets_the_change_of_the_edit(folder, tmp_path):
+    """Oracle: the library's small edit, its change enlarged by OpenCV."""
+    pixels = np.random.default_rng(0).integers(0, 256, (80, 128, 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "photo.png"), pixels[..., ::-1])
+    out = tmp_path / "out.png"
+    words = ("--instruction", "a bear", "--editor", folder, "--steps", 1, "--size", 64)
+    result = run(tmp_path / "photo.png", *words, "--out", out)
+    assert result.exit_code == 0, result.output
+    whole = pixels.astype(np.float32) / 255
+    small = cv2.resize(whole, (64, 40), interpolation=cv2.INTER_AREA)
+    edited = edit(load_editor(str(folder)), [small], "a bear", steps=1).images[0]
+    change = cv2.resize(edited - small, (128, 80), interpolation=cv2.INTER_LINEAR)
+    expected = np.rint(255 * np.clip(whole + change, 0, 1))
+    assert np.abs(cv2.imread(str(out))[..., ::-1] - expected).max() <= 1
 
 
 def test_transparent_pixels_are_laid_over_black(folder, photo, tmp_path):

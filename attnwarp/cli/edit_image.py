@@ -1,0 +1,231 @@
+"""The command attnwarp edit-image. Nothing heavy is imported until it runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from attnwarp.editing.small import check_words, guide_of
+from attnwarp.errors import InputWarning
+
+if TYPE_CHECKING:
+    from attnwarp.editing.editor import Image
+
+TILE_COLUMNS = 5
+
+MOST_PIXELS = 4096
+"""Longest side that an edit works at; more is a typing error that would take all the memory."""
+
+MOST_STRETCH = 0.03
+"""Change of a picture's shape that is not worth a word."""
+
+SEGMENTER = "clip-parts"
+"""What ``--where`` asks if ``--segmenter`` is left out."""
+
+InstructionOption = Annotated[str, typer.Option(help='What to change, such as "make it red".')]
+EditorOption = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME|FOLDER|BASE,CONTROLNET",
+        help="A bundled editor, or a folder or two in diffusers' format.",
+    ),
+]
+PictureEditorOption = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME|FOLDER",
+        help="A bundled editor that takes pictures, or a folder in diffusers' format.",
+    ),
+]
+DeviceOption = Annotated[str, typer.Option(help="Of the editor: cpu or cuda.")]
+WhereOption = Annotated[
+    str | None,
+    typer.Option(
+        "--where", metavar="WORDS", help='What is edited, such as "bear"; the rest stays.'
+    ),
+]
+SegmenterOption = Annotated[
+    str | None,
+    typer.Option(
+        help="What --where asks: clip-parts if left out, or DINO_FOLDER,SAM_FOLDER (transformers)."
+    ),
+]
+ThreadsOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="CPU threads; if left out, one for a small editor, else all cores."),
+]
+
+
+def edit_image(
+    picture: Annotated[Path, typer.Argument(help="A PNG or JPEG file.")],
+    instruction: InstructionOption,
+    out: Annotated[Path, typer.Option(help="PNG file for the result.")],
+    editor: PictureEditorOption = "small-plain",
+    seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 0,
+    steps: Annotated[int, typer.Option(min=1, max=1000, help="Of denoising.")] = 20,
+    size: Annotated[
+        int | None,
+        typer.Option(
+            min=16,
+            max=MOST_PIXELS,
+            help="Longest side to work at in px; the editor's own if left out.",
+        ),
+    ] = None,
+    text_guidance: Annotated[
+        float | None, typer.Option(help="How much the words count; the editor's if left out.")
+    ] = None,
+    image_guidance: Annotated[
+        float | None, typer.Option(help="How much the picture counts; the editor's if left out.")
+    ] = None,
+    sheet: Annotated[
+        Path | None, typer.Option(help="PNG file for a sheet of the picture after every step.")
+    ] = None,
+    words: WhereOption = None,
+    segmenter: SegmenterOption = None,
+    mask_out: Annotated[
+        Path | None, typer.Option("--mask", help="PNG file for the mask that --where gives.")
+    ] = None,
+    device: DeviceOption = "cpu",
+    threads: ThreadsOption = None,
+) -> None:
+    """Edit a picture by an instruction."""
+    if mask_out is not None and words is None:
+        raise ValueError("--mask: needs --where, which makes the mask")
+    check_segmenter(segmenter, words)
+    check_words(instruction)
+    if guide_of(editor) != "picture":
+        raise ValueError(f"--editor {editor}: takes depth maps, expected one that takes a picture")
+    from attnwarp.io.file import check_other
+
+    for path in (out, sheet, mask_out):
+        if path is not None and path.suffix.lower() != ".png":
+            raise ValueError(f"{path}: expected a name that ends in .png")
+        if path is not None and path.is_dir():
+            raise IsADirectoryError(f"{path}: is a folder, expected a PNG file")
+        if path is not None:
+            check_other(path, picture, "the picture to edit")
+    outputs = [("--out", out), ("--sheet", sheet), ("--mask", mask_out)]
+    for (first, one), (second, other) in combinations(outputs, 2):
+        if one is not None and other is not None and one.resolve() == other.resolve():
+            raise ValueError(f"{first}, {second}: got {one} for both, expected a file for each")
+    image = _read(picture)
+
+    import numpy as np
+    import torch
+
+    from attnwarp.editing.editor import edit, own_size, side_multiple
+    from attnwarp.editing.segment import load_segmenter
+    from attnwarp.editing.small import check_instruction, load_editor, thread_count
+    from attnwarp.methods.pictures import enlarged_change
+
+    guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
+    given = {name: value for name, value in guidance.items() if value is not None}
+    model = load_editor(editor, device=device, **given)
+    check_instruction(editor, model, instruction)
+    torch.set_num_threads(thread_count(model, threads))
+    longest = size or own_size(model)
+    whole, image = image, _fit(image, longest, side_multiple(model))
+    h, w = image.shape[:2]
+    _tell_stretch(whole.shape, image.shape, side_multiple(model))
+    share = None
+    if words is not None:
+        mask = load_segmenter(segmenter or SEGMENTER, device=device).segment(image, words)
+        share = mask[..., None].astype(np.float32)
+        if mask_out is not None:
+            _write(mask_out, np.repeat(share, 3, axis=2))
+    tiles: list[Image] = [image]
+    with typer.progressbar(length=steps, label=f"{w} x {h} px", file=_stderr()) as bar:
+
+        def watch(step: int, count: int, latents: Any) -> None:
+            bar.update(1)
+            if sheet is not None:
+                tiles.append(model.decode(latents)[0])
+
+        result = edit(model, [image], instruction, steps=steps, seed=seed, watch=watch)
+    edited = result.images[0]
+    masked = edited if share is None else share * edited + (1 - share) * image
+    # The photograph's own detail stays, and gets the change, enlarged.
+    _write(out, enlarged_change(whole, masked.astype(np.float32)))
+    if sheet is not None:
+        _write(sheet, _sheet(tiles))
+    typer.echo(out)
+
+
+def check_segmenter(segmenter: str | None, words: str | None) -> None:
+    """Refuse ``--segmenter`` without ``--where``."""
+    if segmenter is not None and words is None:
+        raise ValueError("--segmenter: needs --where, the words that it looks for")
+
+
+def _stderr() -> Any:
+    import sys
+
+    return sys.stderr
+
+
+def _read(path: Path) -> Image:
+    """(H, W, 3) sRGB in [0, 1], turned as its EXIF tag asks; transparent pixels are laid over
+    black, as in a scene's edit.
+    """
+    import numpy as np
+
+    from attnwarp.io import read_upright
+
+    stored = read_upright(path)
+    values = stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+    return values[..., :3] * values[..., 3:] if stored.shape[2] == 4 else values
+
+
+def _fit(image: Image, longest: int, multiple: int) -> Image:
+    """The picture with that longest side, its sides rounded to multiples."""
+    import cv2
+    import numpy as np
+
+    h, w = image.shape[:2]
+    scale = longest / max(h, w)
+    width, height = (max(multiple, round(n * scale / multiple) * multiple) for n in (w, h))
+    if (height, width) == (h, w):
+        return image
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    return np.clip(cv2.resize(image, (width, height), interpolation=how), 0, 1)
+
+
+def _tell_stretch(before: Sequence[int], after: Sequence[int], multiple: int) -> None:
+    """Warn of a picture whose shape is clearly another once its sides are multiples."""
+    import warnings
+
+    h, w = before[:2]
+    stretch = (after[1] / after[0]) / (w / h)
+    if abs(math.log(stretch)) > math.log(1 + MOST_STRETCH):
+        warnings.warn(
+            f"{w} x {h} px is edited as {after[1]} x {after[0]}, sides that the editor takes"
+            f" (multiples of {multiple}): {max(stretch, 1 / stretch) - 1:.0%} too"
+            f" {'wide' if stretch > 1 else 'high'}; another --size may fit better",
+            InputWarning,
+            stacklevel=1,
+        )
+
+
+def _sheet(tiles: list[Image]) -> Image:
+    """Pictures side by side, white where a row has none left."""
+    import numpy as np
+
+    blank = np.ones_like(tiles[0])
+    rows = []
+    for start in range(0, len(tiles), TILE_COLUMNS):
+        row = tiles[start : start + TILE_COLUMNS]
+        rows.append(np.concatenate([*row, *[blank] * (TILE_COLUMNS - len(row))], axis=1))
+    return np.concatenate(rows)
+
+
+def _write(path: Path, image: Image) -> None:
+    from attnwarp.io.file import write_atomically
+    from attnwarp.io.picture import encode_picture
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda stream: stream.write(encode_picture(image)))
