@@ -23,8 +23,10 @@ import numpy as np
 import torch
 
 from attnwarp.camera import Camera
-from attnwarp.editing.attention import Recording, RecordingPlan, choose_layers, inject, record
 from attnwarp.editing.editor import STEPS, edit
+from attnwarp.editing.injection import inject
+from attnwarp.editing.layers import choose_layers
+from attnwarp.editing.recording import Recording, RecordingPlan, record
 from attnwarp.editing.small import load_editor, thread_count
 from attnwarp.process import core_count
 from attnwarp.warp import (

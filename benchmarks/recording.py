@@ -28,14 +28,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from attnwarp.editing.attention import (
-    PIX2PIX_BRANCHES,
-    Recording,
-    RecordingPlan,
-    choose_layers,
-    inject,
-    record,
-)
+from attnwarp.editing.injection import inject
+from attnwarp.editing.layers import PIX2PIX_BRANCHES, choose_layers
+from attnwarp.editing.recording import Recording, RecordingPlan, record
 from attnwarp_eval.cost import peak_memory_mb, reset_peak_memory
 from benchmarks import command
 

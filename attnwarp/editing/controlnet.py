@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from attnwarp import check
-from attnwarp.editing.attention import CONTROLNET_BRANCHES
 from attnwarp.editing.editor import (
     LATENT_CHANNELS,
     MOST_GUIDANCE,
@@ -23,6 +22,7 @@ from attnwarp.editing.editor import (
     check_networks,
     tensor_of,
 )
+from attnwarp.editing.layers import CONTROLNET_BRANCHES
 
 
 def control_image(depth: npt.NDArray[Any]) -> Image:

@@ -138,7 +138,7 @@ def edit(
     estimate: Callable[[int, Tensor], Tensor] | None = None,
 ) -> Edit:
     """Edit views together. Record or inject attention by running this inside
-    :func:`attnwarp.editing.attention.record` or :func:`~attnwarp.editing.attention.inject`.
+    :func:`attnwarp.editing.recording.record` or :func:`~attnwarp.editing.injection.inject`.
 
     Args:
         editor: the model.

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from attnwarp import check
-from attnwarp.editing.attention import PIX2PIX_BRANCHES
 from attnwarp.editing.editor import (
     LATENT_CHANNELS,
     MOST_GUIDANCE,
@@ -21,6 +20,7 @@ from attnwarp.editing.editor import (
     check_networks,
     tensor_of,
 )
+from attnwarp.editing.layers import PIX2PIX_BRANCHES
 
 
 def check_pix2pix(

@@ -19,8 +19,9 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.editing.attention import TokenWarp, inject, record
 from attnwarp.editing.editor import Editor
+from attnwarp.editing.injection import TokenWarp, inject
+from attnwarp.editing.recording import record
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
 from attnwarp.methods.geometry import Warps

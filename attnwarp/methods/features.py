@@ -7,8 +7,9 @@ from pathlib import Path
 
 import torch
 
-from attnwarp.editing.attention import Layer, RecordingPlan, choose_layers
 from attnwarp.editing.editor import Editor, guided
+from attnwarp.editing.layers import Layer, choose_layers
+from attnwarp.editing.recording import RecordingPlan
 from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.methods.sight import Size
 
@@ -67,7 +68,7 @@ class Features:
             branches,
             self._kept(branches),
             s.steps,
-            dtype=torch.float16 if s.feature_type == "float16" else torch.float32,
+            dtype=getattr(torch, s.feature_type),
             store=self.store / str(view) if isinstance(self.store, Path) else self.store,  # type: ignore[arg-type]
             chosen=s.feature_range(),
         )

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from attnwarp.camera import Camera
-from attnwarp.editing.attention import all_layers
+from attnwarp.editing.layers import all_layers
 from attnwarp.methods.attention import Attend, joint, self_attention
 from attnwarp.methods.epipolar import line_distances
 from attnwarp.methods.pictures import Size

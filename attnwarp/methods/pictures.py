@@ -12,7 +12,8 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.editing.attention import Layer, Recording
+from attnwarp.editing.layers import Layer
+from attnwarp.editing.recording import Recording
 from attnwarp.methods.sight import Sight
 
 Image = npt.NDArray[np.float32]

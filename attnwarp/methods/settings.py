@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from attnwarp import check
-from attnwarp.editing.attention import Block, Kind
+from attnwarp.editing.layers import Block, Kind
 from attnwarp.editing.schedule import PUBLISHED_STEPS
+from attnwarp.errors import Named
 from attnwarp.settings import Count, Number, Range, Seed, Settings, Share, Weight
 from attnwarp.warp.settings import PRESETS as WARPS
 from attnwarp.warp.settings import WarpSettings
@@ -165,12 +166,13 @@ class AttentionWarpingSettings(MethodSettings):
         depth_from: the model before the edit ("frozen") or as tuned so far ("current").
         a0: weight of the injected features at the first step.
         decay: "linear", a_t = a0 (T - t) / T, or "constant".
-        fractions, kinds, blocks: layers, :func:`attnwarp.editing.attention.choose_layers`.
+        fractions, kinds, blocks: layers, :func:`attnwarp.editing.layers.choose_layers`.
         feature_steps: (from, until) shares of the steps whose features are recorded and injected.
             The others leave every view its own: [0, 0.5] halves the memory.
         branches: guidance branches that get features. None: text and image of InstructPix2Pix,
             both of a ControlNet.
-        feature_type: of the recorded features; float16 halves their memory and rounds.
+        feature_type: of the recorded features. float16 halves their memory and rounds; bfloat16
+            rounds eight times as coarsely and has float32's range.
         training: views that a stage tunes on. "all": the source and everything edited so far.
             "stage": the stage's views. "modulo": view ``step % n`` of the stage's n views, but the
             source at every tenth step; of 40 views 4 are then never visited (the released code).
@@ -225,7 +227,7 @@ class AttentionWarpingSettings(MethodSettings):
     blocks: tuple[Block, ...] = ("up",)
     feature_steps: tuple[float, float] = (0.0, 1.0)
     branches: tuple[str, ...] | None = None
-    feature_type: Literal["float32", "float16"] = "float32"
+    feature_type: Literal["float32", "float16", "bfloat16"] = "float32"
     training: Literal["all", "stage", "modulo"] = "all"
     psnr_views: Literal["all", "before_last_stage"] = "all"
 
@@ -450,8 +452,8 @@ _RELEASED = AttentionWarpingSettings(
     psnr_views="before_last_stage",
 )
 
-PRESETS: dict[str, dict[str, MethodSettings]] = {
-    "attention_warping": {
+PRESETS: Named[Named[MethodSettings]] = Named({
+    "attention_warping": Named({
         "corrected": AttentionWarpingSettings(),
         "paper": AttentionWarpingSettings(
             views_per_stage=MOST_VIEWS,
@@ -478,24 +480,24 @@ PRESETS: dict[str, dict[str, MethodSettings]] = {
             estimate_in="picture",
             estimate_margin=1 / 64,
         ),
-    },
-    "by_view": {"default": ByViewSettings()},
-    "igs2gs": {
+    }),
+    "by_view": Named({"default": ByViewSettings()}),
+    "igs2gs": Named({
         "default": IGS2GSSettings(),
         "released": _IGS2GS,
         "improved": replace(_IGS2GS, iterations=3000),
-    },
-    "dge": {
+    }),
+    "dge": Named({
         "default": DGESettings(),
         "released": DGESettings(text_guidance=7.5, image_guidance=1.5),
-    },
-    "gaussctrl": {
+    }),
+    "gaussctrl": Named({
         "default": GaussCtrlSettings(),
         "paper": GaussCtrlSettings(**_STABLE_DIFFUSION),
         "released": GaussCtrlSettings(control_share=0.0, source_prompt=None, **_STABLE_DIFFUSION),
         "random": GaussCtrlSettings(latents="random", **_STABLE_DIFFUSION),
-    },
-}
+    }),
+})  # fmt: skip
 """Settings by the method's name and their own; the first of a method is its default.
 
 Those of ``attention_warping`` have the warp of their name (:data:`attnwarp.warp.PRESETS`).

@@ -233,7 +233,7 @@ class Sight:
 @dataclass(frozen=True, eq=False)
 class SourceWarp:
     """The warp from one source to the pixels of a target that take it; a
-    :class:`attnwarp.editing.attention.LayerWarp`.
+    :class:`attnwarp.editing.injection.LayerWarp`.
 
     Args:
         sight: of the target.

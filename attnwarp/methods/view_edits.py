@@ -15,9 +15,9 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.digest import digest
-from attnwarp.editing.attention import Recording, in_words
 from attnwarp.editing.editor import edit, side_multiple
 from attnwarp.editing.inversion import NoiseMaps, inversion_steps, invert_view, noise_maps, replay
+from attnwarp.editing.recording import Recording, in_words
 from attnwarp.editing.schedule import steps_as_published
 from attnwarp.gaussians import Gaussians
 from attnwarp.io.names import file_stems

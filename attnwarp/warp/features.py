@@ -7,6 +7,7 @@ from functools import cached_property
 from numbers import Real
 from typing import Any, Literal, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -54,17 +55,23 @@ class FeatureWarp:
         """(H W, 1) float32: 1 in the mask, 0 elsewhere."""
         return self.mask.reshape(-1, 1).float()
 
-    def warp(self, features: Tensor) -> Tensor:
+    def warp(self, features: Tensor | np.ndarray[Any, Any]) -> Tensor:
         """Target features (C, H, W) or (B, C, H, W) from the source's.
 
         Args:
             features: (C, h, w) or (B, C, h, w) floating, of any size with the aspect ratio of the
                 source's grid: :func:`attnwarp.warp.sample`.
 
+        Returns:
+            In the type of ``features``; 0 where a pixel has no position in the source, NaN where it
+            reads one. NaN stands for undefined and is never filled.
+
         Raises:
             ValueError: another number of axes, another aspect ratio, or a type that cannot be
                 blended.
         """
+        if isinstance(features, np.ndarray):
+            features = torch.from_numpy(np.ascontiguousarray(features))
         check.instance(features, Tensor, "features", "torch.Tensor")
         if features.ndim not in (3, 4) or not features.dtype.is_floating_point:
             return sampling.sample(features, self.correspondence)[0]  # says what is wrong

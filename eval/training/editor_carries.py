@@ -18,16 +18,10 @@ import torch
 from torch import Tensor
 
 from attnwarp.camera import Camera
-from attnwarp.editing.attention import (
-    Recording,
-    RecordingPlan,
-    choose_layers,
-    constant,
-    decay,
-    inject,
-    record,
-)
 from attnwarp.editing.editor import Image, edit
+from attnwarp.editing.injection import constant, decay, inject
+from attnwarp.editing.layers import choose_layers
+from attnwarp.editing.recording import Recording, RecordingPlan, record
 from attnwarp.warp import EXACT_DEPTH_TOLERANCE, Surface, WarpSettings, warp_surfaces
 from training.assess import Figure, figure
 from training.card_sections import Kept, asked_for, percent, short_of

@@ -14,8 +14,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from attnwarp.editing.attention import Call, Layer, choose_layers, hooked
 from attnwarp.editing.latents import BLOCK, CHANNELS
+from attnwarp.editing.layers import Call, Layer, choose_layers, hooked
 from training.editing_pairs import SIZE
 from training.editor_answers import settled
 from training.editor_net import T_STEPS, EditorNet, draw_steps, loss_of, noised

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from tiny_editors import unet
 
-from attnwarp.editing.attention import Layer, RecordingPlan
+from attnwarp.editing.layers import Layer
+from attnwarp.editing.recording import RecordingPlan
 from attnwarp_eval.cost import peak_memory_mb
 from benchmarks import recording
 

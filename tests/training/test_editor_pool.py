@@ -5,7 +5,8 @@ import pytest
 import torch
 from picked_answers import picked
 
-from attnwarp.editing.attention import Layer, decay
+from attnwarp.editing.injection import decay
+from attnwarp.editing.layers import Layer
 from training import editing_pairs
 from training.editing_pairs import AMBIGUOUS, GROUPS, load_pairs
 from training.editor import make_tokenizer

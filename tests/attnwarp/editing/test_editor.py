@@ -18,20 +18,13 @@ from diffusers import (
 )
 from tiny_editors import controlnet, nearest_steps, pix2pix, unet
 
-from attnwarp.editing.attention import (
-    CONTROLNET_BRANCHES,
-    PIX2PIX_BRANCHES,
-    RecordingPlan,
-    all_layers,
-    choose_layers,
-    constant,
-    inject,
-    record,
-)
 from attnwarp.editing.controlnet import DepthControlNet, control_image
 from attnwarp.editing.editor import edit, own_size, shared_noise, side_multiple
 from attnwarp.editing.folder import load_parts
+from attnwarp.editing.injection import constant, inject
+from attnwarp.editing.layers import CONTROLNET_BRANCHES, PIX2PIX_BRANCHES, all_layers, choose_layers
 from attnwarp.editing.pix2pix import InstructPix2Pix
+from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.schedule import (
     Schedule,
     following,

@@ -187,16 +187,11 @@ def test_a_picture_edited_by_hand_can_be_the_source():
     """Its own noise is replayed while features are recorded; they then go into another view's edit."""
     from tiny_editors import pix2pix
 
-    from attnwarp.editing.attention import (
-        PIX2PIX_BRANCHES,
-        RecordingPlan,
-        choose_layers,
-        constant,
-        inject,
-        record,
-    )
     from attnwarp.editing.editor import edit
+    from attnwarp.editing.injection import constant, inject
+    from attnwarp.editing.layers import PIX2PIX_BRANCHES, choose_layers
     from attnwarp.editing.pix2pix import InstructPix2Pix
+    from attnwarp.editing.recording import RecordingPlan, record
 
     pipe = pix2pix()
     editor = InstructPix2Pix(pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler)

@@ -1120,7 +1120,7 @@ def test_progress_ends_at_its_total_and_never_falls(scene, editor, tmp_path):
 
 def recorded(scene, editor, tmp_path, settings):
     """The features of the source of an edit."""
-    from attnwarp.editing.attention import record as keep
+    from attnwarp.editing.recording import record as keep
     from attnwarp.methods.features import Features
 
     plan = Features(editor, settings, "cpu").plan(0, (16, 16), further=False)
@@ -1143,7 +1143,7 @@ def test_half_precision_halves_the_features_and_rounds_them_once(scene, editor, 
 
 def test_features_of_chosen_steps_alone_reach_a_target(scene, editor, tmp_path):
     """Oracle: a recording of all steps, with the first steps' weights alone, and no warp."""
-    from attnwarp.editing.attention import decay, inject
+    from attnwarp.editing.injection import decay, inject
 
     settings = replace(QUICK, feature_steps=(0.0, 0.5), stages=1, iterations=0, batch=1)
     everything = recorded(scene, editor, tmp_path, QUICK)

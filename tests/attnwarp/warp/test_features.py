@@ -341,3 +341,8 @@ def test_a_layer_makes_its_taps_once(layer, monkeypatch):
         fresh.blend_tokens(rows, rows, 0.5)
         fresh.warp(random_maps(layer, dtype=dtype))
     assert len(made) == 1
+
+
+def test_numpy_is_warped_as_torch_is(layer):
+    maps = random_maps(layer)
+    assert torch.equal(layer.warp(maps.numpy()), layer.warp(maps))

@@ -8,7 +8,9 @@ import numpy as np
 import torch
 
 from attnwarp.camera import Camera
-from attnwarp.editing.attention import Layer, RecordingPlan, constant, inject, record
+from attnwarp.editing.injection import constant, inject
+from attnwarp.editing.layers import Layer
+from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.warp import FeatureWarp, Surface, WarpedView, warp_surfaces
 from attnwarp_eval.stability.bilinear import Extended, extended, sampling_matrix
 from attnwarp_eval.stability.case import Bound, Case, Way, exact, ways

@@ -9,7 +9,9 @@ import numpy as np
 import torch
 
 from attnwarp.camera import Camera
-from attnwarp.editing.attention import Layer, RecordingPlan, constant, inject, record
+from attnwarp.editing.injection import constant, inject
+from attnwarp.editing.layers import Layer
+from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.warp import Correspondence, FeatureWarp, Surface, preset, warp_surfaces
 from attnwarp_eval.stability.bilinear import Extended, extended, sampling_matrix
 from attnwarp_eval.stability.case import Bound, Case, Way
@@ -215,7 +217,7 @@ def _injected(weight: float, way: Way) -> float:
 
 
 class _At:
-    """A layer's warp where :func:`attnwarp.editing.attention.inject` asks for a view's."""
+    """A layer's warp where :func:`attnwarp.editing.injection.inject` asks for a view's."""
 
     def __init__(self, layer: FeatureWarp) -> None:
         self.layer = layer

@@ -13,19 +13,16 @@ from diffusers.models.attention_processor import AttnProcessor2_0
 from tiny_editors import controlnet, pix2pix, unet
 
 from attnwarp.camera import Camera
-from attnwarp.editing.attention import (
+from attnwarp.editing.injection import constant, decay, inject
+from attnwarp.editing.layers import (
     CONTROLNET_BRANCHES,
     PIX2PIX_BRANCHES,
     Layer,
-    RecordingPlan,
     all_layers,
     choose_layers,
-    constant,
-    decay,
     hooked,
-    inject,
-    record,
 )
+from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.warp import Surface, WarpSettings, warp_surfaces
 
 SIZE = (6, 8)
@@ -517,3 +514,106 @@ def test_what_does_not_match_the_recording_is_refused_by_name():
             plan_of(net, store=store)
     with pytest.raises(ValueError, match="branch: got 'uncond'"):
         recording.features(981.0, recording.plan.layers[0], "uncond")
+
+
+def loud_plan(net, dtype):
+    """A recording of features beyond float16's range."""
+    for name, module in net.named_modules():
+        if name.endswith("attn1") and name.startswith("up_blocks"):
+            module.to_out[0].weight.data *= 1e7
+    return plan_of(net, dtype=dtype)
+
+
+@pytest.mark.parametrize("store", ["device", "cpu", "disk"])
+def test_a_feature_beyond_float16_is_refused_by_layer_step_and_type(store, tmp_path):
+    net = unet(8)
+    place = tmp_path if store == "disk" else store
+    plan = loud_plan(net, torch.float16)
+    plan = RecordingPlan(
+        plan.layers, SIZE, plan.branches, plan.keep, 2, dtype=torch.float16, store=place
+    )
+    said = r"step 0 \(timestep 981\) of up_blocks.* beyond float16's 65504; record in bfloat16"
+    with pytest.raises(ValueError, match=said), record(net, plan):
+        run(net)
+
+
+def test_bfloat16_holds_features_beyond_float16_and_rounds_them_once():
+    """Oracle: torch's own conversion of a recording in float32."""
+    net = unet(8)
+    exact, rounded = (loud_plan_once(net, dtype) for dtype in (torch.float32, torch.bfloat16))
+    with record(net, exact) as whole:
+        run(net)
+    with record(net, rounded) as half:
+        run(net)
+    largest = 0.0
+    for layer in exact.layers:
+        one, other = (r.features(981, layer, "text") for r in (whole, half))
+        assert torch.equal(one.bfloat16(), other)
+        largest = max(largest, float(one.abs().max()))
+    assert largest > 65504
+
+
+def loud_plan_once(net, dtype):
+    if not hasattr(net, "made_loud"):
+        net.made_loud = True
+        return loud_plan(net, dtype)
+    return plan_of(net, dtype=dtype)
+
+
+def nothing(net):
+    """No pass of the UNet at all."""
+
+
+def past_its_hooks(net):
+    x, text = torch.zeros(3, net.config.in_channels, *SIZE), torch.zeros(3, 5, 32)
+    net.forward(x, torch.tensor(981), encoder_hidden_states=text)
+
+
+def of_a_copy(net):
+    run(unet(8), timesteps=(981,))
+
+
+def with_another_forward(net):
+    block = net.up_blocks[0].attentions[0].transformer_blocks[0]
+    attention = block.attn1
+    block.attn1 = torch.nn.Identity()
+    block.attn1.forward = lambda x, **_: attention.forward(x)
+    run(net, timesteps=(981,))
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (nothing, "no pass went through this UNet"),
+        (past_its_hooks, r"call unet\(\.\.\.\), not unet\.forward"),
+        (of_a_copy, "hand over the module that the pipeline calls, not a copy"),
+        (with_another_forward, "not called in any pass; its forward was replaced"),
+    ],
+)
+def test_what_keeps_hooks_from_running_is_an_error_that_names_it(call, said):
+    net = unet(8)
+    plan = plan_of(net, steps=1)
+    with record(net, plan) as recording:
+        run(net, timesteps=(981,))
+    for context in (
+        record(net, plan),
+        inject(net, recording, branches=PIX2PIX_BRANCHES, warps=[None]),
+    ):
+        with pytest.raises(RuntimeError, match=said), context:
+            call(net)
+
+
+def test_a_compiled_unet_is_named_as_such():
+    """torch's own attribute of a module that was compiled in place."""
+    net = unet(8)
+    net.compile(backend="eager")
+    net._compiled_call_impl = lambda *args, **kwargs: None  # what the compiled graph would give
+    said = pytest.raises(RuntimeError, match="the UNet is compiled; use it before torch.compile")
+    with said, record(net, plan_of(net, steps=1)):
+        net()
+
+
+def test_an_error_inside_the_block_is_not_covered_by_another():
+    net = unet(8)
+    with pytest.raises(ZeroDivisionError), record(net, plan_of(net)):
+        1 / 0  # noqa: B018

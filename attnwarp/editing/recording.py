@@ -1,0 +1,333 @@
+"""Recorded attention features: what is kept of a run, the memory it takes, and the recording."""
+
+from __future__ import annotations
+
+import functools
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from attnwarp import check
+from attnwarp.editing.layers import Call, Layer, Size, hooked
+
+
+@dataclass(frozen=True)
+class RecordingPlan:
+    """What is recorded, and the memory it takes, before anything runs.
+
+    Args:
+        layers: to record, see :func:`choose_layers`.
+        latent_size: (h, w) of the latents.
+        branches: the guidance branches in the order of the batch, such as
+            :data:`PIX2PIX_BRANCHES`; ("text",) without guidance.
+        keep: those of them to record.
+        steps: of denoising.
+        views: pictures in a batch.
+        dtype: of what is stored. Half precision halves the memory and rounds.
+        store: "device" leaves features where they are made, "cpu" moves them to main memory, a
+            Path of a folder writes them there. Each recording has a folder of its own in it.
+        chosen: numbers of the steps to record, from 0; all of them if left out. The others are
+            neither stored nor injected, so half of the steps take half of the memory.
+
+    Raises:
+        ValueError: nothing to record, or an unknown branch, step or store; the message names it.
+
+    Example:
+        >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
+        >>> plan = RecordingPlan((layer,), (32, 32), ("uncond", "text"), ("text",), steps=20)
+        >>> plan.bytes == 20 * 32 * 32 * 64 * 4
+        True
+        >>> print(plan)
+        recording 1 layer, 1 branch (text), 20 steps in float32: 5.0 MiB on the device
+        >>> from dataclasses import replace
+        >>> print(replace(plan, chosen=range(10)))
+        recording 1 layer, 1 branch (text), 10 of 20 steps in float32: 2.5 MiB on the device
+    """
+
+    layers: tuple[Layer, ...]
+    latent_size: Size
+    branches: tuple[str, ...]
+    keep: tuple[str, ...]
+    steps: int
+    views: int = 1
+    dtype: torch.dtype = torch.float32
+    store: Literal["device", "cpu"] | Path = "device"
+    chosen: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.layers:
+            raise ValueError("layers: got none, expected at least one")
+        for branch in self.keep:
+            check.one_of(branch, self.branches, "keep")
+        if not self.keep:
+            raise ValueError("keep: got no branch, expected at least one")
+        if not isinstance(self.store, Path) and self.store not in ("device", "cpu"):
+            raise ValueError(
+                f"store: got {self.store!r}, expected 'device', 'cpu' or a folder as a Path"
+            )
+        if min(self.steps, self.views, *self.latent_size) < 1:
+            raise ValueError(
+                f"steps, views, latent_size: got {self.steps}, {self.views}, {self.latent_size},"
+                " expected at least 1"
+            )
+        if self.chosen is not None:
+            for number in self.chosen:
+                check.number(number, 0, self.steps - 1, "chosen", whole=True)
+            if not self.chosen:
+                raise ValueError("chosen: got no step, expected at least one")
+
+    @property
+    def recorded(self) -> frozenset[int]:
+        """Numbers of the steps that are stored, from 0.
+
+        Example:
+            >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
+            >>> sorted(RecordingPlan((layer,), (8, 8), ("text",), ("text",), steps=3).recorded)
+            [0, 1, 2]
+        """
+        return frozenset(range(self.steps) if self.chosen is None else self.chosen)
+
+    @property
+    def bytes(self) -> int:
+        """Of all features together."""
+        values = 0
+        for layer in self.layers:
+            h, w = layer.size(self.latent_size)
+            values += h * w * layer.channels
+        return values * len(self.keep) * self.views * len(self.recorded) * self.dtype.itemsize
+
+    def __str__(self) -> str:
+        return in_words([self])
+
+
+def in_words(plans: Sequence[RecordingPlan]) -> str:
+    """A line for the recordings of one or several sources, with the memory of all together.
+
+    Args:
+        plans: at least one; layers, branches and steps are said of the first.
+
+    Example:
+        >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
+        >>> plan = RecordingPlan((layer,), (32, 32), ("uncond", "text"), ("text",), steps=20)
+        >>> print(in_words([plan, plan]))
+        recording 2 sources, 1 layer, 1 branch (text), 20 steps in float32: 10.0 MiB on the device
+    """
+
+    def counted(number: int, word: str) -> str:
+        plural = "branches" if word == "branch" else f"{word}s"
+        return f"{number} {word if number == 1 else plural}"
+
+    first = plans[0]
+    amount = sum(plan.bytes for plan in plans) / 2**20
+    size = f"{amount / 1024:.2f} GiB" if amount >= 1024 else f"{amount:.1f} MiB"
+    kind = str(first.dtype).removeprefix("torch.")
+    sources = f"{len(plans)} sources, " if len(plans) > 1 else ""
+    places = {"device": "on the device", "cpu": "in main memory"}
+    folders = [plan.store for plan in plans if isinstance(plan.store, Path)]
+    some = len(first.recorded)
+    some_of = "" if some == first.steps else f"{some} of "
+    place = f"in {os.path.commonpath(folders)}" if folders else places[str(first.store)]
+    return (
+        f"recording {sources}{counted(len(first.layers), 'layer')},"
+        f" {counted(len(first.keep), 'branch')} ({', '.join(first.keep)}),"
+        f" {some_of}{counted(first.steps, 'step')} in {kind}: {size} {place}"
+    )
+
+
+@dataclass(eq=False)
+class Recording:
+    """Features of one run, by step, layer and branch.
+
+    Attributes:
+        plan: what was recorded.
+        timesteps: of the steps so far, in their order, those without features included. A scheduler
+            that evaluates a timestep twice (PNDM, Heun) has it twice.
+    """
+
+    plan: RecordingPlan
+    timesteps: list[float] = field(default_factory=list)
+    _features: dict[tuple[int, str], Tensor | Path] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Recording({len(self.timesteps)} steps so far of: {self.plan})"
+
+    @functools.cached_property
+    def _folder(self) -> Path:
+        """A new folder, so that no other recording writes to the same files."""
+        store = Path(self.plan.store)
+        store.mkdir(parents=True, exist_ok=True)
+        return Path(tempfile.mkdtemp(prefix="recording-", dir=store))
+
+    @property
+    def bytes(self) -> int:
+        """Memory or disk that the features hold, whole storages counted."""
+        storages = {}
+        for value in self._features.values():
+            if isinstance(value, Tensor):
+                storages[value.untyped_storage().data_ptr()] = value.untyped_storage().nbytes()
+        files = [value for value in self._features.values() if isinstance(value, Path)]
+        return sum(storages.values()) + sum(path.stat().st_size for path in files)
+
+    def features(self, timestep: float, layer: Layer, branch: str) -> Tensor:
+        """(views, H W, C) features of a step, a layer and a branch; of the first step with that
+        timestep.
+
+        Raises:
+            ValueError: not recorded; the message names what is.
+        """
+        return self._features_of(self.step_of(timestep), layer, branch)
+
+    def _features_of(self, number: int, layer: Layer, branch: str) -> Tensor:
+        if number not in self.plan.recorded:
+            listed = ", ".join(map(str, sorted(self.plan.recorded)))
+            raise ValueError(
+                f"timestep: {self.timesteps[number]:g} is step {number}, whose features were not"
+                f" chosen; those of {listed} were"
+            )
+        if layer not in self.plan.layers:
+            raise ValueError(f"layer: {layer.name} was not recorded")
+        check.one_of(branch, self.plan.keep, "branch")
+        value = self._features[(number, layer.name)]
+        if isinstance(value, Path):
+            from safetensors import safe_open
+
+            with safe_open(value, "pt") as stored:
+                # The other branches stay on disk.
+                return self._of_branch(stored.get_slice("features"), branch)
+        return self._of_branch(value, branch)
+
+    def _of_branch(self, value: Any, branch: str) -> Tensor:
+        """The rows of a branch, of a tensor or a slice of a file."""
+        rows = value.shape[0] if isinstance(value, Tensor) else value.get_shape()[0]
+        views = rows // len(self.plan.keep)
+        row = self.plan.keep.index(branch) * views
+        part: Tensor = value[row : row + views]
+        return part
+
+    def step_of(self, timestep: float, begin: int = 0) -> int:
+        """The number of a timestep among those of the recorded run, from 0.
+
+        Args:
+            begin: of those with that timestep, the first from this number on, or else the first.
+
+        Raises:
+            ValueError: the run had no such timestep.
+        """
+        if timestep not in self.timesteps:
+            listed = ", ".join(f"{t:g}" for t in self.timesteps) or "none"
+            raise ValueError(
+                f"timestep: got {timestep:g}, recorded are {listed}; run both with one scheduler"
+                " and the same steps"
+            )
+        later = timestep in self.timesteps[begin:]
+        return self.timesteps.index(timestep, begin if later else 0)
+
+    def _check_range(self, number: int, layer: Layer, features: Tensor, stored: Tensor) -> None:
+        """Refuse features that half precision turned into infinities."""
+        largest = torch.finfo(self.plan.dtype).max
+        if largest >= torch.finfo(features.dtype).max or not bool(torch.isinf(stored).any()):
+            return
+        value = float(features.detach().abs().amax())
+        kind = str(self.plan.dtype).removeprefix("torch.")
+        raise ValueError(
+            f"dtype: step {number} (timestep {self.timesteps[number]:g}) of {layer.name} has a"
+            f" feature of {value:g}, beyond {kind}'s {largest:g}; record in bfloat16, which has the"
+            " range of float32, or in float32"
+        )
+
+    def _put(self, number: int, layer: Layer, features: Tensor) -> None:
+        """Store (branches x views, H W, C) features of the kept branches."""
+        plan = self.plan
+        key = (number, layer.name)
+        # A copy of its own: a slice would keep the whole batch's memory alive.
+        stored = torch.empty_like(features, dtype=plan.dtype, memory_format=torch.contiguous_format)
+        stored.copy_(features.detach())
+        self._check_range(number, layer, features, stored)
+        if plan.store == "device":
+            self._features[key] = stored
+        elif plan.store == "cpu":
+            self._features[key] = stored.cpu()
+        else:
+            from safetensors.torch import save_file
+
+            path = self._folder / f"{number}-{layer.name}.safetensors"
+            save_file({"features": stored.cpu()}, path)
+            self._features[key] = path
+
+
+@contextmanager
+def record(
+    unet: torch.nn.Module, plan: RecordingPlan, *, announce: Callable[[str], None] | None = None
+) -> Iterator[Recording]:
+    """Record the outputs of the UNet's attention layers while the block runs.
+
+    An output is taken after its projection and before the residual. No bit of it changes.
+
+    Args:
+        unet: a diffusers UNet; any pipeline or loop may call it.
+        plan: what to record.
+        announce: called with the plan in words, the memory included, before anything runs.
+
+    Raises:
+        ValueError: latents of another size, a batch of another number of rows, or more steps, than
+            planned.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.editing.editor import edit
+        >>> from attnwarp.editing.small import load_editor
+        >>> editor = load_editor("small-plain")
+        >>> from attnwarp.editing.layers import choose_layers
+        >>> layers = choose_layers(editor.unet, fractions=(1,), kinds=("self",))
+        >>> plan = RecordingPlan(layers, (8, 8), editor.branches, ("text",), steps=1)
+        >>> with record(editor.unet, plan) as recording:
+        ...     source = edit(editor, [np.zeros((32, 32, 3), np.float32)], "make it red", steps=1)
+        >>> recording.features(recording.timesteps[0], layers[0], "text").shape[:2]  # (views, H W)
+        torch.Size([1, 64])
+    """
+    if announce is not None:
+        announce(str(plan))
+    recording = Recording(plan)
+    rows, chosen = len(plan.branches) * plan.views, plan.recorded
+
+    last: list[Call] = []
+
+    def keep(layer: Layer, features: Tensor, call: Call) -> None:
+        _check_call(plan, call, rows)
+        if last != [call]:
+            if len(recording.timesteps) == plan.steps:
+                raise ValueError(
+                    f"steps: timestep {call.timestep:g} is one more than the {plan.steps} planned;"
+                    " plan a step for each pass through the UNet, len(scheduler.timesteps) of them"
+                    " (some schedulers make more than they are asked for), and record one run"
+                )
+            recording.timesteps.append(call.timestep)
+            last[:] = [call]
+        number = len(recording.timesteps) - 1
+        if number not in chosen:
+            return
+        parts = features.chunk(len(plan.branches))
+        selected = torch.cat([parts[plan.branches.index(branch)] for branch in plan.keep])
+        recording._put(number, layer, selected)
+
+    with hooked(unet, plan.layers, keep):
+        yield recording
+
+
+def _check_call(plan: RecordingPlan, call: Call, rows: int) -> None:
+    if call.latent_size != plan.latent_size:
+        raise ValueError(
+            f"latent_size: got latents of {call.latent_size}, planned {plan.latent_size}"
+        )
+    if call.batch != rows:
+        raise ValueError(
+            f"batch: got {call.batch} rows, planned {rows}: {plan.views} views in"
+            f" {len(plan.branches)} branches ({', '.join(plan.branches)})"
+        )
