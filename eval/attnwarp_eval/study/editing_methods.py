@@ -258,13 +258,13 @@ def _true_pictures(job: Job) -> EditedScene:
 
 
 def _true_pictures_reads(settings: Mapping[str, Any]) -> Set[str]:
-    from attnwarp.warp import WarpSettings
+    from attnwarp.methods import AttentionWarpingSettings
 
     read = {"stages", "views_per_stage", "iterations", "sources", *_LOSSES}
     warp: set[str] = set()
     if settings["sources"] > 1:  # what the sources see of each other orders them
         read |= {"chain_coverage", "mask"}
-        warp = warp_reads(WarpSettings.from_dict(settings["warp"]))
+        warp = warp_reads(AttentionWarpingSettings.from_dict(dict(settings)).warp)
     options = {f"options.warp.{key[4:]}" for key in warp}
     return warp | options | _options(settings, settings.keys() - read)
 
