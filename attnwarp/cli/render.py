@@ -37,8 +37,9 @@ def render(
         int | None, typer.Option(min=1, help="Longest side in px; the cameras' own if left out.")
     ] = None,
     near: Annotated[
-        float, typer.Option(help="Nothing nearer than this is drawn, scene units.")
-    ] = 0.01,
+        float | None,
+        typer.Option(help="Nothing nearer is drawn, scene units; as in a fit if left out."),
+    ] = None,
     depth: Annotated[
         bool, typer.Option("--depth", help="Also NAME.depth.npy: median depth, NaN where none.")
     ] = False,
@@ -61,6 +62,7 @@ def render(
         import attnwarp.render
         from attnwarp.io.file import write_atomically
         from attnwarp.io.names import file_stems
+        from attnwarp.methods.scene import near_of
 
         use_threads(threads)
         splats = read_splats(model, kind, antialiased)
@@ -70,6 +72,7 @@ def render(
         views = dataset.cameras
         check_inputs_stay((out / f"{name}.png" for name in file_stems(views)), dataset.image_paths)
         out.mkdir(parents=True, exist_ok=True)
+        near = near_of(views, splats) if near is None else near
         seen = False
         with display(title=out.name) as show:
             for number, (camera, name) in enumerate(zip(views, file_stems(views), strict=True), 1):

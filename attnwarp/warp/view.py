@@ -371,9 +371,8 @@ def render_surface(
         camera: whose view is rendered; (H, W) is its size.
         settings: their ``depth`` and ``depth_statistic`` choose the depth. 3D splats have "peak"
             depth in place of "intersection".
-        near: nothing nearer than this depth is seen, in scene units. By default the renderer's
-            own, or a hundredth of the splats' median distance where that is less: a world in small
-            units has a surface too.
+        near: nothing nearer than this depth is seen, in scene units; a hundredth of the splats'
+            median distance if left out.
         backend: of :func:`attnwarp.render.render`.
 
     Returns:
@@ -483,28 +482,18 @@ def _checked_segment(
 
 
 def near_plane(gaussians: Gaussians, camera: Camera) -> float:
-    """The default near plane, in scene units: the renderer's, or a hundredth of the median distance
-    of the splats from the camera if that is less.
-    """
-    from attnwarp.render.constants import NEAR
+    """A hundredth of the splats' median distance from the camera, in scene units.
 
-    if not len(gaussians) or _mostly_beyond(gaussians, camera, 100 * NEAR):
+    An absolute length would draw what hangs before the camera in a scene of large units, and
+    nothing at all in one of small units.
+    """
+    if not len(gaussians):
+        from attnwarp.render.constants import NEAR
+
         return NEAR
-    distances = np.linalg.norm(gaussians.world_means() - camera.position, axis=1)
-    return min(NEAR, float(np.median(distances)) / 100)
-
-
-def _mostly_beyond(gaussians: Gaussians, camera: Camera, distance: float) -> bool:
-    """Whether more than half of the splats surely lie beyond a distance from the camera.
-
-    In the means' own precision, which takes a tenth of the time: what float32 may round lies within
-    the limit.
-    """
-    offset = camera.position - gaussians.origin
-    away = gaussians.means.detach() - gaussians.means.new_tensor(offset)
-    limit = 1.01 * distance + 1e-6 * float(np.linalg.norm(offset))
-    beyond = torch.linalg.vector_norm(away, dim=1) > limit
-    return 2 * int(beyond.sum()) > len(gaussians)
+    offset = gaussians.means.new_tensor(camera.position - gaussians.origin)
+    away = torch.linalg.vector_norm(gaussians.means.detach() - offset, dim=1)
+    return float(away.median()) / 100
 
 
 def _normal_rule(

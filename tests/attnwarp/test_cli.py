@@ -469,10 +469,39 @@ def test_render_says_where_no_view_shows_a_splat(data, tmp_path):
         assert done.exit_code == 0, done.stderr
         pictures = [cv2.imread(str(path)) for path in out.glob("*.png")]
         assert len(pictures) == 9 and any(picture.any() for picture in pictures) == (not expected)
-        said = (
-            f"warning: {tmp_path / name}: no view shows any of its splats beyond --near 0.01; check"
+        said = f"warning: {tmp_path / name}: no view shows any of its splats beyond --near 0.033;"
+        assert done.stderr.count(said) == expected  # 0.01 of 1.1 times the cameras' circle of 3
+
+
+def test_what_render_cuts_does_not_depend_on_the_scenes_units(data, tmp_path):
+    """Oracle: the same scene in units of its own, a floater at a 150th of its distance included."""
+    dataset, splat, pictures = read_dataset(data), one_splat(), []
+    eye = torch.tensor(dataset.cameras[0].position).float()
+    floater = eye * (1 - 0.02 / eye.norm())
+    for times in (1.0, 1 / 64, 4.0, 64.0):
+        both = Gaussians(
+            "2d",
+            times * torch.stack([splat.means[0], floater]),
+            torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
+            times * torch.tensor([[0.2, 0.2], [0.01, 0.01]]),
+            torch.ones(2),
+            torch.tensor([[[0.5, 0.5, 0.5]], [[1.5, -1.5, -1.5]]]),
         )
-        assert done.stderr.count(said) == expected
+        cameras = []
+        for camera in dataset.cameras:
+            pose = camera.world_to_camera.copy()
+            pose[:3, 3] *= times
+            cameras.append(replace(camera, world_to_camera=pose))
+        folder = tmp_path / str(times)
+        folder.mkdir()
+        write_ply(folder / "m.ply", both)
+        write_transforms(folder, Dataset(cameras, dataset.image_paths))
+        done = in_process("render", folder / "m.ply", folder, "--out", folder / "out")
+        assert done.exit_code == 0, done.stderr
+        pictures.append(cv2.imread(str(folder / "out" / "0.png")))
+    assert pictures[0][16, 16].min() > 0  # the first splat, not the red floater before it
+    for picture in pictures[1:]:
+        assert np.array_equal(picture, pictures[0])
 
 
 def test_render_says_how_far_it_is(data, tmp_path, monkeypatch):

@@ -42,6 +42,7 @@ class Capture:
         size: longest side of the pictures in px; larger ones are averaged down.
 
     Attributes:
+        near: nothing nearer than this is drawn, in scene units, as in a fit and an edit.
         source: the source camera.
         targets: all other cameras by the name of their file, without suffix.
         center: (3,) where the optical axes pass closest to each other.
@@ -66,6 +67,10 @@ class Capture:
         ]
         source = names[0] if source is None else source
         one_of(source, names, "source")
+        # The fit's losses and networks take their time to import.
+        from attnwarp.methods.scene import near_of
+
+        self.near = near_of(cameras, model)
         self.names = names
         self.source = cameras[names.index(source)]
         self.targets = {camera.name: camera for camera in cameras if camera.name != source}
@@ -85,7 +90,7 @@ class Capture:
 
     def _render(self, name: str, depth: SplatDepth, depth_statistic: DepthStatistic) -> Surface:
         settings = WarpSettings(depth=depth, depth_statistic=depth_statistic)
-        return render_surface(self.model, self.camera(name), settings)
+        return render_surface(self.model, self.camera(name), settings, near=self.near)
 
     def _image(self, name: str) -> Image:
         """(H, W, 3) sRGB of a view in [0, 1]: its picture, or a render where it has none."""
@@ -207,10 +212,10 @@ def read_edit(path: Path, names: Sequence[str]) -> Edit:
     return Edit(path, instruction, source, tuple(views), settings, (BEFORE, *stages))
 
 
-def rendered(model: Gaussians, camera: Camera) -> Image:
+def rendered(model: Gaussians, camera: Camera, near: float) -> Image:
     """(H, W, 3) render of splats over black, in [0, 1]."""
     with torch.no_grad():
-        color = render(model, camera).color
+        color = render(model, camera, near=near).color
     return np.asarray(color.clamp(0, 1).float().cpu().numpy())
 
 

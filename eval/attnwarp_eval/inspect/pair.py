@@ -26,6 +26,7 @@ from attnwarp.warp import (
     warp_surfaces,
     warp_view,
 )
+from attnwarp.warp.view import near_plane
 from attnwarp_eval.inspect.capture import Capture, Edit, rendered
 from attnwarp_eval.inspect.run import RunEdit
 from attnwarp_eval.study import pictures
@@ -117,6 +118,12 @@ class Pair:
         """The scene's truth; None for a user's own scene."""
         return None if isinstance(self.views, Capture) else self.views
 
+    def near(self, model: Gaussians) -> float:
+        """Depth in the target below which nothing of splats is drawn, in scene units."""
+        if isinstance(self.views, Capture):
+            return self.views.near
+        return near_plane(model, self.cameras[1])
+
     @property
     def cameras(self) -> tuple[Camera, Camera]:
         """Source and target."""
@@ -194,6 +201,7 @@ class Pair:
             target,
             self.settings,
             source_surface=self.surfaces[0],
+            near=self.near(self.model),
             **reads,
             warn_empty=False,
         )
@@ -224,7 +232,9 @@ class Pair:
             for depth in ("intersection", "center"):
                 how = "peak" if depth == "intersection" and self.model.kind == "3d" else depth
                 with torch.no_grad():
-                    result = render(self.model, self.cameras[1], depth=how)
+                    result = render(
+                        self.model, self.cameras[1], depth=how, near=self.near(self.model)
+                    )
                 maps[f"{depth}, expected"] = result.depth.double().numpy()
                 maps[f"{depth}, median"] = result.median_depth.double().numpy()
         return maps
@@ -502,7 +512,10 @@ class Pair:
         target = self.cameras[1]
         assert step is not None
         made = self.edit.after(self.target, step)
-        return rendered(self.splats(step), target) if made is None else fitted(made, target)
+        if made is not None:
+            return fitted(made, target)
+        splats = self.splats(step)
+        return rendered(splats, target, self.near(splats))
 
     def splats(self, step: str = "") -> Gaussians:
         """The splats after a step of the edit; those before it where a run has no others.

@@ -48,6 +48,8 @@ def test_the_centre_is_where_the_cameras_look_and_up_is_theirs(own):
     # The cameras stand on a line at z = 3 and look at (x / 2, 0, 0): their axes meet at z = -3.
     assert own.center == pytest.approx([0, 0, -3], abs=1e-6)
     assert own.up == pytest.approx([0, 1, 0], abs=1e-6)
+    # A hundredth of 1.1 times the largest distance from the cameras' mean: they end at x = -0.8, 0.8.
+    assert own.pair("corrected", "3").views.near == pytest.approx(0.01 * 1.1 * 0.8, abs=1e-6)
 
 
 def test_what_stands_before_a_point_comes_from_the_sources_own_depth(own):
