@@ -21,6 +21,7 @@ from attnwarp.cli.options import (
     DataArgument,
     MaxSizeOption,
     Reading,
+    ScreenFilterOption,
     SplatKindOption,
     reading_options,
 )
@@ -64,6 +65,7 @@ def baseline(
     ] = None,
     kind: SplatKindOption = None,
     antialiased: AntialiasedOption = None,
+    screen_filter: ScreenFilterOption = None,
     max_size: MaxSizeOption = None,
     device: DeviceOption = "cpu",
     threads: ThreadsOption = None,
@@ -87,7 +89,7 @@ def baseline(
         from attnwarp.methods.command import run_baseline
 
         dataset = read_views(data, reading, points=False)
-        splats = read_splats(ply, kind, antialiased)
+        splats = read_splats(ply, kind, antialiased, screen_filter)
         check_seen(ply, splats, dataset.cameras)
         warn_of_misfit(ply, splats, dataset)
         result = run_baseline(

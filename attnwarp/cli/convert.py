@@ -13,6 +13,7 @@ from attnwarp.cli.options import (
     Coordinates,
     DataArgument,
     Reading,
+    ScreenFilterOption,
     SplatKindOption,
     reading_options,
 )
@@ -24,6 +25,7 @@ def convert(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write: .ply or .splat.")],
     kind: SplatKindOption = None,
     antialiased: AntialiasedOption = None,
+    screen_filter: ScreenFilterOption = None,
     third_scale: Annotated[
         float | None,
         typer.Option(help="Write 2DGS as thin 3DGS with this third scale (1e-6)."),
@@ -49,7 +51,7 @@ def convert(
         from attnwarp.io.file import check_other
 
         check_other(out, source, "the file to convert")
-        splats = read_splats(source, kind, antialiased)
+        splats = read_splats(source, kind, antialiased, screen_filter)
         if third_scale is not None and splats.kind == "3d":
             raise ValueError(f"--third-scale: {source} holds 3DGS, which has three scales")
         if sh_degree is not None:

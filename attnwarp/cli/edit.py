@@ -32,6 +32,7 @@ from attnwarp.cli.options import (
     Kind,
     MaxSizeOption,
     Reading,
+    ScreenFilterOption,
     Store,
     reading_options,
 )
@@ -109,6 +110,7 @@ def edit(
         int | None, typer.Option(min=1, help="Do not grow the model beyond, for the fit (30000).")
     ] = None,
     antialiased: AntialiasedOption = None,
+    screen_filter: ScreenFilterOption = None,
     max_size: MaxSizeOption = None,
     store: Annotated[Store, typer.Option(help="Where recorded features are kept.")] = Store.cpu,
     device: DeviceOption = "cpu",
@@ -131,7 +133,7 @@ def edit(
         _check_splat_options(
             ply,
             of_fit={"--fit-iterations": fit_iterations, "--max-splats": max_splats},
-            of_file={"--antialiased": antialiased},
+            of_file={"--antialiased": antialiased, "--screen-filter": screen_filter},
         )
         check_segmenter(segmenter, words)
         check_out(out)
@@ -144,7 +146,7 @@ def edit(
         settings = methods.preset("attention_warping", preset, **changes)
         use_threads(threads)
         dataset = read_views(data, reading)
-        splats = None if ply is None else read_splats(ply, kind, antialiased)
+        splats = None if ply is None else read_splats(ply, kind, antialiased, screen_filter)
         if ply is not None and splats is not None:
             check_seen(ply, splats, dataset.cameras)
             warn_of_misfit(ply, splats, dataset)

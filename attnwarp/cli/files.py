@@ -69,8 +69,10 @@ def _is_scene(name: str) -> bool:
     return any((Path(folder) / "scenes" / f"{name}.yaml").is_file() for folder in folders or ())
 
 
-def read_splats(path: Path, kind: Kind | None, antialiased: bool | None) -> Gaussians:
-    """The splats of a .ply or .splat file; ``kind`` and ``antialiased`` overrule what it says."""
+def read_splats(
+    path: Path, kind: Kind | None, antialiased: bool | None, screen_filter: float | None = None
+) -> Gaussians:
+    """The splats of a .ply or .splat file; the other arguments overrule what it says."""
     from dataclasses import replace
 
     from attnwarp.io import read_ply, read_splat
@@ -78,14 +80,18 @@ def read_splats(path: Path, kind: Kind | None, antialiased: bool | None) -> Gaus
     if path.suffix.lower() == ".splat":
         if kind is Kind.two:
             raise ValueError(f"--kind: {path} is a .splat, which holds 3DGS alone")
-        return replace(read_splat(path), antialiased=bool(antialiased))
+        splats = replace(read_splat(path), antialiased=bool(antialiased))
+        return splats if screen_filter is None else replace(splats, screen_filter=screen_filter)
     splats = read_ply(
         path,
         kind=None if kind is None else "2d" if kind is Kind.two else "3d",
         antialiased=antialiased,
+        screen_filter=screen_filter,
     )
-    if antialiased and splats.kind == "2d":
-        raise ValueError(f"--antialiased: {path} holds 2DGS, which has a screen filter instead")
+    given = {"--antialiased": antialiased, "--screen-filter": screen_filter}
+    for option in (name for name, value in given.items() if value):
+        if splats.kind == "2d":
+            raise ValueError(f"{option}: {path} holds 2DGS, which has a screen filter of its own")
     return splats
 
 

@@ -15,6 +15,7 @@ from attnwarp.cli.options import (
     AntialiasedOption,
     Reading,
     RenderThreadsOption,
+    ScreenFilterOption,
     SplatKindOption,
     reading_options,
 )
@@ -49,6 +50,7 @@ def render(
     ] = False,
     kind: SplatKindOption = None,
     antialiased: AntialiasedOption = None,
+    screen_filter: ScreenFilterOption = None,
     *,
     reading: Reading,
 ) -> None:
@@ -65,7 +67,7 @@ def render(
         from attnwarp.methods.scene import near_of
 
         use_threads(threads)
-        splats = read_splats(model, kind, antialiased)
+        splats = read_splats(model, kind, antialiased, screen_filter)
         # Cameras are resized to their images, so those must be there.
         missing = "error" if reading.scale > 1 else "none"
         dataset = read_views(cameras, reading, missing_images=missing, points=False)

@@ -14,6 +14,7 @@ import torch
 from attnwarp.encoders._weights import check_archive, device_of, reason_of
 from attnwarp.encoders.pretrained import check_config
 from attnwarp.errors import InputError, install_command
+from attnwarp.io.text import read_text
 
 WEIGHTS = ("diffusion_pytorch_model", "model", "pytorch_model")
 ENDINGS = {None: (".safetensors", ".bin"), "fp16": (".fp16.safetensors",)}
@@ -169,7 +170,7 @@ def config_of(folder: str | Path, name: str) -> dict[str, Any]:
     if not path.is_file():
         return {}
     with readable(place):
-        config = json.loads(path.read_text(encoding="utf-8"))
+        config = json.loads(read_text(path))
     if not isinstance(config, dict):
         raise InputError(f"{path}: holds {config!r:.40}, expected an object; fetch the model again")
     return config

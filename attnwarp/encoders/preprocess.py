@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from attnwarp import check
 from attnwarp.errors import InputError
+from attnwarp.io.text import read_text
 
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
@@ -195,7 +196,7 @@ def read_preprocessing(folder: Path) -> Preprocessing:
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON file that holds an object. Raises InputError naming the file."""
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error}); fetch the file again") from None
     if not isinstance(value, dict):

@@ -65,6 +65,7 @@ class Model:
     def __init__(self, start: Gaussians, settings: FitSettings, extent: float) -> None:
         self.settings, self.extent = settings, extent
         self.antialiased = settings.antialiased
+        self.screen_filter = start.screen_filter
         g = start.detach().to(dtype=torch.float32)
         # float64 centres far from zero would be moved by float32.
         offset, means = split_origin(start.means.detach().cpu().numpy())
@@ -116,6 +117,7 @@ class Model:
             torch.cat([t["dc"], t["rest"]], dim=1),
             origin=self.origin,
             antialiased=self.antialiased,
+            screen_filter=self.screen_filter,
         )
 
     def step(self, progress: float) -> None:

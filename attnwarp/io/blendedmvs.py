@@ -19,6 +19,7 @@ from attnwarp.io.dataset import Dataset, Missing, nearest_rotation, with_images
 from attnwarp.io.file import FileFormatError
 from attnwarp.io.find import FileFinder
 from attnwarp.io.images import image_size
+from attnwarp.io.text import read_text
 
 CAMERAS, IMAGES = "cams", "blended_images"
 SUFFIX = "_cam.txt"
@@ -89,7 +90,7 @@ def read_blendedmvs(path: str | os.PathLike[str], *, missing_images: Missing = "
 
 
 def _camera(file: Path, image: Path) -> Camera:
-    words = file.read_text(encoding="utf-8", errors="replace").split()
+    words = read_text(file, errors="replace").split()
     matrices = {}
     for name, side in (("extrinsic", 4), ("intrinsic", 3)):
         matrices[name] = _matrix(file, words, name, side)

@@ -27,6 +27,7 @@ from attnwarp.io.dataset import Dataset, Distorted, Missing, with_images
 from attnwarp.io.file import FileFormatError, existing_file
 from attnwarp.io.find import FileFinder
 from attnwarp.io.lens import Lens
+from attnwarp.io.text import read_text
 
 Array = npt.NDArray[np.float64]
 
@@ -417,7 +418,7 @@ def _text_lines(path: Path) -> Iterator[tuple[int, str]]:
     keypoints'.
     """
     try:
-        text = path.read_text(encoding="utf-8", errors="surrogateescape")
+        text = read_text(path, errors="surrogateescape")
     except OSError as error:
         raise FileFormatError(path, f"cannot be read: {error}") from error
     for number, line in enumerate(text.split("\n"), start=1):

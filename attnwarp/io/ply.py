@@ -24,8 +24,9 @@ import torch
 
 from attnwarp import check
 from attnwarp.errors import InputWarning
-from attnwarp.gaussians import Gaussians, Kind
+from attnwarp.gaussians import LARGEST_FILTER, LEAST_FILTER, SCREEN_FILTER, Gaussians, Kind
 from attnwarp.io.file import FileFormatError, existing_file, write_atomically
+from attnwarp.io.text import is_text, plain_ply, split_ply
 
 Array = npt.NDArray[np.float64]
 Columns = dict[str, npt.NDArray[Any]]
@@ -44,8 +45,18 @@ of a standard deviation changes no pixel by more than 0.6 % of the splat's peak.
 
 Coordinates = Literal["auto", "world", "relative"]
 
+COLORS = (
+    ("red", "green", "blue"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("r", "g", "b"),
+)
+"""Names of a point's colours, by who writes them: most programs, MeshLab, some scanners."""
+
 FILTER_3D = "filter_3D"
 """Property of Mip-Splatting's files."""
+
+MIP_SCREEN_FILTER = 0.1
+"""Mip-Splatting's screen filter, px^2 (its ``kernel_size``)."""
 
 LOGIT_OF_ZERO = -120.0
 LOGIT_OF_ONE = 40.0
@@ -58,7 +69,11 @@ nothing in the file is infinite.
 
 
 def read_ply(
-    path: str | os.PathLike[str], *, kind: Kind | None = None, antialiased: bool | None = None
+    path: str | os.PathLike[str],
+    *,
+    kind: Kind | None = None,
+    antialiased: bool | None = None,
+    screen_filter: float | None = None,
 ) -> Gaussians:
     """Read splats.
 
@@ -81,6 +96,9 @@ def read_ply(
         kind: "2d" or "3d" to override the rule above.
         antialiased: overrides the comments ``SplatRenderMode: mip|default`` and ``antialiased
             1|0``; without any, True of Mip-Splatting's files and else False.
+        screen_filter: px^2, overrides the comment ``attnwarp screen_filter``; without any,
+            Mip-Splatting's 0.1 where the file has a ``filter_3D``, else 3DGS's 0.3. Other programs
+            that write ``filter_3D``, such as GOF and RaDe-GS, have no screen filter: give 1e-4.
 
     Returns:
         Gaussians in float32. ``x y z`` of type double that float32 cannot hold and that lie further
@@ -145,10 +163,15 @@ def read_ply(
         alpha *= share
         if antialiased is None and not header.flags:
             antialiased = True
+        width = header.width(MIP_SCREEN_FILTER, screen_filter)
         _warn(
             f"{path}: is of Mip-Splatting: its {FILTER_3D} is merged into scales and opacities, and"
-            f" the splats are {'' if antialiased else 'not '}rendered antialiased"
+            f" the splats are {'' if antialiased else 'not '}rendered antialiased, with a screen"
+            f" filter of {width:g} px^2; of another program, such as GOF, give its own by"
+            " screen_filter (--screen-filter)"
         )
+    else:
+        width = header.width(SCREEN_FILTER, screen_filter)
     if antialiased is None:
         antialiased = header.antialiased(path)
     offset, means = split_origin(xyz)
@@ -169,6 +192,7 @@ def read_ply(
         torch.from_numpy(_read_sh(path, columns, n)),
         origin=header.origin + offset,
         antialiased=antialiased,
+        screen_filter=width,
     )
 
 
@@ -265,6 +289,8 @@ def write_ply(
         comments += ["SplatRenderMode: 2dgs", *(["antialiased 1"] if g.antialiased else [])]
     else:
         comments += [f"SplatRenderMode: {'mip' if g.antialiased else 'default'}"]
+        if g.screen_filter != SCREEN_FILTER:
+            comments += [f"attnwarp screen_filter {g.screen_filter!r}"]
     data = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments)
     write_atomically(path, data.write, follow_link=True)
 
@@ -277,12 +303,16 @@ def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uin
 
     Returns:
         points: (P, 3) float64.
-        colors: (P, 3) uint8 from ``red green blue``, or None when the file has none.
+        colors: (P, 3) uint8 from ``red green blue``, or from another triple of :data:`COLORS`,
+            which is said; None when the file has none.
 
     Raises:
         FileNotFoundError: no such file.
         FileFormatError: not a PLY, truncated, no ``x y z``, a value that is not finite, colours
             that are not uchar.
+
+    Warns:
+        InputWarning: its colours have other names than usual.
 
     Example:
         >>> from attnwarp.io import read_points, write_points
@@ -294,9 +324,11 @@ def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uin
     path = existing_file(path)
     columns, _ = _read_vertices(path)
     points = _stack(path, columns, ("x", "y", "z"), np.float64)
-    names = ("red", "green", "blue")
-    if not any(name in columns for name in names):
+    names = next((triple for triple in COLORS if set(triple) & set(columns)), None)
+    if names is None:
         return points, None
+    if names != COLORS[0]:
+        _warn(f"{path}: its colours are taken from the properties {', '.join(names)}")
     for name in names:
         if name not in columns:
             raise FileFormatError(
@@ -363,16 +395,18 @@ def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
     """The scalar columns of the element ``vertex``, and all comments of the header."""
     import plyfile
 
-    text = _check_counts(path)
+    header, text = _check_header(path)
+    # plyfile wants one kind of line end, and closes what it reads text from.
+    plain = plain_ply(path.read_bytes()) if text or b"\r" in header else None
     try:
-        # plyfile closes what it reads text from.
         # Values too large for their type become infinite, and are refused as such.
         with (
             np.errstate(over="ignore"),
-            io.BytesIO(path.read_bytes()) if text else path.open("rb") as stream,
+            path.open("rb") if plain is None else io.BytesIO(plain) as stream,
         ):
             data = plyfile.PlyData.read(stream)
-            left = 0 if text else path.stat().st_size - stream.tell()
+            size = path.stat().st_size if plain is None else len(plain)
+            left = 0 if text else size - stream.tell()
     except plyfile.PlyHeaderParseError as error:
         raise FileFormatError(
             path, f"not a PLY file, or its header is damaged ({error})"
@@ -394,8 +428,9 @@ def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
     except (ValueError, OverflowError, MemoryError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise FileFormatError(path, f"cannot be read as a PLY file: {first}") from error
-    if text:
-        body = path.read_bytes().partition(b"end_header")[2]
+    if text and plain is not None:
+        found = split_ply(plain)
+        body = b"" if found is None else plain[found[1] :]
         rows = sum(element.count for element in data.elements)
         left = max(0, sum(1 for line in body.splitlines() if line.strip()) - rows)
     if left:
@@ -411,18 +446,33 @@ def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
         )
     vertex = data["vertex"]
     scalar = [p.name for p in vertex.properties if not isinstance(p, plyfile.PlyListProperty)]
+    own = {name: name for name in scalar}
+    # CloudCompare keeps what it does not know as scalar fields of these names.
+    own |= {
+        name.removeprefix("scalar_"): name
+        for name in scalar
+        if name.startswith("scalar_") and name.removeprefix("scalar_") not in own
+    }
     comments = list(data.comments) + [
         comment for element in data.elements for comment in element.comments
     ]
-    return {name: np.asarray(vertex.data[name]) for name in scalar}, comments
+    return {name: np.asarray(vertex.data[place]) for name, place in own.items()}, comments
 
 
-def _check_counts(path: Path) -> bool:
-    """Whether the body is text. Refuses more rows than bytes, before memory is asked for them."""
+def _check_header(path: Path) -> tuple[bytes, bool]:
+    """The header, and whether the body is text. More rows than bytes are refused, before memory is
+    asked for them.
+    """
     size = path.stat().st_size
     with path.open("rb") as stream:
-        header = stream.read(1 << 20).partition(b"end_header")[0]
-    for name, digits in re.findall(rb"^element\s+(\S+)\s+(\d+)", header, re.MULTILINE):
+        begin = stream.read(1 << 20)
+    found = split_ply(begin)
+    if found is None:
+        return b"", False
+    lines, start = found
+    for name, digits in re.findall(
+        rb"^\s*element\s+(\S+)\s+(\d+)", b"\n".join(lines), re.MULTILINE
+    ):
         if len(digits) > 18 or int(digits) > size:
             raise FileFormatError(
                 path,
@@ -430,7 +480,7 @@ def _check_counts(path: Path) -> bool:
                 " get the file again, whole",
                 field=name.decode("ascii", "replace"),
             )
-    return re.search(rb"^format\s+ascii", header, re.MULTILINE) is not None
+    return begin[:start], is_text(lines)
 
 
 def _refuse_other_formats(path: Path, columns: Columns) -> None:
@@ -534,6 +584,13 @@ class _Header:
         self.kinds: dict[Kind, str] = {}
         self.flags: dict[bool, str] = {}
         self.origin: Array = np.zeros(3)
+        self.screen_filter: float | None = None
+
+    def width(self, default: float, given: float | None) -> float:
+        """The screen filter, px^2: the given one, the file's, or the default of its kind."""
+        if given is not None:
+            return given
+        return default if self.screen_filter is None else self.screen_filter
 
     def antialiased(self, path: Path) -> bool:
         if len(self.flags) > 1:
@@ -563,6 +620,17 @@ def _read_comments(path: Path, comments: list[str]) -> _Header:
                     raise FileFormatError(
                         path, f"got {comment!r}, expected three finite numbers", field="origin"
                     )
+            case ["attnwarp", "screen_filter", number]:
+                try:
+                    header.screen_filter = check.number(
+                        float(number), LEAST_FILTER, LARGEST_FILTER, "screen_filter"
+                    )
+                except ValueError:
+                    raise FileFormatError(
+                        path,
+                        f"got {comment!r}, expected px^2 in [{LEAST_FILTER:g}, {LARGEST_FILTER:g}]",
+                        field="screen_filter",
+                    ) from None
             # The tag follows the colon at once in some files.
             case ["splatrendermode:" | "splatrendermode", mode] if mode in (
                 "mip",
@@ -709,7 +777,7 @@ def _logit(opacities: npt.NDArray[np.floating[Any]]) -> Array:
 
 def _not_ascii(content: bytes) -> str:
     """What is wrong with a file whose header is not ASCII text."""
-    lines = content.partition(b"end_header")[0].splitlines()
+    lines, _ = split_ply(content) or ([], 0)
     if lines and lines[0].strip() == b"ply":
         for number, line in enumerate(lines, 1):
             if line.startswith((b"comment", b"obj_info")) and not line.isascii():

@@ -194,7 +194,7 @@ def render(
         sh_degree: use only the harmonics up to this degree.
         near: nothing nearer than this depth is drawn, in scene units. 2D splats are cut per pixel,
             3D splats as a whole by their centre. Scale it with the scene.
-        antialiased: 3D only: compensate the opacity for the 0.3 px^2 blur. Default: what the
+        antialiased: 3D only: compensate the opacity for the screen filter. Default: what the
             Gaussians say.
         pose: (4, 4) world-to-camera transform in place of the camera's; may require gradients.
         ndc: near and far of ``distortion_l2_ndc``, in scene units.
@@ -367,6 +367,7 @@ def _prepare(
         near=float(near),
         antialiased=kind == "3d"
         and (gaussians.antialiased if antialiased is None else bool(antialiased)),
+        screen_filter=gaussians.screen_filter,
         ndc=(float(ndc[0]), float(ndc[1])),
     )
 

@@ -80,6 +80,7 @@ def _view(inputs: Inputs) -> layout.View:
         by_center=inputs.depth == "center",
         antialiased=inputs.antialiased,
         harmonic=inputs.harmonic,
+        blur=float(inputs.screen_filter),
     )
 
 

@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import math
 
+from attnwarp.gaussians import SCREEN_FILTER
+
 ALPHA_MIN = 1 / 255
 """A splat that adds less than one step of an 8-bit image to a pixel is left out there, as in every
 published renderer.
@@ -32,9 +34,9 @@ NEAR = 0.01
 FILTER_SIGMA_2D = math.sqrt(0.5)
 """Sigma in pixels of the 2DGS screen filter: rho = min(u^2 + v^2, |x - c|^2 / sigma^2)."""
 
-BLUR_3D = 0.3
+BLUR_3D = SCREEN_FILTER
 """Variance in square pixels added to a projected 3D splat (3DGS): no splat is thinner than about a
-pixel.
+pixel. Splats fitted with another have it in :attr:`attnwarp.Gaussians.screen_filter`.
 """
 
 JACOBIAN_MARGIN = 0.3

@@ -157,7 +157,7 @@ def rasterize(inputs: Inputs, features: Tensor) -> tuple[Tensor, Tensor]:
     if inputs.kind == "3d":
         mode = "antialiased" if inputs.antialiased else "classic"
         pictures, alphas, _ = rasterization(
-            scales=inputs.scales.float(), rasterize_mode=mode, **common
+            scales=inputs.scales.float(), rasterize_mode=mode, eps2d=inputs.screen_filter, **common
         )
     else:
         flat = torch.cat(

@@ -32,6 +32,7 @@ class Inputs:
     depth: str
     near: float
     antialiased: bool
+    screen_filter: float
     ndc: tuple[float, float]
 
     @property

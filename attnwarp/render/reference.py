@@ -245,7 +245,7 @@ class _Splats:
         # their digits where S11 S22 - S12^2 of a needle loses all: with axes of 1e6 px and less
         # than one, the squares are 1e24 apart.
         M = K[:2, :2] @ J @ half
-        blur = constants.BLUR_3D
+        blur = inputs.screen_filter
         minors = torch.linalg.cross(M[:, 0], M[:, 1])
         sharp = (minors**2).sum(-1)
         det = sharp + blur * (M**2).sum((-1, -2)) + blur**2

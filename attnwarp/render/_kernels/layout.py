@@ -49,6 +49,7 @@ class View(NamedTuple):
     by_center: bool  # a splat's depth is its centre's
     antialiased: bool
     harmonic: bool  # values are spherical harmonics, else features
+    blur: float  # px^2 that the screen filter adds to a 3D splat's variance
 
 
 class Splats(NamedTuple):

@@ -39,7 +39,6 @@ from attnwarp.render._kernels.layout import (
 )
 from attnwarp.render.constants import (
     ALPHA_MIN,
-    BLUR_3D,
     COMPENSATION_MIN,
     EDGE_ON,
     EXTENT_SIGMAS,
@@ -220,7 +219,7 @@ def _reaches(view, c0, c1, c2, size, wanted):
         x_most = 1.0 + abs(view.cx / fx) + 2 * width / fx
         y_most = 1.0 + abs(view.cy / fy) + 2 * height / fy
         x, y = min(max(x, -x_most), x_most), min(max(y, -y_most), y_most)
-        scale, blur = EXTENT_SIGMAS * size * ic, EXTENT_SIGMAS * math.sqrt(BLUR_3D)
+        scale, blur = EXTENT_SIGMAS * size * ic, EXTENT_SIGMAS * math.sqrt(view.blur)
     tall = scale * fy * (1 + abs(y)) + blur
     wide = scale * (fx * (1 + abs(x)) + abs(skew) * (1 + abs(y))) + blur
     x1, x2, y1, y2 = px - wide, px + wide, py - tall, py + tall
@@ -372,7 +371,7 @@ def _side(a0, a1, a2, px, py, scale, view):
 def _ellipsoid(batch, view, a, c, ic, s):
     """The projection of a 3D splat (EWA): its factor, to the batch.
 
-    Sigma = M M^T + BLUR_3D I with the columns of M from :func:`_side`. Its determinant is taken
+    Sigma = M M^T + blur I with the columns of M from :func:`_side`. Its determinant is taken
     from the minors of M (Cauchy-Binet), as a sum of squares: of a needle that is 1e6 pixels long,
     the difference of products would leave nothing.
 
@@ -390,11 +389,11 @@ def _ellipsoid(batch, view, a, c, ic, s):
     x2, y2 = _side(a.m02, a.m12, a.m22, px, py, s.z * ic, view)
     m01, m02, m12 = x0 * y1 - x1 * y0, x0 * y2 - x2 * y0, x1 * y2 - x2 * y1
     sharp = m01 * m01 + m02 * m02 + m12 * m12
-    xx = x0 * x0 + x1 * x1 + x2 * x2 + BLUR_3D
+    xx = x0 * x0 + x1 * x1 + x2 * x2 + view.blur
     xy = x0 * y0 + x1 * y1 + x2 * y2
     square = y0 * y0 + y1 * y1 + y2 * y2
-    yy = square + BLUR_3D
-    det = sharp + (xx + square) * BLUR_3D
+    yy = square + view.blur
+    det = sharp + (xx + square) * view.blur
     inverse = reciprocal(det)
     A, B, C = yy * inverse, -xy * inverse, xx * inverse
     edge = reciprocal_sqrt(A)

@@ -24,7 +24,6 @@ from attnwarp.render._kernels.layout import (
 )
 from attnwarp.render._kernels.projection import harmonics
 from attnwarp.render.constants import (
-    BLUR_3D,
     COMPENSATION_MIN,
     EDGE_ON,
     EXTENT_SIGMAS,
@@ -50,13 +49,14 @@ class ViewColumns(NamedTuple):
     by_center: int = 21
     antialiased: int = 22
     harmonic: int = 23
+    blur: int = 24
 
 
 VIEW = ViewColumns()
 
 
 def view_row(view: View) -> np.ndarray:
-    """(24,) the view for :func:`project_backward`.
+    """(25,) the view for :func:`project_backward`.
 
     One row: with separate values LLVM adds in another order, and the last bits of the gradients
     move.
@@ -246,7 +246,8 @@ def _ellipsoid_backward(view, g, row, opacities, i, work):
     free_y = low <= c[1] / c[2] <= high
     py = min(max(c[1] / c[2], low), high)
     # As _ellipsoid has it, by the axes in the picture.
-    xx, yy, square = BLUR_3D, BLUR_3D, 0.0
+    blur = view[VIEW.blur]
+    xx, yy, square = blur, blur, 0.0
     sxy = 0.0
     for k in range(3):
         f = s[k] / c[2]
@@ -266,7 +267,7 @@ def _ellipsoid_backward(view, g, row, opacities, i, work):
             in_sharp[k, 1] -= minor * wide[j]
             in_sharp[k, 2] += minor * minor
         sharp += 0.5 * in_sharp[k, 2]
-    det = sharp + BLUR_3D * (xx + square)
+    det = sharp + blur * (xx + square)
     factor_xx = row[ELLIPSOID.factor_xx]
     factor_xy = row[ELLIPSOID.factor_xy]
     factor_yy = row[ELLIPSOID.factor_yy]
@@ -279,15 +280,15 @@ def _ellipsoid_backward(view, g, row, opacities, i, work):
         if ratio >= COMPENSATION_MIN:
             # Of log(sharp / det), with det / sharp - 1 in place of a difference of logs.
             g_ratio = g_opacity * opacities[i] * factor / det
-            blurring = -g_ratio * BLUR_3D
-            sharpening = g_ratio * BLUR_3D * (xx + square) / sharp
+            blurring = -g_ratio * blur
+            sharpening = g_ratio * blur * (xx + square) / sharp
         g_opacity *= factor
     g_px, g_py = 0.0, 0.0
     for k in range(3):
         f = s[k] / c[2]
         # The axis in units of the footprint, F M. Its gradient is F^T (sums of w w^T) F M,
         # since Sigma^-1 = F^T F and rho = w.w.
-        u = factor_xx / yy * (in_sharp[k, 0] + BLUR_3D * wide[k])
+        u = factor_xx / yy * (in_sharp[k, 0] + blur * wide[k])
         v = factor_yy * tall[k]
         gu, gv = uu * u + uv * v, uv * u + vv * v
         ux, uy = factor_xx * gu, factor_xy * gu + factor_yy * gv

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from attnwarp.camera import Camera
 from attnwarp.errors import suggest
+from attnwarp.io.text import read_text
 from attnwarp_eval.scene import edits
 from attnwarp_eval.scene.explain import explain
 from attnwarp_eval.scene.meshes import MESH_SUFFIXES
@@ -119,7 +120,7 @@ def _siblings(path: Path) -> list[str]:
 
 def _read(path: Path) -> Scene:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"cannot be read: {error}", path) from error
     try:

@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
 
+from attnwarp.io.text import read_text
 from attnwarp_eval.scene import explain
 from attnwarp_eval.scene.file import is_scene_file, scene_name
 from attnwarp_eval.scene.scene import Scene
@@ -235,7 +236,7 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
             " file's path"
         )
     try:
-        root, data = read_yaml(path.read_text(encoding="utf-8"))
+        root, data = read_yaml(read_text(path))
     except (YamlError, UnicodeDecodeError) as error:
         line = f":{error.line}" if isinstance(error, YamlError) and error.line else ""
         raise StudyError(f"{path}{line}: {error}") from None

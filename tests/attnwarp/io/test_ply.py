@@ -1,14 +1,16 @@
 import math
 import os
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from attnwarp import Gaussians
+from attnwarp import Camera, Gaussians
 from attnwarp.errors import InputWarning
 from attnwarp.io import THIRD_SCALE, FileFormatError, read_ply, read_points, write_ply, write_points
+from attnwarp.render import render
 
 DEGREE = {0: 0, 1: 9, 2: 24, 3: 45}
 
@@ -687,3 +689,77 @@ def test_inserted_bytes_are_refused_wherever_they_are(tmp_path, form, count):
     for start in range(head, len(whole) + 1, 97):
         (tmp_path / "b.ply").write_bytes(whole[:start] + patch + whole[start:])
         refused(tmp_path / "b.ply")
+
+
+@pytest.mark.parametrize(("sigma", "peak"), [(0.5, 0.3027), (1.0, 0.6301), (3.0, 0.8611)])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_a_splat_of_mip_splatting_peaks_as_its_own_renderer_draws_it(
+    sigma, peak, backend, tmp_path
+):
+    """Closed form: 0.9 (s^2 / v)^1.5 v / (v + 0.1) with v = s^2 + 0.45^2, in px."""
+    columns = {name: np.zeros(1, np.float32) for name in names()}
+    depth, focal = 4.0, 100.0
+    columns["z"][:] = depth
+    columns["opacity"][:] = math.log(0.9 / 0.1)
+    columns["rot_0"][:] = 1
+    for i in range(3):
+        columns[f"scale_{i}"][:] = math.log(sigma * depth / focal)
+    columns["filter_3D"] = np.full(1, 0.45 * depth / focal, np.float32)
+    path = by_hand(tmp_path / "mip.ply", columns, 1)
+    with pytest.warns(InputWarning, match="screen filter of 0.1 px"):
+        read = read_ply(path)
+    K = np.array([[focal, 0, 16.5], [0, focal, 16.5], [0, 0, 1]])
+    camera = Camera(K, np.eye(4), 33, 33)
+    drawn = float(render(read, camera, backend=backend).alpha[16, 16])
+    v = sigma**2 + 0.45**2
+    assert drawn == pytest.approx(0.9 * (sigma**2 / v) ** 1.5 * v / (v + 0.1), abs=2e-5)
+    assert drawn == pytest.approx(peak, abs=6e-5)
+
+
+def test_a_screen_filter_is_kept_by_a_file_and_overruled_by_the_caller(tmp_path):
+    wide = replace(model(), screen_filter=0.1)
+    write_ply(tmp_path / "a.ply", wide)
+    write_ply(tmp_path / "b.ply", model())
+    assert b"screen_filter" not in (tmp_path / "b.ply").read_bytes()
+    assert read_ply(tmp_path / "a.ply").screen_filter == 0.1
+    assert read_ply(tmp_path / "a.ply", screen_filter=0.2).screen_filter == 0.2
+    assert read_ply(tmp_path / "b.ply").screen_filter == 0.3
+    assert wide.digest() != model().digest()
+    for wrong in ("0", "wide", "nan"):
+        data = (
+            (tmp_path / "a.ply")
+            .read_bytes()
+            .replace(b"screen_filter 0.1", f"screen_filter {wrong}".encode())
+        )
+        (tmp_path / "c.ply").write_bytes(data)
+        with pytest.raises(FileFormatError, match=f"screen_filter: got .*{wrong}"):
+            read_ply(tmp_path / "c.ply")
+    with pytest.raises(ValueError, match="screen_filter: got 0, expected a number"):
+        replace(model(), screen_filter=0)
+
+
+@pytest.mark.parametrize("width", [1e-4, 0.1, 2.0])
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_any_screen_filter_is_drawn_and_differentiated_as_the_reference_does(width, antialiased):
+    """Oracle: torch's own derivatives of the reference in float64."""
+    rng = np.random.default_rng(3)
+    n = 6
+    means = torch.tensor(rng.uniform(-0.4, 0.4, (n, 3)) + np.array([0, 0, 3]))
+    scales = torch.tensor(rng.uniform(0.05, 0.2, (n, 3)))
+    fields = {
+        "quats": torch.tensor(rng.normal(size=(n, 4))),
+        "opacities": torch.tensor(rng.uniform(0.3, 0.9, n)),
+        "sh": torch.tensor(rng.uniform(-0.5, 0.5, (n, 1, 3))),
+    }
+    K = np.array([[40.0, 0, 16], [0, 40, 16], [0, 0, 1]])
+    camera, found = Camera(K, np.eye(4), 32, 32), {}
+    for backend in ("reference", "cpu"):
+        leaves = [means.clone().requires_grad_(), scales.clone().requires_grad_()]
+        made = Gaussians("3d", means=leaves[0], scales=leaves[1], **fields,
+                         antialiased=antialiased, screen_filter=width)  # fmt: skip
+        view = render(made, camera, backend=backend)
+        (view.color.double() ** 2).sum().backward()
+        found[backend] = [view.color.detach().double(), *(leaf.grad for leaf in leaves)]
+    for one, other in zip(found["reference"], found["cpu"], strict=True):
+        scale = float(one.abs().max())
+        assert float((one - other).abs().max()) < 2e-4 * max(1.0, scale)

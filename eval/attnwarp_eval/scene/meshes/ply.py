@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 
+from attnwarp.io.text import plain_ply, split_ply
 from attnwarp_eval.scene.meshes.surface import Surface, unit_colors
 
 COUNT = re.compile(rb"^element[ \t]+(\S+)[ \t]+(\d+)\s*$", re.M)
@@ -20,7 +21,9 @@ def read_ply(data: bytes) -> Surface:
     """
     from plyfile import PlyData, PlyParseError
 
-    header = data[: data.find(b"end_header")]
+    data = plain_ply(data)
+    found = split_ply(data)
+    header = b"" if found is None else data[: found[1]]
     # plyfile sets room aside before it reads; every item takes at least a byte.
     for name, count in COUNT.findall(header):
         if len(count) > 12 or int(count) > len(data):
@@ -31,8 +34,7 @@ def read_ply(data: bytes) -> Surface:
     try:
         ply = PlyData.read(stream)
         if ply.text:
-            body = data[data.index(b"\n", len(header)) :] if b"\n" in data[len(header) :] else b""
-            lines = sum(bool(line.strip()) for line in body.splitlines())
+            lines = sum(bool(line.strip()) for line in data[len(header) :].splitlines())
             announced = sum(element.count for element in ply.elements)
             if lines != announced:
                 raise ValueError(f"announces {announced} items, but {lines} lines follow")

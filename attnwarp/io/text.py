@@ -1,0 +1,75 @@
+"""Text as other systems and editors write it: how it begins, how its lines end."""
+
+from __future__ import annotations
+
+import codecs
+import re
+from pathlib import Path
+
+MARKS = {
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}
+"""Encodings by what a file begins with; Windows' editors and shells write such marks."""
+
+_LINE_ENDS = re.compile(rb"\r\n|\n|\r")
+
+
+def read_text(path: Path, errors: str = "strict") -> str:
+    """The text of a file, in UTF-8 or with a byte order mark, its lines ended by ``\\n``.
+
+    Args:
+        path: of the file.
+        errors: what becomes of bytes that are no UTF-8, as for :meth:`bytes.decode`.
+
+    Raises:
+        OSError: it cannot be read.
+        UnicodeDecodeError: a byte that is no text.
+
+    Example:
+        >>> from pathlib import Path
+        >>> written = Path("a.txt").write_bytes("a\\r\\nb\\rc".encode("utf-16"))
+        >>> read_text(Path("a.txt"))
+        'a\\nb\\nc'
+    """
+    data = path.read_bytes()
+    encoding = next((name for mark, name in MARKS.items() if data.startswith(mark)), "utf-8")
+    text = data.decode(encoding, errors)
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def split_ply(data: bytes) -> tuple[list[bytes], int] | None:
+    """The lines of a PLY file's header up to ``end_header``, and where its body begins; None where
+    the header does not end.
+
+    Only a line of its own ends the header: a comment may hold the word.
+
+    Example:
+        >>> split_ply(b"ply\\rcomment end_header\\rend_header\\r\\x00")
+        ([b'ply', b'comment end_header', b'end_header'], 34)
+    """
+    lines, start = [], 0
+    for match in _LINE_ENDS.finditer(data):
+        lines.append(data[start : match.start()])
+        start = match.end()
+        if lines[-1].strip() == b"end_header":
+            return lines, start
+    return None
+
+
+def plain_ply(data: bytes) -> bytes:
+    """A PLY file whose header's lines, and those of a text body, end by ``\\n``."""
+    found = split_ply(data)
+    if found is None:
+        return data
+    lines, start = found
+    body = data[start:]
+    if is_text(lines):
+        body = _LINE_ENDS.sub(b"\n", body)
+    return b"\n".join(lines) + b"\n" + body
+
+
+def is_text(lines: list[bytes]) -> bool:
+    """True for a PLY header that announces a body of text."""
+    return any(line.split()[:2] == [b"format", b"ascii"] for line in lines)
