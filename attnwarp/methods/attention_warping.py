@@ -184,9 +184,7 @@ class AttentionWarping(Method):
     def _inject(
         self, stack: ExitStack, recorded: Sequence[RecordedSource], sights: Sequence[Sight | None]
     ) -> None:
-        """Blend recorded features into the editor's while the stack is open. No pixel takes the
-        features of two sources.
-        """
+        """Blend recorded features into the editor's; no pixel takes those of two sources."""
         s, editor = self.settings, self.work.editor
 
         def weight(t: int, T: int) -> float:
@@ -214,9 +212,7 @@ class AttentionWarping(Method):
         self.views.clear()
 
     def counters(self, records: dict[int, dict[str, Any]]) -> dict[str, float]:
-        """Number of sources, bytes of their features, and the mean weight of the warped features
-        over the targets' pixels, before a_t.
-        """
+        """Sources, bytes of their features, mean weight of the warp over targets, before a_t."""
         shares = [about["injected"] for view, about in records.items() if view != self.sources[0]]
         return {
             "sources": len(self.sources),

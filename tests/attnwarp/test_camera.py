@@ -167,6 +167,7 @@ def test_a_camera_cannot_be_changed_in_place():
         cam.K[0, 0] = 1
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -194,6 +195,7 @@ def test_a_whole_number_of_any_type_is_a_size():
         assert (made.width, type(made.width), made.height) == (96, int, 96)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

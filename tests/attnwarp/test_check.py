@@ -76,6 +76,7 @@ def test_a_size_of_numpy_or_torch_is_one_of_whole_numbers():
         assert all(type(side) is int for side in check.size(size, "size"))
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     "value", [10**400, Fraction(10**400), np.longdouble("1e4000"), np.nan, True]
 )

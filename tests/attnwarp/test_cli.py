@@ -365,6 +365,7 @@ def test_a_fit_that_is_stopped_keeps_what_it_has_and_goes_on(data, tmp_path, num
     assert "iterations in" in done.stdout
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -398,6 +399,7 @@ def test_what_cannot_be_used_ends_in_one_clear_line_and_code_2(data, tmp_path, a
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("command", ["fit", "render"])
 def test_an_out_that_cannot_be_a_folder_ends_in_one_clear_line(data, tmp_path, command):
     taken = tmp_path / "taken"
@@ -708,6 +710,7 @@ def test_convert_to_splat_and_back(tmp_path):
     np.testing.assert_array_equal(key(back), key(spread("3d")))
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -768,6 +771,7 @@ def test_a_closed_pipe_is_no_regression_and_no_traceback(tmp_path):
     assert len(read_ply(tmp_path / "b.ply")) == 20
 
 
+@pytest.mark.door
 def test_output_to_a_full_disk_is_one_line(tmp_path):
     write_ply(tmp_path / "a.ply", spread())
     for arguments in (["--help"], ["convert", tmp_path / "a.ply", tmp_path / "b.ply"]):
@@ -800,6 +804,7 @@ def test_a_polite_kill_says_what_is_kept(data, tmp_path, monkeypatch):
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["0.png"]
 
 
+@pytest.mark.door
 def test_a_missing_package_is_named(tmp_path, monkeypatch):
     write_ply(tmp_path / "a.ply", spread())
     monkeypatch.setitem(sys.modules, "plyfile", None)
@@ -807,6 +812,7 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch):
     assert done.exit_code == 2 and "needs the package plyfile: pip install plyfile" in done.stderr
 
 
+@pytest.mark.door
 def test_half_a_jpeg_is_refused_by_name(data, tmp_path):
     folder = tmp_path / "data"
     shutil.copytree(data, folder)
@@ -820,6 +826,7 @@ def test_half_a_jpeg_is_refused_by_name(data, tmp_path):
     assert f"{folder / 'images/4.jpg'}: the picture is damaged" in done.stderr
 
 
+@pytest.mark.door
 def test_a_command_that_is_stopped_before_it_made_its_folder_says_so(tmp_path, capsys):
     for there, expected in (
         (False, "stopped; nothing was written"),

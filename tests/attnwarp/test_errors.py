@@ -45,6 +45,7 @@ def test_a_missing_package_is_an_input_error_that_names_its_extra():
     assert (caught.value.module, caught.value.extra) == ("gsplat", "gpu")
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     "error",
     [
@@ -82,6 +83,7 @@ def run_without(modules, package, argv, cwd):
     )
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("argv", "module", "extra"),
     [

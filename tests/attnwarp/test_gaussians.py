@@ -135,6 +135,7 @@ def test_wrong_splats_are_refused_by_name_and_row(changes, message):
         dataclasses.replace(splats(), **changes)
 
 
+@pytest.mark.door
 def test_an_array_in_place_of_a_tensor_is_named():
     for name in ("means", "quats", "scales", "opacities", "sh"):
         array = getattr(splats(), name).numpy()

@@ -91,6 +91,7 @@ def test_ssim_below_its_window_is_refused(shape):
         losses.ssim(torch.zeros(shape), torch.zeros(shape))
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.uint8])
 def test_ssim_of_another_type_is_refused_by_name(dtype):
     image, target = pictures(dtype=torch.float32)
@@ -100,6 +101,7 @@ def test_ssim_of_another_type_is_refused_by_name(dtype):
         losses.ssim_terms(image, target.to(dtype))
 
 
+@pytest.mark.door
 def test_pictures_of_different_shapes_are_refused():
     with pytest.raises(ValueError, match=r"target: got shape \(8, 9, 3\)"):
         losses.l1(torch.zeros(9, 9, 3), torch.zeros(8, 9, 3))
@@ -278,6 +280,7 @@ def test_distortion_of_two_sheets_is_the_closed_form_in_both_forms():
     )
 
 
+@pytest.mark.door
 def test_an_unknown_form_of_distortion_is_refused():
     view = render(two_discs(0.1), CAMERA, backend="reference")
     with pytest.raises(ValueError, match=r"form: got 'l2', expected one of 'l1', 'l2_ndc'"):

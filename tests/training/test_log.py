@@ -53,6 +53,7 @@ def test_the_table_has_what_each_stage_took_and_the_mean_of_its_last_losses(tmp_
     assert printed.exit_code == 0 and printed.stdout.strip() == table([path])
 
 
+@pytest.mark.door
 def test_a_folder_without_a_log_is_refused_by_name(tmp_path):
     result = CliRunner().invoke(app, ["stages", "--out", str(tmp_path)])
     assert result.exit_code == 2

@@ -206,6 +206,7 @@ def test_a_size_beyond_all_memory_is_refused_as_it_is_typed(folder, photo, tmp_p
     assert result.exit_code == 2 and "--size" in result.output
 
 
+@pytest.mark.door
 def test_a_missing_extra_is_one_clear_line(folder, photo, tmp_path, monkeypatch):
     import sys
 

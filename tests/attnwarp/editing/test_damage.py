@@ -87,6 +87,7 @@ def test_weights_that_are_not_finite_are_refused_by_name(value, tmp_path):
         load_parts(tmp_path, dtype=torch.float32)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("part", "key", "value"),
     [

@@ -271,6 +271,7 @@ def test_a_recorded_edit_injected_into_itself_changes_no_bit_with_every_editor()
             edit(editor, [guide], "a bear", steps=4)
 
 
+@pytest.mark.door
 def test_what_does_not_fit_is_refused_by_name():
     editor = editor_of(pix2pix())
     with pytest.raises(
@@ -338,6 +339,7 @@ def test_a_base_and_a_controlnet_in_two_folders_are_one_editor(tmp_path):
         load_editor(both)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -378,6 +380,7 @@ def test_a_view_that_sees_nothing_is_drawn_from_a_black_control_picture():
     assert np.abs(ours.images[0] - theirs).max() < 1e-5
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("lost", "message"),
     [
@@ -399,6 +402,7 @@ def test_a_missing_file_is_named(lost, message, tmp_path):
         DepthControlNet.from_folder(tmp_path)
 
 
+@pytest.mark.door
 def test_networks_that_do_not_fit_each_other_are_refused_when_their_folder_is_read(tmp_path):
     pix2pix().save_pretrained(tmp_path / "instructions")
     controlnet().save_pretrained(tmp_path / "plain")
@@ -437,6 +441,7 @@ def test_networks_that_do_not_fit_each_other_are_refused_when_their_folder_is_re
         load_editor(f"{tmp_path / 'plain'},{tmp_path / 'wrong'}")
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("name", ["unet", "vae", "controlnet"])
 def test_a_network_of_another_class_is_refused_by_its_name(name, tmp_path):
     controlnet().save_pretrained(tmp_path)
@@ -466,6 +471,7 @@ def test_a_tiny_autoencoder_is_refused_by_pix2pix_and_taken_beside_a_controlnet(
     assert torch.allclose(editor.pixels(latents), expected, rtol=0, atol=1e-6)
 
 
+@pytest.mark.door
 def test_networks_are_refused_before_their_weights_are_read(tmp_path):
     pix2pix().save_pretrained(tmp_path)
     path = tmp_path / "unet" / "config.json"
@@ -559,6 +565,7 @@ def test_sides_of_two_halvings_are_enough_for_stable_diffusions_three():
     assert (other.latents - alone.latents).abs().max() > 1e-3
 
 
+@pytest.mark.door
 def test_weights_that_lack_a_tensor_are_refused_and_not_filled_with_random_numbers(tmp_path):
     from safetensors.torch import load_file, save_file
 
@@ -577,6 +584,7 @@ def test_weights_that_lack_a_tensor_are_refused_and_not_filled_with_random_numbe
     )
 
 
+@pytest.mark.door
 def test_a_scheduler_without_ddim_steps_is_refused_with_the_remedy_which_works():
     pipe = pix2pix()
     parts = {name: getattr(pipe, name) for name in ("unet", "vae", "text_encoder", "tokenizer")}

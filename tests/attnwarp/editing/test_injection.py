@@ -524,6 +524,7 @@ def loud_plan(net, dtype):
     return plan_of(net, dtype=dtype)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("store", ["device", "cpu", "disk"])
 def test_a_feature_beyond_float16_is_refused_by_layer_step_and_type(store, tmp_path):
     net = unet(8)
@@ -581,6 +582,7 @@ def with_another_forward(net):
     run(net, timesteps=(981,))
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("call", "said"),
     [
@@ -603,6 +605,7 @@ def test_what_keeps_hooks_from_running_is_an_error_that_names_it(call, said):
             call(net)
 
 
+@pytest.mark.door
 def test_a_compiled_unet_is_named_as_such():
     """torch's own attribute of a module that was compiled in place."""
     net = unet(8)
@@ -613,6 +616,7 @@ def test_a_compiled_unet_is_named_as_such():
         net()
 
 
+@pytest.mark.door
 def test_an_error_inside_the_block_is_not_covered_by_another():
     net = unet(8)
     with pytest.raises(ZeroDivisionError), record(net, plan_of(net)):

@@ -74,6 +74,7 @@ def test_a_threshold_that_no_box_reaches_is_an_error_with_the_words(folders):
         masks(1, IMAGE)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("model", "file", "message"),
     [
@@ -93,6 +94,7 @@ def test_missing_files_are_named(folders, tmp_path, model, file, message):
         GroundedSam.from_folders(tmp_path / "dino", tmp_path / "sam")
 
 
+@pytest.mark.door
 def test_folders_in_the_wrong_order_and_no_folder_are_errors(folders, tmp_path):
     dino, sam, *_ = folders
     with pytest.raises(InputError, match="lacks tokenizer.json|model_type 'sam'"):
@@ -101,6 +103,7 @@ def test_folders_in_the_wrong_order_and_no_folder_are_errors(folders, tmp_path):
         load_segmenter(f"{tmp_path / 'nowhere'},{sam}")
 
 
+@pytest.mark.door
 def test_damaged_weights_are_one_line(folders, tmp_path):
     shutil.copytree(folders[1], tmp_path / "sam")
     (tmp_path / "sam" / "model.safetensors").write_bytes(b"damaged")
@@ -188,17 +191,20 @@ def test_a_long_picture_is_rated_at_a_bounded_size():
     assert (mask & expected).sum() / (mask | expected).sum() > 0.99
 
 
+@pytest.mark.door
 def test_nothing_in_an_empty_picture_is_an_error(clip):
     with pytest.raises(NoDetectionError, match="no 'dinosaur' was detected"):
         clip.segment(np.full((40, 50, 3), 0.5), "dinosaur")
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("words", ["", " ", "..."])
 def test_words_without_letters_are_refused(clip, words):
     with pytest.raises(InputError, match="words: got"):
         clip.segment(IMAGE, words)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("image", "message"),
     [

@@ -62,6 +62,7 @@ def test_bundled_ones_are_described():
     assert all(encoders.available().values())
 
 
+@pytest.mark.door
 def test_an_installation_without_bundled_weights_says_so(monkeypatch):
     result = importlib.util.find_spec
     monkeypatch.setattr(

@@ -168,6 +168,7 @@ def test_the_layers_bear_torchvision_s_names():
                 assert x.shape[1] == channels[taps.index(i)]
 
 
+@pytest.mark.door
 def test_what_is_missing_is_named_with_the_remedy(placed, tmp_path):
     folder, _, name = placed
     backbone = BACKBONES[name].file
@@ -189,6 +190,7 @@ def test_what_is_missing_is_named_with_the_remedy(placed, tmp_path):
         load_encoder(f"lpips:{tmp_path}")
 
 
+@pytest.mark.door
 def test_pairs_that_do_not_fit_are_named(tmp_path_factory, placed):
     encoder = load_encoder(f"lpips:{placed[0]}")
     with pytest.raises(ValueError, match="b: got 2 pictures, expected 1, as a"):

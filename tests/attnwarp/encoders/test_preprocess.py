@@ -178,6 +178,7 @@ def test_a_factor_that_is_not_used_is_not_looked_at(tmp_path):
     assert read_preprocessing(tmp_path).scale == 255  # of bytes, as they are
 
 
+@pytest.mark.door
 def test_a_part_of_a_newer_file_that_is_no_object_is_refused_by_name(tmp_path):
     (tmp_path / "processor_config.json").write_text('{"image_processor": "CLIPImageProcessor"}')
     with pytest.raises(

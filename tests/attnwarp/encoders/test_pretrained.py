@@ -294,6 +294,7 @@ def test_a_folder_that_will_not_do_is_refused_with_the_remedy(
     assert str(folder) in str(caught.value) and "://" not in str(caught.value)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("part", "key", "value"),
     [
@@ -320,6 +321,7 @@ def test_a_value_that_no_network_computes_with_is_named(clip_folder, tmp_path, p
         load_encoder(f"clip:{folder}")
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("key", "value"), [("layer_norm_eps", 1e308), ("qkv_bias", 0), ("mlp_ratio", True)]
 )
@@ -334,6 +336,7 @@ def edit(path, **changes):
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
+@pytest.mark.door
 def test_missing_tensors_are_not_filled_with_noise(clip_folder, tmp_path):
     from safetensors.torch import load_file, save_file
 
@@ -349,6 +352,7 @@ def test_missing_tensors_are_not_filled_with_noise(clip_folder, tmp_path):
         load_encoder(f"clip:{tmp_path / 'clip'}")
 
 
+@pytest.mark.door
 def test_weights_that_are_not_numbers_are_refused(clip_folder, tmp_path):
     from safetensors.torch import load_file, save_file
 
@@ -361,6 +365,7 @@ def test_weights_that_are_not_numbers_are_refused(clip_folder, tmp_path):
         load_encoder(f"clip:{tmp_path / 'clip'}")
 
 
+@pytest.mark.door
 def test_another_model_s_tokenizer_is_refused(clip_folder, tmp_path):
     # transformers would read every text at its first token, which is the same for all of them.
     shutil.copytree(clip_folder[0], tmp_path / "clip")
@@ -374,6 +379,7 @@ def test_another_model_s_tokenizer_is_refused(clip_folder, tmp_path):
         load_encoder(f"clip:{tmp_path / 'clip'}")
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     "bad, complaint",
     [
@@ -396,6 +402,7 @@ def test_a_bad_picture_is_named(clip, bad, complaint):
         clip.images([np.zeros((8, 8, 3), np.float32), bad])
 
 
+@pytest.mark.door
 def test_one_picture_or_text_instead_of_a_list_is_refused(clip, dino):
     with pytest.raises(TypeError, match="got one picture"):
         clip.images(np.zeros((8, 8, 3)))
@@ -405,6 +412,7 @@ def test_one_picture_or_text_instead_of_a_list_is_refused(clip, dino):
         clip.texts([3])
 
 
+@pytest.mark.door
 def test_a_device_that_is_not_there_is_named(clip_folder):
     with pytest.raises(InputError, match="device 'tpu-ish': unknown, expected cpu or cuda"):
         load_encoder(f"clip:{clip_folder[0]}", device="tpu-ish")

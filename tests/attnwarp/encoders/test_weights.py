@@ -39,6 +39,7 @@ def test_objects_that_could_run_code_are_refused_without_advice_to_run_them(tmp_
     assert "ran" not in capfd.readouterr().out
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("kept", [0.1, 0.5, 0.99])
 def test_a_cut_file_of_lpips_is_named(kept, tmp_path):
     path = tmp_path / BACKBONES["squeeze"].file
@@ -59,6 +60,7 @@ def bomb(path):
     assert path.stat().st_size < 1_000_000
 
 
+@pytest.mark.door
 def test_compressed_weights_are_refused_before_they_fill_the_memory(tmp_path):
     bomb(tmp_path / "a.pth")
     pix2pix().save_pretrained(tmp_path / "editor", safe_serialization=False)

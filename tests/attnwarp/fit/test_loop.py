@@ -282,6 +282,7 @@ def test_seconds_that_cannot_be_are_refused_by_name(scene, name, value):
         fit(start, scene[0], settings, **{name: value})
 
 
+@pytest.mark.door
 def test_a_held_out_view_that_renders_as_nan_is_no_equal_picture(scene, monkeypatch):
     def broken(gaussians, camera, **options):
         view = render(gaussians, camera, **options)
@@ -373,6 +374,7 @@ def test_a_measure_of_the_callers_own_is_part_of_the_curve(scene, tmp_path):
     assert again.history == result.history and same_bits(again.gaussians, result.gaussians)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("position", "value", "message"),
     [
@@ -389,6 +391,7 @@ def test_an_argument_of_another_type_is_named(scene, position, value, message):
         fit(*arguments)
 
 
+@pytest.mark.door
 def test_a_second_fit_into_a_folder_is_refused_while_the_first_goes_on(scene, tmp_path):
     start, settings = begin(scene, iterations=2, sh_degree=0)
     refusals = []
@@ -404,6 +407,7 @@ def test_a_second_fit_into_a_folder_is_refused_while_the_first_goes_on(scene, tm
     assert same_bits(after.gaussians, result.gaussians)
 
 
+@pytest.mark.door
 def test_a_checkpoint_of_other_settings_or_views_is_refused_by_name(scene, tmp_path):
     start, settings = begin(scene, iterations=5, sh_degree=0)
     fit(start, scene[0], settings, folder=tmp_path)
@@ -447,12 +451,14 @@ def test_a_restart_that_is_stopped_before_its_first_save_loses_nothing(scene, tm
     assert fit(start, scene[0], settings, folder=tmp_path).iteration == 2
 
 
+@pytest.mark.door
 def test_numbers_that_explode_end_in_a_clear_error(scene):
     start, settings = begin(scene, iterations=5, sh_degree=0, lr_dc=1e39)
     with pytest.raises(RuntimeError, match=r"after 1 iterations: .*lower the learning rates"):
         fit(start, scene[0], settings)
 
 
+@pytest.mark.door
 def test_splats_of_another_kind_or_degree_are_refused(scene):
     start, _ = begin(scene, sh_degree=0)
     with pytest.raises(ValueError, match=r"start: is of kind '2d', but settings.kind is '3d'"):
@@ -461,6 +467,7 @@ def test_splats_of_another_kind_or_degree_are_refused(scene):
         fit(start, scene[0], FitSettings())
 
 
+@pytest.mark.door
 def test_splats_that_lie_elsewhere_than_in_main_memory_are_refused(scene):
     start, settings = begin(scene, iterations=5, sh_degree=0)
     # A device without a GPU, which holds no numbers: the door of Gaussians would look at them.
@@ -469,6 +476,7 @@ def test_splats_that_lie_elsewhere_than_in_main_memory_are_refused(scene):
         fit(start, scene[0], settings)
 
 
+@pytest.mark.door
 def test_a_view_too_small_for_ssim_is_named_before_the_first_iteration(scene):
     start, settings = begin(scene, iterations=5, sh_degree=0)
     small = dataclasses.replace(ring(3)[1].resize(16, 8), name="small.png")
@@ -479,6 +487,7 @@ def test_a_view_too_small_for_ssim_is_named_before_the_first_iteration(scene):
     assert fit(start, views, without).iteration == 5
 
 
+@pytest.mark.door
 def test_views_that_show_nothing_of_the_splats_end_in_a_clear_error(scene):
     start, settings = begin(
         scene,
@@ -502,6 +511,7 @@ def test_settings_survive_json():
     assert FitSettings.from_dict(json.loads(json.dumps(settings.to_dict()))) == settings
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -523,6 +533,7 @@ def test_settings_out_of_range_are_refused_by_name(changes, message):
         FitSettings(**changes)
 
 
+@pytest.mark.door
 def test_an_unknown_setting_is_refused_with_the_nearest_known_one():
     with pytest.raises(ValueError, match="did you mean 'lr_means'"):
         FitSettings.from_dict({"lr_mean": 1e-4})

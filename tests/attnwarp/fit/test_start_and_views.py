@@ -154,6 +154,7 @@ def test_white_is_one_in_every_depth(dtype):
     assert seen.dtype == torch.float32 and float(seen.min()) == 1
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("image", "message"),
     [
@@ -328,6 +329,7 @@ def test_a_point_far_astray_costs_the_others_no_digits():
     np.testing.assert_allclose(g.world_means()[:50], points, atol=1e-6)
 
 
+@pytest.mark.door
 def test_cameras_at_one_place_that_look_different_ways_are_refused():
     view = dict(width=8, height=8, fov_y=40)
     cameras = [Camera.look_at((4, 0, 1), end, **view) for end in ((9, 0, 1), (4, 5, 1), (4, -5, 1))]
@@ -335,6 +337,7 @@ def test_cameras_at_one_place_that_look_different_ways_are_refused():
         random_points(cameras, 10)
 
 
+@pytest.mark.door
 def test_cameras_at_one_place_that_look_in_opposite_directions_are_refused():
     view = dict(width=8, height=8, fov_y=40)
     both = [Camera.look_at((1, 2, 3), (1 + x, 2, 3), **view) for x in (1, -1)]

@@ -191,12 +191,14 @@ def test_a_distorted_camera_that_no_image_uses_does_not_matter(tmp_path):
     assert len(read_colmap(tmp_path, missing_images="none")) == 3
 
 
+@pytest.mark.door
 def test_a_model_id_that_is_not_known_is_refused(tmp_path):
     write_binary(tmp_path, cameras=[(7, 42, 8, 6, (1.0,))])
     with pytest.raises(FileFormatError, match=r"model: got id 42.*newer COLMAP"):
         read_colmap(tmp_path, missing_images="none")
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
 def test_a_binary_file_cut_anywhere_says_what_is_missing(tmp_path, name):
     write_binary(tmp_path)
@@ -214,6 +216,7 @@ def test_a_binary_file_cut_anywhere_says_what_is_missing(tmp_path, name):
         read_colmap(tmp_path, missing_images="none")
 
 
+@pytest.mark.door
 def test_counts_that_are_too_large_end_in_an_error_and_not_in_a_long_wait(tmp_path):
     write_binary(tmp_path)
     whole = (tmp_path / "points3D.bin").read_bytes()
@@ -222,6 +225,7 @@ def test_counts_that_are_too_large_end_in_an_error_and_not_in_a_long_wait(tmp_pa
         read_colmap(tmp_path, missing_images="none")
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("name", "line", "parts"),
     [
@@ -247,6 +251,7 @@ def test_a_damaged_line_is_named(tmp_path, name, line, parts):
         assert part in str(caught.value), str(caught.value)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("name", ["b.png", "12", "b c d.png", "1 2 d.png"])
 def test_an_image_where_keypoints_belong_is_refused_and_not_skipped(tmp_path, name):
     write_text(tmp_path)
@@ -327,6 +332,7 @@ def test_points_that_are_not_wanted_are_not_read(tmp_path, write):
     assert len(data) == 3 and data.points is None and data.colors is None
 
 
+@pytest.mark.door
 def test_missing_images_are_listed(tmp_path):
     write_binary(tmp_path / "sparse/0")
     with pytest.raises(
@@ -396,6 +402,7 @@ def test_a_folder_that_is_both_kinds_or_none_is_not_guessed(tmp_path):
         read_dataset(tmp_path, format="nerf")
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("write", [write_binary, write_text])
 def test_an_image_that_stands_twice_is_refused(tmp_path, write):
     images = poses()
@@ -405,6 +412,7 @@ def test_an_image_that_stands_twice_is_refused(tmp_path, write):
         read_dataset(tmp_path, missing_images="none")
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("write", [write_binary, write_text])
 def test_a_camera_that_stands_twice_is_refused(tmp_path, write):
     write(tmp_path, cameras=[*CAMERAS, CAMERAS[0]])

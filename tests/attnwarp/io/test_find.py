@@ -149,6 +149,7 @@ def test_a_file_whose_name_has_a_backslash_is_taken_as_it_is(tmp_path):
     assert colours(read_transforms(transforms(tmp_path, ["images/a.png"]))) == [2]
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     "name",
     ["C:\\Users\\me\\scene\\images\\c.png", "/home/other/scene/images/c.png", "photos/C.PNG"],

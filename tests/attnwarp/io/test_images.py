@@ -163,6 +163,7 @@ def test_the_transparent_value_of_a_grey_png_of_16_bits_is_transparent(tmp_path)
     np.testing.assert_array_equal(image[..., 3], [[65535, 0, 65535], [0, 65535, 65535]])
 
 
+@pytest.mark.door
 def test_a_file_that_is_no_picture_is_refused_by_path(tmp_path):
     (tmp_path / "a.png").write_bytes(b"nothing")
     with pytest.raises(FileFormatError, match=r"a\.png: cannot be read as an image"):
@@ -175,6 +176,7 @@ def noise(path, size=(64, 48), **options):
     return path
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.webp", "a.tif"])
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
 def test_a_picture_that_breaks_off_is_refused_by_path(tmp_path, name, share):
@@ -269,6 +271,7 @@ def chunk(name, data):
     return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
+@pytest.mark.door
 def test_a_picture_beyond_pillows_limit_is_refused_in_one_line(tmp_path):
     header = struct.pack(">IIBBBBB", 40_000, 40_000, 8, 2, 0, 0, 0)
     data = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0"))
@@ -278,6 +281,7 @@ def test_a_picture_beyond_pillows_limit_is_refused_in_one_line(tmp_path):
             read(tmp_path / "big.png")
 
 
+@pytest.mark.door
 def test_what_is_not_there_or_empty_is_said(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.png: no such file"):
         read_image(tmp_path / "none.png")
@@ -298,6 +302,7 @@ def test_a_folder_whose_name_is_no_utf8_is_read(tmp_path):
     assert np.array_equal(read_image(folder / "a.png"), pixels)
 
 
+@pytest.mark.door
 def test_a_grey_tiff_of_16_bits_with_alpha_is_refused(tmp_path):
     """OpenCV halves its depth and drops its alpha."""
     pixels = np.zeros((8, 8, 2), np.uint16)

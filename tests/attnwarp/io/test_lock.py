@@ -52,6 +52,7 @@ def test_a_folder_that_was_made_and_not_used_is_removed(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["kept", "used"]
 
 
+@pytest.mark.door
 def test_an_error_lets_go(tmp_path):
     for _ in range(2):
         with pytest.raises(KeyError), alone_in(tmp_path):

@@ -133,6 +133,7 @@ def test_a_missing_scale_names_its_folder(tmp_path, cameras):
         read_dataset(tmp_path / "scene", scale=3)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -155,6 +156,7 @@ def test_a_damaged_camera_is_named(tmp_path, cameras, change, message):
     assert "00000001_cam.txt" in str(raised.value)
 
 
+@pytest.mark.door
 def test_images_that_are_missing_are_named_or_left_out(tmp_path, cameras):
     blendedmvs(tmp_path / "scene", cameras)
     (tmp_path / "scene" / "blended_images" / "00000001.jpg").unlink()

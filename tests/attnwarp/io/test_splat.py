@@ -80,6 +80,7 @@ def test_a_far_origin_is_refused_unless_the_caller_leaves_it_out(tmp_path):
     assert {row[:3] for row in records(tmp_path / "a.splat")} == world
 
 
+@pytest.mark.door
 def test_bad_values_are_refused(tmp_path):
     g = model()
     g.quats[7] = 0
@@ -125,6 +126,7 @@ def test_what_is_written_is_read_back_to_a_byte(tmp_path):
     )
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("change", "part"),
     [

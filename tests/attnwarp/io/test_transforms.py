@@ -211,6 +211,7 @@ def test_a_pose_that_is_not_rigid_is_refused_with_frame_and_size_of_the_error(
         assert part in str(caught.value)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("top", "parts"),
     [
@@ -243,6 +244,7 @@ def test_coefficients_of_zero_are_a_pinhole(tmp_path):
     assert len(data) == 3
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("text", "part"),
     [
@@ -263,6 +265,7 @@ def test_what_is_no_transforms_file_is_refused(tmp_path, text, part):
     assert part in str(caught.value)
 
 
+@pytest.mark.door
 def test_missing_images_are_listed_and_can_be_waived(tmp_path):
     path = folder_of(tmp_path, n=7)
     for i in (1, 2, 4, 5, 6):
@@ -277,6 +280,7 @@ def test_missing_images_are_listed_and_can_be_waived(tmp_path):
     assert len(data.cameras) == 7
 
 
+@pytest.mark.door
 def test_an_image_of_another_size_is_refused_or_resizes_its_camera(tmp_path):
     path = folder_of(tmp_path)
     image(tmp_path / "images/001.png", (4, 3))
@@ -329,6 +333,7 @@ def test_no_camera_is_resized_to_a_picture_of_another_shape(tmp_path):
         read_transforms(path, resize_cameras=True)
 
 
+@pytest.mark.door
 def test_a_file_that_is_no_image_is_refused(tmp_path):
     path = folder_of(tmp_path)
     (tmp_path / "images/001.png").write_text("not a picture")
@@ -393,6 +398,7 @@ def test_the_written_file_says_what_other_readers_look_for(tmp_path):
     assert len(read_points(tmp_path / data["ply_file_path"])[0]) == 11
 
 
+@pytest.mark.door
 def test_cameras_without_images_are_written_by_name_and_skew_is_refused(tmp_path):
     camera = Camera.look_at((3, 1, 2), (0, 0, 0), width=8, height=6, fov_y=50, name="front")
     write_transforms(tmp_path, Dataset([camera], [None]))
@@ -430,6 +436,7 @@ LISTED = [-0.02, 0.01, 0.003, 0.0, 1e-4, -2e-4]
 NAMED = {"k1": -0.02, "k2": 0.01, "k3": 0.003, "p1": 1e-4, "p2": -2e-4}
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("level", ["top", "frame"])
 @pytest.mark.parametrize("keys", [{"distortion_params": LISTED}, NAMED])
 def test_distortion_is_refused_or_handed_on_wherever_it_stands(tmp_path, level, keys):
@@ -442,6 +449,7 @@ def test_distortion_is_refused_or_handed_on_wherever_it_stands(tmp_path, level, 
     assert lens.coefficients == (-0.02, 0.01, 1e-4, -2e-4, 0.003, 0.0, 0.0, 0.0)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("top", "frame", "part"),
     [
@@ -465,6 +473,7 @@ def test_a_list_of_zeros_is_a_pinhole(tmp_path):
     assert data.lenses == [None]
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("key", "value"),
     [
@@ -557,6 +566,7 @@ def test_frames_may_be_named_in_either_way_too(tmp_path):
     assert read_transforms(path).splits == ["train", "test", "train"]
 
 
+@pytest.mark.door
 def test_a_split_that_names_no_frame_is_refused_with_the_nearest_name(tmp_path):
     lists = split_names(tmp_path, lambda name: name)
     lists["test_filenames"] = ["image/001.png"]
@@ -567,6 +577,7 @@ def test_a_split_that_names_no_frame_is_refused_with_the_nearest_name(tmp_path):
         read_transforms(folder_of(tmp_path, **lists))
 
 
+@pytest.mark.door
 def test_names_of_frames_that_were_removed_by_hand_are_refused_with_the_remedy_that_mends_it(
     tmp_path,
 ):

@@ -164,6 +164,7 @@ def test_coefficients_that_fold_the_picture_over_are_refused():
         undistorted_camera(camera_of("OPENCV"), Lens("brown", (-3.0, 0.0)))
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("focal", [300.0, 800.0, 1200.0, 2000.0])
 def test_a_fold_inside_the_picture_is_refused_where_only_the_border_has_an_inverse(focal):
     # r (1 - 1.5 r^2 + r^4) rises up to 0.354 at r = 0.632 and falls from there on; 1 - 1.5 r^2

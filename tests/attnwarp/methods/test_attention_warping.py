@@ -384,6 +384,7 @@ def test_a_folder_of_another_format_is_refused(scene, editor, tmp_path):
         run(scene, editor, tmp_path, settings)
 
 
+@pytest.mark.door
 def test_a_view_that_renders_as_nan_is_no_picture(finished, scene, editor, monkeypatch):
     """Of an edit that is complete but for what its folder says of the end."""
     render = attnwarp.methods.scene.render
@@ -503,6 +504,7 @@ def test_killed_at_20_random_moments_it_gives_the_same_bytes(finished, scene, ed
     assert files(tmp_path / "often") == files(finished[1])
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("settings", "words", "message"),
     [
@@ -520,6 +522,7 @@ def test_a_folder_of_another_edit_is_refused_by_name(
     assert files(finished[1]) == before
 
 
+@pytest.mark.door
 def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(scene, editor, tmp_path):
     refusals = []
 
@@ -534,6 +537,7 @@ def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(scene, ed
     assert run(scene, editor, tmp_path).edited.keys() == result.edited.keys()
 
 
+@pytest.mark.door
 def test_a_folder_that_was_tuned_by_other_weights_is_refused(scene, editor, tmp_path):
     """The same folder of LPIPS weights, with another network in it."""
     weights = tmp_path / "lpips"
@@ -565,6 +569,7 @@ def test_a_folder_that_was_tuned_by_other_weights_is_refused(scene, editor, tmp_
         run(scene, editor, None, replace(settings, size=16, detail="none"))
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("record", "key"),
     [("rounds/1/v0", "sha256"), ("rounds/2/{}", "sha256")],
@@ -585,6 +590,7 @@ def test_a_record_that_lacks_something_is_named_and_made_anew_once_it_is_gone(
     assert files(tmp_path / "edit") == files(folder)
 
 
+@pytest.mark.door
 def test_seconds_that_are_none_are_named(finished, scene, editor, tmp_path):
     shutil.copytree(finished[1], tmp_path / "edit")
     (tmp_path / "edit" / "times.json").write_text('{"edit": "x"}')
@@ -592,6 +598,7 @@ def test_seconds_that_are_none_are_named(finished, scene, editor, tmp_path):
         run(scene, editor, tmp_path / "edit")
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -613,6 +620,7 @@ def test_an_argument_of_another_type_is_named(scene, editor, changes, message):
         attention_warping(**{**given, "instruction": "a bear", "settings": QUICK, **changes})
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("name", "remedy"), [("times.json", "remove it"), ("manifest.json", "name another folder")]
 )
@@ -642,6 +650,7 @@ def test_results_without_a_manifest_are_taken_for_no_edit_and_stay(
     assert files(folder) == before
 
 
+@pytest.mark.door
 def test_pictures_of_another_program_where_results_go_are_refused_and_stay(scene, editor, tmp_path):
     (tmp_path / "masks").mkdir()
     (tmp_path / "masks" / "v1.png").write_bytes(b"a person's own")
@@ -731,6 +740,7 @@ def test_a_persons_files_where_results_go_are_left_alone(name, scene, editor, tm
     assert path.read_bytes() == b"mine"
 
 
+@pytest.mark.door
 def test_a_folder_of_another_scene_is_refused_by_name(finished, scene, editor):
     model, views, images = scene
     with pytest.raises(InputError, match=r"inputs\.images"):
@@ -898,6 +908,7 @@ def test_views_are_edited_at_the_editors_size_and_their_change_enlarged(scene, e
     assert read_image(tmp_path / "masks" / "v1.png").shape == (64, 64, 3)
 
 
+@pytest.mark.door
 def test_arguments_that_do_not_fit_are_named(scene, editor):
     model, views, images = scene
     with pytest.raises(ValueError, match="images: got 4, expected 5"):
@@ -913,6 +924,7 @@ def test_arguments_that_do_not_fit_are_named(scene, editor):
         run((model, views, images), editor, settings=inverted, source_picture=images[0])
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -1310,6 +1322,7 @@ def test_an_estimate_of_a_source_is_decoded_once_for_all_that_take_it(scene, edi
     )
 
 
+@pytest.mark.door
 def test_a_source_prompt_that_is_too_long_is_refused_before_any_work(
     scene, depth_editor, monkeypatch
 ):

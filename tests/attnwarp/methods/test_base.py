@@ -262,6 +262,7 @@ def test_arguments_that_do_not_fit_are_named(run, scene, editor, depth_editor, t
             IGS2GSSettings(start=wrong)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
@@ -290,6 +291,7 @@ def test_the_lowest_start_that_the_steps_fit_below_is_taken(run):
     assert run("dge", replace(one_round, steps=3, starts=(2, 0))).counters["rounds"] == 1
 
 
+@pytest.mark.door
 def test_a_folder_of_another_method_or_budget_is_refused_by_name(run, tmp_path):
     none = {"steps": 2, "iterations": 0}
     run("by_view", ByViewSettings(**none), folder=tmp_path)
@@ -299,11 +301,13 @@ def test_a_folder_of_another_method_or_budget_is_refused_by_name(run, tmp_path):
         run("by_view", ByViewSettings(**none), folder=tmp_path, budget=Budget(seconds=5))
 
 
+@pytest.mark.door
 def test_a_budget_of_another_type_is_named(run):
     with pytest.raises(TypeError, match=r"budget: got dict, expected attnwarp.methods.Budget"):
         run("by_view", budget={"seconds": 3})
 
 
+@pytest.mark.door
 def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(run, tmp_path):
     refusals = []
 

@@ -312,6 +312,7 @@ def test_a_mask_that_could_be_that_of_two_views_is_refused_with_both(first, mess
         mask_files(tmp_path, views_of_one_name()[first:])
 
 
+@pytest.mark.door
 def test_a_mask_of_another_shape_is_refused_and_one_of_another_size_is_not(tmp_path):
     view = Camera.look_at((3, 0, 0), (0, 0, 0), width=48, height=32, fov_y=40)
     path = tmp_path / "mask.png"
@@ -381,6 +382,7 @@ def test_transparent_pixels_of_a_mask_or_a_picture_by_hand_are_black(tmp_path):
     assert edited[:, 16:].all() and not edited[:, :16].any()
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("more", "message"),
     [
@@ -421,6 +423,7 @@ def test_what_cannot_be_used_is_one_clear_line(more, message, place, tmp_path, m
     assert len(result.output.strip().splitlines()) == 1
 
 
+@pytest.mark.door
 def test_a_source_whose_picture_is_missing_is_said_to_be(place, tmp_path):
     shutil.copytree(place, tmp_path / "copy")
     (tmp_path / "copy/data/images/v2.png").unlink()
@@ -430,6 +433,7 @@ def test_a_source_whose_picture_is_missing_is_said_to_be(place, tmp_path):
     assert "--source: the picture of 'v2' is missing; name another view" in result.output
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
@@ -449,6 +453,7 @@ def test_settings_that_an_edit_cannot_have_are_refused_before_the_fit(
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.door
 def test_splats_that_no_camera_sees_are_refused_by_name_before_the_edit(place, tmp_path):
     """Oracle: the cameras' own projection; all centres lie outside every picture."""
     model = splats()

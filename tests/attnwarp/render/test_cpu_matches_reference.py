@@ -361,6 +361,7 @@ def test_it_works_in_a_forked_child(make_camera, make_splats) -> None:
     assert os.read(reading, 1) == b"1"
 
 
+@pytest.mark.door
 def test_changing_a_parameter_in_place_before_the_backward_pass_is_an_error(
     make_camera, make_splats
 ) -> None:
@@ -435,6 +436,7 @@ def test_a_changed_map_hinders_only_the_gradients_that_read_it(
             assert torch.equal(gradient(name, True), gradient(name, False))
 
 
+@pytest.mark.door
 def test_a_changed_alpha_is_refused_by_a_backgrounds_gradient(make_camera, make_splats) -> None:
     camera = make_camera(4, 16, 16)
     background = torch.zeros(3, requires_grad=True)

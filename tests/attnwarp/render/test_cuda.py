@@ -110,6 +110,7 @@ def test_a_camera_with_skew_is_refused(make_camera, make_splats) -> None:
     assert float((with_skew - without).abs().max()) > 1e-2
 
 
+@pytest.mark.door
 def test_it_says_why_it_cannot_run(make_camera, make_splats, monkeypatch) -> None:
     camera = square_pixels(make_camera(3, 8, 8))
     solid = make_splats(3, "3d", 5, camera)

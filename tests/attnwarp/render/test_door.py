@@ -70,11 +70,13 @@ def test_a_bad_argument_is_named_with_what_came_and_what_was_expected(
         render(gaussians(), camera(), **arguments)
 
 
+@pytest.mark.door
 def test_intersection_of_3d_splats_is_refused_with_the_remedy() -> None:
     with pytest.raises(ValueError, match="use 'peak'"):
         render(gaussians(kind="3d"), camera(), depth="intersection")
 
 
+@pytest.mark.door
 def test_other_types_are_refused() -> None:
     with pytest.raises(TypeError, match="gaussians: got int"):
         render(3, camera())  # type: ignore[arg-type]
@@ -84,6 +86,7 @@ def test_other_types_are_refused() -> None:
         render(gaussians(), camera(), pose=np.eye(4))  # type: ignore[arg-type]
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("background", ["white", ["1", "1", "1"], [1.0, None, 1.0], object()])
 def test_a_background_that_is_no_numbers_is_named_with_how_many_are_expected(
     background: Any,
@@ -146,6 +149,7 @@ def test_counters_say_what_was_done() -> None:
     assert counters["pairs"] % 16 == counters["composited"] % 16 == 0
 
 
+@pytest.mark.door
 def test_normal_from_depth_refuses_a_depth_of_another_size() -> None:
     with pytest.raises(ValueError, match="depth: got shape"):
         api.normal_from_depth(torch.ones(3, 3), camera())
@@ -165,6 +169,7 @@ def test_importing_the_door_loads_neither_numba_nor_gsplat() -> None:
     assert "attnwarp.render" in modules and not modules & {"numba", "gsplat", "scipy"}
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("features", [[[1.0], [2.0], [3.0]], np.zeros((3, 1), np.float32)])
 def test_features_that_are_no_tensor_are_refused_by_name(features) -> None:
     with pytest.raises(TypeError, match=r"features: got \w+, expected a torch.Tensor"):

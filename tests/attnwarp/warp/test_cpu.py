@@ -346,6 +346,7 @@ def test_results_outlive_the_next_call():
     assert torch.equal(first.mask, copies[1])
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -76,6 +76,7 @@ def test_a_tap_of_no_weight_may_hold_anything():
     assert sample_at(features, xy).item() == 1.0
 
 
+@pytest.mark.door
 def test_integer_features_are_refused_unless_nearest():
     labels = torch.tensor([[[1, 2], [3, 4]]])
     xy = torch.tensor([[[0.2, 0.4], [1.9, 1.1]]], dtype=torch.float64)
@@ -163,6 +164,7 @@ def test_a_position_on_the_border_is_in_and_beyond_it_takes_the_borders_value():
     assert in_bounds(moved, (2, 2)).sum() == 3  # the corner, and the two centres of the second row
 
 
+@pytest.mark.door
 def test_maps_of_other_proportions_than_the_source_are_refused_by_name():
     wide = orbit(0, size=16, width=32)
     c = correspond(wide, wide, np.full((16, 32), 4.0))

@@ -100,6 +100,7 @@ def test_every_field_changes_what_it_says():
         assert not same, name
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -122,6 +123,7 @@ def test_a_wrong_setting_is_refused_by_name(change, message):
         preset("releases")
 
 
+@pytest.mark.door
 def test_an_unknown_name_of_any_table_lists_the_known_ones_and_the_nearest():
     from attnwarp import methods
 

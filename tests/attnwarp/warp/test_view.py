@@ -295,6 +295,7 @@ def test_a_rule_says_what_it_needs():
         warp_surfaces(camera, camera, Surface(depth), Surface(depth), PRESETS["released"])
 
 
+@pytest.mark.door
 def test_a_mistaken_argument_is_named_with_what_was_expected():
     disc, camera = shell(50), orbit(0, size=8)
     for change, message in (
@@ -322,6 +323,7 @@ def test_a_mistaken_argument_is_named_with_what_was_expected():
         view.at((4, 4)).warp([[0.0]])
 
 
+@pytest.mark.door
 def test_what_no_rule_reads_is_refused_with_the_setting_that_would_read_it():
     disc, camera = shell(50), orbit(0, size=8)
     for change, message in (

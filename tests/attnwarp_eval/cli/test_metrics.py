@@ -242,6 +242,7 @@ def test_pixels_alone_need_no_encoder(data):
     assert saved(folder)["not_computed"]["Perceptual distance"] == "left out by --perceptual none"
 
 
+@pytest.mark.door
 def test_nothing_that_can_be_computed_is_wrong_usage(data):
     folder, _ = data
     done = call("metrics", f"--edited={folder / 'edited'}", "--out", folder / "out")
@@ -266,6 +267,7 @@ def test_pictures_without_a_partner_are_named_and_left_out(data, models):
     assert list(result["embedding.clip_similarity"]["views"]) == list(VIEWS)
 
 
+@pytest.mark.door
 def test_names_that_never_meet_are_told_apart(data):
     folder, _ = data
     for path in (folder / "edited").iterdir():
@@ -284,6 +286,7 @@ def test_names_that_never_meet_are_told_apart(data):
     )
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     "group, suffix", [("edited", "tif"), ("originals", "PNG"), ("masks", "png")]
 )
@@ -470,6 +473,7 @@ def test_a_mask_acts_on_the_perceptual_distance_too(data, models):
     assert saved(folder)["metrics"]["perceptual.distance"]["value"] is None
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     "spoil, complaint",
     [

@@ -124,6 +124,7 @@ def test_a_manifest_that_lies_is_refused_in_one_line(folders, tmp_path, change, 
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("text", ["[" * 100_000, "{", "\x00", '"a"', "[]", "\ud800"])
 def test_a_damaged_manifest_is_refused_in_one_line(tmp_path, text):
     (tmp_path / "manifest.json").write_bytes(text.encode("utf-8", "surrogatepass"))
@@ -147,6 +148,7 @@ def test_inspecting_an_edit_writes_nothing_to_its_folder(folders, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.door
 def test_what_is_missing_is_named_with_the_remedy(folders, tmp_path):
     for arguments, message in (
         ((folders / "edit", folders), "name them with --ply FILE.ply"),

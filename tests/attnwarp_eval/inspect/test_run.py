@@ -160,6 +160,7 @@ def test_an_edited_view_without_pictures_names_what_to_open(run, edited, options
     assert "attnwarp edit" in result.stderr
 
 
+@pytest.mark.door
 def test_a_hostile_study_is_one_line_without_control_characters(tmp_path):
     erase = "\x1b[2J"
     for content, message in (
@@ -192,6 +193,7 @@ def test_a_run_without_edits_is_not_shown_on_a_scene_that_has_changed(tmp_path):
             subject.of_run(store.root)
 
 
+@pytest.mark.door
 def test_runs_that_do_not_fit_and_damaged_ones_are_refused(tmp_path):
     run = make(tmp_path / "changed", content="0" * 64)
     with pytest.raises(InputError, match="'spheres' has changed since the run was made"):

@@ -160,6 +160,7 @@ def test_an_encoder_s_nan_is_refused_and_not_taken_for_undefined(bad):
         directional_similarity(E, E, E[0], images[2])
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     "call, complaint",
     [

@@ -375,6 +375,7 @@ def test_edit_psnr_where_no_view_has_a_finite_one(psnr, pooled):
     assert got.identical + got.undefined == len(psnr)
 
 
+@pytest.mark.door
 def test_edit_psnr_refuses_views_that_do_not_match():
     flat = np.full((2, 2, 3), 0.5)
     with pytest.raises(
@@ -465,6 +466,7 @@ def test_an_empty_mask_has_no_distance_and_asks_for_none():
     )
 
 
+@pytest.mark.door
 def test_a_perceptual_distance_refuses_what_the_others_do():
     image, target = pictures()
     bad = image.copy()

@@ -205,6 +205,7 @@ def test_an_exact_correspondence_has_no_endpoint_error():
     assert got["warp.coverage"] == got["warp.below_half_px"] == 1
 
 
+@pytest.mark.door
 def test_every_figure_is_registered_and_named_whatever_stands_behind_it():
     mask = np.ones((2, 2), bool)
     xy = np.zeros((2, 2, 2))

@@ -119,6 +119,7 @@ def _another_scene(cells):
     cells[0]["scene"] = "bear"
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("load", "damage"),
     [

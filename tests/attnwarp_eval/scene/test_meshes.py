@@ -301,6 +301,7 @@ def test_a_coff_has_colours_and_colours_of_faces_are_told(tmp_path):
         assert read_text(tmp_path, "c.off", text).tint.tolist() == np.eye(3).tolist()
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
 def test_an_obj_in_utf_16_is_refused_by_name(tmp_path, encoding):
     """As assimp's box_UTF16BE.obj is, which begins with a byte order mark."""
@@ -310,6 +311,7 @@ def test_an_obj_in_utf_16_is_refused_by_name(tmp_path, encoding):
         read_mesh(tmp_path / "box.obj")
 
 
+@pytest.mark.door
 def test_a_mesh_at_the_end_of_the_world_is_refused_by_name(tmp_path):
     with pytest.raises(
         ValueError, match=r"vertex 2 lies 1e\+30 from the origin, expected at most 1e\+09"
@@ -430,6 +432,7 @@ def accessor(key, value):
     return lambda document: document["accessors"][0].update({key: value})
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -477,6 +480,7 @@ cameras: {{look_at: [0, 0, 0], radius: 9, source: {{yaw: 0, height: 1}}, targets
 """
 
 
+@pytest.mark.door
 def test_a_scene_names_the_object_that_reaches_too_far(tmp_path):
     trimesh.creation.icosphere(1).export(tmp_path / "ball.ply")
     path = tmp_path / "thing.yaml"

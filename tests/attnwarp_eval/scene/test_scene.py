@@ -305,6 +305,7 @@ def test_what_is_wrong_with_an_own_mesh_is_told_with_its_line(tmp_path, old, new
     assert caught.value.line is not None
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("body", "says"),
     [
@@ -324,6 +325,7 @@ def test_a_body_that_cannot_be_meshed_is_told_with_its_name_and_remedy(tmp_path,
         load_scene(path).shapes()
 
 
+@pytest.mark.door
 def test_a_camera_inside_a_body_or_a_box_is_refused(tmp_path):
     for shape in (
         (

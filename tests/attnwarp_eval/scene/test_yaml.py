@@ -96,6 +96,7 @@ def test_aliases_that_repeat_little_mean_what_they_repeat():
     assert data == {"a": [1, 2], "b": [[1, 2], [1, 2]], "c": {"d": 4, "e": [1, 2]}}
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

@@ -218,6 +218,7 @@ def test_a_scene_is_fitted_above_27_db_in_two_thousand_steps(spheres, kind, tmp_
     assert result.history[-1].measures["depth.abs_rel"] < 0.03
 
 
+@pytest.mark.door
 @pytest.mark.parametrize("noise", ["inf", "1e39", "nan", "-1"])
 def test_noise_beyond_any_scene_is_refused_and_nothing_is_written(tmp_path, noise):
     arguments = ["scenes", "export", "spheres", str(tmp_path / "out"), "--noise", noise]

@@ -260,6 +260,7 @@ def test_a_result_that_is_not_finite_breaks_and_an_error_of_another_kind_is_not_
         dataclasses.replace(case, measure=crash).outcome(1, Way("cpu"))
 
 
+@pytest.mark.door
 def test_a_case_whose_levels_do_not_fit_is_refused():
     with pytest.raises(ValueError, match="focal_length: 2 is none of its levels"):
         dataclasses.replace(hard_case("focal_length"), required=2)
@@ -305,6 +306,7 @@ def test_the_study_needs_no_scene_resumes_reports_and_is_gated(tmp_path, monkeyp
     assert {row.metric for row in worse.rows if row.verdict == "worse"} == {"stability.margin"}
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -121,6 +121,7 @@ def test_a_run_with_a_plugin_that_is_not_here_names_it(tmp_path):
             read(store)
 
 
+@pytest.mark.door
 def test_a_plugin_that_cannot_be_imported_is_no_damage_of_a_run(tmp_path):
     store = Store(tmp_path / "run")
     content = {"name": "own", "scenes": ["spheres"], "variants": {"a": {}}}
@@ -132,6 +133,7 @@ def test_a_plugin_that_cannot_be_imported_is_no_damage_of_a_run(tmp_path):
     assert done.returncode == 2 and "the plugin 'nope' cannot be imported" in done.stderr
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -149,6 +151,7 @@ def test_a_plugin_that_cannot_be_imported_is_named(tmp_path, monkeypatch, text, 
         plugins.load_plugins.__wrapped__()
 
 
+@pytest.mark.door
 def test_the_list_of_studies_ends_with_one_line_where_a_plugin_cannot_be_imported(tmp_path):
     (tmp_path / "my_broken.py").write_text("1 / 0")
     environment = {"PYTHONPATH": str(tmp_path), "ATTNWARP_PLUGINS": "my_broken"}

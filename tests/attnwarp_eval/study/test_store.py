@@ -71,6 +71,7 @@ def test_a_run_of_former_code_in_one_folder_is_read_and_resumed_where_it_is(tmp_
     assert former.read_bytes() == whole and not new.exists()
 
 
+@pytest.mark.door
 def test_a_folder_of_cells_that_is_a_link_is_refused(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "run" / "cells").mkdir(parents=True)
@@ -79,6 +80,7 @@ def test_a_folder_of_cells_that_is_a_link_is_refused(tmp_path):
         pass
 
 
+@pytest.mark.door
 def test_a_folder_of_others_results_or_the_current_one_with_other_things_is_refused(
     tmp_path, monkeypatch
 ):
@@ -99,6 +101,7 @@ def test_a_folder_of_others_results_or_the_current_one_with_other_things_is_refu
     Store("").refuse_strangers()
 
 
+@pytest.mark.door
 def test_a_file_in_place_of_a_runs_folder_is_named_and_left_alone(tmp_path):
     path = tmp_path / "study.yaml"
     path.write_text("name: mine")
@@ -115,6 +118,7 @@ def test_a_record_reads_back_as_written(tmp_path):
     assert store.done() == {record()["id"]}
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -136,6 +140,7 @@ def test_a_changed_record_is_refused_with_the_remedy(tmp_path, damage, message):
     assert "run again" in str(caught.value)
 
 
+@pytest.mark.door
 def test_a_truncated_record_is_refused(tmp_path):
     store = Store(tmp_path)
     store.write(record())
@@ -158,6 +163,7 @@ def test_a_cell_of_another_content_is_refused_in_one_line_and_computed_anew(tmp_
     assert store.path(record()["id"]).read_bytes() == whole
 
 
+@pytest.mark.door
 def test_a_sealed_record_that_its_probe_cannot_read_is_refused_in_one_line(tmp_path):
     store = Store(tmp_path)
     store.write(record())
@@ -216,6 +222,7 @@ def test_study_json_carries_the_sha256_of_its_content(tmp_path):
     assert not store.verify().sealed
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     "text",
     ["[]", "null", "NaN", '{"cells": NaN}', '{"study": {}, "cells": 3}', '{"cells": []}', "[" * 10**5,
@@ -299,11 +306,13 @@ def test_a_lock_that_is_a_link_leaves_its_target_alone(tmp_path):
     assert target.read_text() == "precious"
 
 
+@pytest.mark.door
 def test_a_folder_that_is_not_a_run_says_how_to_make_one(tmp_path):
     with pytest.raises(StoreError, match="attnwarp-eval run"):
         Store(tmp_path).verify()
 
 
+@pytest.mark.door
 def test_a_second_run_on_the_same_folder_is_refused(tmp_path):
     with (
         Store(tmp_path).lock(),

@@ -195,16 +195,19 @@ def test_titles_of_shipped_studies_stand_in_one_column():
     assert len(starts) == 1
 
 
+@pytest.mark.door
 def test_a_study_that_does_not_exist_names_those_that_do():
     with pytest.raises(StudyError, match="did you mean 'quick'"):
         load_study("quik")
 
 
+@pytest.mark.door
 def test_a_view_that_a_scene_lacks_is_named(tmp_path):
     with pytest.raises(StudyError, match="'yaw031'; did you mean 'yaw030'"):
         cells(load_study(write(tmp_path, views=["yaw031"])))
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -244,6 +247,7 @@ def test_keys_may_name_scenes_that_are_left_out(tmp_path):
     assert (pictured["warp"], pictured["fit"]) == (("yaw030",), ("orbit_000_of_9",))
 
 
+@pytest.mark.door
 def test_a_key_that_stands_twice_is_refused_with_its_line(tmp_path):
     path = tmp_path / "twice.yaml"
     path.write_text("name: a\nscenes: [spheres]\nname: b\n")

@@ -191,6 +191,7 @@ def test_one_name_is_one_method_in_all_runs(tmp_path, changes, message):
     assert message.format(first=first.root) in done.stderr
 
 
+@pytest.mark.door
 def test_a_folder_that_is_no_run_and_a_missing_picture_are_one_line(run, tmp_path):
     done = build(tmp_path, "--out", tmp_path / "a")
     assert done.exit_code == 2 and "not a run's folder" in done.stderr

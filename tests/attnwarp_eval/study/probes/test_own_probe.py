@@ -143,6 +143,7 @@ def test_a_figure_that_its_metrics_do_not_specify_costs_the_cell(tmp_path, monke
     assert "gives 'chord.length', which its metrics do not specify" in summary.failures[0].error
 
 
+@pytest.mark.door
 def test_two_probes_of_one_name_are_refused():
     class Other(Chord):
         pass

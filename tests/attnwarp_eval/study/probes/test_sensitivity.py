@@ -292,6 +292,7 @@ def test_weights_that_change_under_a_run_are_refused(scene, tmp_path, encoders):
         compute(probe("sensitivity"), cell, tmp_path, threads=1)
 
 
+@pytest.mark.door
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
