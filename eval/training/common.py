@@ -104,9 +104,9 @@ def settings(module: Mapping[str, Any], *splits: str) -> dict[str, Any]:
     Args:
         module: the recipe's ``globals()``, imported constants such as the words for colours
             included.
-        splits: names of the pictures that it is trained on, in :data:`training.data.SPLITS`.
+        splits: names of the pictures that it is trained on, in :data:`training.worlds.data.SPLITS`.
     """
-    from training.data import DATA_PROTOCOL, SPLITS
+    from training.worlds.data import DATA_PROTOCOL, SPLITS
 
     plain = (bool, int, float, str, tuple, list, dict)
     constants = {

@@ -1,6 +1,6 @@
 """The answer that a noise picks, from the definition: one noise and one list at a time."""
 
-from training.editor_answers import codes
+from training.editors.answers import codes
 
 
 def picked(noise, candidates):

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from attnwarp.errors import InputError
-from training import clip, common, dino, naming, perceptual
+from training import common
 from training.common import Run, minutes, rate, settings
-from training.data import DATA_PROTOCOL, SPLITS
+from training.encoders import clip, dino, naming, perceptual
+from training.worlds.data import DATA_PROTOCOL, SPLITS
 
 STEPS = 5
 
@@ -180,7 +181,7 @@ def test_what_a_recipe_says_is_its_constants_its_words_and_its_pictures():
 def test_a_checkpoint_without_a_recipe_is_still_exported(tmp_path):
     from safetensors.torch import load_file
 
-    from training.__main__ import export
+    from training.encoders.__main__ import export
 
     state = {"weight": torch.randn(4, 3), "count": torch.tensor([7])}
     torch.save({"model": state, "epoch": 6}, tmp_path / "perceptual-small.pt")

@@ -5,7 +5,7 @@ import torch
 from typer.testing import CliRunner
 
 from training.common import Run
-from training.edit import app
+from training.editors.__main__ import app
 from training.log import Entry, append, log_path, read_log, table
 
 

@@ -18,10 +18,10 @@ from attnwarp.editing.segment import (
     segments_of,
 )
 from attnwarp.errors import InputError
-from training.assemblies import KINDS
-from training.editing_pairs import PAIR_SPLITS, THING, edit_looks, edit_world, shown_things
-from training.part_pictures import PARTS, PartSplit, render_part_world
-from training.render import pictures
+from attnwarp_eval.drawn.assemblies import KINDS
+from training.worlds.editing_pairs import PAIR_SPLITS, THING, edit_looks, edit_world, shown_things
+from training.worlds.part_pictures import PARTS, PartSplit, render_part_world
+from training.worlds.render import pictures
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (50, 70, 3), dtype=np.uint8)
 IMAGE = PIXELS.astype(np.float32) / 255

@@ -18,10 +18,10 @@ from attnwarp.encoders.base import (
 )
 from attnwarp.encoders.bundled import WEIGHTS, load
 from attnwarp.errors import InputError
-from training import assess
-from training.assemblies import KINDS
-from training.data import Pictures, Split, looks_of, render_world
-from training.part_pictures import PARTS, PartSplit, render_part_world
+from attnwarp_eval.drawn.assemblies import KINDS
+from training.assess import figures as assess
+from training.worlds.data import Pictures, Split, looks_of, render_world
+from training.worlds.part_pictures import PARTS, PartSplit, render_part_world
 
 NAMES = ("clip-small", "clip-parts", "dino-small", "perceptual-small")
 SHORT = {

@@ -1,0 +1,176 @@
+"""Figures of an encoder about parts: surfaces by name, edits by direction, on held-out worlds and the package's own scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.encoders.base import TextImageEncoder
+from attnwarp_eval.drawn.assemblies import KINDS, WHOLE_NOUNS
+from attnwarp_eval.drawn.worlds import draw_look
+from training.assess.figures import Figure, as_float, figure
+from training.encoders.clip_parts import surface_choices, surface_number
+from training.worlds.part_captions import (
+    Caption,
+    Surface,
+    part_words,
+    said,
+    sentence,
+    true_of,
+    with_article,
+)
+from training.worlds.part_pictures import PARTS, PartPictures
+
+Array = npt.NDArray[np.float64]
+
+LEAST_SHARE = 0.02
+"""Of a picture that a part covers where it is asked about."""
+
+SCENES = ("bear", "person", "dinosaur", "face", "garden", "stump")
+"""The scenes that have edits; no recipe sees them."""
+
+SCENE_SIZE = 256
+SCENE_SAMPLES = 32
+SCENE_VIEWS = 3
+
+
+def part_figures(encoder: TextImageEncoder, pictures: PartPictures) -> list[Figure]:
+    """Naming of wholes and of parts' surfaces, and the direction of an edit of a part."""
+    embedded = _unit(encoder.images(as_float(pictures.images)))
+    return [
+        _wholes(encoder, embedded, pictures),
+        _surfaces(encoder, embedded, pictures),
+        _directions(encoder, embedded, pictures),
+    ]
+
+
+def _wholes(encoder: TextImageEncoder, images: Array, pictures: PartPictures) -> Figure:
+    words = np.stack([
+        _unit(encoder.texts([f"a photo of {with_article(n)}" for n in WHOLE_NOUNS[k]])).mean(axis=0) for k in KINDS
+    ])  # fmt: skip
+    guess = (images @ _unit(words).T).argmax(axis=1)
+    return figure(
+        "name the thing with parts, new shapes",
+        guess == pictures.kind,
+        pictures.world,
+        chance=1 / len(KINDS),
+    )
+
+
+def _surfaces(encoder: TextImageEncoder, images: Array, pictures: PartPictures) -> Figure:
+    """Which of 17 colours and materials a part has, by the picture as a whole."""
+    choices = surface_choices()
+    numbers = surface_number(pictures.surfaces)
+    right, worlds = [], []
+    words = {
+        p: _unit(encoder.texts([f"a photo of {part_words(p, s, np.random.default_rng(4))}" for s in choices]))
+        for p in range(len(PARTS))
+    }  # fmt: skip
+    for row in range(len(pictures)):
+        shares = pictures.shares[pictures.place[row]]
+        for p in np.flatnonzero((shares >= LEAST_SHARE) & (numbers[row] >= 0)):
+            guess = int((words[int(p)] @ images[row]).argmax())
+            right.append(guess == numbers[row, p])
+            worlds.append(int(pictures.world[row]))
+    return figure(
+        "name a part's colour or material, new shapes", right, worlds, chance=1 / len(choices)
+    )
+
+
+def _directions(encoder: TextImageEncoder, images: Array, pictures: PartPictures) -> Figure:
+    """Which of 8 edits of parts of one picture was made, by directional similarity.
+
+    The seven others give a surface to a part of it too: the same part or another that is seen.
+    """
+    rng = np.random.default_rng(6)
+    right, worlds = [], []
+    for before in np.flatnonzero(pictures.look == 0):
+        shares = pictures.shares[pictures.place[before]]
+        for look in (1, 2):
+            after = before + look
+            old, new = pictures.surfaces[before], pictures.surfaces[after]
+            (p,) = np.flatnonzero((old != new).any(axis=1))
+            if (
+                shares[p] < LEAST_SHARE
+                or not (pictures.images[before] != pictures.images[after]).any()
+            ):
+                continue
+            kind = int(pictures.kind[before])
+            seen = np.flatnonzero(shares >= LEAST_SHARE)
+            edits: list[tuple[int, Surface]] = [(int(p), said(new[p], rng))]
+            while len(edits) < 8:
+                other = draw_look(0, rng, pairs="any")
+                q = int(p) if rng.uniform() < 0.5 else int(rng.choice(seen))
+                edit = (q, said((other.finish, other.color, other.second), rng))
+                false = not true_of(
+                    [Caption(kind, None, (edit,))], pictures, np.array([before, after])
+                ).any()
+                if false and edit not in edits:
+                    edits.append(edit)
+            seed = int(rng.integers(2**31))
+            pairs = [
+                [
+                    sentence(Caption(kind, None, ((q, s),)), np.random.default_rng(seed))
+                    for s in (said(old[q], rng), surface)
+                ]
+                for q, surface in edits
+            ]
+            texts = _unit(encoder.texts([t for pair in pairs for t in pair])).reshape(
+                len(edits), 2, -1
+            )
+            likeness = _unit(texts[:, 1] - texts[:, 0]) @ _unit(images[after] - images[before])
+            right.append(bool(likeness[0] > likeness[1:].max()))  # a tie is no find
+            worlds.append(int(pictures.world[before]))
+    return figure(
+        "the edit of a part among 8, by directional similarity", right, worlds, chance=1 / 8
+    )
+
+
+def scene_figure(
+    encoder: TextImageEncoder, *, scenes: Sequence[str] = SCENES
+) -> tuple[Figure, dict[str, float]]:
+    """Which of a scene's own edits was made, by directional similarity; and the share of each scene.
+
+    Each answer of an ambiguous edit is an edit of its own. Their true pictures are the package's.
+    """
+    from attnwarp_eval.study.edit_truth import ONLY, edit_truth
+    from attnwarp_eval.world import world
+
+    right, names, chance = [], [], []
+    for name in scenes:
+        of = world(name, SCENE_SIZE)
+        views = tuple(
+            list(of.targets)[k]
+            for k in np.linspace(0, len(of.targets) - 1, SCENE_VIEWS).round().astype(int)
+        )
+        sources, targets, pictures = [], [], []
+        for edit in of.scene.spec.edits:
+            truth = edit_truth(name, SCENE_SIZE, SCENE_SAMPLES, edit.name, views)
+            words = {answer.name: answer.target for answer in edit.answers} or {ONLY: edit.target}
+            for answer, shown in truth.answers.items():
+                sources.append(edit.source)
+                targets.append(words[answer])
+                pictures.append(
+                    [(truth.originals[v], shown[v], truth.union[v].mean()) for v in views]
+                )
+        away = _unit(_unit(encoder.texts(targets)) - _unit(encoder.texts(sources)))
+        for k, row in enumerate(pictures):
+            for before, after, share in row:
+                if share < 0.01:
+                    continue
+                change = _unit(encoder.images([after])) - _unit(encoder.images([before]))
+                right.append(int((away @ change[0]).argmax()) == k)
+                names.append(name)
+                chance.append(1 / len(pictures))
+    shares = {
+        s: float(np.mean([r for r, n in zip(right, names, strict=True) if n == s])) for s in scenes
+    }
+    what = "the edit among a scene's own, by directional similarity"
+    return figure(what, right, names, chance=float(np.mean(chance)), asked=0.85), shares
+
+
+def _unit(x: npt.ArrayLike) -> Array:
+    x = np.asarray(x, dtype=np.float64)
+    return x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-12)
