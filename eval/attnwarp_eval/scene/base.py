@@ -46,7 +46,7 @@ def _no_truth(value: Any) -> Any:
 
 
 Number = Annotated[float, BeforeValidator(_no_truth)]
-"""A number, which yes and true are not. YAML reads 1e3 as text, so that text of a number counts."""
+"""A number, which true is not."""
 
 Seed = Annotated[int, Field(ge=-(2**62), le=2**62)]
 """What the noise is hashed with: a 64-bit number, with room for octaves."""

@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-import yaml
 from pydantic import ValidationError
 
 from attnwarp.camera import Camera
@@ -19,7 +18,7 @@ from attnwarp_eval.scene.scene import Scene, SceneError, inside, orbit_camera, v
 from attnwarp_eval.scene.spec import MeshSpec, RectangleSpec, SceneSpec
 from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
 from attnwarp_eval.scene.transport import contradictions
-from attnwarp_eval.scene.yaml import YamlError, line_of, read_yaml
+from attnwarp_eval.scene.yaml import Place, YamlError, line_of, read_yaml
 
 
 def scene_folders() -> list[Path]:
@@ -124,7 +123,7 @@ def _read(path: Path) -> Scene:
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"cannot be read: {error}", path) from error
     try:
-        root, data = read_yaml(text)
+        lines, data = read_yaml(text)
     except YamlError as error:
         hint = "" if error.line else "; docs/scenes.md has an example to start from"
         raise SceneError(f"{error}{hint}", path, error.line) from error
@@ -139,20 +138,20 @@ def _read(path: Path) -> Scene:
         more = f" (and {len(problems) - 1} more below it)" if len(problems) > 1 else ""
         loc = (*first["loc"], "type") if first["type"] == "union_tag_invalid" else first["loc"]
         raise SceneError(
-            explain(first, SceneSpec, "docs/scenes.md") + more, path, line_of(root, loc)
+            explain(first, SceneSpec, "docs/scenes.md") + more, path, line_of(lines, loc)
         ) from error
     scene = Scene(spec, path)
-    _check(scene, root)
+    _check(scene, lines)
     return scene
 
 
-def _check(scene: Scene, root: yaml.Node) -> None:
+def _check(scene: Scene, lines: dict[Place, int]) -> None:
     """What no single field can say: names that clash, files that are missing, cameras that cannot
     be.
     """
 
     def refuse(message: str, *loc: int | str) -> None:
-        raise SceneError(message, scene.path, line_of(root, loc))
+        raise SceneError(message, scene.path, line_of(lines, loc))
 
     names: dict[str, int] = {}
     for k, item in enumerate(scene.spec.objects):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import yaml
@@ -26,41 +26,66 @@ class YamlError(ValueError):
         super().__init__(message)
 
 
-def read_yaml(text: str) -> tuple[yaml.Node, Any]:
-    """The nodes of a YAML text, for line numbers, and what they mean.
+class _Loader(yaml.SafeLoader):
+    """PyYAML's own parser, which reads alike on every machine. A number is decimal, as in YAML 1.2:
+    YAML 1.1 reads ``030`` as 24, ``1:30`` as 90, ``no`` as false and ``1e3`` as text.
+    """
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
+
+
+TAG = "tag:yaml.org,2002:"
+
+for _kind, _pattern, _first in (
+    ("int", r"[-+]?[0-9]+", "-+0123456789"),
+    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", "-+.0123456789"),
+    ("float", r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", "-+."),
+    ("bool", "true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("null", "~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("merge", "<<", "<"),
+):
+    _Loader.add_implicit_resolver(TAG + _kind, re.compile(f"^(?:{_pattern})$"), list(_first))
+
+SCALARS: dict[str, Callable[[str], Any]] = {
+    "str": str,
+    "int": int,
+    "float": lambda text: float(text.lower().replace(".inf", "inf").replace(".nan", "nan")),
+    "bool": lambda text: {"true": True, "false": False}[text.lower()],
+    "null": lambda text: None,
+}
+
+
+Place = tuple[int | str, ...]
+"""Keys and indices that lead to a value; () is the whole file."""
+
+
+def read_yaml(text: str) -> tuple[dict[Place, int], Any]:
+    """The line (from 1) of every place of a YAML text, and what the text means.
+
+    Numbers are decimal: ``030`` is 30. Other notations of numbers, such as ``0x1e`` or ``1:30``,
+    are words; so are dates, and ``yes``, ``no``, ``on`` and ``off``. Every key is a word.
 
     Raises:
-        YamlError: the text is empty or no YAML; a key stands twice or is no word; a value is no
-            date or number although it is written as one; or the text is too long, too deep, or
-            repeats itself by aliases too often.
+        YamlError: the text is empty or no YAML; a key stands twice or is no word; a value is not
+            what its tag says; or the text is too long, too deep, or repeats itself by aliases too
+            often.
 
     Example:
-        >>> root, data = read_yaml("size: [2, 3]")
-        >>> data
-        {'size': [2, 3]}
+        >>> lines, data = read_yaml("fov: 045\\nsize: [3e2, 0256]")
+        >>> data, lines["size", 1]
+        ({'fov': 45, 'size': [300.0, 256]}, 2)
     """
     if len(text) > LONGEST:
         raise YamlError(f"has {len(text):,} characters, more than {LONGEST:,}")
-    if FAST is not None and not DISPUTED.intersection(text):
-        try:
-            return _read(text, FAST)
-        except YamlError:
-            pass  # It may be usable all the same, and messages are those of PyYAML's own parser.
-    return _read(text, EXACT)
-
-
-def _read(text: str, loader: type[Any]) -> tuple[yaml.Node, Any]:
     try:
-        _limit(text, loader)
-        reading = loader(text)
-        try:
-            root = reading.get_single_node()
-            if root is None:
-                raise YamlError("the file is empty")
-            _check_keys(root)
-            data = reading.construct_document(root)
-        finally:
-            reading.dispose()
+        root = yaml.compose(text, Loader=_Loader)
+        if root is None:
+            raise YamlError("the file is empty")
+        reading = _Reading()
+        reading.lines[()] = root.start_mark.line + 1
+        return reading.lines, reading.value(root, ())
+    except YamlError:
+        raise
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         raise YamlError(
@@ -68,9 +93,66 @@ def _read(text: str, loader: type[Any]) -> tuple[yaml.Node, Any]:
             f"{_bare_color(text)}",
             mark.line + 1 if mark else None,
         ) from error
-    except yaml.YAMLError as error:
+    except RecursionError:
+        raise YamlError(f"nested deeper than {DEEPEST} levels") from None
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # an escape such as \\UFFFFFFFF
         raise YamlError(f"not valid YAML: {_line(error)}") from error
-    return root, data
+
+
+class _Reading:
+    """From nodes to values; an alias is read wherever it stands, so that its values count again."""
+
+    def __init__(self) -> None:
+        self.lines: dict[Place, int] = {}
+        self.count = 0
+
+    def value(self, node: yaml.Node, place: Place) -> Any:
+        line = node.start_mark.line + 1
+        self.count += 1
+        if self.count > MOST_VALUES:
+            raise YamlError(f"means more than {MOST_VALUES:,} values, aliases included", line)
+        if len(place) > DEEPEST:
+            raise YamlError(f"nested deeper than {DEEPEST} levels", line)
+        if isinstance(node, yaml.MappingNode):
+            return self._mapping(node, place)
+        if isinstance(node, yaml.SequenceNode):
+            for i, item in enumerate(node.value):
+                self.lines[*place, i] = item.start_mark.line + 1
+            return [self.value(item, (*place, i)) for i, item in enumerate(node.value)]
+        kind = node.tag.removeprefix(TAG)
+        if kind not in SCALARS:
+            raise YamlError(f"the tag {node.tag!r} means nothing here; leave it out", line)
+        try:
+            return SCALARS[kind](node.value)
+        except (ValueError, LookupError) as error:
+            raise YamlError(f"{node.value[:40]!a} is no {kind}", line) from error
+
+    def _mapping(self, node: yaml.MappingNode, place: Place) -> dict[str, Any]:
+        own: dict[str, int] = {}
+        data: dict[str, Any] = {}
+        for key, _ in node.value:
+            line = key.start_mark.line + 1
+            if not isinstance(key, yaml.ScalarNode):
+                raise YamlError("a key is a list or a mapping, expected a word", line)
+            if key.value in own:  # YAML itself lets the last win
+                raise YamlError(
+                    f"the key {key.value!r} stands here and on line {own[key.value]}; keep one",
+                    line,
+                )
+            own[key.value] = line
+        # What is merged comes first, so that own keys win.
+        for key, item in sorted(node.value, key=lambda entry: entry[0].tag != TAG + "merge"):
+            if key.tag == TAG + "merge":
+                several = isinstance(item, yaml.SequenceNode)
+                for one in reversed(item.value) if several else [item]:
+                    value = self.value(one, place)
+                    if not isinstance(value, dict):
+                        raise YamlError("<<: expected keys with values", own[key.value])
+                    data |= value
+            else:
+                self.lines[*place, key.value] = own[key.value]
+                data[key.value] = self.value(item, (*place, key.value))
+        return data
 
 
 BARE_COLOR = re.compile(
@@ -87,121 +169,16 @@ def _bare_color(text: str) -> str:
     return ""
 
 
-def line_of(node: yaml.Node, loc: Sequence[int | str]) -> int:
-    """Line (from 1) of the deepest node that ``loc`` leads to; the tags that unions put into a loc
+def line_of(lines: dict[Place, int], loc: Sequence[int | str]) -> int:
+    """Line (from 1) of the deepest place that ``loc`` leads to; the tags that unions put into a loc
     lead nowhere.
     """
-    line = node.start_mark.line + 1
+    place: Place = ()
     for step in loc:
-        if isinstance(node, yaml.MappingNode):
-            for key, value in node.value:
-                if key.value == step:
-                    line, node = key.start_mark.line + 1, value
-                    break
-        elif (
-            isinstance(node, yaml.SequenceNode) and isinstance(step, int) and step < len(node.value)
-        ):
-            node = node.value[step]
-            line = node.start_mark.line + 1
-    return line
+        if (*place, step) in lines:
+            place = (*place, step)
+    return lines[place]
 
 
 def _line(error: object) -> str:
     return " ".join(str(error).split())
-
-
-class _Values(yaml.constructor.SafeConstructor):
-    """PyYAML's safe conversions, which raise whatever Python raises."""
-
-    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        try:
-            return super().construct_object(node, deep)
-        except (
-            ValueError, TypeError, LookupError, AttributeError, OverflowError,
-        ) as error:  # fmt: skip
-            if isinstance(error, YamlError):
-                raise
-            kind = node.tag.removeprefix("tag:yaml.org,2002:")
-            written = ascii(node.value[:40]) if isinstance(node, yaml.ScalarNode) else "this"
-            raise YamlError(f"{written} is no {kind}", node.start_mark.line + 1) from error
-
-
-class _Exact(_Values, yaml.SafeLoader):
-    """All in Python."""
-
-
-EXACT: type[Any] = _Exact
-FAST: type[Any] | None = None
-"""libyaml's parser where PyYAML has it: 15 times as fast."""
-
-DISPUTED = frozenset("\t!\ufeff")
-"""Characters that libyaml and PyYAML's own parser read otherwise in places: ``title: !``, a tab
-after a colon, a byte order mark on a later line."""
-
-if yaml.__with_libyaml__:
-
-    class _Fast(_Values, yaml.CSafeLoader):
-        """The parser in C."""
-
-    FAST = _Fast
-
-
-def _limit(text: str, loader: type[Any]) -> None:
-    """Refuse depth and repetition before anything is built, since both end a program."""
-    sizes: dict[str, int] = {}
-    open_: list[tuple[str | None, int]] = []  # anchor and size so far of what is not closed yet
-    total = 0
-    try:
-        for event in yaml.parse(text, Loader=loader):
-            line = event.start_mark.line + 1
-            size = 0
-            match event:
-                case yaml.AliasEvent():
-                    if any(anchor == event.anchor for anchor, _ in open_):
-                        raise YamlError(f"*{event.anchor} stands for what it is part of", line)
-                    size = sizes.get(event.anchor, 1)
-                case yaml.ScalarEvent():
-                    size = 1
-                    if event.anchor:
-                        sizes[event.anchor] = size
-                case yaml.SequenceStartEvent() | yaml.MappingStartEvent():
-                    open_.append((event.anchor, 1))
-                    if len(open_) > DEEPEST:
-                        raise YamlError(f"nested deeper than {DEEPEST} levels", line)
-                case yaml.SequenceEndEvent() | yaml.MappingEndEvent():
-                    anchor, size = open_.pop()
-                    if anchor:
-                        sizes[anchor] = size
-            if open_:
-                open_[-1] = (open_[-1][0], open_[-1][1] + size)
-            total = max(total, size, *(inner for _, inner in open_)) if open_ else max(total, size)
-            if total > MOST_VALUES:
-                raise YamlError(f"means more than {MOST_VALUES:,} values, aliases included", line)
-    except (ValueError, OverflowError) as error:  # an escape such as \\UFFFFFFFF
-        if isinstance(error, YamlError):
-            raise
-        raise YamlError(f"not valid YAML: {_line(error)}") from error
-
-
-def _check_keys(node: yaml.Node, checked: set[int] | None = None) -> None:
-    """YAML itself lets the last of two equal keys win, silently."""
-    checked = set() if checked is None else checked
-    if id(node) in checked:
-        return
-    checked.add(id(node))
-    if isinstance(node, yaml.MappingNode):
-        lines: dict[str, int] = {}
-        for key, value in node.value:
-            line = key.start_mark.line + 1
-            if not isinstance(key, yaml.ScalarNode):
-                raise YamlError("a key is a list or a mapping, expected a word", line)
-            if key.value in lines:
-                raise YamlError(
-                    f"the key {key.value!r} stands here and on line {lines[key.value]}; keep one",
-                    line,
-                )
-            lines[key.value] = line
-            _check_keys(value, checked)
-    elif isinstance(node, yaml.SequenceNode):
-        for item in node.value:
-            _check_keys(item, checked)

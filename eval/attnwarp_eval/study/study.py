@@ -236,7 +236,7 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
             " file's path"
         )
     try:
-        root, data = read_yaml(read_text(path))
+        lines, data = read_yaml(read_text(path))
     except (YamlError, UnicodeDecodeError) as error:
         line = f":{error.line}" if isinstance(error, YamlError) and error.line else ""
         raise StudyError(f"{path}{line}: {error}") from None
@@ -268,10 +268,10 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         study = parse_study(data)
     except ValidationError as error:
         place = _place(error.errors()[0])
-        line = f":{line_of(root, place)}" if place else ""
+        line = f":{line_of(lines, place)}" if place else ""
         raise StudyError(f"{path}{line}: {explain_errors(error)}") from None
     if problems := [
-        (line_of(root, place), f"{'.'.join(place)}: {why}")
+        (line_of(lines, place), f"{'.'.join(place)}: {why}")
         for place, why in unused(study, keys, probes())
     ]:
         told = "; line ".join(f"{line}: {problem}" for line, problem in sorted(problems))

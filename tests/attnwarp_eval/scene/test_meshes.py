@@ -490,7 +490,7 @@ def test_a_scene_names_the_object_that_reaches_too_far(tmp_path):
     path.write_text(SCENE.format(file="ball.ply", scale="1e30"))
     with pytest.raises(
         SceneError,
-        match=r"thing.yaml:5: .*shape.scale: got '1e30', but input should be less than or equal to 1000000000",
+        match=r"thing.yaml:5: .*shape.scale: got 1e\+30, but input should be less than or equal to 1000000000",
     ):
         load_scene(path)
 
