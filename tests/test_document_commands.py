@@ -75,7 +75,10 @@ def check_own(program, words):
 def check_python(words, folder):
     assert words[0] == "-m"
     module = words[1]
-    assert (folder / Path(*module.split("."))).with_suffix(".py").is_file()
+    at = folder / Path(*module.split("."))
+    if at.is_dir():  # Python runs a package's __main__
+        module, at = f"{module}.__main__", at / "__main__"
+    assert at.with_suffix(".py").is_file()
     sys.path.insert(0, str(folder))
     try:
         found = importlib.import_module(module)

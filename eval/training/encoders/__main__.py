@@ -152,7 +152,7 @@ def _recipe(name: str) -> Any:
         "dino-small": "dino",
         "perceptual-small": "perceptual",
     }
-    return importlib.import_module(f"training.{modules[name]}")
+    return importlib.import_module(f"training.encoders.{modules[name]}")
 
 
 def _seconds(encoder: Any, rounds: int = 7) -> float:
