@@ -34,7 +34,7 @@ from attnwarp.io.lock import alone_in
 from attnwarp.io.ply import read_ply
 from attnwarp.settings import Number, Settings, Weight
 
-FORMAT = 3
+FORMAT = 4
 """Raised when files of a run's folder, or what a run does, change meaning; folders of another
 format are then refused."""
 
@@ -291,7 +291,7 @@ class Workdir:
         buffer = io.BytesIO()
         torch.save(state, buffer)
         data = buffer.getbuffer()
-        head = b"%s %s\n" % (_MAGIC, hashlib.sha256(data).hexdigest().encode())
+        head = b"%s %d %s\n" % (_MAGIC, FORMAT, hashlib.sha256(data).hexdigest().encode())
 
         def write(stream: Any) -> None:
             stream.write(head)
@@ -307,16 +307,19 @@ class Workdir:
             remedy: the end of a message.
 
         Raises:
-            FileFormatError: it is damaged, or no checkpoint.
+            FileFormatError: it is damaged, made by an older version, or no checkpoint.
         """
         import torch
 
         path = self.path / name
         head, _, data = path.read_bytes().partition(b"\n")
-        words = head.split()
-        if words[:2] != _MAGIC.split() or len(words) != 3:
-            raise FileFormatError(path, f"not a checkpoint of this version; {remedy}")
-        if words[2] != hashlib.sha256(data).hexdigest().encode():
+        start, _, rest = head.partition(_MAGIC + b" ")
+        version, _, checksum = rest.partition(b" ")
+        if start or not rest:
+            raise FileFormatError(path, f"not a checkpoint; {remedy}")
+        if version != b"%d" % FORMAT:
+            raise FileFormatError(path, f"made by an older version; {remedy}")
+        if checksum != hashlib.sha256(data).hexdigest().encode():
             raise FileFormatError(path, f"its checksum does not match, so it is damaged; {remedy}")
         try:
             state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)

@@ -17,20 +17,6 @@ Prediction = Literal["epsilon", "sample", "v_prediction"]
 PUBLISHED_STEPS = 1000
 """Steps of Stable Diffusion, whose numbers publications give."""
 
-START_PROTOCOL = 2
-"""Of edits that start from partly noised pictures: what their published timestep means.
-
-It stands for Stable Diffusion's share of signal (:func:`steps_as_published`). Up to 1, it was a
-step of the editor's own schedule. Manifests and studies record it, so that no run mixes the two.
-"""
-
-FRESH_PROTOCOL = 2
-"""Of edits by attention warping whose views have noise of their own: how it is drawn.
-
-Each seed and view has a draw that no other has. Up to 1, neighbouring seeds shared draws. Manifests
-and studies record it, as they do :data:`START_PROTOCOL`.
-"""
-
 
 @dataclass(frozen=True, eq=False)
 class Schedule:

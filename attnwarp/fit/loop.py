@@ -292,10 +292,8 @@ class _Run:
             return
         remedy = f"remove it and {SPLATS} to begin again"
         state = folder.load(CHECKPOINT, remedy)
-        # Checkpoints from before they named the first splats can't be held to them.
-        stored_of = {"start": self.start, **state}
         for name, expected in self.identity().items():
-            stored = stored_of.get(name)
+            stored = state.get(name)
             if stored == expected:
                 continue
             if isinstance(expected, dict) and isinstance(stored, dict):

@@ -52,7 +52,6 @@ class Model:
 
     Attributes:
         origin: (3,) float64 world coordinates that "means" are relative to.
-        start_origin: (3,) the origin of the splats that the fit began with.
         tensors: the leaves by name: "means" (N, 3), "dc" (N, 1, 3), "rest" (N, K - 1, 3), "opacity"
             (N,) logits, "scales" (N, 2 or 3) logarithms, "quats" (N, 4).
         first, second: Adam's moments by name.
@@ -69,7 +68,7 @@ class Model:
         g = start.detach().to(dtype=torch.float32)
         # float64 centres far from zero would be moved by float32.
         offset, means = split_origin(start.means.detach().cpu().numpy())
-        self.start_origin, self.origin = start.origin, start.origin + offset
+        self.origin = start.origin + offset
         self.tensors: dict[str, Tensor] = {
             "means": torch.tensor(means, device=g.means.device),
             "dc": g.sh[:, :1].clone(),
@@ -190,8 +189,7 @@ class Model:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what :meth:`state` gave."""
-        # States once held no origin: the one of the start was the model's own.
-        origin = np.array(state.get("origin", self.start_origin), dtype=np.float64)
+        origin = np.array(state["origin"], dtype=np.float64)
         check.shape(origin, (3,), "origin")
         self.steps, self.origin = int(state["steps"]), origin
         for name in NAMES:

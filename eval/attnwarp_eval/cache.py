@@ -31,10 +31,6 @@ SEAL = b"attnwarp sha256 "
 seal behind it.
 """
 
-_OLD_END = b"PK\x05\x06"
-"""Of a zip file's last record. A file that ends with it has no seal: an earlier version wrote it.
-"""
-
 _warned: set[Path] = set()
 """Damaged files that this process has named."""
 
@@ -53,7 +49,7 @@ def read_arrays(kind: str, key: str) -> dict[str, npt.NDArray[Any]] | None:
         return None
     content, seal = data[:-_SEAL_SIZE], data[-_SEAL_SIZE:]
     if seal != _seal(kind, key, content):
-        if data[-22:-18] != _OLD_END and path not in _warned:
+        if path not in _warned:
             _warned.add(path)
             print(f"attnwarp-eval: {path}: damaged; it is computed again", file=sys.stderr)
         return None

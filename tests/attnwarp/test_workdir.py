@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from attnwarp.io import FileFormatError
-from attnwarp.workdir import CheckpointClock, Workdir
+from attnwarp.workdir import FORMAT, CheckpointClock, Workdir
 
 
 def state():
@@ -59,8 +59,12 @@ def test_every_flipped_bit_and_every_end_is_refused(tmp_path):
 
 
 def test_a_checkpoint_of_an_earlier_version_is_refused(tmp_path):
-    torch.save({"format": 1, **state()}, tmp_path / "c.pt")
-    refused(tmp_path / "c.pt", "not a checkpoint of this version")
+    path = tmp_path / "c.pt"
+    torch.save(state(), path)
+    refused(path, "not a checkpoint")
+    folder_of(path).save(path.name, state())
+    path.write_bytes(path.read_bytes().replace(b" %d " % FORMAT, b" %d " % (FORMAT - 1), 1))
+    refused(path, "made by an older version")
 
 
 class Evil:
@@ -78,7 +82,7 @@ def test_code_is_not_run_and_nobody_is_advised_to_run_it(tmp_path, capfd):
             evil = name.endswith("data.pkl")
             new.writestr(name, pickle.dumps(Evil(), protocol=2) if evil else old.read(name))
     data = made.getvalue()
-    head = f"attnwarp checkpoint {hashlib.sha256(data).hexdigest()}\n"
+    head = f"attnwarp checkpoint {FORMAT} {hashlib.sha256(data).hexdigest()}\n"
     (tmp_path / "c.pt").write_bytes(head.encode() + data)
     message = refused(tmp_path / "c.pt", "do not use it")
     for advice in ("weights_only", "trust", "torch.load", "allowlist"):

@@ -80,13 +80,6 @@ def test_a_file_cut_short_lengthened_or_under_another_name_is_not_read(folder, c
     assert capsys.readouterr().err.count("damaged") == 2
 
 
-def test_a_file_of_an_earlier_version_is_computed_again_without_a_word(folder, capsys):
-    (folder / "kind").mkdir()
-    np.savez(folder / "kind" / "key.npz", x=np.arange(3))
-    assert cache.read_arrays("kind", "key") is None
-    assert capsys.readouterr().err == ""
-
-
 def test_a_damaged_file_leaves_the_meshes_of_a_scene_as_they_are(folder, capsys):
     from attnwarp_eval.scene.file import load_scene
 

@@ -1,6 +1,6 @@
 """Damaged studies, runs and derived files: a right result or one line, in 10 s and 1 GiB.
 
-The run is one that former code computed (``data/runs.tar.xz``), reduced to one scene and sealed. A
+The run is a stored one (``data/runs.tar.xz``), reduced to one scene. A
 failure is repeated by its label: the name of the format and the seed of :mod:`damage_files`.
 """
 
@@ -52,11 +52,6 @@ pictures: {variants: [corrected], views: [yaw030]}
 """
 
 
-def entries(cells):
-    """Under which names the figures of each cell appear."""
-    return {c["id"]: (c["scene"], c["probe"], c["seed"], sorted(c["variants"])) for c in cells}
-
-
 class StudyFile:
     def __init__(self, folder):
         self.path = folder / "study.yaml"
@@ -75,10 +70,8 @@ class StudyFile:
 class StudyJson:
     """study.json, with its checksum: either its content or an error."""
 
-    sealed = True
-
     def __init__(self, folder):
-        self.store = run_in(folder, self.sealed)
+        self.store = run_in(folder)
         self.path = self.store.root / "study.json"
         self.whole = self.path.read_bytes()
         self.content = json.loads(self.whole)
@@ -86,19 +79,6 @@ class StudyJson:
     def use(self, data):
         self.path.write_bytes(data)
         assert self.store.read_study() == self.content
-
-
-class FormerStudyJson(StudyJson):
-    """Without its checksum, as former code wrote it: no figure appears under another name."""
-
-    sealed = False
-
-    def use(self, data):
-        self.path.write_bytes(data)
-        names = entries(self.content["cells"])
-        for cell in read_results(self.store).cells:
-            label = (cell.scene, cell.probe, cell.seed, sorted(cell.variants))
-            assert cell.record is None or names[cell.id] == label
 
 
 class Cell:
@@ -155,13 +135,12 @@ class CacheFile:
 FORMATS = {
     "study": StudyFile,
     "study.json": StudyJson,
-    "former study.json": FormerStudyJson,
     "cell": Cell,
     "cache": CacheFile,
 }
 
 
-def run_in(folder, sealed=True):
+def run_in(folder):
     """The stored run with one of its scenes, which loads at once."""
     with tarfile.open(DATA) as archive:
         # Python 3.11.3 and before have no filters.
@@ -172,10 +151,7 @@ def run_in(folder, sealed=True):
     study["study"]["scenes"] = ["spheres"]
     del study["scenes"]["bear"]
     study["cells"] = [cell for cell in study["cells"] if cell["scene"] == "spheres"]
-    if sealed:
-        store.write_study(study)
-    else:
-        (store.root / "study.json").write_text(json.dumps(study, indent=1))
+    store.write_study(study)
     return store
 
 

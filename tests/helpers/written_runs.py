@@ -10,6 +10,15 @@ ENVIRONMENT = {
     "versions": {"python": "3"},
     "machine": {"system": "Linux", "arch": "x", "cores": 2},
     "git": {"sha": "a" * 40, "dirty": False},
+    "source": "0" * 64,
+}
+
+TRANSPORT = {
+    "needed": {"direct": "lights[0] is a sun"},
+    "not_simulated": {},
+    "plan": {"integrator": "path", "sensor": {"type": "perspective"}, "reasons": []},
+    "everything_on": "volpath",
+    "variant": "scalar_rgb",
 }
 
 
@@ -42,6 +51,8 @@ def record(views, *, spec=None, environment=ENVIRONMENT, cost=None, **extra):
 
 def outcome(kind, scene, variants, data, cell_id="", seed=0):
     """An expected cell of probe ``kind``; ``data`` is its record's JSON or None."""
+    if data is not None and kind == "calibration":
+        data = {"effects": TRANSPORT, **data}
     typed = None if data is None else probe(kind).read(data)
     return Outcome(cell_id or f"{kind}-{scene}", kind, scene, tuple(variants), kind, seed, typed)
 

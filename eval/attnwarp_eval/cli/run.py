@@ -389,8 +389,6 @@ def report(
     with clear_errors():
         store = Store(run)
         _write_report(store, timings=timings, pictures=pictures)
-        if "sha256" not in store.read_study():
-            typer.echo(f"attnwarp-eval: {_unsealed(run)}", err=True)
         results = read_results(store)
     missing = len(results.cells) - results.measured
     if results.failures:
@@ -442,16 +440,7 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
             f" {'it' if bad == 1 else 'them'}",
             TOO_LITTLE,
         )
-    if not problems.sealed:
-        typer.echo(_unsealed(run))
     typer.echo(f"{run}: {problems.checked} cells, every hash fits, none is missing")
-
-
-def _unsealed(run: Path) -> str:
-    return (
-        f"not sealed: {run / 'study.json'} has no checksum: former code wrote it, or the checksum"
-        " was removed; run the study again to seal it"
-    )
 
 
 def studies() -> None:

@@ -14,7 +14,6 @@ from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import canonical_json, without_nan
 from attnwarp_eval.compare.snapshot import Figure, Measured, Snapshot
 from attnwarp_eval.files import write_atomic
-from attnwarp_eval.scene.file import scene_name
 
 FORMAT = 1
 """Version of the file's layout; a reader refuses others."""
@@ -122,7 +121,7 @@ def _parse(first: str, lines: list[str]) -> Snapshot:
     if "baseline" not in header:
         raise ValueError("not a baseline (its first line has no key 'baseline')")
     if header["baseline"] != FORMAT:
-        raise ValueError(f"layout {header['baseline']!r}, expected {FORMAT}")
+        raise ValueError("made by an older version")
     if len(lines) != header.get("lines"):
         raise ValueError(f"{len(lines)} lines behind the first, which says {header.get('lines')!r}")
     if _seal(header, lines) != header.get("sha256"):
@@ -137,17 +136,7 @@ def _parse(first: str, lines: list[str]) -> Snapshot:
     keys = [cell.key for cell in cells]
     if keys != sorted(set(keys)):
         raise ValueError("its cells are not sorted, or one stands there twice")
-    cells = sorted(_by_name(cells), key=lambda cell: cell.key)
     return Snapshot(str(header.get("study")), str(header.get("digest")), tuple(cells))
-
-
-def _by_name(cells: list[Measured]) -> list[Measured]:
-    """Cells whose scenes are called as runs call them; former baselines had the paths of files."""
-    scenes = {cell.scene for cell in cells}
-    names = {where: scene_name(where) for where in scenes}
-    if len(set(names.values())) < len(scenes):
-        return cells
-    return [replace(cell, scene=names[cell.scene]) for cell in cells]
 
 
 def _add(cells: list[Measured], data: dict[str, Any]) -> None:

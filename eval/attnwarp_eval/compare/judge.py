@@ -133,8 +133,8 @@ class Comparison:
             )
         if self.unread:
             return (
-                f"both sides share no gated figure of {', '.join(map(repr, self.unread))}; write a"
-                " baseline of earlier code anew with --update, or gate on a study without it"
+                f"both sides share no gated figure of {', '.join(map(repr, self.unread))}; gate on"
+                " a study without it"
             )
         return ""
 

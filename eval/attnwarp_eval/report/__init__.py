@@ -56,16 +56,16 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
 
 
 def wrong_results(store: Store) -> list[str]:
-    """What is wrong with a run's ``results.jsonl``, one line. It may not be there yet, and former
-    code wrote no checksum of it.
+    """What is wrong with a run's ``results.jsonl``, one line. It may not be there yet.
 
     Args:
         store: the run.
     """
     path = store.root / "results.jsonl"
-    if not _sum_of(path).is_file():
+    there = {file.is_file() for file in (path, _sum_of(path))}
+    if there == {False}:
         return []
-    if path.is_file() and _sum_of(path).read_bytes() == _sum_line(path, path.read_bytes()):
+    if there == {True} and _sum_of(path).read_bytes() == _sum_line(path, path.read_bytes()):
         return []
     return [
         f"{path.name}: is not what was written; attnwarp-eval report {store.root} writes it anew"

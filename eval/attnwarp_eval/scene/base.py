@@ -12,9 +12,6 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
-    JsonValue,
-    SerializerFunctionWrapHandler,
-    model_serializer,
 )
 
 from attnwarp_eval.colors import to_linear
@@ -90,12 +87,6 @@ def linear_rgb(color: str) -> tuple[float, float, float]:
     return float(r), float(g), float(b)
 
 
-LATER: dict[str, JsonValue] = {"later": True}
-"""``Field(default, json_schema_extra=LATER)``: a key that the format did not have at first. While
-it keeps its default it is left out of what is hashed, so that files written before it mean, and are
-called, what they always did."""
-
-
 class Spec(BaseModel):
     """Base of everything a scene file says: unknown keys and numbers that are not finite are
     refused.
@@ -104,11 +95,3 @@ class Spec(BaseModel):
     model_config = ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True
     )
-
-    @model_serializer(mode="wrap")
-    def _leave_out_what_came_later(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        for name, about in type(self).model_fields.items():
-            if about.json_schema_extra == LATER and getattr(self, name) == about.default:
-                values.pop(name, None)
-        return values

@@ -13,7 +13,6 @@ from pydantic import Field, model_validator
 
 from attnwarp_eval.scene import solids
 from attnwarp_eval.scene.base import (
-    LATER,
     Color,
     Coordinate,
     Length,
@@ -54,8 +53,8 @@ class _PartSpec(Spec):
     mirror: bool = False
     color: Color = "#ffffff"
     blend: bool | Length = True
-    carve: bool = Field(False, json_schema_extra=LATER)
-    ring: RingSpec | None = Field(None, json_schema_extra=LATER)
+    carve: bool = False
+    ring: RingSpec | None = None
 
 
 class _TurnedPart(_PartSpec):
@@ -63,8 +62,8 @@ class _TurnedPart(_PartSpec):
 
     center: Vector
     pitch: float = 0.0
-    yaw: float = Field(0.0, json_schema_extra=LATER)
-    roll: float = Field(0.0, json_schema_extra=LATER)
+    yaw: float = 0.0
+    roll: float = 0.0
 
 
 class EllipsoidPart(_TurnedPart):
@@ -168,7 +167,7 @@ class BodySpec(Spec):
     position: Vector = (0.0, 0.0, 0.0)
     yaw: float = 0.0
     scale: Positive = 1.0
-    relief: ReliefSpec | None = Field(None, json_schema_extra=LATER)
+    relief: ReliefSpec | None = None
 
     @model_validator(mode="after")
     def _something_to_carve(self) -> BodySpec:

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -38,8 +39,8 @@ from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
 Array = npt.NDArray[np.float64]
 
 SCENE_PROTOCOL = 1
-"""Raised whenever the same file would mean another world (shapes, textures, lights); part of every
-content hash.
+"""Raised whenever the same file would mean another world (shapes, textures, lights, defaults); part
+of every content hash.
 """
 
 
@@ -277,13 +278,14 @@ class Scene:
             for item in self.spec.objects
             if isinstance(item.shape, MeshSpec)
         }
-        spec = self.spec.model_dump(mode="json", include={"objects", "lights", "medium"})
-        # Scenes without mesh files keep the names that they had before meshes had a reader of ours.
-        reader = (READER_PROTOCOL,) if files else ()
-        # Fog once ended at thin glass, so scenes with both have other names than they had.
-        panes = any(getattr(item.material, "thin", False) for item in self.spec.objects)
-        behind = ("fog behind thin glass",) if panes and self.spec.medium else ()
-        return content_key("world", SCENE_PROTOCOL, MESHING_PROTOCOL, spec, files, *reader, *behind)
+        protocols = (SCENE_PROTOCOL, MESHING_PROTOCOL, READER_PROTOCOL)
+        return content_key("world", protocols, self._said("objects", "lights", "medium"), files)
+
+    def _said(self, *keys: str) -> dict[str, Any]:
+        """Entries of the file, as JSON, without what has its default: with and without it, a file
+        says the same, and a key that the format gains later renames no scene.
+        """
+        return self.spec.model_dump(mode="json", include={*keys}, exclude_defaults=True)
 
     @functools.cached_property
     def content_hash(self) -> str:
@@ -292,9 +294,8 @@ class Scene:
 
         Edits are left out: they are other scenes, with hashes of their own.
         """
-        return content_key(
-            "scene", self.world_hash, self.spec.model_dump(mode="json", exclude={"edits"})
-        )
+        own = type(self.spec).model_fields.keys() - {"edits"}
+        return content_key("scene", self.world_hash, self._said(*own))
 
 
 def _turn_z(degrees: float) -> Array:

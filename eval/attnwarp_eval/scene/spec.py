@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from attnwarp_eval.scene.base import LATER, Color, Coordinate, Direction, Positive, Spec, Vector
+from attnwarp_eval.scene.base import Color, Coordinate, Direction, Positive, Spec, Vector
 from attnwarp_eval.scene.bodies import BodySpec
 from attnwarp_eval.scene.materials import (
     TEXTURED,
@@ -93,9 +93,9 @@ class ObjectSpec(Spec):
     name: str = Field(min_length=1)
     shape: ShapeSpec
     texture: Texture = Plain(type="plain", color="#ffffff", variation=0.0, grain=0.1)
-    material: Material = Field(DiffuseMaterial(), json_schema_extra=LATER)
-    emission: EmissionSpec | None = Field(None, json_schema_extra=LATER)
-    velocity: Vector | None = Field(None, json_schema_extra=LATER)
+    material: Material = DiffuseMaterial()
+    emission: EmissionSpec | None = None
+    velocity: Vector | None = None
 
     @model_validator(mode="after")
     def _a_texture_where_it_shows(self) -> ObjectSpec:
@@ -172,7 +172,7 @@ class CamerasSpec(Spec):
     size: tuple[Pixels, Pixels] = (512, 512)
     source: ViewSpec
     targets: tuple[ViewSpec, ...] = Field(min_length=1)
-    lens: LensSpec | None = Field(None, json_schema_extra=LATER)
+    lens: LensSpec | None = None
 
 
 class AppearanceSpec(Spec):
@@ -267,6 +267,6 @@ class SceneSpec(Spec):
     lights: tuple[LightSpec, ...]
     cameras: CamerasSpec
     appearance: AppearanceSpec = Field(default_factory=AppearanceSpec)
-    medium: MediumSpec | None = Field(None, json_schema_extra=LATER)
-    effects: EffectsSpec = Field(EffectsSpec(), json_schema_extra=LATER)
+    medium: MediumSpec | None = None
+    effects: EffectsSpec = EffectsSpec()
     edits: tuple[EditSpec, ...] = ()

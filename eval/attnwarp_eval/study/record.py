@@ -135,14 +135,14 @@ class Environment:
         machine: ``system``, ``arch`` and ``cores``.
         revision: of the source; None for an installed copy.
         dirty: whether the source had local changes.
-        source: SHA-256 of the source; None in records of former code.
+        source: SHA-256 of the source.
     """
 
     versions: Mapping[str, str]
     machine: Mapping[str, Any]
     revision: str | None
     dirty: bool | None
-    source: str | None = None
+    source: str
 
     def to_json(self) -> Json:
         """As a record's file has it, and as :func:`attnwarp_eval.cost.environment` gives it."""
@@ -150,14 +150,14 @@ class Environment:
             "versions": dict(self.versions),
             "machine": dict(self.machine),
             "git": {"sha": self.revision, "dirty": self.dirty},
-            **({} if self.source is None else {"source": self.source}),
+            "source": self.source,
         }
 
     @classmethod
     def from_json(cls, data: Json) -> Environment:
         """From :meth:`to_json`; one object for all records of the same environment."""
         versions, machine, git = data["versions"], data["machine"], data["git"]
-        code = (git["sha"], git["dirty"], data.get("source"))
+        code = (git["sha"], git["dirty"], data["source"])
         key = (cls, *versions.items(), *machine.items(), *code)
         if key not in _environments:
             _environments[key] = cls(versions, machine, *code)
@@ -167,15 +167,8 @@ class Environment:
         """Whether both were computed by the same state of the source and the same packages.
 
         The hash of the source decides: revisions that differ in documents alone are the same code.
-        Packages that only one of them names do not count: former code recorded fewer. It recorded
-        no hash either, and then two states with local changes count as different.
         """
-        shared = self.versions.keys() & other.versions.keys()
-        if any(self.versions[name] != other.versions[name] for name in shared):
-            return False
-        if self.source is not None and other.source is not None:
-            return self.source == other.source
-        return not self.dirty and (self.revision, self.dirty) == (other.revision, other.dirty)
+        return (self.versions, self.source) == (other.versions, other.source)
 
 
 @dataclass(frozen=True)

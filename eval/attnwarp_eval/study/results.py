@@ -73,11 +73,7 @@ class Shared:
 
 
 def _value(figures: Mapping[str, float], metric: str) -> float:
-    """A figure of a view, NaN without one. Former cells recorded some PSNRs without their mean
-    squared errors, which follow.
-    """
-    if metric not in figures and "mse" in metric:
-        return float(10 ** (-figures.get(metric.replace("mse", "psnr"), math.nan) / 10))
+    """A figure of a view, NaN without one."""
     return figures.get(metric, math.nan)
 
 

@@ -11,7 +11,6 @@ from typing import Any
 from pydantic import ValidationError
 
 from attnwarp.errors import InputError
-from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cost import environment
 from attnwarp_eval.scene.base import silence_notices
 from attnwarp_eval.scene.file import load_scene
@@ -26,9 +25,6 @@ from attnwarp_eval.study.schema import Study, StudyError, did_you_mean
 from attnwarp_eval.study.store import Problems, Store, StoreError
 from attnwarp_eval.study.study import cells_of, explain_errors, parse_study
 from attnwarp_eval.study.work import compute_and_write
-
-Label = tuple[str | None, str | None, int, list[str]]
-"""Scene, probe, seed and names of variants."""
 
 
 @dataclass
@@ -152,7 +148,6 @@ def verify(store: Store) -> Problems:
     problems = store.verify()
     try:
         study = parse_study(stored["study"])
-        stored = _by_name(stored, study)
         cells = [_entry(cell) for cell in cells_of(study, _scenes(study))]
     except (InputError, ValidationError) as error:
         text = explain_errors(error) if isinstance(error, ValidationError) else error
@@ -163,7 +158,6 @@ def verify(store: Store) -> Problems:
             "the study names other cells today: a scene or a protocol has changed since; run it"
             " again for the new ones"
         )
-    problems.damaged += _wrong_labels(store, stored["cells"], cells)
     return problems
 
 
@@ -186,8 +180,7 @@ def stored_study(store: Store) -> Stored:
     """The study of a run, and its expected cells, as ``study.json`` has them.
 
     Raises:
-        StoreError: the folder is no run, its study cannot be read, or a cell of an unsealed run has
-            a label that is not its own.
+        StoreError: the folder is no run, or its study cannot be read.
 
     Example:
         >>> from attnwarp_eval.study.run import expected, plan, stored_study
@@ -205,7 +198,6 @@ def stored_study(store: Store) -> Stored:
         study = parse_study(stored["study"])
     except ValidationError as error:
         raise StoreError(f"{path}: {explain_errors(error)}; {remedy}") from None
-    stored = _by_name(stored, study)
     needs_scenes = {p.name: p.needs_scenes for p in probes()}
     for cell in stored["cells"]:
         on_scene = needs_scenes.get(cell["probe"], True)
@@ -216,23 +208,9 @@ def stored_study(store: Store) -> Stored:
                 f"{path}: cell {cell['title']!r} names a probe or a scene that the study lacks;"
                 f" {remedy}"
             )
-    if "sha256" not in stored:
-        _check_labels(store, stored, study)
     scenes = stored.get("scenes", {}).items()
     said = {name: entry["notices"] for name, entry in scenes if entry.get("notices")}
     return Stored(study, stored["cells"], said)
-
-
-def _by_name(stored: dict[str, Any], study: Study) -> dict[str, Any]:
-    """A ``study.json`` whose scenes are called by name; former ones called them by their files."""
-    names = dict(zip(study.scenes, study.scene_names, strict=True))
-    return {
-        **stored,
-        "scenes": {names.get(k, k): entry for k, entry in stored.get("scenes", {}).items()},
-        "cells": [
-            {**cell, "scene": names.get(cell["scene"], cell["scene"])} for cell in stored["cells"]
-        ],
-    }
 
 
 def _check_plugins(store: Store, stored: dict[str, Any]) -> None:
@@ -261,107 +239,6 @@ def _check_plugins(store: Store, stored: dict[str, Any]) -> None:
 
 def _remedy(store: Store) -> str:
     return f"run the study again with --out {store.root}, which writes it anew"
-
-
-def _check_labels(store: Store, stored: dict[str, Any], study: Study) -> None:
-    """Check under which names figures of an unsealed run would appear.
-
-    A ``study.json`` without a checksum is of former code, or its checksum was removed: the file
-    does not tell which. Records have checksums of their own, so each record's spec is searched
-    among today's cells of the study. A scene or a protocol that has changed gives other ids today;
-    the search leaves both out, and takes a scene's name from its hash in ``study.json``. A spec
-    that today's code writes otherwise still tells its scene, probe and seed; of its variants only
-    the names can then be checked. A preset or a default that has changed can give another variant
-    the settings of a record, so that today's cell has more names than the former one.
-
-    Args:
-        store: the run's folder.
-        stored: the content of its ``study.json``.
-        study: the study in it.
-
-    Raises:
-        StoreError: a cell has another label than its record or the study gives it.
-    """
-    try:
-        today = cells_of(study, _scenes(study))
-    except InputError:  # such as a scene that is gone
-        today = []
-    expected_labels = {_search_key(cell.spec, cell.scene): _label(_entry(cell)) for cell in today}
-    scenes = {entry["hash"]: name for name, entry in stored.get("scenes", {}).items()}
-    done = store.done()
-    for cell in stored["cells"]:
-        if cell["id"] not in done:
-            continue
-        try:
-            spec = store.read(cell["id"])["spec"]
-        except StoreError:
-            continue  # a failure of the report, without figures
-        scene = scenes.get(spec["scene"]) if "scene" in spec else cell["scene"]
-        label = _label(cell)
-        of_record = (scene, spec.get("probe"), spec.get("seed", cell["seed"]), label[3])
-        expected = expected_labels.get(_search_key(spec, scene), of_record)
-        if label != expected and label != _without_names_of_others(expected, cell, stored["cells"]):
-            raise StoreError(_wrong_label(store, cell["id"], label, expected))
-        names = study.probes.get(cell["probe"], [])
-        for name in cell["variants"] if probe(cell["probe"]).judges_variants else []:
-            if name not in names:
-                raise StoreError(
-                    f"{store.root / 'study.json'}: cell {cell['id']} has the variant {name!r},"
-                    f" which the study does not name for {cell['probe']}; {_remedy(store)}"
-                )
-
-
-def _without_names_of_others(
-    expected: Label, cell: dict[str, Any], listed: list[dict[str, Any]]
-) -> Label:
-    """What a cell was called before today's variants shared it.
-
-    A variant that formerly had other settings has a cell of its own in the run. So a name that
-    damage took from a label is told apart: no other cell has it.
-
-    Args:
-        expected: the label of today's cell.
-        cell: the run's.
-        listed: all cells of the run.
-    """
-    others = {
-        name
-        for other in listed
-        if other["id"] != cell["id"] and _label(other)[:3] == expected[:3]
-        for name in other["variants"]
-    }
-    return (*expected[:3], [name for name in expected[3] if name not in others])
-
-
-def _search_key(spec: dict[str, Any], scene: str | None) -> str:
-    """The same for cells of one study whose scene or protocol has changed between them."""
-    return digest({**spec, "protocol": None, "scene": scene if "scene" in spec else None})
-
-
-def _wrong_labels(
-    store: Store, listed: list[dict[str, Any]], today: list[dict[str, Any]]
-) -> list[str]:
-    """A line for each cell that ``study.json`` lists under another name than the study gives it."""
-    labels, expected_labels = ({c["id"]: _label(c) for c in cells} for cells in (listed, today))
-    return [
-        _wrong_label(store, cell_id, labels[cell_id], expected_labels[cell_id])
-        for cell_id in sorted(labels.keys() & expected_labels.keys())
-        if labels[cell_id] != expected_labels[cell_id]
-    ]
-
-
-def _wrong_label(store: Store, cell_id: str, label: Label, expected: Label) -> str:
-    return (
-        f"{store.root / 'study.json'}: cell {cell_id} is called {label}, but the study calls it"
-        f" {expected}; {_remedy(store)}"
-    )
-
-
-def _label(cell: dict[str, Any]) -> Label:
-    """Under which names the figures of a listed cell appear. Their order follows that of the
-    study's file, which a run does not keep.
-    """
-    return cell["scene"], cell["probe"], cell["seed"], sorted(cell["variants"])
 
 
 def expected(plan: Plan) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """A run's folder: one JSON file a cell, written beside its name, flushed to disk, then renamed.
 
 Cells lie in folders by the first two digits of their ids, as file systems list folders of 100,000
-files slowly. Former code put them all into one folder; such runs are read and resumed as they are.
+files slowly.
 """
 
 from __future__ import annotations
@@ -23,8 +23,10 @@ from attnwarp.io.file import remove_abandoned
 from attnwarp.io.lock import locked
 from attnwarp_eval.canonical_json import digest, write_json
 
-FORMAT = 1
-"""Version of the layout of a cell's file; a reader refuses others."""
+FORMAT = 2
+"""Version of all files of a run; a reader refuses others."""
+
+OLDER = "made by an older version; run it again"
 
 T = TypeVar("T")
 
@@ -42,8 +44,6 @@ class Problems:
     damaged: list[str] = field(default_factory=list)
     unexpected: list[str] = field(default_factory=list)
     checked: int = 0
-    sealed: bool = True
-    """Whether study.json carries a checksum; former code wrote none."""
 
     @property
     def ok(self) -> bool:
@@ -147,17 +147,18 @@ class Store:
             remove_abandoned(folder)
 
     def write_study(self, study: dict[str, Any]) -> None:
-        """Write the resolved study and its expected cells with their checksum. Cells of a former
+        """Write the resolved study and its expected cells with their checksum. Cells of another
         study stay.
         """
         # In the study's own order: seconds are taken on a scene's first edit.
-        write_json(self.root / "study.json", {**study, "sha256": digest(study)}, sort_keys=False)
+        write_json(self.root / "study.json", _sealed(study), sort_keys=False)
 
     def read_study(self) -> dict[str, Any]:
-        """The resolved study; without ``sha256`` where former code wrote it.
+        """The content of ``study.json``.
 
         Raises:
-            StoreError: the folder is not a run, or the file was changed since it was written.
+            StoreError: the folder is not a run, an older version made it, or the file was changed
+                since it was written.
         """
         path = self.root / "study.json"
         if not path.is_file():
@@ -170,7 +171,9 @@ class Store:
         except ValueError as error:
             problem: str | None = f"damaged ({error})"
         else:
-            problem = _study_problem(study)
+            if study.get("format") != FORMAT:
+                raise StoreError(f"{path}: {OLDER}")
+            problem = _seal_problem(study)
         if problem:
             raise StoreError(
                 f"{path}: {problem}; run the study again with --out {self.root}, which writes it"
@@ -180,22 +183,11 @@ class Store:
 
     def path(self, cell_id: str) -> Path:
         """The path of a cell's record."""
-        name = f"{cell_id}.json"
-        former = self.cells / name
-        return former if former.is_file() else self.cells / cell_id[:2] / name
+        return self.cells / cell_id[:2] / f"{cell_id}.json"
 
     def done(self) -> set[str]:
         """Ids of the cells that have a record; a record's file is always whole."""
-        ids: set[str] = set()
-        folders = [self.cells] if self.cells.is_dir() else []
-        for folder in folders:
-            with os.scandir(folder) as entries:
-                for entry in entries:
-                    if entry.name.endswith(".json"):
-                        ids.add(entry.name.removesuffix(".json"))
-                    elif folder == self.cells and entry.is_dir(follow_symlinks=False):
-                        folders.append(self.cells / entry.name)
-        return ids
+        return {path.stem for path in self.cells.glob("??/*.json")}
 
     def write(self, record: dict[str, Any]) -> None:
         """Write the record of a finished cell, and remove a former failure of it.
@@ -203,9 +195,7 @@ class Store:
         Args:
             record: with at least ``id`` and ``spec``.
         """
-        sealed = {**record, "format": FORMAT}
-        sealed["sha256"] = digest(sealed)
-        write_json(self.path(record["id"]), sealed, durable=_flush_is_due())
+        write_json(self.path(record["id"]), _sealed(record), durable=_flush_is_due())
         (self.failed / f"{record['id']}.json").unlink(missing_ok=True)
 
     def write_failure(self, cell_id: str, failure: dict[str, Any]) -> None:
@@ -227,7 +217,7 @@ class Store:
         """The record of a finished cell.
 
         Raises:
-            StoreError: the file is missing, damaged, or of another layout.
+            StoreError: the file is missing, damaged, or made by an older version.
         """
         path = self.path(cell_id)
         try:
@@ -238,7 +228,11 @@ class Store:
             raise StoreError(
                 f"{path}: not JSON ({error}); run again, which computes it anew"
             ) from None
-        problem = self._problem(cell_id, record)
+        if record.get("format") != FORMAT:
+            raise StoreError(f"{path}: {OLDER}")
+        problem = _seal_problem(record)
+        if _digest(record.get("spec")) != cell_id:
+            problem = "the hash of its spec is not its id"
         if problem:
             raise StoreError(f"{path}: {problem}; run again, which computes it anew")
         return record
@@ -275,21 +269,11 @@ class Store:
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         return {**about, "path": path.relative_to(self.root).as_posix(), "sha256": sha256}
 
-    def _problem(self, cell_id: str, record: dict[str, Any]) -> str | None:
-        if record.get("format") != FORMAT:
-            return f"format {record.get('format')!r}, expected {FORMAT}"
-        if _digest(record.get("spec")) != cell_id:
-            return "the hash of its spec is not its id"
-        body = {k: v for k, v in record.items() if k != "sha256"}
-        if _digest(body) != record.get("sha256"):
-            return "its checksum does not fit its content"
-        return None
-
     def verify(self) -> Problems:
         """Recompute every hash and compare with the list of expected cells."""
         study = self.read_study()
         expected = {c["id"]: c["title"] for c in study["cells"]}
-        problems = Problems(sealed="sha256" in study)
+        problems = Problems()
         done = self.done()
         failed = {f["id"]: f for f in self.failures()}
         for cell_id, title in expected.items():
@@ -380,53 +364,20 @@ def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is no number of JSON")
 
 
-_LABELS: dict[str, type] = {
-    "id": str,
-    "title": str,
-    "scene": str,
-    "variants": list,
-    "probe": str,
-    "seed": int,
-}
-"""What ``study.json`` holds of each expected cell."""
-
-_STUDY_KEYS = {"study", "scenes", "cells", "sha256", "plugins"}
-"""Of ``study.json``. Another one is what damage made of these; if it was the checksum's, the file
-would pass for one of former code, which wrote none.
-"""
+def _sealed(content: dict[str, Any]) -> dict[str, Any]:
+    """The content with the format's version, and the checksum of both."""
+    body = {**_without_seal(content), "format": FORMAT}
+    return {**body, "sha256": digest(body)}
 
 
-def _study_problem(study: dict[str, Any]) -> str | None:
-    """What is wrong with the content of ``study.json``."""
-    body = {key: value for key, value in study.items() if key != "sha256"}
-    if "sha256" in study and _digest(body) != study["sha256"]:
+def _without_seal(content: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in content.items() if key != "sha256"}
+
+
+def _seal_problem(content: dict[str, Any]) -> str | None:
+    if _digest(_without_seal(content)) != content.get("sha256"):
         return "its checksum does not fit its content"
-    unknown = sorted(study.keys() - _STUDY_KEYS)
-    if unknown:
-        return f"damaged (unknown key {unknown[0][:40]!r})"
-    cells = study.get("cells")
-    if not isinstance(study.get("study"), dict) or not isinstance(cells, list):
-        return "damaged (no study, or no list of cells)"
-    scenes = study.get("scenes", {})
-    for scene in scenes.values() if isinstance(scenes, dict) else [scenes]:
-        if not isinstance(scene, dict) or not isinstance(scene.get("hash"), str):
-            return "damaged (scenes: expected the hash of each)"
-        if not _are_texts(scene.get("notices", [])):
-            return "damaged (scenes: expected notices as texts)"
-    if not _are_texts(study.get("plugins", [])):
-        return "damaged (plugins: expected names)"
-    for index, cell in enumerate(cells):
-        entry = cell if isinstance(cell, dict) else {}
-        for key, kind in _LABELS.items():
-            if not isinstance(entry.get(key), kind):
-                return f"damaged (cells[{index}].{key}: expected a {kind.__name__})"
-        if not entry["variants"] or not all(isinstance(name, str) for name in entry["variants"]):
-            return f"damaged (cells[{index}].variants: expected names)"
     return None
-
-
-def _are_texts(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(text, str) for text in value)
 
 
 def _digest(value: Any) -> str | None:

@@ -22,8 +22,7 @@ BEFORE, AFTER = "before", "render"
 
 
 OF_A_METHOD = (
-    "method", "settings", "start_protocol", "fresh_noise", "no_mask", "editor", "geometry", "mask",
-    "fit", "splats", "budget", "by_hand",
+    "method", "settings", "editor", "geometry", "mask", "fit", "splats", "budget", "by_hand",
 )  # fmt: skip
 """Entries of a cell's spec that decide its pictures, not how they are measured."""
 

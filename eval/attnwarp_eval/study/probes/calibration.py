@@ -67,28 +67,25 @@ class Transport:
         not_simulated: effects that are not -> the same.
         plan: of the rendering, as JSON.
         everything_on: the integrator that would simulate everything.
-        variant: of Mitsuba, which draws the pictures' noise; None in former records.
+        variant: of Mitsuba, which draws the pictures' noise.
     """
 
     needed: Mapping[str, str]
     not_simulated: Mapping[str, str]
     plan: Mapping[str, Any]
     everything_on: str
-    variant: str | None = None
+    variant: str
 
 
 @dataclass(frozen=True)
 class Extra:
-    """``transport`` is None in records of runs that were made before it was saved."""
+    """The transport of the cell's scene."""
 
-    transport: Transport | None
+    transport: Transport
 
     def to_json(self) -> Json:
         """The record's entry ``effects``."""
-        if self.transport is None:
-            return {}
-        effects = dataclasses.asdict(self.transport)
-        return {"effects": {k: v for k, v in effects.items() if (k, v) != ("variant", None)}}
+        return {"effects": dataclasses.asdict(self.transport)}
 
 
 @register
@@ -138,9 +135,8 @@ class Calibration(Probe[Extra]):
         return Extra(Transport(**transport_of(work.world.scene), variant=variant()))
 
     def read_extra(self, data: Json) -> Extra:
-        """From the record's entry ``effects``, if it has one."""
-        effects = data.get("effects")
-        return Extra(None if effects is None else Transport(**effects))
+        """From the record's entry ``effects``."""
+        return Extra(Transport(**data["effects"]))
 
     def problems(self, results: Results) -> list[str]:
         """One line a scene and figure; empty when the instrument is calibrated."""
@@ -240,8 +236,6 @@ class Calibration(Probe[Extra]):
         rows = []
         for cell, record in results.finished(self.name):
             transport = record.extra.transport
-            if transport is None:
-                continue
             beyond = [
                 f"{name} ({words})" for name, words in transport.needed.items() if name not in USUAL
             ]
@@ -268,18 +262,13 @@ class Calibration(Probe[Extra]):
             ),
         ]
         variants = sorted(
-            {
-                record.extra.transport.variant
-                for _, record in results.finished(self.name)
-                if record.extra.transport and record.extra.transport.variant
-            }
+            {record.extra.transport.variant for _, record in results.finished(self.name)}
         )
-        if variants:
-            text.append(
-                f"The pictures are of Mitsuba's {' and '.join(f'`{name}`' for name in variants)}."
-                " Another variant draws other noise, and an editor of pictures that differ by noise"
-                " makes edits that differ too."
-            )
+        text.append(
+            f"The pictures are of Mitsuba's {' and '.join(f'`{name}`' for name in variants)}."
+            " Another variant draws other noise, and an editor of pictures that differ by noise"
+            " makes edits that differ too."
+        )
         columns = [
             "scene",
             "effects",

@@ -23,7 +23,6 @@ import torch
 from pydantic import Field
 
 from attnwarp import Camera, Gaussians, check
-from attnwarp.editing.schedule import FRESH_PROTOCOL, START_PROTOCOL
 from attnwarp.errors import InputError
 from attnwarp.fit import compile_kernels
 from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
@@ -209,7 +208,7 @@ class EditingProbe(Probe[EditResult]):
     """One edit of one scene by one method."""
 
     name = "editing"
-    protocol = 2  # 1: views agreed or not however few of their pixels were compared
+    protocol = 2
     study_part = StudyPart
     variant_part = VariantPart
     metrics = metrics_of("multiview.", "fidelity.", "embedding.", "depth.", "image.")
@@ -363,16 +362,10 @@ class EditingProbe(Probe[EditResult]):
         """The method with all its settings, the editor, and where splats and warps come from."""
         own = variant.part(VariantPart)
         settings = settings_of(study, variant, seed)
-        noised = settings.get("start") or settings.get("starts")
-        fresh = own.method == "attention_warping" and settings.get("noise") == "fresh"
         return {
             "spp": study.spp,
             "method": own.method,
             "settings": settings,
-            **({"start_protocol": START_PROTOCOL} if noised else {}),
-            **({"fresh_noise": FRESH_PROTOCOL} if fresh else {}),
-            # Features once went to pixels without depth too.
-            **({"no_mask": "where there is depth"} if settings.get("mask") is False else {}),
             "editor": editor_identity(editor_of(study, variant)),
             "geometry": variant.geometry,
             "mask": own.mask,

@@ -393,25 +393,6 @@ def test_a_variant_is_the_same_cell_with_or_without_another_ones_budget(folder):
     assert len({cell.id for cell in cells.values()}) == 3
 
 
-def test_only_cells_whose_views_have_noise_of_their_own_say_how_it_is_drawn(folder):
-    """A record of former draws is then not taken for one of these."""
-    fresh = {"noise": "fresh"}
-    variants = {
-        "full": {}, "fresh": {"options": fresh}, "truth": {"method": "true pictures"},
-        "released": {"options": {"preset": "released-controlnet"}}, "by view": {"method": "by_view"},
-        "timed": {"method": "by_view", "budget": {"seconds_of": "fresh"}},
-    }  # fmt: skip
-    study = load(folder, editing={}, variants=variants, probes={"editing": [*variants]})
-    scenes = {name: load_scene(name) for name in study.scenes}
-    cells = [cell for cell in cells_of(study, scenes) if cell.probe == "editing"]
-    said = {cell.variant: cell.spec.get("fresh_noise") for cell in cells}
-    assert said == {
-        "full": None, "fresh": 2, "truth": None, "released": 2, "by view": None, "timed": None,
-    }  # fmt: skip
-    limits = {cell.variant: cell.spec.get("budget") for cell in cells}
-    assert limits["timed"]["seconds_of"]["fresh_noise"] == 2
-
-
 @pytest.mark.parametrize("name", ["comparison-quick", "comparison-six", "comparison", "beyond"])
 def test_studies_that_compare_methods_tune_attention_warping_alike(name):
     """Further sources leave fewer views, so fewer stages. Oracle: stages counted by hand."""
