@@ -145,7 +145,7 @@ def test_what_cannot_be_built_is_one_line(run, tmp_path, arguments, message):
 def test_a_method_whose_name_has_a_comma_can_be_chosen(tmp_path):
     run = write_run(tmp_path)
     path = run.root / "study.json"
-    run.write_study(json.loads(path.read_text().replace('"warped"', '"alone, warped"')))
+    Store(run.root).write_study(json.loads(path.read_text().replace('"warped"', '"alone, warped"')))
     done = build(run.root, "--out", tmp_path / "a", "--methods", "third,alone, warped")
     assert done.exit_code == 0, done.output
     sides = [set(item["sides"]) - {SCRAMBLED} for item in read(tmp_path / "a")[1]["items"]]
