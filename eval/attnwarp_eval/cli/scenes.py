@@ -42,11 +42,7 @@ def show(
 
         loaded = load_scene(scene)
         typer.echo(contents(loaded))
-        with progress() as progressing:
-            # Measured once and kept; minutes where light goes far, as through glass.
-            progressing.step(f"{loaded.name}: measuring how often its light bounces")
-            made = pictures_made(loaded)
-        typer.echo(made)
+        typer.echo(pictures_made(loaded))
 
 
 @app.command()
@@ -150,6 +146,39 @@ def edits(
 
         loaded = load_scene(scene)
         typer.echo(json.dumps(to_dict(loaded), indent=2) if as_json else describe(loaded))
+
+
+@app.command()
+def calibrate(
+    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+) -> None:
+    """Measure how many bounces of light a scene and its edits need, and write them into its file.
+
+    A scene takes some ten seconds, minutes where light goes far, as through glass.
+    """
+    with clear_errors(), progress() as show:
+        from attnwarp.errors import InputError
+        from attnwarp.io.text import read_text
+        from attnwarp_eval.files import write_atomic
+        from attnwarp_eval.scene.file import load_scene, scene_file
+        from attnwarp_eval.scene.rewrite import with_bounces
+        from attnwarp_eval.truth.bounces import search, worlds
+
+        path, numbers = scene_file(scene), {}
+        for which, world in worlds(load_scene(scene)):
+            show.step(f"{world.name}: measuring how often its light bounces")
+            found = search(world)
+            numbers[which] = found.bounces
+            # After each, so that what was measured outlives an interruption.
+            write_atomic(path, with_bounces(read_text(path), numbers).encode())
+            typer.echo(f"{world.name}: {found.words}")
+        for which, world in worlds(load_scene(path)):
+            if world.spec.appearance.bounces != numbers[which]:
+                raise InputError(
+                    f"{path}: {world.name} has no entry of its own in the file, as it is repeated"
+                    f" by an alias; write it out, with bounces: {numbers[which]}"
+                )
+    typer.echo(path)
 
 
 @app.command()

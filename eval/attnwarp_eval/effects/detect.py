@@ -18,7 +18,6 @@ from attnwarp_eval.effects.saving import Cost
 from attnwarp_eval.scene import transport
 from attnwarp_eval.scene.materials import EFFECTS, NOT_SIMULATED, Effect
 from attnwarp_eval.scene.scene import Scene, SceneError
-from attnwarp_eval.truth.bounces import answer
 from attnwarp_eval.truth.mitsuba import graph
 from attnwarp_eval.truth.passes import convex, sampler, small_lights
 from attnwarp_eval.truth.plan import bounces_of, everything_on, plan
@@ -31,8 +30,8 @@ class Finding:
     Attributes:
         needed: whether the scene calls for it.
         simulated: whether pictures show it.
-        source: "detected", "pinned", "said" (the scene's own cap on bounces leaves it out),
-            "measured" (too little of it for ``bounces: auto``) or "absent".
+        source: "detected", "pinned", "said" (the scene's own cap on bounces leaves it out) or
+            "absent".
         evidence: what in the file, in Mitsuba's graph and in the loaded scene says so.
 
     Example:
@@ -43,7 +42,7 @@ class Finding:
 
     needed: bool
     simulated: bool
-    source: Literal["detected", "pinned", "said", "measured", "absent"]
+    source: Literal["detected", "pinned", "said", "absent"]
     evidence: tuple[str, ...]
 
 
@@ -73,15 +72,12 @@ def detect(scene: Scene) -> dict[Effect, Finding]:
                 scene.path,
             )
     bounces = scene.spec.appearance.bounces
-    measured = (answer(scene).words,) if bounces == "auto" else ()
     out: dict[Effect, Finding] = {}
     for effect in EFFECTS:
-        if effect == "interreflection" and measured and bounces_of(scene) == 1:
-            out[effect] = Finding(False, False, "absent" if convex(scene) else "measured", measured)
+        if effect == "interreflection" and bounces is None and bounces_of(scene) == 1:
+            out[effect] = Finding(False, False, "absent", (_ABSENT[effect],))
         elif effect in spec_effects:
             evidence = (spec_effects[effect], *by_graph.get(effect, ()))
-            if effect == "interreflection":
-                evidence += measured
             pinned = effect in scene.spec.effects.pin
             caustic = effect == "caustics" and not _caustic_simulated(scene)
             out[effect] = Finding(
@@ -274,7 +270,7 @@ def describe(scene: Scene, about: dict[str, Any]) -> Iterator[str]:
                 else "NOT SIMULATED"
             )
         else:
-            word = "left out" if finding["source"] in ("said", "measured") else "no"
+            word = "left out" if finding["source"] == "said" else "no"
         yield f"  {name:16} {word:14} {'; '.join(finding['evidence'])}"
     for title, key in (("plan", "plan"), ("everything on", "everything_on")):
         yield ""
@@ -306,11 +302,10 @@ def describe(scene: Scene, about: dict[str, Any]) -> Iterator[str]:
             low, high = cost["again"]
             yield f"  the plan's time against itself: {low:.2f} to {high:.2f}"
         if cap := cost["cap"]:
-            whose = "the measured" if scene.spec.appearance.bounces == "auto" else "the scene's"
             if cap["bias"] is not None:
                 low, high = cap["bias_interval"]
                 yield (
-                    f"  not for the same error: {whose} cap of {cap['bounces']} bounces changes"
+                    f"  not for the same error: the scene's cap of {cap['bounces']} bounces changes"
                     f" the picture's light by {cap['bias']:+.1%} ({low:+.1%} to {high:+.1%})"
                     " against light without a cap"
                 )

@@ -8,8 +8,6 @@
 4. Fresh seeds: Welch's test with Satterthwaite's degrees of freedom on every pixel, every 8 x 8
    block and the whole picture, with Sidak's correction over all of them, AND equivalence of the
    whole (two one-sided tests within 1 %).
-5. With ``bounces: auto``, whose plan leaves out a little light on purpose: equivalence of the whole
-   with the same passes without an end of bounces, by pairs of one seed.
 
 A difference that is not significant does not show equality: the equivalence test must hold, which
 noise prevents. An effect that neither side simulates is invisible to every comparison, so a scene
@@ -38,7 +36,6 @@ from attnwarp_eval.statistics.equivalence import (
     sidak,
     welch,
 )
-from attnwarp_eval.truth import bounces
 from attnwarp_eval.truth.mitsuba import comparable, render_plan
 from attnwarp_eval.truth.passes import Lens, Pass, Plan, convex, small_lamps, small_lights
 from attnwarp_eval.truth.plan import bounces_of, everything_on, plan
@@ -294,14 +291,7 @@ def prove(
         seeds=seeds, seconds=seconds - (time.perf_counter() - start), seed=seed,
     )  # fmt: skip
     rungs.extend(ladder.rungs)
-    verdict = ladder.verdict
-    number = bounces_of(scene)
-    if scene.spec.appearance.bounces == "auto" and number != "unlimited":
-        rung = _complete(scene, number, seed + 5000)
-        rungs.append(rung)
-        if rung.passed is not True and verdict != "refused":
-            verdict = "can't tell" if rung.passed is None else "refused"
-    return finish(verdict, ladder.detectable)
+    return finish(ladder.verdict, ladder.detectable)
 
 
 Pictures = Callable[[int, int, int, int], Array]
@@ -410,22 +400,6 @@ def climb(
     return Climb("certified" if same.equal else "can't tell", tuple(rungs), detectable)
 
 
-def _complete(scene: Scene, number: int, seed: int) -> Rung:
-    """Whether the light that a measured number of bounces leaves out is below the margin, in the
-    source view and with other seeds than those that it was measured with.
-    """
-    left = bounces.shortfall(bounces.pictures_of(scene, seed), number, scene.source)
-    beyond = 2 * abs(left.difference) - left.bound >= MARGIN
-    return Rung(
-        "bounces",
-        True if left.holds else False if beyond else None,
-        f"{number} of them leave out {left.difference:+.2%} +- {left.error:.2%} of the light of the"
-        f" same passes without an end, at {left.spp} samples; |d| + t SE = {left.bound:.2%}, "
-        + (f"below {MARGIN:.0%}" if left.holds else f"not below {MARGIN:.0%}"),
-        asdict(left),
-    )
-
-
 def _with_spp(made: Plan, spp: int) -> Plan:
     from dataclasses import replace
 
@@ -469,9 +443,7 @@ def _structural(scene: Scene, ours: Plan) -> Rung:
     )
     cap = bounces_of(scene)
     words = "what is left out is in neither the file nor Mitsuba's graphs"
-    if scene.spec.appearance.bounces == "auto" and cap != "unlimited":
-        words += f"; light beyond {cap} bounces is left out, of which the last rung says how much"
-    if findings["interreflection"].source == "said":
+    if cap != "unlimited" and not convex(scene):
         words += (
             f"; bounces beyond {cap} are left out by the scene's own word and not part of this"
             " proof"

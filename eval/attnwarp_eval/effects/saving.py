@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Cap:
-    """What a scene's cap on bounces cuts off, pinned or measured, and what everything on costs.
+    """What a scene's cap on bounces cuts off, and what everything on costs.
 
     Attributes:
         bounces: the cap.
@@ -118,8 +118,8 @@ def measure(
 ) -> Cost:
     """Render plan and everything on in turn and time both, after one unmeasured picture each.
 
-    Where the scene caps its bounces or the number is measured, everything on within the cap is a
-    third, unless it is what the plan says.
+    Where the scene caps its bounces, everything on within the cap is a third, unless it is what the
+    plan says.
 
     Args:
         size, spp: of the picture; if left out as large as needed for tracing, not starting, to take

@@ -22,7 +22,6 @@ from attnwarp_eval.scene.materials import NOT_SIMULATED
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.transport import called_for
 from attnwarp_eval.statistics.equivalence import Equivalence
-from attnwarp_eval.truth.bounces import answer
 from attnwarp_eval.truth.plan import everything_on, plan
 
 USUAL = ("geometry", "direct", "shadows", "textures")
@@ -86,7 +85,7 @@ def measure_entry(scene: Scene, settings: Settings, tell: Tell = untold) -> dict
         "content": scene.content_hash,
         "variant": variant(),
         "needed": [name for name, one in findings.items() if one.needed and one.simulated],
-        "left_out": [name for name, one in findings.items() if one.source in ("said", "measured")],
+        "left_out": [name for name, one in findings.items() if one.source == "said"],
         "not_simulated": [
             name for name, one in findings.items() if one.needed and not one.simulated
         ],
@@ -94,8 +93,6 @@ def measure_entry(scene: Scene, settings: Settings, tell: Tell = untold) -> dict
         "everything_on": everything_on(scene, capped=False).to_dict(),
         "picture": f"{scene.name}.jpg",
     }
-    if scene.spec.appearance.bounces == "auto":
-        entry["bounces"] = answer(scene).words
     if settings.rounds:
         tell(f"{scene.name}: time against everything on")
         entry["cost"] = measure(scene, rounds=settings.rounds).to_dict()
@@ -287,7 +284,7 @@ def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Re
             f"**Times**: {size} x {size}, {spp} samples, in turn, {rounds} rounds. Everything on"
             " follows light until roulette ends"
             " it. **At equal noise**: the same times the ratio of variances. Where a scene caps"
-            " its bounces, by its own word or as measured below, the plan leaves light out, so that"
+            " its bounces, the plan leaves light out, so that"
             " the two pictures have other means and equal noise is not equal error: the **light"
             " changed by the cap** is the mean of the plan's pictures against that of everything"
             " on without a cap. **At equal error** is therefore against everything on within the"
@@ -297,17 +294,6 @@ def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Re
             " nothing was seen to be saved."
         )
     sections = [Section("Every scene", tables=[replace(table(entries), timed=())])]
-    words = [f"- {e['scene']}: {e['bounces']}" for e in entries if e.get("bounces")]
-    if words:
-        text = [
-            (
-                "Of scenes that say `bounces: auto`: the light that the number taken leaves out in"
-                " the view where it is the least certain, and that one bounce fewer leaves out"
-                " (docs/bounces.md)."
-            ),
-            "\n".join(words),
-        ]
-        sections.append(Section("Measured numbers of bounces", text))
     drawn = [entry for entry in entries if "largest_difference" in entry]
     if drawn:
         text = [

@@ -52,12 +52,14 @@ def apply(spec: SceneSpec, edit: EditSpec, answer: AnswerSpec | None = None) -> 
             raise ValueError(f"edit {edit.name!r}: there is no object {change.object!r}")
         k = places[change.object]
         objects[k] = changed(objects[k], change)
+    light = {} if does.bounces is None else {"bounces": does.bounces}
     return spec.model_copy(
         update={
             "name": "-".join([spec.name, edit.name, *([answer.name] if answer else [])]),
             "title": f"{spec.title}: {edit.instruction}",
             "objects": tuple(objects),
             "lights": spec.lights if does.lights is None else does.lights,
+            "appearance": spec.appearance.model_copy(update=light),
             "edits": (),
         }
     )

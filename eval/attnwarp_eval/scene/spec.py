@@ -175,15 +175,18 @@ class CamerasSpec(Spec):
     lens: LensSpec | None = None
 
 
+Bounces = Annotated[int, Field(ge=1, le=64)] | Literal["unlimited"]
+
+
 class AppearanceSpec(Spec):
     """How pictures are made: light bounces (1 is direct light only) and samples a pixel.
 
-    ``bounces: auto`` takes the fewest bounces that hold every view's light within 1 %, measured by
-    :mod:`attnwarp_eval.truth.bounces`. ``bounces: unlimited`` follows light until it is gone. Every
-    surface and every scattering counts as a bounce.
+    ``bounces: unlimited`` follows light until it is gone, and so does a file without a number.
+    ``attnwarp-eval scenes calibrate`` writes the fewest bounces that hold every view's light within
+    1 %. Every surface and every scattering counts as a bounce.
     """
 
-    bounces: Annotated[int, Field(ge=1, le=64)] | Literal["auto", "unlimited"] = "auto"
+    bounces: Bounces | None = None
     spp: int = Field(default=16, ge=1, le=65536)
 
 
@@ -224,12 +227,14 @@ class AnswerSpec(Spec):
     target: str
     changes: tuple[ObjectChange, ...] = ()
     lights: tuple[LightSpec, ...] | None = None
+    bounces: Bounces | None = None
 
 
 class EditSpec(Spec):
     """An edit whose result is known: what is asked for, the prompts, and what it does to the scene.
 
-    An ambiguous instruction has several ``answers``, each as right as the others.
+    An ambiguous instruction has several ``answers``, each as right as the others. ``bounces`` are
+    those of the edited scene's pictures; left out, the scene's.
     """
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
@@ -238,6 +243,7 @@ class EditSpec(Spec):
     target: str
     changes: tuple[ObjectChange, ...] = ()
     lights: tuple[LightSpec, ...] | None = None
+    bounces: Bounces | None = None
     answers: tuple[AnswerSpec, ...] = ()
 
     @model_validator(mode="after")

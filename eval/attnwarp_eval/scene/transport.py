@@ -93,7 +93,8 @@ def called_for(spec: SceneSpec) -> dict[Effect, str]:
     if spec.cameras.lens:
         note("depth_of_field", f"cameras.lens has an aperture of {spec.cameras.lens.aperture:g}")
     if spec.appearance.bounces != 1:
-        note("interreflection", f"appearance.bounces is {spec.appearance.bounces}")
+        number = spec.appearance.bounces or "left open"
+        note("interreflection", f"appearance.bounces is {number}")
     return evidence_of
 
 

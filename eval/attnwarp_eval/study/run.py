@@ -25,6 +25,7 @@ from attnwarp_eval.study.schema import Study, StudyError, did_you_mean
 from attnwarp_eval.study.store import Problems, Store, StoreError
 from attnwarp_eval.study.study import cells_of, explain_errors, parse_study
 from attnwarp_eval.study.work import compute_and_write
+from attnwarp_eval.truth.plan import open_bounces
 
 
 @dataclass
@@ -90,7 +91,11 @@ def plan(study: Study, store: Store) -> Plan:
         else:
             other_code += not record.environment.same_code(this)
     named = dict(zip(study.scene_names, scenes.values(), strict=True))
-    said = {name: lines for name, scene in named.items() if (lines := notices(scene))}
+    said = {
+        name: lines
+        for name, scene in named.items()
+        if (lines := [*notices(scene), *open_bounces(scene)])
+    }
     return Plan(study, named, cells, todo, other_code, said)
 
 

@@ -1,4 +1,4 @@
-"""How many bounces of light a scene calls for, measured: what ``bounces: auto`` means.
+"""How many bounces of light a scene calls for, measured: `attnwarp-eval scenes calibrate`.
 
 The fewest bounces whose pictures are shown to have, in every view, the light of pictures without
 an end of bounces within :data:`MARGIN`: |d| + t SE of the mean over pairs of pictures of one seed,
@@ -6,31 +6,24 @@ with t the 99 % quantile of Student's distribution (two one-sided tests, Schuirm
 view must pass, so that no correction for their number is needed; a number that is too small passes
 with a chance of at most 1 % for each of the :data:`SAMPLES` tried. Where noise or light leaves no
 number up to :data:`MOST` that passes, light has no end.
-
-Answers of the package's scenes are recorded beside them (``scenes/bounces.json``), those of other
-scenes in the cache. :func:`attnwarp_eval.effects.proof.prove` measures with other seeds again.
 """
 
 from __future__ import annotations
 
 import functools
-import json
 import math
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
-from attnwarp_eval.cache import content_key, read_arrays, write_arrays
 from attnwarp_eval.scene import transport
+from attnwarp_eval.scene.rewrite import Which
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.statistics.equivalence import paired_test
-from attnwarp_eval.truth.llvm import variant
-from attnwarp_eval.truth.mitsuba import APPEARANCE_PROTOCOL, build, comparable, render_plan
+from attnwarp_eval.truth.mitsuba import build, comparable, render_plan
 from attnwarp_eval.truth.passes import Bounces, convex, plan_passes
 
 Array = npt.NDArray[np.float64]
@@ -58,9 +51,6 @@ AT_ONCE = 64
 
 FIRST, MOST = 2, 12
 """The number that is tried first, and the most that are tried."""
-
-PROTOCOL = 2
-"""Raised whenever the same scene would be measured otherwise."""
 
 
 @dataclass(frozen=True)
@@ -136,25 +126,22 @@ class Answer:
         words = ", ".join(out).replace("%", " %")
         return words if self.held else f"no number suffices, light has no end: {words}"
 
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
-        return asdict(self)
-
-    @staticmethod
-    def from_dict(data: dict[str, Any]) -> Answer:
-        """What :meth:`to_dict` made."""
-        held, fewer = (Shortfall(**data[k]) if data[k] else None for k in ("held", "fewer"))
-        return Answer(data["bounces"], held, fewer, data["made_by"])
-
 
 def _leave(shortfall: Shortfall) -> str:
     return "leaves out" if shortfall.bounces == 1 else "leave out"
 
 
-def answer(scene: Scene) -> Answer:
-    """How many bounces ``scene`` calls for, whatever its file says: recorded, cached, or measured.
+# Measuring
+# --------------------------------------------------------------------------------------------------
 
-    Measuring renders some hundred pictures of 32 x 32, which takes some ten seconds.
+Pictures = Callable[[Bounces, Camera, int], Array]
+"""(PAIRS, H, W, 3) pictures of a number of bounces, a view and samples a pixel."""
+
+
+def search(scene: Scene) -> Answer:
+    """Measure how many bounces ``scene`` calls for, whatever its file says.
+
+    That renders some hundred pictures of 32 x 32, which takes some ten seconds.
 
     Example:
         A single ball on nothing never lights itself, so nothing is measured.
@@ -169,61 +156,13 @@ def answer(scene: Scene) -> Answer:
         ...     "lights": [{"type": "sun", "elevation": 40, "azimuth": 0, "irradiance": 2}],
         ...     "cameras": {"look_at": [0, 0, 0], "radius": 3, "source": view,
         ...                 "targets": [{"yaw": 90, "height": 1}]}})
-        >>> answer(Scene(spec)).bounces
+        >>> search(Scene(spec)).bounces
         1
     """
     import mitsuba
 
     if convex(scene) and scene.spec.medium is None:
         return Answer(1, None, None, None)
-    recorded = _recorded().get(key(scene))
-    if recorded is not None:
-        return recorded
-    place = content_key(
-        key(scene), APPEARANCE_PROTOCOL, mitsuba.__version__, variant(), build.TEXELS
-    )
-    stored = read_arrays("bounces", place)
-    if stored is None:
-        stored = {"answer": np.array(json.dumps(search(scene).to_dict()))}
-        write_arrays("bounces", place, stored)
-    return Answer.from_dict(json.loads(str(stored["answer"])))
-
-
-def key(scene: Scene) -> str:
-    """SHA-256 of what the answer follows from: all that is lit and seen, from every view, and how
-    it is measured. Size and samples of the scene's pictures are not among it.
-    """
-    return content_key(
-        "bounces",
-        PROTOCOL,
-        [MARGIN, CONFIDENCE, SIZE, TEXELS, PAIRS, *SAMPLES, MOST],
-        scene.world_hash,
-        scene.spec.cameras.model_dump(mode="json", exclude={"size"}),
-    )
-
-
-RECORD = "bounces.json"
-"""Beside the package's scenes: name -> key and answer. scripts/record_bounces.py writes it."""
-
-
-@functools.cache
-def _recorded() -> dict[str, Answer]:
-    path = Path(__file__).parents[1] / "scenes" / RECORD
-    entries = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    return {entry["key"]: Answer.from_dict(entry["answer"]) for entry in entries.values()}
-
-
-# Measuring
-# --------------------------------------------------------------------------------------------------
-
-Pictures = Callable[[Bounces, Camera, int], Array]
-"""(PAIRS, H, W, 3) pictures of a number of bounces, a view and samples a pixel."""
-
-
-def search(scene: Scene) -> Answer:
-    """Measure how many bounces ``scene`` calls for; nothing is read from record or cache."""
-    import mitsuba
-
     small = scene.with_size(SIZE, SIZE)
     made_by = f"{mitsuba.__version__} {comparable(small)}"
     pictures = pictures_of(small)
@@ -259,6 +198,15 @@ def search(scene: Scene) -> Answer:
         else:
             fewer = below
     return Answer(number, last, fewer, made_by)
+
+
+def worlds(scene: Scene) -> Iterator[tuple[Which, Scene]]:
+    """A scene, then everything that its edits make of it."""
+    yield (None, None), scene
+    for edit in scene.edits:
+        for answer in edit.answers or (None,):
+            name = answer.name if answer else None
+            yield (edit.name, name), scene.edited(edit.name, name)
 
 
 def shortfall(pictures: Pictures, bounces: int, view: Camera) -> Shortfall:

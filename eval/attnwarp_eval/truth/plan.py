@@ -1,7 +1,6 @@
-"""How a scene's pictures are made: with the bounces its file pins, or with the measured number.
+"""How a scene's pictures are made, with the number of bounces that its file names.
 
-:func:`plan` needs no loading, but for the number of bounces where the file leaves it open
-(:mod:`attnwarp_eval.truth.bounces`). docs/effects.md has the reasons.
+:func:`plan` needs no loading. docs/effects.md has the reasons.
 """
 
 from __future__ import annotations
@@ -12,13 +11,12 @@ from typing import Literal
 from attnwarp_eval.scene.materials import Effect
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SkySpec
-from attnwarp_eval.truth.bounces import answer
 from attnwarp_eval.truth.passes import (
     ROULETTE,
     Bounces,
     Pass,
     Plan,
-    check_plannable,
+    convex,
     plan_passes,
 )
 
@@ -67,22 +65,34 @@ def plan(
         )
     if bounces is not None:
         return plan_passes(scene, spp, bounces)
-    pinned = scene.spec.appearance.bounces
-    if pinned != "auto":
-        return plan_passes(scene, spp, pinned)
-    check_plannable(scene, spp)
-    measured = answer(scene)
-    return plan_passes(scene, spp, measured.bounces, (f"bounces: auto: {measured.words}",))
+    return plan_passes(scene, spp, bounces_of(scene), tuple(open_bounces(scene)))
 
 
 def bounces_of(scene: Scene) -> Bounces:
-    """How many bounces a scene's pictures have: the number that its file pins, or with ``bounces:
-    auto`` the measured one.
+    """Bounces of a scene's pictures: the number that its file names; without one, all that a path
+    can have: a single convex surface never lights itself.
     """
-    wanted = scene.spec.appearance.bounces
-    if wanted != "auto":
-        return wanted
-    return answer(scene).bounces
+    named = scene.spec.appearance.bounces
+    if named is not None:
+        return named
+    return 1 if convex(scene) and scene.spec.medium is None else "unlimited"
+
+
+def open_bounces(scene: Scene) -> list[str]:
+    """One line where a scene's pictures follow light without an end, as its file names no number;
+    else none.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> open_bounces(load_scene("spheres"))
+        []
+    """
+    if scene.spec.appearance.bounces is not None or bounces_of(scene) == 1:
+        return []
+    return [
+        "the file names no number of bounces, so light is followed until it is gone;"
+        " `attnwarp-eval scenes calibrate FILE` measures how many are enough and writes the number"
+    ]
 
 
 def everything_on(scene: Scene, spp: int | None = None, *, capped: bool = True) -> Plan:
@@ -94,9 +104,8 @@ def everything_on(scene: Scene, spp: int | None = None, *, capped: bool = True) 
 
     Args:
         spp: samples a pixel; the scene's own number if left out.
-        capped: keep the scene's own cap on bounces, which is part of what its truth means, or with
-            ``bounces: auto`` the measured one. Without it light is followed until roulette ends it:
-            what the cap saves.
+        capped: keep the scene's own cap on bounces, which is part of what its truth means. Without
+            it light is followed until roulette ends it: what the cap saves.
     """
     ours = plan(scene, spp)
     spp = spp or scene.spec.appearance.spp

@@ -58,7 +58,7 @@ def contents(scene: Scene) -> str:
 
 
 def pictures_made(scene: Scene) -> str:
-    """How a scene's pictures are planned, in words; ``bounces: auto`` is measured by rendering."""
+    """How a scene's pictures are planned, in words."""
     spec = scene.spec
     lines = ["pictures are made by"]
     planned = plan(scene)

@@ -48,7 +48,7 @@ def test_a_scene_is_shown_before_how_its_pictures_are_made():
     assert done.exit_code == 0, done.output
     contents, made = done.stdout.split("pictures are made by\n")
     assert contents.startswith("spheres: ") and "\nlights: sun, sky\n" in contents
-    assert "light from sun, sky\n" in made and "because bounces: auto" in made
+    assert "light from sun, sky\n" in made and "because 3 bounces: paths of up to 4 edges" in made
 
 
 def test_an_export_is_made_anew_in_its_own_folder(tmp_path):

@@ -129,7 +129,7 @@ def test_rows_that_no_cell_has_are_not_overwritten_and_a_name_is_one_scene(tmp_p
             collect(["opposed"], tmp_path, Settings())
         assert path.read_text() == content and [*tmp_path.iterdir()] == [path]
     text = (scene_folders()[-1] / "opposed.yaml").read_text()
-    (tmp_path / "opposed.yaml").write_text(text.replace("bounces: auto", "bounces: 2"))
+    (tmp_path / "opposed.yaml").write_text(text.replace("bounces: 1", "bounces: 2"))
     names = ["opposed", str(tmp_path / "opposed.yaml")]
     with pytest.raises(InputError, match="two scenes have the name 'opposed'"):
         collect(names, tmp_path / "out", Settings())

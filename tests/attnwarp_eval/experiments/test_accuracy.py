@@ -213,7 +213,7 @@ def test_an_unknown_scene_is_one_line(tmp_path):
 def test_two_scenes_of_one_name_are_refused_and_one_named_twice_is_one(tmp_path):
     text = (scene_folders()[-1] / "opposed.yaml").read_text()
     other = tmp_path / "opposed.yaml"
-    other.write_text(text.replace("bounces: auto", "bounces: 2"))
+    other.write_text(text.replace("bounces: 1", "bounces: 2"))
     out = tmp_path / "out"
     for command in (["accuracy", "--out", str(out)], ["time", "--json"]):
         result = CliRunner().invoke(app, ["scenes", *command, "opposed", str(other)])

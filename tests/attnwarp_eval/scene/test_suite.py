@@ -34,9 +34,9 @@ HARD = [
 # Baselines and records name these scenes by their content, so a key that the format gains must leave
 # it alone.
 CONTENT = {
-    "bear": "dd94fe543137c05cce707def5151cabbc51a8a7d63f7808d4d42d5a21d452129",
-    "fence": "76099cc31a41b233d9d6194587aac914404c79ac747bf7966808f08d8b44ec61",
-    "spheres": "1569a80df85cd2739fef22593a6a2584d4f524f0da9ef26c4c1af235e4125cba",
+    "bear": "3e24d10143115144a0c633846db37a042b8b3a269bf2f445669010be1d346e0a",
+    "fence": "2d9807c5f923e40ed79881f48c3f1c51238ab16e003b1f3869e67f5885b0301c",
+    "spheres": "65838062f7c0e995b1b2233f0b7137994327e2e152c1b7b457b9396c71b6af2f",
 }
 
 

@@ -1,22 +1,23 @@
-"""The number of bounces that ``bounces: auto`` takes: against light whose sum is known."""
+"""The number of bounces that a scene calls for: against light whose sum is known."""
 
 import dataclasses
-import json
-import re
 
 import numpy as np
 import pytest
 from effect_scenes import FLOOR, GLASS, MIRROR, SKY, SUN, WALL, ball, make
+from typer.testing import CliRunner
 
 from attnwarp.camera import Camera
-from attnwarp_eval.effects.proof import _complete
-from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.cli.main import app
+from attnwarp_eval.scene.file import list_scenes, load_scene
+from attnwarp_eval.scene.rewrite import with_bounces
+from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SceneSpec
+from attnwarp_eval.study import Store, parse_study
+from attnwarp_eval.study.run import plan as plan_run
 from attnwarp_eval.truth import bounces, mitsuba
-from attnwarp_eval.truth.bounces import Answer, Shortfall, answer, dealt, search, shortfall
-from attnwarp_eval.truth.mitsuba import build
-from attnwarp_eval.truth.plan import bounces_of, everything_on, plan
-from scripts.record_bounces import SCENES, worlds
+from attnwarp_eval.truth.bounces import dealt, search, shortfall, worlds
+from attnwarp_eval.truth.plan import bounces_of, everything_on, open_bounces, plan
 
 pytestmark = pytest.mark.usefixtures("coarse_textures")
 
@@ -60,7 +61,7 @@ def test_noise_calls_for_more_samples_and_never_passes_for_light_that_is_there()
 def closed(albedo, **rest):
     """A floor and a wall of one gray, which light each other."""
     gray = {"type": "plain", "color": albedo, "variation": 0.0, "grain": 0.1}
-    return make([FLOOR | {"texture": gray}, WALL | {"texture": gray}], [SKY, SUN], "auto", **rest)
+    return make([FLOOR | {"texture": gray}, WALL | {"texture": gray}], [SKY, SUN], None, **rest)
 
 
 def test_pictures_dealt_from_one_expect_the_same_pixels():
@@ -84,7 +85,6 @@ def test_a_corner_of_two_walls_needs_the_bounces_that_everything_on_shows(monkey
     assert isinstance(result.bounces, int) and result.held.holds and not result.fewer.holds
     assert result.held.bounces == result.bounces == result.fewer.bounces + 1
     # Everything on (another integrator, other seeds) says the same of the light that is missing.
-    monkeypatch.setattr(bounces, "search", lambda scene: result)
     endless = everything_on(scene, 64, capped=False)
     for number, held in ((result.bounces, True), (result.bounces - 1, False)):
         light = [
@@ -92,8 +92,8 @@ def test_a_corner_of_two_walls_needs_the_bounces_that_everything_on_shows(monkey
             for made in (plan(scene, 64, bounces=number), endless)
         ]
         assert (light[1] / light[0] - 1 < bounces.MARGIN) == held
-        # The ladder's last rung measures again, and refuses what is known to be too few.
-        assert _complete(scene, number, 7).passed == held
+        # With other seeds, too.
+        assert shortfall(bounces.pictures_of(scene, 7), number, scene.source).holds == held
 
 
 def test_a_black_world_needs_one_bounce_and_a_mirror_or_glass_what_it_shows(monkeypatch):
@@ -101,50 +101,101 @@ def test_a_black_world_needs_one_bounce_and_a_mirror_or_glass_what_it_shows(monk
     assert search(closed("#000000")).bounces == 1
     least = {None: 1, "mirror": 2, "glass": 3}
     for material in (None, MIRROR, GLASS):
-        spec = make([FLOOR, ball(material)], [SKY], "auto").spec
+        spec = make([FLOOR, ball(material)], [SKY], None).spec
         expected = least[material["type"] if material else None]
         assert bounces.transport.fewest_bounces(spec) == expected
 
 
-def test_an_answer_is_measured_once_and_again_where_anything_it_depends_on_changes(
+FILE = """\
+name: corner
+title: A corner  # of two walls
+objects:
+  - {name: floor, shape: {type: rectangle, center: [0, 0, 0], size: [6, 6], facing: [0, 0, 1]},
+     texture: {type: plain, color: '#c0c0c0', variation: 0}}
+  - {name: wall, shape: {type: rectangle, center: [0, 2, 1], size: [6, 2], facing: [0, -1, 0]},
+     texture: {type: plain, color: '#c0c0c0', variation: 0}}
+lights: [{type: sky, horizon: '#ffffff', zenith: '#ffffff', radiance: 1}]
+appearance: {spp: 4}
+cameras:
+  look_at: [0, 0, 0.4]
+  radius: 3
+  source: {yaw: -80, height: 2}
+  targets: [{yaw: -60, height: 1.5}]
+edits:
+  # No light leaves a black surface.
+  - name: night
+    instruction: Make it black
+    source: a corner
+    target: a black corner
+    changes: [{object: floor, recolor: {'#c0c0c0': '#000000'}}, {object: wall, recolor: {'#c0c0c0': '#000000'}}]
+"""
+
+
+def test_calibrating_writes_the_measured_numbers_and_leaves_the_rest_of_the_file(
     monkeypatch, tmp_path
 ):
-    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
-    searched = []
-    held = Shortfall(3, "source", 16, 0.004, 0.0005, 0.0053, 0.02)
-    monkeypatch.setattr(
-        bounces, "search", lambda scene: searched.append(scene) or Answer(3, held, None, "m")
-    )
-    scene = closed("#c0c0c0")
-    assert answer(scene) == answer(scene) == Answer(3, held, None, "m") and len(searched) == 1
-    assert bounces_of(scene) == 3 and plan(scene).passes[0].max_depth == 4
-    assert any("bounces: auto: 3 leave out 0.40 %" in reason for reason in plan(scene).reasons)
-    # Of pictures of another size, and with other samples, the answer is the same.
-    answer(scene.with_size(64, 48))
-    answer(closed("#c0c0c0", spp=4))
-    assert len(searched) == 1
-    others = [closed("#c0c0c1"), closed("#c0c0c0", cameras={"radius": 3.5})]
-    others.append(closed("#c0c0c0", cameras={"targets": [{"yaw": 61, "height": 1.5}]}))
-    for count, other in enumerate(others, 2):
-        answer(other)
-        assert len(searched) == count
-    monkeypatch.setattr(build, "TEXELS", build.TEXELS // 2)
-    answer(scene)
-    assert len(searched) == len(others) + 2
-    monkeypatch.setattr(bounces, "variant", lambda: "another")
-    answer(scene)
-    assert len(searched) == len(others) + 3
-    pinned = make([FLOOR, WALL], [SKY], 7)
-    assert bounces_of(pinned) == 7 and len(searched) == len(others) + 3
+    monkeypatch.setattr(bounces, "SIZE", 16)
+    path = tmp_path / "corner.yaml"
+    path.write_text(FILE)
+    done = CliRunner().invoke(app, ["scenes", "calibrate", str(path)])
+    assert done.exit_code == 0, done.output
+    number = load_scene(path).spec.appearance.bounces
+    # The two surfaces reflect half of the light and see each other.
+    assert f"corner: {number} leave out " in done.stdout and 1 < number <= bounces.MOST
+    expected = FILE.replace("{spp: 4}", f"{{bounces: {number}, spp: 4}}")
+    expected = expected.replace("name: night\n", "name: night\n    bounces: 1\n")
+    assert path.read_text() == expected
+    assert bounces_of(load_scene(path).edited("night")) == 1
 
 
-def test_a_pinned_number_and_the_default():
-    scene = closed("#c0c0c0")
-    data = scene.spec.model_dump(mode="json")
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("appearance: {}", "appearance: {bounces: 3}"),
+        ("appearance: {bounces: unlimited}  # far", "appearance: {bounces: 3}  # far"),
+        ("appearance:\n  # few\n  spp: 8", "appearance:\n  # few\n  bounces: 3\n  spp: 8"),
+        ("lights: []", "appearance: {bounces: 3}\nlights: []"),
+        ("edits: [{name: a, target: t}]\nappearance: {bounces: 1}",
+         "edits: [{name: a, bounces: 2, target: t}]\nappearance: {bounces: 3}"),
+        ("appearance: {bounces: 1}\nedits:\n- name: b\n  answers:\n  - name: c\n    bounces: 4\n  - {name: d}",
+         "appearance: {bounces: 3}\nedits:\n- name: b\n  answers:\n  - name: c\n    bounces: 3\n"
+         "  - {bounces: unlimited, name: d}"),
+    ],
+)  # fmt: skip
+def test_a_number_takes_the_place_of_the_former_or_one_of_its_own(before, after):
+    numbers = {
+        (None, None): 3,
+        ("a", None): 2,
+        ("b", "c"): 3,
+        ("b", "d"): "unlimited",
+    }
+    for newline in ("\n", "\r\n"):
+        text = f"name: s\n{before}\n".replace("\n", newline)
+        written = with_bounces(text, numbers).replace("\r\n", "\n")
+        assert written == f"name: s\n{after}\n"
+        assert with_bounces(written, numbers) == written
+
+
+def test_a_file_without_a_number_has_all_bounces_and_says_so_in_one_line(tmp_path):
+    data = closed("#c0c0c0").spec.model_dump(mode="json")
     del data["appearance"]
-    assert SceneSpec.model_validate(data).appearance.bounces == "auto"
-    with pytest.raises(ValueError, match="bounces"):
-        SceneSpec.model_validate(data | {"appearance": {"bounces": "some"}})
+    scene = Scene(SceneSpec.model_validate(data))
+    (line,) = open_bounces(scene)
+    assert "scenes calibrate" in line and "\n" not in line and plan(scene).reasons[0] == line
+    assert bounces_of(scene) == "unlimited" and plan(scene).passes[0].max_depth == -1
+    # A single convex surface never lights itself.
+    alone = make([ball()], [SKY], None)
+    assert bounces_of(alone) == 1 and open_bounces(alone) == []
+    named = make([FLOOR, WALL], [SKY], 7)
+    assert bounces_of(named) == 7 and open_bounces(named) == []
+    for wrong in ("auto", "some", 0):
+        with pytest.raises(ValueError, match="bounces"):
+            SceneSpec.model_validate(data | {"appearance": {"bounces": wrong}})
+    path = tmp_path / "corner.yaml"
+    path.write_text(FILE)
+    study = {"name": "s", "scenes": [str(path)], "size": 16, "variants": {"a": {}}}
+    study = parse_study(study | {"probes": {"depth": ["a"]}})
+    assert plan_run(study, Store(tmp_path / "run")).notices == {"corner": [line]}
 
 
 def test_rays_of_the_materials_find_the_same_sky_as_rays_toward_it():
@@ -172,36 +223,21 @@ def test_rays_of_the_materials_find_the_same_sky_as_rays_toward_it():
 # --------------------------------------------------------------------------------------------------
 
 
-def recorded():
-    return json.loads((SCENES / bounces.RECORD).read_text(encoding="utf-8"))
+CHOSEN = ("caustic", "fog", "glass", "mirror")
+"""Scenes that are about long paths."""
 
 
-def test_every_scene_that_leaves_the_number_open_and_every_edit_has_its_answer_recorded(
-    monkeypatch, tmp_path
-):
-    # An empty cache and nothing to measure with: the record alone answers.
-    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
-    monkeypatch.setattr(bounces, "search", None)
-    scenes = {scene.name: scene for scene in worlds()}
-    pinned = re.compile(r"bounces: (\d+|unlimited)")
-    files = [path for path in SCENES.glob("*.yaml") if not pinned.search(path.read_text())]
-    assert files and {path.stem for path in files} <= set(scenes) == set(recorded())
-    for name, entry in recorded().items():
-        scene = scenes[name]
-        assert entry["key"] == bounces.key(scene)
-        result = Answer.from_dict(entry["answer"])
-        assert result == answer(scene) and result.bounces == bounces_of(scene)
-        assert result.held.holds and result.held.bounces == result.bounces
-        assert result.fewer is None or result.fewer.bounces == result.bounces - 1
+def test_every_scene_of_the_package_and_every_edit_has_a_number():
+    for name in list_scenes():
+        for _, scene in worlds(load_scene(name)):
+            assert isinstance(scene.spec.appearance.bounces, int), scene.name
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", sorted({path.stem for path in SCENES.glob("*.yaml")} & recorded().keys())
-)
-def test_a_recorded_answer_is_measured_again(name):
+@pytest.mark.parametrize("name", sorted({*list_scenes()} - {*CHOSEN}))
+def test_the_number_of_a_scene_of_the_package_is_measured_again(name):
     scene = load_scene(name)
     number = search(scene).bounces
-    assert number == answer(scene).bounces
+    assert number == scene.spec.appearance.bounces
     # With other seeds.
-    assert _complete(scene, number, 7).passed
+    assert shortfall(bounces.pictures_of(scene, 7), number, scene.source).holds
