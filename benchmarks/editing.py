@@ -83,8 +83,7 @@ def measure(
     stored = work / plan.name / "figures.json"
     if stored.exists():
         figures: dict[str, Any] = json.loads(stored.read_text())
-        if "peak_mb" in figures:  # a former version did not measure it
-            return figures
+        return figures
     dataset = read_dataset(data)
     train, test = hold_out(dataset)
     if test is None or dataset.points is None:

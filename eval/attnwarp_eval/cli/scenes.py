@@ -1,14 +1,19 @@
-"""Commands about scenes whose truth is exact: list, show, render, export, effects, cost."""
+"""Commands about scenes whose truth is exact: list, show, render, export, calibrate,
+effects, cost.
+"""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progress, resumable
+
+if TYPE_CHECKING:
+    from attnwarp_eval.scene.scene import Scene
 
 app = typer.Typer(
     help="The scenes whose truth is known: list them, read one, look at one.", no_args_is_help=True
@@ -65,6 +70,7 @@ def render(
         from attnwarp_eval.truth.show import render_views
 
         loaded = load_scene(scene).with_size(size, size)
+        _say_open_bounces(loaded)
         folder = out or Path("runs") / "scenes" / loaded.name
         with progress() as show:
             written = list(
@@ -97,12 +103,21 @@ def export(
 
         loaded = load_scene(scene)
         _check_no_capture(out)
+        _say_open_bounces(loaded)
         with progress() as show:
             attnwarp_eval.splats.export.export(
                 loaded, out, views=views, size=size, spp=spp, points=points, noise=noise, seed=seed,
                 progress=lambda text: show.step(f"{loaded.name}: {text}"),
             )  # fmt: skip
     typer.echo(out / "transforms.json")
+
+
+def _say_open_bounces(scene: Scene) -> None:
+    """One line where the scene's file leaves the number of bounces open."""
+    from attnwarp_eval.truth.plan import open_bounces
+
+    for line in open_bounces(scene):
+        typer.echo(f"attnwarp-eval: {scene.name}: {line}", err=True)
 
 
 def _check_no_capture(folder: Path) -> None:

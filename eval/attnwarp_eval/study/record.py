@@ -212,7 +212,7 @@ class Record(Generic[E]):
             data["id"],
             data["spec"],
             tuple(map(View.from_json, data["views"])),
-            tuple(map(PictureFile.from_json, data.get("pictures", []))),
+            tuple(map(PictureFile.from_json, data["pictures"])),
             Cost.from_json(data["cost"]),
             Environment.from_json(data["environment"]),
             extra,

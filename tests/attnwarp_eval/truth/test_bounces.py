@@ -196,6 +196,9 @@ def test_a_file_without_a_number_has_all_bounces_and_says_so_in_one_line(tmp_pat
     study = {"name": "s", "scenes": [str(path)], "size": 16, "variants": {"a": {}}}
     study = parse_study(study | {"probes": {"depth": ["a"]}})
     assert plan_run(study, Store(tmp_path / "run")).notices == {"corner": [line]}
+    options = ["--size", "16", "--spp", "1", "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, ["scenes", "render", str(path), *options])
+    assert done.exit_code == 0 and done.stderr == f"attnwarp-eval: corner: {line}\n"
 
 
 def test_rays_of_the_materials_find_the_same_sky_as_rays_toward_it():
