@@ -6,9 +6,9 @@ with the package), angles in degrees, colours sRGB '#rrggbb', z up.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from attnwarp_eval.scene.base import Color, Coordinate, Direction, Positive, Spec, Vector
 from attnwarp_eval.scene.bodies import BodySpec
@@ -175,7 +175,18 @@ class CamerasSpec(Spec):
     lens: LensSpec | None = None
 
 
-Bounces = Annotated[int, Field(ge=1, le=64)] | Literal["unlimited"]
+def _number_of_bounces(value: Any) -> Any:
+    if isinstance(value, str) and value != "unlimited":
+        raise ValueError(
+            f"got {value!r}, expected 1 to 64 or unlimited; take it out, and attnwarp-eval scenes"
+            " calibrate FILE measures the number"
+        )
+    return value
+
+
+Bounces = Annotated[
+    Annotated[int, Field(ge=1, le=64)] | Literal["unlimited"], BeforeValidator(_number_of_bounces)
+]
 
 
 class AppearanceSpec(Spec):

@@ -103,6 +103,12 @@ MISTAKES = [
         13,
         r"appearance.bounces: got 65, but input should be less than or equal to 64",
     ),
+    (
+        "lights:\n",
+        "appearance: {bounces: auto}\nlights:\n",
+        13,
+        r"appearance.bounces: got 'auto', expected 1 to 64 or unlimited; take it out, and .* calibrate",
+    ),
     ("radius: 0.5", "radius: .nan", 11, r"objects\[1\].shape.radius: got nan, but .*finite"),
     ("radius: 0.5", "radius: big", 11, r"objects\[1\].shape.radius: got 'big', but .*valid number"),
     ("      radius: 0.5\n", "", 8, r"objects\[1\].shape.radius: is missing"),
