@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from attnwarp.cli.bundled_scene import SIZE, capture, exact_masks, is_scene
 from attnwarp.cli.edit_image import (
     MOST_PIXELS,
     SEGMENTER,
@@ -51,7 +53,13 @@ FIT_ITERATIONS, FIT_SPLATS = 3_000, 30_000
 def edit(
     data: DataArgument,
     instruction: InstructionOption,
-    out: Annotated[Path, typer.Option(help="Folder for the result; an edit in it is resumed.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for the result; an edit in it is resumed. Named after DATA and the"
+            " instruction, in runs/edits, if left out."
+        ),
+    ] = None,
     ply: Annotated[
         Path | None, typer.Option(help="Splats of the scene; fitted first if left out.")
     ] = None,
@@ -118,7 +126,16 @@ def edit(
     *,
     reading: Reading,
 ) -> None:
-    """Edit a scene: one view by an instruction, the others along with it, the splats on all."""
+    """Edit a scene: one view by an instruction, the others along with it, the splats on all.
+
+    DATA may be a bundled scene's name, such as bear: its pictures and exact masks are rendered.
+    """
+    if out is None:
+        out = Path(
+            "runs",
+            "edits",
+            re.sub(r"[^a-z0-9]+", "-", f"{data.stem} {instruction}".lower()).strip("-"),
+        )
     with clear_errors(
         f"stopped; what {out} holds is whole, and the same command goes on from it", out
     ):
@@ -129,6 +146,9 @@ def edit(
         }  # fmt: skip
         changes = {name: value for name, value in options.items() if value is not None}
         flags = {name: f"--{name.replace('_', '-')}" for name in options}
+        bundled = is_scene(str(data)) and not data.exists()
+        if bundled:
+            changes.setdefault("size", SIZE)
         changes |= assignments(change or [], {**flags, "method": "--each-view-alone"})
         _check_splat_options(
             ply,
@@ -145,6 +165,10 @@ def edit(
 
         settings = methods.preset("attention_warping", preset, **changes)
         use_threads(threads)
+        if bundled:
+            data = capture(str(data), out / "scene")
+            if masks is None and words is None:
+                masks = exact_masks(data, instruction)
         dataset = read_views(data, reading)
         splats = None if ply is None else read_splats(ply, kind, antialiased, screen_filter)
         if ply is not None and splats is not None:

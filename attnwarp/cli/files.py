@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from attnwarp.cli.bundled_scene import is_scene
 from attnwarp.cli.options import Kind, Reading
 from attnwarp.cli.shell import echo
 from attnwarp.errors import InputError, InputWarning
@@ -54,19 +54,12 @@ def read_views(path: Path, reading: Reading, **options: Any) -> Dataset:
             f"{path}: expected transforms.json, its folder or a COLMAP folder; for a scene:"
             f" {export}, then give DIR"
         )
-    if _is_scene(str(path)) and not path.exists():
+    if is_scene(str(path)) and not path.exists():
         raise FileNotFoundError(
             f"{path}: no such file or folder; for a scene: {export}, then give DIR"
         )
     typed = {**vars(reading), "ignore_keys": reading.ignore_keys or ()}
     return read_dataset(path, **(typed | options))
-
-
-def _is_scene(name: str) -> bool:
-    """Whether the evaluation harness, where it is installed, ships a scene of that name."""
-    package = find_spec("attnwarp_eval")
-    folders = package.submodule_search_locations if package is not None else None
-    return any((Path(folder) / "scenes" / f"{name}.yaml").is_file() for folder in folders or ())
 
 
 def read_splats(

@@ -441,6 +441,31 @@ def test_a_disk_without_room_ends_in_one_clear_line(data, tmp_path, command):
     assert not list((tmp_path / "out").iterdir())  # nor is half a file left
 
 
+@pytest.mark.slow
+def test_a_bundled_scene_is_edited_by_its_name_inside_an_exact_mask(tmp_path, monkeypatch):
+    """Oracle: outside the exported mask of the ball, edited views are the pictures before."""
+    monkeypatch.chdir(tmp_path)
+    quick = ["--stages", 1, "--steps", 2, "--iterations", 1, "--fit-iterations", 1]
+    words = "make the beach ball red"
+    done = in_process("edit", "spheres", "--instruction", words, *quick)
+    assert done.exit_code == 0, done.stderr
+    out = tmp_path / "runs" / "edits" / "spheres-make-the-beach-ball-red"
+    data = read_dataset(out / "scene")
+    edited = {path.name: path for path in (out / "rounds").glob("*/*.png")}
+    assert len(data.cameras) == 24 and len(edited) > 4
+    outside, inside = [], []
+    for camera, path in zip(data.cameras, data.image_paths, strict=True):
+        name = Path(camera.name).name
+        if name in edited:
+            mask = cv2.imread(str(out / "scene" / "masks" / "beach_ball" / name))[..., 0]
+            # A latent is four pixels wide: its pixels go with the mask.
+            near = cv2.dilate(mask, np.ones((9, 9), np.uint8)) > 0
+            change = np.abs(cv2.imread(str(edited[name])).astype(int) - cv2.imread(str(path)))
+            outside.append(change[~near].max())
+            inside.extend(change[mask > 0].ravel())
+    assert max(outside) <= 1 < np.mean(inside)
+
+
 def test_render_needs_no_points(data, tmp_path):
     write_ply(tmp_path / "m.ply", one_splat())
     colmap = tmp_path / "colmap"

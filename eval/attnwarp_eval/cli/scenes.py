@@ -5,7 +5,7 @@ effects, cost.
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
@@ -136,7 +136,7 @@ def _check_no_capture(folder: Path) -> None:
         return
     try:
         frames = json.loads(path.read_bytes())["frames"]
-        exported = all(EXPORTED.fullmatch(frame["file_path"]) for frame in frames)
+        exported = all(EXPORTED.fullmatch(PurePath(frame["file_path"]).name) for frame in frames)
     except (ValueError, LookupError, TypeError, RecursionError):
         exported = False
     if not exported:

@@ -108,7 +108,7 @@ def orbit(scene: Scene, count: int, size: int | None = None) -> list[Camera]:
     return cameras
 
 
-EXPORTED = re.compile(r"images/orbit_\d+_of_\d+\.png")
+EXPORTED = re.compile(r"orbit_\d+_of_\d+\.png")
 """Pictures of an export: its cameras' names are of :func:`orbit_name`."""
 
 
@@ -224,9 +224,10 @@ def export(
     seed: int = 0,
     progress: Tell = untold,
 ) -> Dataset:
-    """Write a scene as a data set: transforms.json, images/*.png and points.ply.
+    """Write a scene as a data set: transforms.json, images/*.png, masks/OBJECT/*.png, points.ply.
 
-    One view of eight is in the split "test", the others in "train". Files that exist are
+    One view of eight is in the split "test", the others in "train". A mask is white at the pixels
+    whose centres show its object; objects that no view shows have none. Files that exist are
     overwritten, and pictures of a former export removed; a folder without transforms.json is one
     whose export did not end.
 
@@ -251,18 +252,28 @@ def export(
     # It is written last: until then nothing may pass for the cameras of what is written here.
     (folder / "transforms.json").unlink(missing_ok=True)
     progress("points")
-    cloud = first_points(scene, points, noise=noise, seed=seed)
+    geometry = Geometry(scene)
+    cloud = first_points(scene, points, noise=noise, seed=seed, geometry=geometry)
     cameras = orbit(scene, views, size)
     paths: list[Path | None] = []
+    shown = []
     for k, camera in enumerate(cameras):
         progress(f"view {k + 1} of {views}")
         path = folder / "images" / f"{camera.name}.png"
         paths.append(write_picture(path, picture(scene, camera, spp)))
+        shown.append(geometry.trace(camera).object_id)
+    masks = []
+    for number in sorted({*np.unique(shown)} - {-1}):
+        of = folder / "masks" / scene.object_names[number]
+        for camera, ids in zip(cameras, shown, strict=True):
+            white = np.repeat(255 * (ids == number)[..., None].astype(np.uint8), 3, axis=-1)
+            masks.append(write_picture(of / f"{camera.name}.png", white))
     splits: list[str | None] = ["test" if out else "train" for out in held_out(views)]
     dataset = Dataset(cameras, paths, cloud.points, cloud.colors, splits)
     write_transforms(folder, dataset, points_name="points.ply")
     # Pictures of a former export with other views: programs that read the folder would mix both.
-    for other in set((folder / "images").glob("*.png")) - set(paths):
-        if EXPORTED.fullmatch(f"images/{other.name}"):
+    former = {*(folder / "images").glob("*.png"), *(folder / "masks").glob("*/*.png")}
+    for other in former - {*paths, *masks}:
+        if EXPORTED.fullmatch(other.name):
             other.unlink()
     return dataset

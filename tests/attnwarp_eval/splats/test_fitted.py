@@ -1,6 +1,7 @@
 """Views to fit on, the exported folder, and the probe that measures a fit."""
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -108,6 +109,30 @@ def test_an_exported_scene_reads_back_as_it_is(spheres, tmp_path):
         np.testing.assert_allclose(theirs.K, ours.K, rtol=1e-15)
         image = cv2.imread(str(path))[..., ::-1]
         np.testing.assert_array_equal(image, export.picture(spheres, ours, 1))
+
+
+def test_exported_masks_are_the_pixels_whose_rays_meet_the_object_first(spheres, tmp_path):
+    """Closed form: rays through pixel centres and the scene's six balls, which nothing else hides."""
+    balls = {
+        item.name: (np.array(item.shape.center), item.shape.radius)
+        for item in spheres.spec.objects if item.shape.type == "sphere"
+    }  # fmt: skip
+    data = export.export(spheres, tmp_path, views=5, size=48, spp=1, points=20)
+    assert len(balls) == 6
+    for camera in data.cameras:
+        rays = camera.directions() @ camera.rotation
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        nearest = []
+        for center, radius in balls.values():
+            to = center - camera.position
+            along = rays @ to
+            square = radius**2 - (to @ to - along**2)
+            nearest.append(np.where(square > 0, along - np.sqrt(np.maximum(square, 0)), np.inf))
+        first = np.argmin(nearest, axis=0)
+        for number, name in enumerate(balls):
+            file = tmp_path / "masks" / name / f"{Path(camera.name).stem}.png"
+            expected = (first == number) & np.isfinite(nearest[number])
+            np.testing.assert_array_equal(cv2.imread(str(file))[..., 0] == 255, expected)
 
 
 def test_an_export_that_stops_half_way_leaves_no_cameras_of_the_one_before(

@@ -119,7 +119,7 @@ class Editing(Part):
     editor: EditorPart = EditorPart()
     edits: dict[str, dict[str, str | None]] = Field(default_factory=dict)
     options: dict[str, Any] = Field(
-        default_factory=dict, description="fields of attnwarp.methods.PropagateSettings"
+        default_factory=dict, description="fields of attnwarp.methods.AttentionWarpingSettings"
     )
     by_yaw: list[str] = Field(default_factory=list)
     choice: list[str] = Field(

@@ -1,0 +1,56 @@
+"""A scene of the evaluation harness in place of a person's capture: `attnwarp edit bear`."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import typer
+
+from attnwarp.cli.shell import echo
+
+VIEWS, SIZE = 24, 128
+"""Pictures of a bundled scene, and their edge in px: the larger size of the bundled editors."""
+
+
+def is_scene(name: str) -> bool:
+    """Whether the evaluation harness, where it is installed, ships a scene of that name."""
+    package = find_spec("attnwarp_eval")
+    folders = package.submodule_search_locations if package is not None else None
+    return any((Path(folder) / "scenes" / f"{name}.yaml").is_file() for folder in folders or ())
+
+
+def capture(name: str, folder: Path) -> Path:
+    """Render a scene's pictures, points and exact masks into a folder; what is there is kept.
+
+    Raises:
+        typer.Exit: the harness failed, and said why.
+    """
+    if not (folder / "transforms.json").is_file():  # it is written last
+        echo(f"{name}: a bundled scene; rendering {VIEWS} pictures of it: {folder}")
+        # The library does not import the instrument: its command runs beside this one.
+        command = [sys.executable, "-m", "attnwarp_eval", "scenes", "export", name, str(folder)]
+        options = ["--views", str(VIEWS), "--size", str(SIZE)]
+        done = subprocess.run([*command, *options], stdout=subprocess.DEVNULL, check=False)
+        if done.returncode:
+            raise typer.Exit(done.returncode)
+    return folder
+
+
+def exact_masks(folder: Path, instruction: str) -> Path | None:
+    """Exact masks of the object that an instruction names, in a folder of :func:`capture`.
+
+    Returns:
+        The folder of masks; None, which is said, where the instruction names no object.
+    """
+    objects = sorted(path.name for path in (folder / "masks").iterdir())
+    words = f" {' '.join(re.findall(r'[a-z0-9]+', instruction.lower()))} "
+    named = [name for name in objects if f" {name.replace('_', ' ')} " in words]
+    if not named:
+        echo(f"the whole picture is edited: {instruction!r} names none of {', '.join(objects)}")
+        return None
+    echo(f"nothing but the {named[0]} is edited, inside its exact mask: {folder / 'masks'}")
+    return folder / "masks" / named[0]
