@@ -27,7 +27,7 @@ def run(
         Path | None, typer.Option(help="The run's folder; runs/<study> if left out.")
     ] = None,
     jobs: Annotated[
-        int, typer.Option("--jobs", "-j", min=1, help="Worker processes; 1 stays in this one.")
+        int, typer.Option("--jobs", "-j", min=1, help="Worker processes, at most one a core.")
     ] = 1,
     scheduler: Annotated[
         str | None,

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import json
 import logging
+import multiprocessing
 import queue
 import signal
-import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from attnwarp.errors import InputError
-from attnwarp.process import STOPS, core_count, heeded
+from attnwarp.process import core_count
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probes import probe
@@ -156,7 +158,6 @@ def run_on_workers(
         Each cell as it ends, with what went wrong.
     """
     import dask
-    from distributed import Client, LocalCluster
 
     threads = max(1, core_count() // jobs)
     # dask has workers give freed memory back at once; image-sized arrays then cost more page faults
@@ -175,10 +176,25 @@ def run_on_workers(
         # First, so that it ends last: a cluster that closes lets dask speak of broken connections.
         stack.enter_context(_silent())
         stack.enter_context(dask.config.set(settings))
-        with _signals_wait(), _errors_of_dask("the worker processes could not be started"):
+        client = stack.enter_context(_local_client(jobs))
+        yield from _Runner(client, cells, _Local(root, threads), started).run()
+
+
+@contextlib.contextmanager
+def _local_client(jobs: int) -> Iterator[Client]:
+    """A client of new worker processes on this machine.
+
+    A cluster starts and ends in a thread, and processes that an error or Ctrl-C leaves are killed
+    meanwhile: dask itself waits for those that start, and for cells.
+    """
+    from distributed import Client, LocalCluster
+
+    with ThreadPoolExecutor(1) as thread:
+        with _without_ctrl_c():
             # No memory limit: near one dask pauses a worker for good, since a world's caches are
             # never given back.
-            cluster = LocalCluster(
+            starting = thread.submit(
+                LocalCluster,
                 n_workers=jobs,
                 processes=True,
                 threads_per_worker=1,
@@ -188,9 +204,26 @@ def run_on_workers(
                 dashboard_address="127.0.0.1:0",
                 scheduler_kwargs={"dashboard": False},
             )
-            stack.enter_context(_closed(cluster))
-            client = stack.enter_context(_closed(Client(cluster)))
-        yield from _Runner(client, cells, _Local(root, threads), started).run()
+        try:
+            with _errors_of_dask("the worker processes could not be started"):
+                client = Client(starting.result())
+            with _closed(client):
+                yield client
+        except BaseException:
+            _kill_workers_until_done(starting)
+            if not starting.exception():
+                _kill_workers_until_done(thread.submit(starting.result().close))
+            raise
+        with contextlib.suppress(OSError, RuntimeError):
+            starting.result().close()
+
+
+def _kill_workers_until_done(end: concurrent.futures.Future[Any]) -> None:
+    while not end.done():
+        for process in multiprocessing.active_children():
+            if process.name.startswith("Dask Worker"):
+                process.kill()
+        concurrent.futures.wait([end], timeout=0.1)
 
 
 def run_on_scheduler(
@@ -293,31 +326,18 @@ def _errors_of_dask(what: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _signals_wait() -> Iterator[None]:
-    """Worker processes that start inside never see Ctrl-C: this process receives it and ends them.
-
-    Ctrl-C and a polite kill wait until they run: dask cannot end a cluster that has started by
-    half, and would leave its workers behind.
+def _without_ctrl_c() -> Iterator[None]:
+    """Threads that start inside, and their worker processes, never see Ctrl-C: the main thread
+    receives it and ends them.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     # Threads and processes inherit what is blocked. multiprocessing's tracker, started by the first
     # process, would unblock it.
     resource_tracker.ensure_running()
-    received: list[int] = []
-    former = {n: signal.getsignal(n) for n in heeded((signal.SIGINT, *STOPS))}
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    for number in former:
-        signal.signal(number, lambda number, frame: received.append(number))
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)  # one that waited comes here
-        for number, handler in former.items():
-            signal.signal(number, handler)
-        if received:  # in place of dask's error where the workers received the signal too
-            signal.raise_signal(received[0])
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
 class _Runner:

@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from attnwarp.errors import InputError
+from attnwarp.process import core_count
 from attnwarp_eval.cost import environment
 from attnwarp_eval.scene.base import silence_notices
 from attnwarp_eval.scene.file import load_scene
@@ -294,7 +295,8 @@ def execute(
     Args:
         plan: what to do.
         store: the run's folder.
-        jobs: worker processes; 1 stays in this process. The numbers do not depend on it.
+        jobs: worker processes, at most one a cell and a core; 1 stays in this process. The
+            numbers do not depend on it.
         scheduler: address or file of a dask scheduler, whose workers compute instead.
         keep_going: go on after a failed cell; else stop at the first.
         listen: called at every start and end.
@@ -305,6 +307,7 @@ def execute(
         ClusterLost: the connection to the scheduler broke; what had ended is stored.
     """
     start = time.perf_counter()
+    jobs = min(jobs, len(plan.todo), core_count())
     store.write_study(expected(plan))
     summary = Summary(expected=len(plan.cells), reused=plan.reused)
 

@@ -6,15 +6,14 @@ import pathlib
 import signal
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
 import yaml
 
+from attnwarp.process import core_count
 from attnwarp_eval.report.results import lines, read_results
 from attnwarp_eval.study import load_study
-from attnwarp_eval.study.cluster import _signals_wait
 from attnwarp_eval.study.run import execute, plan
 from attnwarp_eval.study.store import Store
 
@@ -25,7 +24,6 @@ STUDY = {
     "views": ["yaw030"],
     "feature_sizes": [16],
     "spp": 1,
-    "splats": {"count": 200},
     "variants": {f"splats {n}": {"splats": {"count": n}} for n in (200, 300, 400)},
     "probes": {"depth": ["splats 200", "splats 300", "splats 400"]},
 }
@@ -36,16 +34,21 @@ WITHOUT_GIT = {**os.environ, "GIT_DIR": "/nonexistent"}
 
 def command(run):
     program = [sys.executable, "-m", "attnwarp_eval", "run", "study.yaml"]
-    return [*program, "--out", str(run), "--jobs", "2"]
+    return [*program, "--out", str(run), "--jobs", "64"]
+
+
+def children(pid):
+    """Living processes that ``pid`` started."""
+    tasks = pathlib.Path(f"/proc/{pid}/task").glob("*")
+    return [int(child) for task in tasks for child in read(task / "children").split()]
 
 
 def workers(pid):
-    """Living worker processes below ``pid``."""
+    """Living worker processes below ``pid``, and those that they started themselves."""
     pids = []
-    for task in pathlib.Path(f"/proc/{pid}/task").glob("*"):
-        for child in read(task / "children").split():
-            pids += [int(child)] if is_worker(child) else []
-            pids += workers(child)
+    for child in children(pid):
+        pids += [child] if is_worker(child) else []
+        pids += workers(child)
     return pids
 
 
@@ -70,21 +73,35 @@ def finish(folder, run):
     return list(lines(read_results(store), timings=False))
 
 
-KILLS_ITSELF = "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
+STARTS_WORKERS = """
+from attnwarp_eval.study.cluster import _local_client
+if __name__ == "__main__":
+    with _local_client(16):
+        print("started")
+"""
 
 
-def test_ctrl_c_waits_while_workers_start_and_none_of_them_sees_it():
-    done = []
-    with pytest.raises(KeyboardInterrupt), _signals_wait():
-        os.kill(os.getpid(), signal.SIGINT)
-        # A worker's process is started by a thread of dask's.
-        thread = threading.Thread(
-            target=lambda: done.append(subprocess.run([sys.executable, "-c", KILLS_ITSELF]))
-        )
-        thread.start()
-        thread.join()
-    assert done[0].returncode == 0
-    assert subprocess.run([sys.executable, "-c", KILLS_ITSELF]).returncode != 0
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0, 1, 3])
+def test_ctrl_c_ends_workers_that_are_many_and_still_start_within_five_seconds(tmp_path, seconds):
+    (tmp_path / "starts.py").write_text(STARTS_WORKERS)
+    process = subprocess.Popen(
+        [sys.executable, "starts.py"], cwd=tmp_path, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+    )  # fmt: skip
+    started = set()
+    while not started and process.poll() is None:
+        started.update(workers(process.pid))
+        time.sleep(0.01)
+    time.sleep(seconds)
+    started.update(workers(process.pid))
+    begin = time.monotonic()
+    os.killpg(process.pid, signal.SIGINT)
+    out, errors = process.communicate(timeout=120)
+    assert time.monotonic() - begin < 5
+    assert out == "" and errors.splitlines()[-1].startswith("KeyboardInterrupt")
+    assert errors.count("Traceback") == 1  # none of a worker
+    assert started and not any(map(is_worker, started))
 
 
 @pytest.mark.parametrize(
@@ -108,10 +125,11 @@ def test_a_stop_of_a_run_on_workers_says_what_is_kept_and_leaves_none_of_them(
         command(run), cwd=tmp_path, env=WITHOUT_GIT, text=True,
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True,
     )  # fmt: skip
-    started = set()
+    started, own = set(), set()
     deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
         started.update(workers(process.pid))
+        own.update(filter(is_worker, children(process.pid)))
         if started and (moment == "workers start" or list((run / "cells").rglob("*.json"))):
             break
         time.sleep(0.01)
@@ -122,6 +140,7 @@ def test_a_stop_of_a_run_on_workers_says_what_is_kept_and_leaves_none_of_them(
     last = f"interrupted; {len(kept)} cells are kept, the same command goes on from here\n"
     assert message.endswith(f"attnwarp-eval: {last}") and "Traceback" not in message
     assert started and not any(map(is_worker, started))
+    assert len(own) <= min(core_count(), 4)  # cells
     results = finish(tmp_path, run)
     assert {name: Store(run).path(name[:-5]).stat().st_mtime_ns for name in kept} == kept
     assert results and results == finish(tmp_path, tmp_path / "undisturbed")
