@@ -105,12 +105,12 @@ def welch_interval(
     """
     from scipy import stats
 
-    first, second = _samples(a, b)
-    difference, variance, freedom = map(float, _difference(first, second))
+    test = welch(a, b)
+    difference = float(test.difference)
     # Samples without noise: what is left is the rounding of equal numbers, whatever their unit.
-    if math.sqrt(variance) <= 1e-12 * max(np.abs(first).max(), np.abs(second).max()):
+    if test.error <= 1e-12 * max(np.abs(a).max(), np.abs(b).max()):
         return difference, difference, difference
-    reach = float(stats.t.ppf(0.5 + level / 2, freedom)) * math.sqrt(variance)
+    reach = float(stats.t.ppf(0.5 + level / 2, test.freedom) * test.error)
     return difference, difference - reach, difference + reach
 
 

@@ -298,14 +298,11 @@ def benjamini_hochberg(p: Sequence[float]) -> list[float]:
         >>> [round(p, 6) for p in benjamini_hochberg([0.01, 0.04, 0.03, float("nan")])]
         [0.03, 0.04, 0.04, nan]
     """
-    values = np.asarray(p, dtype=np.float64)
-    adjusted = np.full(values.shape, np.nan)
-    defined = np.flatnonzero(np.isfinite(values))
-    order = defined[np.argsort(values[defined], kind="stable")]
-    smallest = 1.0
-    for rank in range(len(order), 0, -1):
-        smallest = min(smallest, float(values[order[rank - 1]]) * len(order) / rank)
-        adjusted[order[rank - 1]] = smallest
+    from scipy import stats
+
+    adjusted = np.array(p, dtype=np.float64)
+    defined = np.isfinite(adjusted)
+    adjusted[defined] = stats.false_discovery_control(adjusted[defined])
     return [float(v) for v in adjusted]
 
 

@@ -6,10 +6,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
 from attnwarp_eval.statistics.intervals import ROUNDING, ByView
 
@@ -64,23 +62,12 @@ def _power(mean: float, deviation: float, scenes: int, level: float) -> float:
 
 
 def _noncentral(t: float, free: int, shift: float) -> float:
-    """The distribution function of a noncentral t with ``free`` degrees of freedom.
-
-    That of (normal + shift) / sqrt(chi^2 / free), averaged over quantiles of the latter: within
-    1e-4, and defined for every shift, where scipy's has no value for large ones.
-    """
+    """The distribution function of a noncentral t with ``free`` degrees of freedom."""
     from scipy import special
 
-    return float(special.ndtr(t * _roots(free) - shift).mean())
-
-
-@lru_cache(maxsize=64)
-def _roots(free: int) -> npt.NDArray[np.float64]:
-    from scipy import stats
-
-    quantiles = (np.arange(2000) + 0.5) / 2000
-    roots: npt.NDArray[np.float64] = np.sqrt(stats.chi2.ppf(quantiles, free) / free)
-    return roots
+    value = float(special.nctdtr(free, shift, t))
+    # scipy gives NaN in far tails, where the value is 0 or 1.
+    return value if math.isfinite(value) else float(t > shift)
 
 
 def effect_interval(
@@ -106,7 +93,7 @@ def effect_interval(
     from scipy import optimize
 
     observed = mean / deviation * math.sqrt(scenes)
-    reach = 10 + 5 * abs(observed)  # no root of a chi^2 over its mean is 5 within these quantiles
+    reach = 10 + 5 * abs(observed)
 
     def bound(share: float) -> float:
         def missed(shift: float) -> float:

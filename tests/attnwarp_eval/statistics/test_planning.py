@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import integrate, stats
 
 from attnwarp_eval.statistics.planning import (
     MOST_SCENES,
@@ -61,11 +61,16 @@ def test_four_of_five_intervals_of_an_effect_have_it(effect, scenes):
     assert np.mean([low <= effect <= high for low, high in bounds]) == pytest.approx(0.8, abs=0.04)
 
 
-def test_bounds_of_an_effect_are_scipys_where_scipy_has_them_and_defined_beyond():
+def test_bounds_of_an_effect_are_those_of_an_integral_and_defined_in_far_tails():
+    """Oracle: the noncentral t is (normal + shift) / (chi / sqrt(freedom)), integrated over chi."""
     low, high = effect_interval(1.0, 1.0, 6)
     for bound, share in ((low, 0.9), (high, 0.1)):
-        shift = bound * math.sqrt(6)
-        assert stats.nct.cdf(math.sqrt(6), 5, shift) == pytest.approx(share, abs=1e-4)
+
+        def below(chi, bound=bound):
+            t = math.sqrt(6) * (chi / math.sqrt(5) - bound)
+            return stats.norm.cdf(t) * stats.chi.pdf(chi, 5)
+
+        assert integrate.quad(below, 0, 20)[0] == pytest.approx(share, abs=1e-7)
     low, high = effect_interval(-50.0, 1e-3, 6)
     assert -8e4 < low < -5e4 < high < -2e4
 
