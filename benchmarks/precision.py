@@ -248,7 +248,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         ("color", "alpha", "weight"),
         ("normal",),
         ("depth", "median_depth"),
-        ("distortion_l1", "distortion_l2_ndc"),
+        ("distortion_l1", "distortion_ordered", "distortion_l2_ndc"),
     )
     for row in rows:
         cells = [f"{row['ratio']:.0e}", row["mode"]]

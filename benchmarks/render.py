@@ -123,7 +123,7 @@ def _differentiate(splats: Gaussians, view: Camera) -> None:
     """A forward and a backward pass. Upstream gradients of ones: the loss is not what is
     measured."""
     traced = render(splats, view, backend="cpu")
-    outputs = [traced.color, traced.alpha, traced.normal, traced.distortion_l1]
+    outputs = [traced.color, traced.alpha, traced.normal, traced.distortion_ordered]
     ones = torch.ones(view.height, view.width)
     torch.autograd.backward(
         outputs, [ones[..., None].expand_as(o) if o.ndim == 3 else ones for o in outputs]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -27,8 +27,9 @@ class Render:
     mode.
 
     Per pixel, w_i = alpha_i prod_{j<i} (1 - alpha_j) is the share of splat i, z_i its depth there.
-    Backend "cuda" leaves out what gsplat cannot give: there ``median_depth`` and ``distortion_l1``
-    are NaN everywhere, ``weight`` carries no gradient, and ``counters`` holds only "splats".
+    Backend "cuda" leaves out what gsplat cannot give: there ``median_depth``,
+    ``distortion_ordered`` and ``distortion_l1`` are NaN everywhere, ``weight`` carries no gradient,
+    and ``counters`` holds only "splats".
 
     Attributes:
         color: (H, W, C) sum w_i c_i + (1 - alpha) background: sRGB colour, or the features passed
@@ -41,9 +42,9 @@ class Render:
             splat's. NaN everywhere from backend "cuda".
         normal: (H, W, 3) sum w_i n_i in world axes, each n_i turned to face the camera; its length
             is at most alpha.
-        distortion_l1: (H, W) sum over ordered pairs of w_i w_j |z_i - z_j| (2DGS paper, gsplat), 2
-            sum_{j<i} w_i w_j (z_i - z_j) in compositing order: the two agree where depth grows
-            along that order. Scene units. NaN everywhere from backend "cuda".
+        distortion_ordered: (H, W) 2 sum_{j<i} w_i w_j (z_i - z_j) in compositing order (gsplat):
+            ``distortion_l1`` where depth grows along that order. A pair out of order counts
+            negative. Scene units. NaN everywhere from backend "cuda".
         distortion_l2_ndc: (H, W) sum_{j<i} w_i w_j (m_i - m_j)^2 with m = far / (far - near) (1 -
             near / z) and the planes ``ndc`` (the original 2DGS code). No unit.
         weight: (N,) sum over pixels of w_i: how much of the picture a splat makes up; 0 means it is
@@ -87,7 +88,7 @@ class Render:
     depth: Tensor
     median_depth: Tensor
     normal: Tensor
-    distortion_l1: Tensor
+    distortion_ordered: Tensor
     distortion_l2_ndc: Tensor
     weight: Tensor
     counters: dict[str, int] = field(repr=False)
@@ -95,6 +96,19 @@ class Render:
     depth_mode: str
     backend: str
     _pose: Tensor = field(repr=False)
+    _exact: Callable[[], Tensor] = field(repr=False)
+
+    @cached_property
+    def distortion_l1(self) -> Tensor:
+        """(H, W) sum over ordered pairs of w_i w_j |z_i - z_j| (2DGS paper), in scene units.
+
+        Every pair of splats counts twice, as in the paper's sum over i and j. Made on first use, by
+        a second pass over the splats; differentiable. NaN everywhere from backend "cuda".
+
+        Raises:
+            RuntimeError: the splats were modified in place since they were rendered.
+        """
+        return self._exact()
 
     @cached_property
     def valid(self) -> Tensor:
@@ -178,7 +192,8 @@ def render(
     Gradients reach every tensor that requires them: means, quats, scales, opacities, sh (or
     ``features``), ``pose`` and ``background``. They come from every output except
     ``Render.counters`` and the mask ``valid``. Backend "cuda" gives none from ``weight``. Its
-    ``median_depth`` and ``distortion_l1`` are NaN, so a loss must not use them.
+    ``median_depth``, ``distortion_ordered`` and ``distortion_l1`` are NaN, so a loss must not use
+    them.
 
     Args:
         gaussians: N splats of kind "2d" (2DGS) or "3d" (3DGS), float32 or float64.
@@ -274,7 +289,11 @@ def _result(
         )
     values = {name: getattr(outputs, name) for name in Outputs.__dataclass_fields__}
     return Render(
-        **values, camera=used, depth_mode=inputs.depth, backend=backend, _pose=inputs.pose
+        **{"_exact" if name == "exact" else name: value for name, value in values.items()},
+        camera=used,
+        depth_mode=inputs.depth,
+        backend=backend,
+        _pose=inputs.pose,
     )
 
 

@@ -9,6 +9,8 @@
 4. Rasterization: composite tile by tile, square by square, until every pixel is opaque.
 5. Backward: the same tiles back to front, a row of gradients for each splat of a tile; each splat's
    rows are summed, and taken to the parameters and the pose.
+6. Exact distortion, for who asks for it: the same tiles front to back once more, in the backward
+   pass too.
 
 Threads follow ``torch.set_num_threads``; the result has the same bits for any number of them.
 """
@@ -17,6 +19,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,6 +28,7 @@ import torch
 from attnwarp.render import _pool
 from attnwarp.render._kernels import (
     backward,
+    distortion,
     evaluation,
     layout,
     projection_backward,
@@ -39,12 +43,12 @@ from attnwarp.render.binned import (
     join,
 )
 from attnwarp.render.dispatch import call
-from attnwarp.render.interface import OUTPUTS, Inputs, Outputs
+from attnwarp.render.interface import OUTPUTS, PICTURES, Inputs, Outputs
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 
 MAP_READERS = {
-    "alpha": ("depth", "distortion_l1", "distortion_l2_ndc", "background"),
-    "depth": ("depth", "distortion_l1"),
+    "alpha": ("depth", "distortion_ordered", "distortion_l2_ndc", "distortion_l1", "background"),
+    "depth": ("depth", "distortion_ordered", "distortion_l1"),
 }
 """Outputs whose gradients read a map that the caller holds, and the background, whose own does."""
 
@@ -90,6 +94,58 @@ def _workspace(channels: int) -> rasterization.Workspace:
         entries,
         np.empty(rasterization.BLOCK, np.int32),
     )
+
+
+def _pairs_workspace(room: int) -> distortion.Workspace:
+    return distortion.Workspace(
+        aligned(distortion.BUFFER_FLOATS),
+        aligned(distortion.WORK_FLOATS),
+        aligned_doubles(evaluation.MOMENTS),
+        _pool.empty(room * distortion.PAST, np.float32),
+        _pool.empty(room, np.int64),
+        np.empty(layout.SQUARES, np.int64),
+    )
+
+
+def _rooms(lists: layout.Lists) -> np.ndarray:
+    """(tiles,) how many places the splats of each tile need in ``distortion.Workspace``."""
+    squares = distortion.bits(lists.entries >> layout.PLACE_BITS)
+    before = np.concatenate([[0], np.cumsum(squares)])
+    return before[lists.starts + lists.counts] - before[lists.starts]
+
+
+def _exact_distortion(drawn: _Drawn) -> torch.Tensor:
+    """(H, W) ``distortion_l1`` of what was drawn with its state."""
+    binned, state = drawn.binned, drawn.pictures.state
+    target = _pool.empty(state.shape[1:], np.float32)
+    rooms = _rooms(binned.lists)[binned.tiles.order]
+
+    def work(first: int, last: int) -> None:
+        space = _pairs_workspace(int(rooms[first:last].max()))
+        call(
+            distortion.distort,
+            first, last, binned.view, binned.tiles, binned.lists, binned.table, state, target,
+            space,
+        )  # fmt: skip
+
+    run_jobs(work, binned.pieces(binned.lists.counts))
+    return torch.from_numpy(target)
+
+
+class _Exact(torch.autograd.Function):
+    """The exact distortion, made when it is first asked for.
+
+    Its gradient goes to a placeholder among the outputs of ``_Composite``, whose backward pass
+    takes it on with those of the other outputs.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, placeholder: torch.Tensor, drawn: _Drawn) -> torch.Tensor:
+        return _exact_distortion(drawn)
+
+    @staticmethod
+    def backward(ctx: Any, upstream: torch.Tensor) -> tuple[torch.Tensor, None]:
+        return upstream, None
 
 
 def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
@@ -166,23 +222,23 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, inputs: Inputs, counters: dict[str, int], *tensors: torch.Tensor
+        ctx: Any, inputs: Inputs, kept: list[_Drawn], *tensors: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
         drawn = _draw(inputs, with_state=any(ctx.needs_input_grad))
-        counters.update(drawn.counters)
+        kept.append(drawn)
         ctx.drawn = drawn
         ctx.origin = as_array(inputs.origin, np.float64)
         ctx.shapes = [(t.shape, t.dtype) for t in tensors]
         ctx.set_materialize_grads(False)
-        arrays = (*drawn.pictures[:-1], drawn.weight)
-        outputs = tuple(torch.from_numpy(array) for array in arrays)
+        outputs = tuple(torch.from_numpy(array) for array in drawn.pictures[:-1])
         _, alpha, depth, *_ = outputs
         # Saved so that torch notices when one of them is changed in place before the backward pass.
         ctx.save_for_backward(*tensors)
         # Not saved, as most gradients read neither. Detached, they hold no graph, but they share
         # the caller's memory and its count of changes in place.
         ctx.maps = {"alpha": alpha.detach(), "depth": depth.detach()}
-        return outputs
+        placeholder = torch.zeros(1).expand(inputs.height, inputs.width)
+        return *outputs, placeholder, torch.from_numpy(drawn.weight)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -192,7 +248,9 @@ class _Composite(torch.autograd.Function):
         if ctx.needs_input_grad[8] and "color" in wanted:
             wanted.add("background")
         drawn = _with_sound_maps(ctx.drawn, ctx.maps, wanted)
-        shapes = [array.shape for array in (*drawn.pictures[:-1], drawn.weight)]
+        height, width = drawn.pictures.alpha.shape
+        exact = (height if "distortion_l1" in wanted else 0, width)
+        shapes = [*(picture.shape for picture in drawn.pictures[:-1]), exact, drawn.weight.shape]
         given = layout.Upstream(
             *(
                 _pool.zeros(shape, np.float32) if grad is None else as_array(grad, np.float32)
@@ -281,6 +339,8 @@ def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:
     columns = layout.GRADIENTS + 3 + max(3, binned.channels)
     total = _pool.zeros((n, columns), np.float64)
     order, counts = binned.tiles.order, binned.lists.counts
+    exact = len(upstream.exact) > 0
+    rooms = _rooms(binned.lists)[order] if exact else np.zeros(tile_count, np.int64)
     before = np.concatenate([[0], np.cumsum(counts[order])])
     buffer = np.empty((0, columns), np.float32)
     first = 0
@@ -298,30 +358,21 @@ def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:
         pieces = 8 * thread_count()
         cuts = np.searchsorted(before, np.linspace(before[first], before[last], pieces + 1)[1:-1])
         edges = sorted({first, *(int(c) for c in cuts if first < c < last), last})
-        run_jobs(
-            backward.rasterize_backward,
-            [
-                (
-                    begin,
-                    end,
-                    binned.view,
-                    binned.tiles,
-                    binned.lists,
-                    binned.table,
-                    binned.background,
-                    drawn.ndc_scale,
-                    drawn.pictures,
-                    upstream,
-                    rows,
-                    backward.Workspace(
-                        aligned(backward.buffer_floats(binned.channels)),
-                        aligned(backward.WORK_FLOATS),
-                        aligned_doubles(evaluation.MOMENTS),
-                    ),
-                )
-                for begin, end in itertools.pairwise(edges)
-            ],
-        )
+
+        def work(begin: int, end: int, rows: layout.Rows = rows) -> None:
+            space = backward.Workspace(
+                aligned(backward.buffer_floats(binned.channels)),
+                aligned(backward.WORK_FLOATS),
+                aligned_doubles(evaluation.MOMENTS),
+                _pairs_workspace(int(rooms[begin:end].max())),
+            )
+            call(
+                backward.rasterize_backward,
+                begin, end, binned.view, binned.tiles, binned.lists, binned.table,
+                binned.background, drawn.ndc_scale, drawn.pictures, upstream, rows, space,
+            )  # fmt: skip
+
+        run_jobs(work, list(itertools.pairwise(edges)))
         # Threads partition splats, so each splat's rows are summed in tile order: same bits for any
         # thread count.
         run_jobs(
@@ -337,10 +388,10 @@ def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:
 
 def render(inputs: Inputs) -> Outputs:
     """Render on the CPU; see :func:`attnwarp.render.render`."""
-    counters: dict[str, int] = {}
+    kept: list[_Drawn] = []
     tensors = _Composite.apply(
         inputs,
-        counters,
+        kept,
         inputs.means,
         inputs.quats,
         inputs.scales,
@@ -349,4 +400,35 @@ def render(inputs: Inputs) -> Outputs:
         inputs.pose,
         inputs.background,
     )
-    return Outputs(**dict(zip(OUTPUTS, tensors, strict=True)), counters=counters)
+    (drawn,) = kept
+    *pictures, placeholder, weight = tensors
+    # Without gradients nothing is left for a second pass, which most pictures never need.
+    exact = (
+        partial(_exact_distortion_later, placeholder, drawn)
+        if placeholder.requires_grad
+        else partial(_exact_distortion_anew, inputs, _versions(inputs))
+    )
+    outputs = dict(zip(PICTURES, pictures, strict=True))
+    return Outputs(**outputs, weight=weight, counters=drawn.counters, exact=exact)
+
+
+def _exact_distortion_later(placeholder: torch.Tensor, drawn: _Drawn) -> torch.Tensor:
+    # Whoever reads it first may have switched gradients off; others read the same.
+    with torch.enable_grad():
+        result: torch.Tensor = _Exact.apply(placeholder, drawn)
+    return result
+
+
+def _versions(inputs: Inputs) -> list[int]:
+    tensors = (inputs.means, inputs.quats, inputs.scales, inputs.opacities)
+    return [0 if tensor.is_inference() else tensor._version for tensor in tensors]
+
+
+def _exact_distortion_anew(inputs: Inputs, versions: list[int]) -> torch.Tensor:
+    if _versions(inputs) != versions:
+        raise RuntimeError(
+            "distortion_l1: is made when it is first read, and the splats were modified by an"
+            " inplace operation since they were rendered; read it before that"
+        )
+    with torch.no_grad():
+        return _exact_distortion(_draw(inputs, with_state=True))

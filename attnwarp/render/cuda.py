@@ -128,10 +128,11 @@ def composite(inputs: Inputs, rasterizer: object) -> Outputs:
         depth=torch.where(drawn, sums[..., c + 3] / safe, nan),
         median_depth=nan,
         normal=sums[..., c : c + 3],
-        distortion_l1=nan.clone(),
+        distortion_ordered=nan.clone(),
         distortion_l2_ndc=scale * (alpha * sums[..., c + 5] - sums[..., c + 4] ** 2).clamp(min=0),
         weight=weight[:, 0],
         counters={"splats": len(means)},
+        exact=nan.clone,
     )
 
 

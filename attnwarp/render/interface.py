@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from torch import Tensor
 
@@ -43,18 +44,35 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Outputs:
-    """What a backend returns; the fields are those of :class:`attnwarp.render.Render`."""
+    """What a backend returns; the outputs are those of :class:`attnwarp.render.Render`."""
 
     color: Tensor
     alpha: Tensor
     depth: Tensor
     median_depth: Tensor
     normal: Tensor
-    distortion_l1: Tensor
+    distortion_ordered: Tensor
     distortion_l2_ndc: Tensor
     weight: Tensor
     counters: dict[str, int]
+    exact: Callable[[], Tensor]  # makes distortion_l1
+
+    @property
+    def distortion_l1(self) -> Tensor:
+        """(H, W), made anew at each use."""
+        return self.exact()
 
 
-OUTPUTS = tuple(field.name for field in fields(Outputs) if field.name != "counters")
-"""Names of the differentiable outputs, in the order of their fields."""
+PICTURES = (
+    "color",
+    "alpha",
+    "depth",
+    "median_depth",
+    "normal",
+    "distortion_ordered",
+    "distortion_l2_ndc",
+)
+"""Names of the outputs that are pictures and made at once."""
+
+OUTPUTS = (*PICTURES, "distortion_l1", "weight")
+"""Names of the differentiable outputs."""

@@ -112,20 +112,20 @@ def render(
             indexing="ij",
         )
         parts.append(splats.composite(x.reshape(-1), y.reshape(-1)))
-    merged = [torch.cat([part[k] for part in parts]) for k in range(7)]
+    merged = [torch.cat([part[k] for part in parts]) for k in range(8)]
     shape = (inputs.height, inputs.width)
     color, normal = merged[0].reshape(*shape, -1), merged[4].reshape(*shape, 3)
-    alpha, depth, median, l1, l2 = (merged[k].reshape(shape) for k in (1, 2, 3, 5, 6))
+    alpha, depth, median, ordered, l2, l1 = (merged[k].reshape(shape) for k in (1, 2, 3, 5, 6, 7))
     color = color + (1 - alpha)[..., None] * background
     weight = torch.zeros(len(means), dtype=torch.float64).index_add(
-        0, index, torch.stack([part[7] for part in parts]).sum(dim=0)
+        0, index, torch.stack([part[8] for part in parts]).sum(dim=0)
     )
     counters = {
         "splats": len(means),
         "pairs": len(means) * inputs.width * inputs.height,
-        "contributing": sum(int(part[8]) for part in parts),
+        "contributing": sum(int(part[9]) for part in parts),
     }
-    return Outputs(color, alpha, depth, median, normal, l1, l2, weight, counters)
+    return Outputs(color, alpha, depth, median, normal, ordered, l2, weight, counters, l1.clone)
 
 
 @dataclass(frozen=True)
@@ -143,8 +143,8 @@ class _Splats:
     limits: Thresholds
 
     def composite(self, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-        """Colour over black, alpha, depth, median, normal, l1, l2 per pixel, weight per splat,
-        contributing pairs.
+        """Colour over black, alpha, depth, median, normal, distortions (ordered, l2, l1) per
+        pixel, weight per splat, contributing pairs.
         """
         inputs, limits = self.inputs, self.limits
         rays = torch.stack(_unproject(x, y, self.K), dim=-1)
@@ -175,9 +175,13 @@ class _Splats:
             median = nan
         near, far = inputs.ndc
         m = far / (far - near) * (1 - near / z)
-        l1 = 2 * (w * (z * _before(w) - _before(w * z))).sum(dim=1)
+        ordered = _signed_gaps(w, z)
+        # By depth at the pixel, no pair is out of order. Depths that are equal in float32 stay in
+        # compositing order: |z_i - z_j| has no slope there, and the sign of rounding is none.
+        by_depth = z.detach().float().argsort(dim=1, stable=True)
+        l1 = _signed_gaps(w.gather(1, by_depth), z.gather(1, by_depth))
         l2 = (w * (m * m * _before(w) + _before(w * m * m) - 2 * m * _before(w * m))).sum(dim=1)
-        return color, total, depth, median, normal, l1, l2, w.sum(dim=0), drawn.sum()
+        return color, total, depth, median, normal, ordered, l2, l1, w.sum(dim=0), drawn.sum()
 
     def _extent(self, variance_z: Tensor) -> tuple[Tensor, Tensor]:
         near = self.inputs.near
@@ -266,6 +270,11 @@ class _Splats:
         along, across = (ray * center).sum(-1), (ray * ray).sum(-1)
         lo, hi = self._extent(sigma[:, 2, 2])
         return alpha, torch.minimum(torch.maximum(along / across, lo), hi), drawn
+
+
+def _signed_gaps(w: Tensor, z: Tensor) -> Tensor:
+    """Sum over ordered pairs of w_i w_j (z_i - z_j), each pair with the later one first."""
+    return 2 * (w * (z * _before(w) - _before(w * z))).sum(dim=1)
 
 
 def _before(values: Tensor) -> Tensor:

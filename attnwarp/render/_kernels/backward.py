@@ -11,7 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from attnwarp.render._kernels import distortion
 from attnwarp.render._kernels.compilation import bare, f32, f64, inlined, jit, prefetch, u64
+from attnwarp.render._kernels.distortion import PAST, PAST_AT, count_bits, pair_up, prepare
 from attnwarp.render._kernels.evaluation import (
     depth_from,
     evaluate,
@@ -78,15 +80,16 @@ class Slots(NamedTuple):
     alpha: int = 8
     d_depth: int = 9
     d_l2: int = 10
-    d_l1: int = 11
+    d_l1: int = 11  # of the ordered sum and of the exact one
     d_median: int = 12
     behind_alpha: int = 13
     behind_depth: int = 14
     # Begins with minus the gradient in alpha times the transmittance, which is all that alpha
     # changes with: where a pixel is opaque, a difference of sums of weights has no digits of it.
     behind_loss: int = 15
-    d_normal: int = 16  # (3)
-    d_color: int = 19  # (channels)
+    d_exact: int = 16
+    d_normal: int = 17  # (3)
+    d_color: int = 20  # (channels)
 
 
 SLOT = Slots()
@@ -115,6 +118,7 @@ class Workspace(NamedTuple):
     buffer: np.ndarray  # (buffer_floats,) float32, see Slots
     splat: np.ndarray  # (WORK_FLOATS,) float32, see WorkRegions
     moments: np.ndarray  # (MOMENTS,) float64; see lay_out
+    pairs: distortion.Workspace
 
 
 class DiscSums(NamedTuple):
@@ -219,8 +223,11 @@ def _select_drawn(buffer, p, background, scale):
     slot = SLOT.d_depth * PIXELS + p
     store(buffer, slot, select(drawn, load(buffer, slot) / A, zero))
     store(buffer, SLOT.d_l2 * PIXELS + p, select(drawn, d_l2 * A, zero))
+    slot = SLOT.d_exact * PIXELS + p
+    d_exact = load(buffer, slot) * f32(2.0)
+    store(buffer, slot, select(drawn, d_exact, zero))
     slot = SLOT.d_l1 * PIXELS + p
-    store(buffer, slot, select(drawn, load(buffer, slot) * f32(2.0), zero))
+    store(buffer, slot, select(drawn, load(buffer, slot) * f32(2.0) + d_exact, zero))
     slot = SLOT.d_median * PIXELS + p
     store(buffer, slot, select(drawn, load(buffer, slot), zero))
     slot = SLOT.depth * PIXELS + p
@@ -248,6 +255,8 @@ def _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream):
         copy4(buffer, SLOT.d_depth * PIXELS + p, upstream.depth, pixel)
         copy4(buffer, SLOT.d_l2 * PIXELS + p, upstream.l2, pixel)
         copy4(buffer, SLOT.d_l1 * PIXELS + p, upstream.l1, pixel)
+        if upstream.exact.shape[0] > 0:
+            copy4(buffer, SLOT.d_exact * PIXELS + p, upstream.exact, pixel)
         copy4(buffer, SLOT.d_median * PIXELS + p, upstream.median, pixel)
         separate4(buffer, SLOT.d_normal * PIXELS + p, PIXELS, upstream.normal, 3 * pixel)
         separate4(buffer, SLOT.d_color * PIXELS + p, PIXELS, upstream.color, 3 * pixel)
@@ -282,14 +291,24 @@ def _load_tile(buffer, tile, background, scale, pictures, upstream):
             buffer[u64(SLOT.behind_loss * PIXELS) + p] = -d_alpha * state[STATE.transmittance, y, x]
             buffer[u64(SLOT.d_depth * PIXELS) + p] = d_depth
             buffer[u64(SLOT.d_l2 * PIXELS) + p] = d_l2 * A
-            buffer[u64(SLOT.d_l1 * PIXELS) + p] = f32(2.0) * upstream.l1[y, x]
+            d_l1 = f32(2.0) * upstream.l1[y, x]
+            if upstream.exact.shape[0] > 0:
+                d_exact = f32(2.0) * upstream.exact[y, x]
+                buffer[u64(SLOT.d_exact * PIXELS) + p] = d_exact
+                d_l1 += d_exact
+            buffer[u64(SLOT.d_l1 * PIXELS) + p] = d_l1
             buffer[u64(SLOT.d_median * PIXELS) + p] = upstream.median[y, x]
             buffer[u64(SLOT.alpha * PIXELS) + p] = A
 
 
 @inlined
-def _blame(space, s, row, hit, alpha, z, inverse_z, step, d_weight, k, channels, features, out):
+def _blame(
+    space, s, row, hit, alpha, z, inverse_z, step, d_weight, k, channels, features, out, place
+):
     """Gradients of a splat's 16 pixels in its alpha and its z; moves the sums behind it on.
+
+    Args:
+        place: where its pairs out of order begin in ``space.pairs.past``; negative: not wanted.
 
     Returns:
         Its weights; alpha times the gradient in alpha; the gradient in z.
@@ -325,6 +344,10 @@ def _blame(space, s, row, hit, alpha, z, inverse_z, step, d_weight, k, channels,
     lean = load(buffer, SLOT.alpha * PIXELS + s) - w - two * behind_alpha
     g = g + d_l1 * (dz * lean + w_dz + two * behind_depth)
     in_z = w * (d_depth + d_l1 * lean)
+    if place >= 0:
+        d_twice, past = two * load(buffer, SLOT.d_exact * PIXELS + s), space.pairs.past
+        g = g + d_twice * load(past, place + PAST_AT.spread)
+        in_z = in_z + w * d_twice * load(past, place + PAST_AT.lean)
     is_median = step == load(buffer, SLOT.median_step * PIXELS + s)
     in_z = in_z + select(is_median, load(buffer, SLOT.d_median * PIXELS + s), zero)
     # Chain rule through 1/z: d(1/z)/dz = -1/z^2.
@@ -438,8 +461,11 @@ def _add_ellipsoid(work, nx, ny, in_alpha, in_z, by_center, sums):
 
 
 @inlined
-def _splat_backward(space, table, view, tile, k, step, squares, d_weight, channels, rows, line):
-    """The row of gradients of splat k of the table in a tile, from the squares it may show in."""
+def _splat_backward(
+    space, table, view, tile, k, step, squares, d_weight, channels, rows, line, place
+):
+    """The row of gradients of splat k of the table in a tile, from the squares it may show in;
+    ``place`` as in :func:`_blame`, of the first square."""
     buffer, work, moments = space.buffer, space.splat, space.moments
     discs, by_center = view.discs, view.by_center
     zero = load(buffer, SLOT.x * PIXELS) * f32(0.0)
@@ -473,12 +499,15 @@ def _splat_backward(space, table, view, tile, k, step, squares, d_weight, channe
         )
         z, inverse_z = depth_from(work, WORK.row, scaled, inverse, discs, by_center, zero, zero)
         hit = inside & (step <= load(buffer, SLOT.last_step * PIXELS + s))
+        pairs = place
+        if place >= 0:
+            place += PAST
         if not any_true(hit):
             continue
         hits += 1
         w, in_alpha, in_z = _blame(
             space, s, WORK.row, hit, alpha, z, inverse_z, step, d_weight, k, channels,
-            table.features, rows[line],
+            table.features, rows[line], pairs,
         )  # fmt: skip
         f0, f1, f2, f3, f4, f5 = _add_features(buffer, s, w, (f0, f1, f2, f3, f4, f5))
         sums = (b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14, b15, b16)
@@ -537,6 +566,9 @@ def rasterize_backward(
         buffer[SLOT.x * PIXELS + p] = f32(p // 16 % SIDE * 4 + p % 4) - f32(TILE / 2 - 0.5)
         buffer[SLOT.y * PIXELS + p] = f32(p // (16 * SIDE) * 4 + p // 4 % 4) - f32(TILE / 2 - 0.5)
     prepare_moments(space.moments, 0)
+    exact = upstream.exact.shape[0] > 0
+    if exact:
+        prepare(space.pairs)
     for visited in range(first, last):
         t = tiles.order[visited]
         begin, count = lists.starts[t], lists.counts[t]
@@ -549,6 +581,11 @@ def rasterize_backward(
             _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream)
         else:
             _load_tile(buffer, tile, background, scale, pictures, upstream)
+        places = 0
+        if exact:
+            places = pair_up(
+                space.pairs, table, view, tile, entries, begin, count, pictures.state, True
+            )
         for back in range(count):
             e = begin + count - 1 - back
             entry = entries[e]
@@ -557,9 +594,10 @@ def rasterize_backward(
             if squares != 0:
                 k, step = entry & PLACE, f32(e - begin + 1)
                 line = target.starts[t] + count - 1 - back
+                places -= count_bits(squares)
                 _splat_backward(
                     space, table, view, tile, k, step, squares, upstream.weight[k], channels,
-                    target.rows, line,
+                    target.rows, line, places * PAST if exact else -1,
                 )  # fmt: skip
 
 

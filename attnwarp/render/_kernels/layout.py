@@ -259,7 +259,7 @@ class Pictures(NamedTuple):
     depth: np.ndarray  # (H, W)
     median: np.ndarray  # (H, W)
     normal: np.ndarray  # (H, W, 3)
-    l1: np.ndarray  # (H, W)
+    l1: np.ndarray  # (H, W), ordered
     l2: np.ndarray  # (H, W)
     state: np.ndarray  # (5, H, W), see STATE; (5, 0, W) if there is no backward pass
 
@@ -296,8 +296,9 @@ class Upstream(NamedTuple):
     depth: np.ndarray  # (H, W)
     median: np.ndarray  # (H, W)
     normal: np.ndarray  # (H, W, 3)
-    l1: np.ndarray  # (H, W)
+    l1: np.ndarray  # (H, W), ordered
     l2: np.ndarray  # (H, W)
+    exact: np.ndarray  # (H, W), or (0, W) if there is none
     weight: np.ndarray  # (M,), in the order of depth
 
 

@@ -140,7 +140,7 @@ def test_gradients_with_scales_of_ratio_1e6_agree_with_autograd(
         ):
             scale = float(expected.abs().max())
             bound = 1e-4 * scale + 1e-9
-            if name == "distortion_l1" and leaf == 3:
+            if name in ("distortion_l1", "distortion_ordered") and leaf == 3:
                 bound = max(bound, rounded)
             assert float((actual - expected).abs().max()) <= bound, (name, leaf, scale)
 
@@ -264,6 +264,7 @@ def test_the_bits_do_not_depend_on_the_number_of_threads(kind, make_camera, make
                 view.color.sum()
                 + view.depth.nan_to_num().sum()
                 + view.distortion_l1.sum()
+                + view.distortion_ordered.sum()
                 + view.normal.sum()
             )
             loss.backward()
@@ -376,8 +377,8 @@ def test_changing_a_parameter_in_place_before_the_backward_pass_is_an_error(
 
 
 READ_BY_OWN_GRADIENTS = {
-    "alpha": {"depth", "distortion_l1", "distortion_l2_ndc"},
-    "depth": {"depth", "distortion_l1"},
+    "alpha": {"depth", "distortion_ordered", "distortion_l1", "distortion_l2_ndc"},
+    "depth": {"depth", "distortion_ordered", "distortion_l1"},
 }
 
 

@@ -52,7 +52,8 @@ def test_outputs_are_made_from_composited_features(kind, make_camera, make_splat
         # Features pass through float32, as on the GPU.
         assert float((a - b).abs().nan_to_num().max()) < 1e-5, name
     # What the docstrings of the door say is not there.
-    assert bool(made.median_depth.isnan().all()) and bool(made.distortion_l1.isnan().all())
+    for name in ("median_depth", "distortion_ordered", "distortion_l1"):
+        assert bool(getattr(made, name).isnan().all()), name
     assert made.counters == {"splats": 27} and not made.weight.requires_grad
 
 

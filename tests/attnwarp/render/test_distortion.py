@@ -1,0 +1,184 @@
+"""Exact depth distortion against a sum over all pairs, in NumPy from the papers' formulas."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from attnwarp import Camera, Gaussians
+from attnwarp.losses import depth_distortion
+from attnwarp.render import render
+
+BACKENDS = ("cpu", "reference")
+
+
+def crossing_discs(count: int, seed: int) -> Gaussians:
+    """Tilted discs of sigma 0.3 to 0.8 at depths of 2 to 4, which cross one another."""
+    rng = np.random.default_rng(seed)
+    means = np.column_stack([rng.uniform(-0.7, 0.7, (count, 2)), rng.uniform(2, 4, count)])
+    axis, angle = rng.normal(size=(count, 3)) * [1, 1, 0.2], rng.uniform(0.2, 1.0, count)
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    quats = np.column_stack([np.cos(angle / 2), axis * np.sin(angle / 2)[:, None]])
+    scales, opacities = rng.uniform(0.3, 0.8, (count, 2)), rng.uniform(0.05, 0.5, count)
+    parts = (means, quats, scales, opacities, np.zeros((count, 1, 3)))
+    return Gaussians("2d", *(torch.tensor(part) for part in parts))
+
+
+def front_camera(width: int, height: int) -> Camera:
+    K = np.array([[30.0, 0, width / 2], [0, 30, height / 2], [0, 0, 1]])
+    return Camera(K, np.eye(4), width, height)
+
+
+def weights_and_depths(splats: Gaussians, camera: Camera):
+    """(P, N) weights and depths by ray-disc intersection, front to back by the centres' depth."""
+    order = np.argsort(splats.means[:, 2].numpy(), kind="stable")
+    means, scales, quats, opacities = (
+        part.numpy()[order]
+        for part in (splats.means, splats.scales, splats.quats, splats.opacities)
+    )
+    w, x, y, z = quats.T
+    # Columns of the rotation: the discs' axes and their normals.
+    u_axis = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1)
+    v_axis = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1)
+    normal = np.cross(u_axis, v_axis)
+    rays = camera.directions().reshape(-1, 3)
+    depth = (normal * means).sum(1) / (rays @ normal.T)
+    offset = depth[..., None] * rays[:, None] - means
+    u, v = ((offset * axis).sum(-1) for axis in (u_axis, v_axis))
+    rho = (u / scales[:, 0]) ** 2 + (v / scales[:, 1]) ** 2
+    alpha = opacities * np.exp(-rho / 2)
+    alpha[(alpha < 1 / 255) | (depth <= 0)] = 0
+    # No disc of these is so small or so steep that the screen filter draws it.
+    pixels = rays[:, None, :2] * 30 - 30 * means[:, :2] / means[:, 2:]
+    assert (rho <= 2 * (pixels**2).sum(-1) + 1e-9)[alpha > 0].all()
+    before = np.cumprod(np.column_stack([np.ones(len(rays)), 1 - alpha[:, :-1]]), axis=1)
+    assert before.min() > 1e-4  # no ray ends
+    return alpha * before, depth
+
+
+def over_all_pairs(splats: Gaussians, camera: Camera) -> np.ndarray:
+    """(H, W) sum_ij w_i w_j |z_i - z_j|."""
+    w, z = weights_and_depths(splats, camera)
+    total = np.einsum("pi,pj,pij->p", w, w, np.abs(z[:, :, None] - z[:, None, :]))
+    return total.reshape(camera.height, camera.width)
+
+
+def leaves_of(splats: Gaussians) -> Gaussians:
+    names = ("means", "scales", "opacities")
+    return dataclasses.replace(
+        splats, **{name: getattr(splats, name).clone().requires_grad_() for name in names}
+    )
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(("width", "height"), [(32, 16), (19, 21)])  # whole tiles and parts
+def test_it_is_the_sum_over_all_pairs(backend: str, width: int, height: int) -> None:
+    camera, splats = front_camera(width, height), crossing_discs(16, seed=3)
+    expected = over_all_pairs(splats, camera)
+    view = render(splats, camera, backend=backend)
+    # In compositing order it is another sum: the scene has what must be corrected.
+    assert float(view.distortion_ordered.mean()) < 0.9 * expected.mean()
+    assert float(view.distortion_ordered.min()) < 0
+    assert np.abs(view.distortion_l1.double().numpy() - expected).max() < 2e-6
+    assert float(view.distortion_l1.min()) >= 0
+    mean = float(depth_distortion(view, "l1", scale=2.0))
+    assert mean == pytest.approx(expected.mean() / 2, rel=1e-5)
+    assert float(depth_distortion(view)) == pytest.approx(expected.mean(), rel=1e-5)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_its_gradient_is_that_of_the_sum_over_all_pairs(backend: str) -> None:
+    """Oracle: central differences of the sum in float64."""
+    camera, splats = front_camera(14, 12), crossing_discs(10, seed=5)
+    upstream = np.random.default_rng(0).normal(size=(12, 14))
+    leaves = leaves_of(splats)
+    view = render(leaves, camera, backend=backend)
+    # Other outputs have gradients of their own beside it.
+    loss = (view.distortion_l1 * torch.tensor(upstream)).sum()
+    (loss + 0 * view.color.sum() + 0 * view.distortion_ordered.sum()).backward()
+    step = 1e-6
+    for name in ("means", "scales", "opacities"):
+        values = getattr(splats, name)
+        expected = np.zeros(tuple(values.shape))
+        for index in np.ndindex(*values.shape):
+            sums = []
+            for sign in (1, -1):
+                moved = values.clone()
+                moved[index] += sign * step
+                changed = dataclasses.replace(splats, **{name: moved})
+                sums.append((over_all_pairs(changed, camera) * upstream).sum())
+            expected[index] = (sums[0] - sums[1]) / (2 * step)
+        error = np.abs(getattr(leaves, name).grad.double().numpy() - expected).max()
+        assert error < 2e-5 * np.abs(expected).max(), name
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_it_does_not_depend_on_which_of_two_sheets_is_composited_first(backend: str) -> None:
+    """Two planes, constant across the picture: moved in its own plane, the second comes first."""
+    tilt = math.radians(40)
+    quats = [[math.cos(s * tilt / 2), 0, math.sin(s * tilt / 2), 0] for s in (1, -1)]
+    along = np.array([math.cos(tilt), 0, math.sin(tilt)])
+    camera, views = front_camera(16, 16), []
+    for shift in (-0.2, 0.2):
+        means = torch.tensor(np.stack([[0, 0, 3.0], [0, 0, 3.0] + shift * along]))
+        discs = Gaussians(
+            "2d", means, torch.tensor(quats), torch.full((2, 2), 1e4, dtype=torch.float64),
+            torch.full((2,), 0.5), torch.zeros(2, 1, 3),
+        )  # fmt: skip
+        views.append(render(discs, camera, backend=backend))
+    column = np.arange(16) + 0.5 - 8
+    slopes = [math.tan(s * tilt) for s in (1, -1)]
+    depths = [3 / (1 + slope * column / 30) for slope in slopes]
+    expected = 2 * 0.5 * 0.25 * np.abs(depths[0] - depths[1])
+    for view in views:
+        np.testing.assert_allclose(view.distortion_l1[4].double().numpy(), expected, atol=1e-5)
+    ordered = [view.distortion_ordered[4].double().numpy() for view in views]
+    np.testing.assert_allclose(ordered[0], -ordered[1], atol=1e-5)
+
+
+def test_the_order_of_the_splats_in_the_input_changes_no_bit() -> None:
+    camera, splats = front_camera(33, 17), crossing_discs(40, seed=8)
+    turned = splats.select(torch.tensor(np.random.default_rng(1).permutation(40)))
+    pictures = [render(each, camera).distortion_l1 for each in (splats, turned)]
+    assert torch.equal(*pictures)
+
+
+def test_sheets_far_away_and_close_together_keep_their_digits() -> None:
+    """Crossing discs moved 1000 units back: gaps of 1e-3 of the depth."""
+    splats = crossing_discs(12, seed=2)
+    far = dataclasses.replace(splats, means=splats.means + torch.tensor([0, 0, 1000.0]))
+    K = np.array([[9000.0, 0, 8], [0, 9000, 8], [0, 0, 1]])
+    camera = Camera(K, np.eye(4), 16, 16)
+    expected = render(far, camera, backend="reference").distortion_l1
+    error = (render(far, camera).distortion_l1 - expected).abs().max()
+    assert float(error) < 1e-4 * float(expected.max())
+
+
+def test_it_carries_gradients_when_it_was_first_read_without() -> None:
+    camera, splats = front_camera(16, 16), leaves_of(crossing_discs(6, seed=1))
+    view = render(splats, camera)
+    with torch.no_grad():
+        first = view.distortion_l1
+    assert first.requires_grad and view.distortion_l1 is first
+    with torch.no_grad():
+        without = render(splats, camera)
+    assert torch.equal(without.distortion_l1, first.detach())
+    assert not without.distortion_l1.requires_grad
+
+
+def test_splats_that_were_moved_since_are_refused_where_nothing_was_kept() -> None:
+    camera, splats = front_camera(16, 16), crossing_discs(6, seed=1)
+    view = render(splats, camera)
+    splats.means.add_(1)
+    with pytest.raises(RuntimeError, match="distortion_l1: .* inplace operation"):
+        _ = view.distortion_l1
+
+
+def test_a_picture_of_nothing_has_none() -> None:
+    nothing = crossing_discs(2, seed=0).select(torch.tensor([], dtype=torch.long))
+    for backend in BACKENDS:
+        assert not render(nothing, front_camera(5, 4), backend=backend).distortion_l1.any()
