@@ -80,6 +80,25 @@ def test_a_fit_brings_held_out_views_closer_to_their_pictures(scene, kind):
     assert last.psnr > first.psnr + 5
 
 
+def test_a_fit_that_weighs_the_exact_distortion_has_less_of_it(scene):
+    """Oracle: the reference's sum over the fitted splats."""
+    left = {}
+    for form, weight in (("l1", 0.0), ("l1", 3.0), ("ordered", 3.0)):
+        start, settings = begin(
+            scene,
+            iterations=150,
+            distortion=weight,
+            distortion_form=form,
+            distortion_from=0,
+            **FAST,
+        )
+        splats = fit(start, scene[0], settings).gaussians
+        views = [render(splats, camera, backend="reference") for camera in scene[0].cameras]
+        left[form, weight] = sum(float(view.distortion_l1.mean()) for view in views)
+    assert left["l1", 3.0] < 0.7 * left["l1", 0.0]
+    assert left["l1", 3.0] < left["ordered", 3.0]
+
+
 def test_the_harmonics_come_in_one_degree_after_another(scene, monkeypatch):
     asked = []
 
