@@ -227,11 +227,13 @@ def _edited(result: Any) -> EditedScene:
 def _true_pictures(job: Job) -> EditedScene:
     """The first answer's true pictures in every view, and splats tuned on them: the ceiling.
 
-    Stages, their views and their tuning are those of ``attention_warping``.
+    Stages, their views and their tuning are those of ``attention_warping``. Where the change of an
+    edit is added to the picture, edits are as large as it; else they have ``size``.
     """
     from attnwarp.methods import AttentionWarpingSettings
     from attnwarp.methods.attention_warping import AttentionWarping
     from attnwarp.methods.base import ViewEdit, run
+    from attnwarp.methods.pictures import resized
 
     pictures = next(iter(job.truth.values()))
 
@@ -242,7 +244,10 @@ def _true_pictures(job: Job) -> EditedScene:
             return self.edit_targets(0, [self.sources[number]])
 
         def edit_targets(self, stage: int, batch: Sequence[int], *_: Any) -> list[ViewEdit]:
-            return [ViewEdit(pictures[view], {"injected": 0.0}) for view in batch]
+            edits = {view: pictures[view] for view in batch}
+            if self.settings.detail == "none":
+                edits = {view: resized(edits[view], self.work.sizes[view]) for view in batch}
+            return [ViewEdit(edits[view], {"injected": 0.0}) for view in batch]
 
     def make(work: Any, settings: Any) -> TruePictures:
         return TruePictures(work, settings, 0, None, None, "cpu")
@@ -260,7 +265,9 @@ def _true_pictures(job: Job) -> EditedScene:
 def _true_pictures_reads(settings: Mapping[str, Any]) -> Set[str]:
     from attnwarp.methods import AttentionWarpingSettings
 
-    read = {"stages", "views_per_stage", "iterations", "sources", *_LOSSES}
+    read = {"stages", "views_per_stage", "iterations", "sources", "detail", *_LOSSES}
+    if settings["detail"] == "none":
+        read.add("size")
     warp: set[str] = set()
     if settings["sources"] > 1:  # what the sources see of each other orders them
         read |= {"chain_coverage", "mask"}
