@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from attnwarp.reporting import SILENT, Reporter
+
 RETRY_SECONDS = 0.01
 """Pause before a lost interrupt is sent again: the destructor that lost it is left by then."""
 
@@ -95,12 +97,12 @@ def stops_interrupt() -> Iterator[None]:
 
 
 @contextmanager
-def asked_to_stop(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+def asked_to_stop(report: Reporter = SILENT) -> Iterator[Callable[[], bool]]:
     """Whether Ctrl-C, a polite kill or the terminal's end came; a second one stops at once, as it
     would without this.
 
     Args:
-        say: shows a line to the user.
+        report: receives a line at the first.
     """
     asked = False
 
@@ -109,7 +111,7 @@ def asked_to_stop(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
         if asked:
             raise KeyboardInterrupt
         asked = True
-        say("stopping after this iteration; press Ctrl-C again to leave at once")
+        report.log("stopping after this iteration; press Ctrl-C again to leave at once")
 
     handlers = {number: signal.signal(number, note) for number in heeded((signal.SIGINT, *STOPS))}
     try:

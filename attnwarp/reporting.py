@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import bisect
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.progress import Progress, Task
 
 LINE_SECONDS = 10.0
 """Seconds between two lines where there is no terminal."""
@@ -27,20 +28,56 @@ class Reporter:
     Example:
         >>> from attnwarp.reporting import Reporter
         >>> class Printed(Reporter):
-        ...     def step(self, done, total, text):
+        ...     def step(self, done, total, text, left=None):
         ...         print(f"{done / total:.0%}: {text}")
         >>> Printed().step(3, 4, "tuning")
         75%: tuning
     """
 
-    def step(self, done: int, total: int, text: str) -> None:
-        """Receive that ``done`` of ``total`` steps are done, and what is at work."""
+    def step(self, done: int, total: int, text: str, left: float | None = None) -> None:
+        """Receive how many steps are done, and what is at work.
+
+        Args:
+            done: steps.
+            total: steps in all; 0 while their number is unknown.
+            text: what is at work, or has just ended.
+            left: seconds, where the work knows more of them than its pace tells.
+        """
 
     def log(self, text: str) -> None:
         """Receive a line that stays to be read."""
 
 
 SILENT = Reporter()
+
+
+class Part(Reporter):
+    """Reports one of many works: what it says is shown with the count of all of them.
+
+    Args:
+        report: of all works.
+        done: works that ended before.
+        total: works in all.
+
+    Example:
+        >>> from attnwarp.reporting import Part, reporter
+        >>> import sys
+        >>> from rich.console import Console
+        >>> with reporter(Console(file=sys.stdout, width=100)) as report:
+        ...     Part(report, 9, 9).step(1, 400, "view 1")
+        [9/9] view 1
+    """
+
+    def __init__(self, report: Reporter, done: int, total: int) -> None:
+        self._report, self._done, self._total = report, done, total
+
+    def step(self, done: int, total: int, text: str, left: float | None = None) -> None:
+        """Name what is at work."""
+        self._report.step(self._done, self._total, text)
+
+    def log(self, text: str) -> None:
+        """Pass a line on."""
+        self._report.log(text)
 
 
 class Pace:
@@ -50,15 +87,15 @@ class Pace:
 
     Example:
         >>> from attnwarp.reporting import Pace
-        >>> Pace().left(3, 9)  # too early to tell
-        ''
+        >>> Pace().left(3, 9) is None  # too early to tell
+        True
     """
 
     def __init__(self) -> None:
         self._counts: list[tuple[float, int]] = []
 
-    def left(self, done: int, total: int) -> str:
-        """The end of a line, such as ", 3 min left"; empty while it cannot be told."""
+    def left(self, done: int, total: int) -> float | None:
+        """Seconds; None while they cannot be told."""
         now = time.perf_counter()
         if self._counts and done < self._counts[-1][1]:
             self._counts.clear()  # other work
@@ -66,10 +103,10 @@ class Pace:
             self._counts.append((now, done))
         began, before = self._counts[0]
         if now - began < PACE_SECONDS or not before < done < total:
-            return ""
+            return None
         half = before + (done - before) // 2 if done - before >= FEWEST else before
         since, had = self._counts[bisect.bisect_right(self._counts, half, key=lambda c: c[1]) - 1]
-        return f", {_duration((now - since) / (done - had) * (total - done))} left"
+        return (now - since) / (done - had) * (total - done)
 
 
 def _duration(seconds: float) -> str:
@@ -78,89 +115,100 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-class Show(Protocol):
-    """Shows how work stands."""
+class _Shown(Reporter):
+    """Shows steps where a kind of output wants them: `show` is the subclass's."""
 
-    def __call__(self, done: int, total: int, text: str, line: str | None = None) -> None:
-        """Show ``done`` of ``total`` and the text; ``line`` replaces the text where there is no
-        terminal.
-        """
-        ...
+    def __init__(self, console: Console, title: str) -> None:
+        self.console, self.title = console, title
+        self._pace = Pace()
 
+    def step(self, done: int, total: int, text: str, left: float | None = None) -> None:
+        paced = self._pace.left(done, total)
+        self.show(done, total, text, paced if left is None else left)
 
-@contextmanager
-def display(console: Console | None = None, *, title: str) -> Iterator[Show]:
-    """A display of progress on stderr, or on another console.
+    def show(self, done: int, total: int, text: str, left: float | None) -> None:
+        raise NotImplementedError
 
-    Args:
-        console: of rich; a terminal gets a bar, anything else lines with the time left.
-        title: of the work.
-
-    Example:
-        >>> import sys
-        >>> from rich.console import Console
-        >>> from attnwarp.reporting import display
-        >>> with display(Console(file=sys.stdout, width=100), title="bear") as show:
-        ...     show(9, 9, "done")
-        bear [9/9] done
-    """
-    import rich.console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-    from rich.table import Column
-
-    target = console or rich.console.Console(stderr=True)
-    if not target.is_terminal:
-        yield _lines(target, title)
-        return
-    # On a narrow terminal the text goes over two lines rather than the counts losing their digits.
-    columns = (
-        TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True)),
-        BarColumn(bar_width=12, table_column=Column(no_wrap=True)),
-        MofNCompleteColumn(table_column=Column(no_wrap=True)),
-        TimeRemainingColumn(table_column=Column(no_wrap=True)),
-        TextColumn("{task.fields[text]}", markup=False, table_column=Column(no_wrap=False)),
-    )
-    with Progress(*columns, console=target) as bar:
-        task = bar.add_task(title, total=None, text="")
-
-        def show(done: int, total: int, text: str, line: str | None = None) -> None:
-            bar.update(task, completed=done, total=total, text=text)
-
-        yield show
+    def log(self, text: str) -> None:
+        # Whole, so that it can be searched.
+        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def _lines(console: Console, title: str) -> Show:
-    last = time.perf_counter()
-    pace = Pace()
+class _Lines(_Shown):
+    def __init__(self, console: Console, title: str, every: bool) -> None:
+        super().__init__(console, title)
+        self._every = every
+        self._last = time.perf_counter()
+        self._done: int | None = None
 
-    def show(done: int, total: int, text: str, line: str | None = None) -> None:
-        nonlocal last
-        now, left = time.perf_counter(), pace.left(done, total)
-        if now - last < LINE_SECONDS and done != total:
+    def show(self, done: int, total: int, text: str, left: float | None) -> None:
+        now = time.perf_counter()
+        further = self._every and self._done not in (None, done)
+        self._done = done
+        if now - self._last < LINE_SECONDS and not further and (done != total or not total):
             return
-        last = now
-        whole = f"{title} [{done}/{total}] {text if line is None else line}{left}"
-        console.print(whole, markup=False, highlight=False, soft_wrap=True)
+        self._last = now
+        count = f"[{done}/{total}]" if total else ""
+        rest = "" if left is None else f", {_duration(left)} left"
+        self.log(" ".join(part for part in (self.title, count, text + rest) if part))
 
-    return show
+
+class _Bar(_Shown):
+    def __init__(self, console: Console, title: str, stack: ExitStack) -> None:
+        super().__init__(console, title)
+        self._stack = stack
+        self._bar: Progress | None = None
+
+    def show(self, done: int, total: int, text: str, left: float | None) -> None:
+        if self._bar is None:  # what comes before the first step needs none
+            self._bar = self._stack.enter_context(_bar(self.console))
+            self._bar.add_task(self.title, total=None, text=text, count="", ends=None)
+        self._bar.update(
+            self._bar.task_ids[0],
+            completed=done,
+            total=total or None,
+            text=text,
+            count=f"{done}/{total}" if total else "",
+            ends=None if left is None else time.perf_counter() + left,
+        )
+
+
+def _bar(console: Console) -> Progress:
+    from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.table import Column
+    from rich.text import Text
+
+    class Left(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            ends = task.fields["ends"]
+            left = 0 if ends is None else ends - time.perf_counter()
+            return Text(f"{_duration(left)} left" if left > 0 else "")
+
+    def text(name: str, **column: Any) -> TextColumn:
+        return TextColumn(name, markup=False, table_column=Column(**column))
+
+    # On a narrow terminal the text goes over two lines rather than the counts losing their digits.
+    return Progress(
+        text("{task.description}", no_wrap=True),
+        BarColumn(bar_width=12, table_column=Column(no_wrap=True)),
+        text("{task.fields[count]}", no_wrap=True),
+        TimeElapsedColumn(table_column=Column(no_wrap=True)),
+        Left(table_column=Column(no_wrap=True)),
+        text("{task.fields[text]}"),
+        console=console,
+    )
 
 
 @contextmanager
 def reporter(
-    console: Console | None = None, *, title: str, log: Callable[[str], None] | None = None
+    console: Console | None = None, *, title: str = "", every: bool = False
 ) -> Iterator[Reporter]:
     """Report on stderr, or on another console: a bar on a terminal, a line now and then elsewhere.
 
     Args:
         console: of rich.
         title: of the work.
-        log: prints lines that stay; the console if left out.
+        every: each step that is done gets a line where there is no terminal.
 
     Example:
         >>> import sys
@@ -170,17 +218,11 @@ def reporter(
         ...     report.step(9, 9, "done")
         bear [9/9] done
     """
-    with display(console, title=title) as show:
-        yield _Shown(show, log)
+    from rich.console import Console as RichConsole
 
-
-class _Shown(Reporter):
-    def __init__(self, show: Show, log: Callable[[str], None] | None) -> None:
-        self._show, self._log = show, log
-
-    def step(self, done: int, total: int, text: str) -> None:
-        self._show(done, total, text)
-
-    def log(self, text: str) -> None:
-        if self._log is not None:
-            self._log(text)
+    target = console or RichConsole(stderr=True)
+    if not target.is_terminal:
+        yield _Lines(target, title, every)
+        return
+    with ExitStack() as stack:
+        yield _Bar(target, title, stack)

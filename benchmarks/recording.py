@@ -89,7 +89,7 @@ def measure(
     recorded: list[Recording] = []
 
     def recording() -> AbstractContextManager[Recording]:
-        return record(unet, plan, announce=lambda _: None)
+        return record(unet, plan)
 
     def injection() -> AbstractContextManager[None]:
         return inject(unet, recorded[0], branches=PIX2PIX_BRANCHES)

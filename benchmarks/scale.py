@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+from attnwarp.reporting import Reporter
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cost import peak_memory_mb
 from attnwarp_eval.files import write_atomic
@@ -252,18 +253,17 @@ def cluster(cells: int, folder: Path, wait: float = 0.0) -> str:
         planned = plan(study_of(cells, wait), store)
         before = [0.0] * (2 + WORKERS)
         start = 0.0
-        ended = 0
         warm = cells // 4
 
-        def listen(cell: Any, event: str, failure: Any) -> None:
-            nonlocal ended, before, start
-            ended += event != "start"
-            if ended == warm and not start:
-                before, start = _cpu(processes, psutil), time.perf_counter()
+        class Clock(Reporter):
+            def step(self, done: int, total: int, text: str, left: float | None = None) -> None:
+                nonlocal before, start
+                if done == warm and not start:
+                    before, start = _cpu(processes, psutil), time.perf_counter()
 
         while not file.is_file():
             time.sleep(0.1)
-        summary = execute(planned, store, scheduler=str(file), listen=listen)
+        summary = execute(planned, store, scheduler=str(file), report=Clock())
         wall = time.perf_counter() - start
         used = [b - a for a, b in zip(before, _cpu(processes, psutil), strict=True)]
         assert summary.complete, summary.failures[:1]

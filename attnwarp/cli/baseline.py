@@ -25,8 +25,9 @@ from attnwarp.cli.options import (
     SplatKindOption,
     reading_options,
 )
-from attnwarp.cli.shell import assignments, check_out, clear_errors, echo, use_threads
+from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
 from attnwarp.editing.small import check_words, guide_of
+from attnwarp.reporting import reporter
 
 
 class BaselineMethod(StrEnum):
@@ -73,9 +74,8 @@ def baseline(
     reading: Reading,
 ) -> None:
     """Edit a scene by another method, for comparison with attnwarp edit."""
-    with clear_errors(
-        f"stopped; what {out} holds is whole, and the same command goes on from it", out
-    ):
+    stopped = f"stopped; what {out} holds is whole, and the same command goes on from it"
+    with clear_errors(stopped, out), reporter(title=out.name) as report:
         changes = assignments(change or [], {})
         check_out(out)
         check_inputs_stay([out / "edited.ply"], [ply])
@@ -90,12 +90,12 @@ def baseline(
 
         dataset = read_views(data, reading, points=False)
         splats = read_splats(ply, kind, antialiased, screen_filter)
-        check_seen(ply, splats, dataset.cameras)
+        check_seen(ply, splats, dataset.cameras, report)
         warn_of_misfit(ply, splats, dataset)
         result = run_baseline(
             method.value, dataset, splats, editor, instruction, settings, out,
             budget=budget, max_size=max_size, device=device, threads=threads,
-            say=echo,
+            report=report,
         )  # fmt: skip
         ended = f", cut short by its {result.cut.replace('_', ' ')}" if result.cut else ""
         typer.echo(

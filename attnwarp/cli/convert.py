@@ -18,6 +18,7 @@ from attnwarp.cli.options import (
     reading_options,
 )
 from attnwarp.cli.shell import check_out, clear_errors
+from attnwarp.reporting import reporter
 
 
 def convert(
@@ -95,5 +96,6 @@ def undistort(
         check_other(out, data if data.is_dir() else data.parent, "the folder to undistort")
         dataset = read_views(data, reading, distorted="keep")
         count = sum(lens is not None for lens in dataset.lenses)
-        result = attnwarp.io.undistort(dataset, out)
+        with reporter(title=out.name) as report:
+            result = attnwarp.io.undistort(dataset, out, report=report)
         typer.echo(f"{out}: {len(result)} pictures, {count} of them undistorted")

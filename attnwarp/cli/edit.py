@@ -38,9 +38,10 @@ from attnwarp.cli.options import (
     Store,
     reading_options,
 )
-from attnwarp.cli.shell import assignments, check_out, clear_errors, echo, use_threads
+from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
 from attnwarp.editing.small import check_words, guide_of
 from attnwarp.errors import InputWarning
+from attnwarp.reporting import reporter
 
 NO_FEATURES = 0.001
 """Share of the targets' pixels below which each view was, in effect, edited alone."""
@@ -136,9 +137,8 @@ def edit(
             "edits",
             re.sub(r"[^a-z0-9]+", "-", f"{data.stem} {instruction}".lower()).strip("-"),
         )
-    with clear_errors(
-        f"stopped; what {out} holds is whole, and the same command goes on from it", out
-    ):
+    stopped = f"stopped; what {out} holds is whole, and the same command goes on from it"
+    with clear_errors(stopped, out), reporter(title=out.name) as report:
         options: dict[str, Any] = {
             "stages": stages, "views_per_stage": views_per_stage, "steps": steps,
             "iterations": iterations, "size": size, "seed": seed,
@@ -172,7 +172,7 @@ def edit(
         dataset = read_views(data, reading)
         splats = None if ply is None else read_splats(ply, kind, antialiased, screen_filter)
         if ply is not None and splats is not None:
-            check_seen(ply, splats, dataset.cameras)
+            check_seen(ply, splats, dataset.cameras, report)
             warn_of_misfit(ply, splats, dataset)
         from attnwarp.methods.command import FitPlan, edit_dataset
 
@@ -187,7 +187,7 @@ def edit(
             source_picture=source_picture, masks=masks, words=words,
             segmenter=segmenter or SEGMENTER, max_size=max_size, store=store.value, device=device,
             threads=threads,
-            say=echo,
+            report=report,
         )  # fmt: skip
         seconds = sum(result.seconds.values())
         views = len(result.edited)

@@ -12,6 +12,7 @@ import typer
 
 from attnwarp.editing.small import check_words, guide_of
 from attnwarp.errors import InputWarning
+from attnwarp.reporting import reporter
 
 if TYPE_CHECKING:
     from attnwarp.editing.editor import Image
@@ -139,14 +140,14 @@ def edit_image(
         if mask_out is not None:
             _write(mask_out, np.repeat(share, 3, axis=2))
     tiles: list[Image] = [image]
-    with typer.progressbar(length=steps, label=f"{w} x {h} px", file=_stderr()) as bar:
+    with reporter(title=out.name) as report:
 
-        def watch(step: int, count: int, latents: Any) -> None:
-            bar.update(1)
+        def on_step(step: int, count: int, latents: Any) -> None:
+            report.step(step + 1, count, f"{w} x {h} px")
             if sheet is not None:
                 tiles.append(model.decode(latents)[0])
 
-        result = edit(model, [image], instruction, steps=steps, seed=seed, watch=watch)
+        result = edit(model, [image], instruction, steps=steps, seed=seed, on_step=on_step)
     edited = result.images[0]
     masked = edited if share is None else share * edited + (1 - share) * image
     # The photograph's own detail stays, and gets the change, enlarged.
@@ -160,12 +161,6 @@ def check_segmenter(segmenter: str | None, words: str | None) -> None:
     """Refuse ``--segmenter`` without ``--where``."""
     if segmenter is not None and words is None:
         raise ValueError("--segmenter: needs --where, the words that it looks for")
-
-
-def _stderr() -> Any:
-    import sys
-
-    return sys.stderr
 
 
 def _read(path: Path) -> Image:

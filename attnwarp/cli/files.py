@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from attnwarp.cli.bundled_scene import is_scene
 from attnwarp.cli.options import Kind, Reading
-from attnwarp.cli.shell import echo
 from attnwarp.errors import InputError, InputWarning
 
 if TYPE_CHECKING:
     from attnwarp.camera import Camera
     from attnwarp.gaussians import Gaussians
     from attnwarp.io import Dataset
+    from attnwarp.reporting import Reporter
 
 COVERED = 0.002
 """Share of a picture, 8 pixels of 64 x 64, below which splats leave nothing to edit in it."""
@@ -88,13 +88,14 @@ def read_splats(
     return splats
 
 
-def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera]) -> None:
+def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera], report: Reporter) -> None:
     """Refuse splats that no camera sees, before an edit spends minutes on them.
 
     Args:
         path: of the splats, for the message.
         splats: of the scene.
         cameras: of the data set; the first that sees splats ends the search.
+        report: receives a line where kernels are compiled first.
 
     Raises:
         InputError: the splats cover less than :data:`COVERED` of every view.
@@ -105,7 +106,7 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera]) -> None
     from attnwarp.methods.scene import near_of
     from attnwarp.render import render
 
-    compile_kernels(splats.kind, echo)
+    compile_kernels(splats.kind, report)
     near = near_of(cameras, splats)
     with torch.no_grad():
         for camera in cameras:

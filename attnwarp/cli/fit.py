@@ -25,8 +25,9 @@ from attnwarp.cli.options import (
     RenderThreadsOption,
     reading_options,
 )
-from attnwarp.cli.shell import STOPPED, assignments, check_out, clear_errors, echo, use_threads
+from attnwarp.cli.shell import STOPPED, assignments, check_out, clear_errors, use_threads
 from attnwarp.process import asked_to_stop
+from attnwarp.reporting import Reporter, reporter
 
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Views
@@ -96,9 +97,10 @@ def fit(
     reading: Reading,
 ) -> None:
     """Fit splats to posed pictures. Stopped half-way and started again, it goes on where it was."""
-    with clear_errors(
-        f"stopped; what {out} holds is whole, and the same command goes on from its checkpoint", out
-    ):
+    stopped = (
+        f"stopped; what {out} holds is whole, and the same command goes on from its checkpoint"
+    )
+    with clear_errors(stopped, out), reporter(title=out.name) as report:
         # What needs nothing heavy is read first: a typing error is answered at once.
         changes = assignments(change or [], OWN_OPTIONS)
         check_out(out)
@@ -126,6 +128,7 @@ def fit(
             checkpoint_seconds,
             restart,
             third_scale,
+            report,
         )
         last = result.history[-1]
         held = f", held-out PSNR {last.psnr:.2f} dB" if last.psnr is not None else ""
@@ -134,7 +137,7 @@ def fit(
             f" in {result.seconds:.0f} s{held}"
         )
         if result.stopped == "asked":
-            typer.echo("stopped; the same command goes on from here", err=True)
+            report.log("stopped; the same command goes on from here")
             raise typer.Exit(STOPPED)
 
 
@@ -173,6 +176,7 @@ def _fit(
     checkpoint_seconds: float,
     restart: bool,
     third_scale: float | None,
+    report: Reporter,
 ) -> Fit:
     changes = {**changes, "kind": kind.value[:2], "seed": seed}
     if iterations is not None:
@@ -188,7 +192,6 @@ def _fit(
 
     import attnwarp.fit
     from attnwarp.fit.loop import CHECKPOINT, SPLATS
-    from attnwarp.fit.progress import more_points, progress_display
     from attnwarp.fit.start import FIRST_POINTS
     from attnwarp.io.names import file_stems
 
@@ -205,23 +208,20 @@ def _fit(
     if test is not None:
         held_out = attnwarp.fit.load_views(test, max_size=max_size, damaged="error")
     if first is not None and start is not None:
-        check_seen(start, first, train.cameras)
+        check_seen(start, first, train.cameras, report)
         warn_of_misfit(start, first, train)
         first = first.with_sh_degree(settings.sh_degree)
     else:
         first = attnwarp.fit.first_splats(
-            dataset, views.cameras, settings, echo, random=points or FIRST_POINTS
+            dataset, views.cameras, settings, report, random=points or FIRST_POINTS
         )
     out.mkdir(parents=True, exist_ok=True)
-    if settings.max_splats is not None and len(first) > settings.max_splats:
-        echo(more_points(len(first), settings.max_splats))
-    attnwarp.fit.compile_kernels(settings.kind, echo)
     try:
-        with asked_to_stop(echo) as stop, progress_display(title=out.name) as watch:
+        with asked_to_stop(report) as stop:
             result = attnwarp.fit.fit(
                 first, views, settings, held_out=held_out, folder=out, restart=restart,
                 max_seconds=max_seconds, checkpoint_seconds=checkpoint_seconds,
-                third_scale=third_scale, watch=watch, stop=stop,
+                third_scale=third_scale, report=report, stop=stop,
             )  # fmt: skip
     except ValueError as error:
         if not any(str(out / name) in str(error) for name in (CHECKPOINT, SPLATS)):

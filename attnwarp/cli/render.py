@@ -21,7 +21,7 @@ from attnwarp.cli.options import (
 )
 from attnwarp.cli.shell import check_out, clear_errors, use_threads
 from attnwarp.errors import InputWarning
-from attnwarp.reporting import display
+from attnwarp.reporting import reporter
 
 
 @reading_options(without="missing_images")
@@ -76,7 +76,7 @@ def render(
         out.mkdir(parents=True, exist_ok=True)
         near = near_of(views, splats) if near is None else near
         seen = False
-        with display(title=out.name) as show:
+        with reporter(title=out.name) as report:
             for number, (camera, name) in enumerate(zip(views, file_stems(views), strict=True), 1):
                 if size is not None:
                     factor = size / max(camera.width, camera.height)
@@ -94,7 +94,7 @@ def render(
                     )
                 if normal:
                     write_image(out / f"{name}.normal.png", (view.normal.numpy() + 1) / 2)
-                show(number, len(views), name if number < len(views) else "done")
+                report.step(number, len(views), name if number < len(views) else "done")
         if not seen:
             warnings.warn(
                 f"{model}: no view shows any of its splats beyond --near {near:g}; {UNSEEN}",

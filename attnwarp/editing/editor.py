@@ -134,7 +134,7 @@ def edit(
     pictures: Sequence[Image] | None = None,
     noise: Tensor | None = None,
     latents: Tensor | None = None,
-    watch: Callable[[int, int, Tensor], None] | None = None,
+    on_step: Callable[[int, int, Tensor], None] | None = None,
     estimate: Callable[[int, Tensor], Tensor] | None = None,
 ) -> Edit:
     """Edit views together. Record or inject attention by running this inside
@@ -154,7 +154,7 @@ def edit(
         noise: (B, C, h, w) in place of the seed's.
         latents: (B, C, h, w) to begin from as they are, such as those of an inversion; neither
             ``start`` nor ``noise`` goes with them.
-        watch: called with the step, the number of steps and the latents after each step.
+        on_step: called with the step, the number of steps and the latents after each step.
         estimate: called with the step and the (B, C, h, w) clean latents that are predicted there;
             what it returns takes their place.
 
@@ -203,8 +203,8 @@ def edit(
         for number, (now, then) in enumerate(following(timesteps)):
             change = None if estimate is None else partial(estimate, number)
             x = editor.schedule.step(task.predict(x, now), x, now, then, change)
-            if watch is not None:
-                watch(number, len(timesteps), x)
+            if on_step is not None:
+                on_step(number, len(timesteps), x)
     return Edit(editor.decode(x), x, timesteps)
 
 

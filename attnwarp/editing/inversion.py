@@ -230,7 +230,7 @@ def replay(
     predict: Predict,
     noise: NoiseMaps,
     *,
-    watch: Callable[[int, int, Tensor], None] | None = None,
+    on_step: Callable[[int, int, Tensor], None] | None = None,
 ) -> Tensor:
     """(B, C, h, w) latents that the noise maps lead to.
 
@@ -240,7 +240,7 @@ def replay(
         schedule: of the model, that of the inversion.
         predict: the network's output.
         noise: of :func:`edit_friendly_invert`.
-        watch: called with the step, the number of steps and the latents after each step.
+        on_step: called with the step, the number of steps and the latents after each step.
     """
     x = noise.start
     with torch.no_grad():
@@ -248,8 +248,8 @@ def replay(
             mean, sigma = _mean(schedule, predict(x, now), x, now, then)
             scale = sigma if sigma > 0 else torch.ones_like(sigma)
             x = (mean + scale * noise.maps[step]).to(x.dtype)
-            if watch is not None:
-                watch(step, len(noise.timesteps), x)
+            if on_step is not None:
+                on_step(step, len(noise.timesteps), x)
     return x
 
 

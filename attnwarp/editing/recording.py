@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -263,17 +263,14 @@ class Recording:
 
 
 @contextmanager
-def record(
-    unet: torch.nn.Module, plan: RecordingPlan, *, announce: Callable[[str], None] | None = None
-) -> Iterator[Recording]:
+def record(unet: torch.nn.Module, plan: RecordingPlan) -> Iterator[Recording]:
     """Record the outputs of the UNet's attention layers while the block runs.
 
     An output is taken after its projection and before the residual. No bit of it changes.
 
     Args:
         unet: a diffusers UNet; any pipeline or loop may call it.
-        plan: what to record.
-        announce: called with the plan in words, the memory included, before anything runs.
+        plan: what to record; ``print(plan)`` tells the memory that it takes.
 
     Raises:
         ValueError: latents of another size, a batch of another number of rows, or more steps, than
@@ -292,8 +289,6 @@ def record(
         >>> recording.features(recording.timesteps[0], layers[0], "text").shape[:2]  # (views, H W)
         torch.Size([1, 64])
     """
-    if announce is not None:
-        announce(str(plan))
     recording = Recording(plan)
     rows, chosen = len(plan.branches) * plan.views, plan.recorded
 

@@ -2,7 +2,7 @@
 docs/fitting.md.
 """
 
-from attnwarp.fit.loop import Fit, Record, Step, fit
+from attnwarp.fit.loop import Fit, Record, fit
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.start import extent_of, first_splats, from_points, random_points
 from attnwarp.fit.views import Views, hold_out, load_views
@@ -12,7 +12,6 @@ __all__ = [
     "Fit",
     "FitSettings",
     "Record",
-    "Step",
     "Views",
     "compile_kernels",
     "extent_of",

@@ -24,6 +24,7 @@ from attnwarp.fit.warm import compile_kernels
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError, write_ply
 from attnwarp.render import Render, render
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp.workdir import CheckpointClock, Workdir, results_in
 
 Tensor = torch.Tensor
@@ -69,35 +70,6 @@ class Record:
     psnr: float | None
     psnr_pooled: float | None
     measures: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Step:
-    """How a fit stands, for whoever watches it.
-
-    Attributes:
-        iteration, iterations: done, and in all.
-        loss, psnr: of the pictures fitted on, smoothed over the last iterations; PSNR in dB.
-        held_out: PSNR at the last evaluation, dB, or None.
-        splats: their number.
-        seconds: spent on iterations.
-        evaluated: iteration of that evaluation.
-
-    Example:
-        >>> from attnwarp.fit import Step
-        >>> step = Step(100, 3000, loss=0.02, psnr=28.0, held_out=None, splats=60, seconds=2.0)
-        >>> print(f"{step.iteration / step.iterations:.0%} done")
-        3% done
-    """
-
-    iteration: int
-    iterations: int
-    loss: float
-    psnr: float
-    held_out: float | None
-    splats: int
-    seconds: float
-    evaluated: int | None = None
 
 
 @dataclass(eq=False)
@@ -148,7 +120,7 @@ def fit(
     third_scale: float | None = None,
     backend: str = "auto",
     measure: Measure | None = None,
-    watch: Callable[[Step], object] | None = None,
+    report: Reporter = SILENT,
     stop: Callable[[], bool] | None = None,
 ) -> Fit:
     """Fit splats to posed pictures.
@@ -175,7 +147,7 @@ def fit(
         backend: of :func:`attnwarp.render.render`.
         measure: called at every evaluation with the splats; its figures go into the history. A view
             of the truth, such as the error of depth.
-        watch: told how the fit stands after every iteration; see :mod:`attnwarp.fit.progress`.
+        report: receives how the fit stands after every iteration.
         stop: asked before every iteration; True ends the fit in good order.
 
     Raises:
@@ -230,11 +202,16 @@ def fit(
     check.seconds(checkpoint_seconds, "checkpoint_seconds")
     if third_scale is not None and settings.kind != "2d":
         raise ValueError(f"third_scale: got {third_scale} for kind '3d', expected None")
+    if settings.max_splats is not None and len(start) > settings.max_splats:
+        report.log(
+            f"{len(start)} first splats, more than max_splats {settings.max_splats}: the fit keeps"
+            " them all and adds none"
+        )
     run = _Run(start, views, settings, held_out, backend, measure, third_scale)
     with nullcontext() if folder is None else results_in(Path(folder)) as place:
         if place is not None:
             run.resume(Workdir(place, "a fit"), restart=restart)
-        return run.go(max_seconds, CheckpointClock(checkpoint_seconds), watch, stop)
+        return run.go(max_seconds, CheckpointClock(checkpoint_seconds), report, stop)
 
 
 class _Run:
@@ -346,12 +323,12 @@ class _Run:
         self,
         max_seconds: float | None,
         clock: CheckpointClock,
-        watch: Callable[[Step], object] | None,
+        report: Reporter,
         stop: Callable[[], bool] | None,
     ) -> Fit:
         s = self.settings
         if self.backend in ("auto", "cpu") and self.iteration < s.iterations:
-            compile_kernels(s.kind)
+            compile_kernels(s.kind, report)
         if not self.history:
             self.evaluate()
         while True:
@@ -365,8 +342,7 @@ class _Run:
             # The last before it is shown, so that what stays on a screen is the result's.
             if self.iteration % s.evaluate_every == 0 or self.iteration == s.iterations:
                 self.evaluate()
-            if watch is not None:
-                watch(self.step())
+            report.step(self.iteration, s.iterations, self.figures())
             if self.folder is not None and clock.due:
                 with clock.saving():
                     self.save()
@@ -406,18 +382,14 @@ class _Run:
             return False
         return max(values[-patience:]) < max(values[:-patience]) + self.settings.min_gain
 
-    def step(self) -> Step:
-        last = self.history[-1] if self.history else None
-        return Step(
-            self.iteration,
-            self.settings.iterations,
-            self.loss,
-            losses.psnr_of_mse(self.error),
-            last.psnr if last else None,
-            len(self.model),
-            self.seconds,
-            last.iteration if last else None,
-        )
+    def figures(self) -> str:
+        """One line; loss and PSNR are of the pictures fitted on, smoothed."""
+        last = self.history[-1]
+        held = "" if last.psnr is None else f", held out {_decibels(last.psnr)}"
+        if held and last.iteration != self.iteration:
+            held += f" at {last.iteration}"
+        psnr = _decibels(losses.psnr_of_mse(self.error))
+        return f"loss {self.loss:.4f}, PSNR {psnr}{held}, {len(self.model)} splats"
 
     def background(self, *, fitting: bool) -> Tensor:
         """What is behind everything; for pictures that are looked at or measured, never random."""
@@ -521,3 +493,7 @@ class _Run:
                 measures=dict(self.measure(gaussians)) if self.measure else {},
             )
         )
+
+
+def _decibels(value: float) -> str:
+    return f"{value:.2f} dB" if math.isfinite(value) else "inf dB"

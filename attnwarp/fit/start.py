@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +16,7 @@ from attnwarp.gaussians import Gaussians, Kind
 if TYPE_CHECKING:
     from attnwarp.fit.settings import FitSettings
     from attnwarp.io import Dataset
+from attnwarp.reporting import SILENT, Reporter
 
 Array = npt.NDArray[np.float64]
 
@@ -196,42 +197,42 @@ def first_splats(
     dataset: Dataset,
     cameras: Sequence[Camera],
     settings: FitSettings,
-    say: Callable[[str], object],
+    report: Reporter = SILENT,
     *,
     random: int = FIRST_POINTS,
 ) -> Gaussians:
     """First splats at a data set's points, or at random ones where it has none.
 
-    Args:
-        dataset: whose points and colours are taken.
-        cameras: of the views that are fitted on.
-        settings: kind, degree and seed of the splats.
-        say: told where random points are taken, and of points that lie too far away
-            (:func:`within_reach`).
-        random: their number.
+        Args:
+            dataset: whose points and colours are taken.
+            cameras: of the views that are fitted on.
+            settings: kind, degree and seed of the splats.
+            report: receives a line where random points are taken, and of points that lie too far
+            away (:func:`within_reach`).
+            random: their number.
 
-    Example:
-        >>> from attnwarp import Camera
-        >>> from attnwarp.fit import FitSettings, first_splats
-        >>> from attnwarp.io import Dataset
-        >>> view = dict(width=64, height=48, fov_y=40)
-        >>> cameras = [Camera.look_at(eye, (0, 0, 0), **view) for eye in ((3, 0, 0), (0, 3, 0))]
-        >>> data = Dataset(cameras, ["a.png", "b.png"])
-        >>> splats = first_splats(data, cameras, FitSettings(), print, random=50)
-        the data has no points: beginning with 50 random ones
-        >>> len(splats), splats.kind
-        (50, '2d')
+        Example:
+            >>> from attnwarp import Camera
+            >>> from attnwarp.fit import FitSettings, first_splats
+            >>> from attnwarp.io import Dataset
+    from attnwarp.reporting import SILENT, Reporter
+            >>> view = dict(width=64, height=48, fov_y=40)
+            >>> cameras = [Camera.look_at(eye, (0, 0, 0), **view) for eye in ((3, 0, 0), (0, 3, 0))]
+            >>> data = Dataset(cameras, ["a.png", "b.png"])
+            >>> splats = first_splats(data, cameras, FitSettings(), random=50)
+            >>> len(splats), splats.kind
+            (50, '2d')
     """
     points, colors = dataset.points, dataset.colors
     if points is None or not len(points):
-        say(f"the data has no points: beginning with {random} random ones")
+        report.log(f"the data has no points: beginning with {random} random ones")
         points, colors = random_points(cameras, random, seed=settings.seed)
     else:
         near = within_reach(np.asarray(points, np.float64), cameras)
         if not near.all():
             count = int((~near).sum())
             verb = "is" if count == 1 else "are"
-            say(
+            report.log(
                 f"{count} of {len(near)} points {verb} left out, over {FAR} times as far from the"
                 " cameras as the others"
             )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 
 import torch
 
@@ -11,18 +10,15 @@ from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians, Kind
 from attnwarp.losses import normal_consistency
 from attnwarp.render import render
+from attnwarp.reporting import SILENT, Reporter
 
-SILENT_SECONDS = 5.0
+QUIET_SECONDS = 5.0
 """A person is told of what takes longer. Loading what is compiled takes about one."""
 
 _ready: set[Kind] = set()
 
 
-def _nobody(text: str) -> None:
-    pass
-
-
-def compile_kernels(kind: Kind, say: Callable[[str], object] | None = None) -> None:
+def compile_kernels(kind: Kind, report: Reporter = SILENT) -> None:
     """Have numba compile the CPU renderer and its gradients, or load what it compiled before.
 
     Otherwise the first iteration does so, and the seconds of a fit hold a minute that no later fit
@@ -30,7 +26,7 @@ def compile_kernels(kind: Kind, say: Callable[[str], object] | None = None) -> N
 
     Args:
         kind: of the splats, "2d" or "3d".
-        say: told once if it takes seconds.
+        report: receives one line if it takes seconds.
 
     Example:
         >>> from attnwarp.fit import compile_kernels
@@ -39,7 +35,7 @@ def compile_kernels(kind: Kind, say: Callable[[str], object] | None = None) -> N
     if kind in _ready:
         return
     text = "waiting for the renderer, which is compiled once after an installation: about a minute"
-    timer = threading.Timer(SILENT_SECONDS, say or _nobody, [text])
+    timer = threading.Timer(QUIET_SECONDS, report.log, [text])
     timer.daemon = True
     timer.start()
     try:

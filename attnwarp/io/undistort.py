@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -17,13 +16,14 @@ from attnwarp.io.images import encode_png, read_image
 from attnwarp.io.lens import undistorted_camera, undistorted_image
 from attnwarp.io.names import numbered
 from attnwarp.io.transforms import read_transforms, write_transforms
+from attnwarp.reporting import SILENT, Reporter
 
 
 def undistort(
     dataset: Dataset,
     folder: str | os.PathLike[str],
     *,
-    progress: Callable[[int, int], object] | None = None,
+    report: Reporter = SILENT,
 ) -> Dataset:
     """Write undistorted pictures, and a transforms.json for them.
 
@@ -34,7 +34,7 @@ def undistort(
         dataset: read with ``distorted="keep"``; cameras without a picture are left out.
         folder: receives transforms.json and images/NAME.png, numbered where names are the same;
             made if need be.
-        progress: called with the number of pictures done and their total.
+        report: receives each picture that is done.
 
     Returns:
         The data set that was written.
@@ -83,8 +83,7 @@ def undistort(
         path.parent.mkdir(parents=True, exist_ok=True)
         data = encode_png(image)
         write_atomically(path, lambda stream, data=data: stream.write(data))  # type: ignore[misc]
-        if progress is not None:
-            progress(i + 1, len(cameras))
+        report.step(i + 1, len(cameras), names[i])
     result = replace(dataset, cameras=cameras, image_paths=paths, lenses=[None] * len(cameras))
     write_transforms(folder, result)
     return result

@@ -98,7 +98,7 @@ class ByView(Method):
                 start=start,
                 pictures=None if start is None else [work.picture(view) for view in batch],
                 noise=work.noise(0, batch),
-                watch=lambda *_: step(),
+                on_step=lambda *_: step(),
             )
         about: dict[str, Any] = {"start": start}
         if start is not None:

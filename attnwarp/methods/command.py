@@ -24,7 +24,6 @@ from attnwarp.fit import (
     first_splats,
     fit,
     load_views,
-    progress,
 )
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import THIRD_SCALE, Dataset, read_upright, write_ply
@@ -42,7 +41,7 @@ from attnwarp.methods.tuning import perceptual_net
 from attnwarp.methods.view_edits import check_editor
 from attnwarp.methods.words import masks_by_words, words_folder
 from attnwarp.process import asked_to_stop
-from attnwarp.reporting import reporter
+from attnwarp.reporting import Reporter
 
 FIT_FOLDER = "fit"
 
@@ -88,7 +87,7 @@ def edit_dataset(
     store: Any,
     device: str,
     threads: int | None,
-    say: Callable[[str], None],
+    report: Reporter,
 ) -> tuple[Result, Path]:
     """Fit where no splats are given, edit, and write the page and a PLY for other viewers.
 
@@ -108,7 +107,7 @@ def edit_dataset(
         max_size: larger pictures are averaged down to it.
         store, device: see :func:`attnwarp.methods.attention_warping` and ``load_editor``.
         threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
-        say: shows a line to the user.
+        report: receives how the work stands.
 
     Returns:
         The edit and the path of its page.
@@ -134,11 +133,11 @@ def edit_dataset(
         h, w, _ = by_hand.shape
         # Again in the edit, but here before an editor is loaded and a fit spends its minutes.
         check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
-    segments = None if masks is None else _masks(masks, views.cameras, pictures, say)
+    segments = None if masks is None else _masks(masks, views.cameras, pictures, report)
     editor = load_editor(editor_name, device=device)
     check_instruction(editor_name, editor, instruction)
     if words is not None:
-        segments = _by_words(words, segmenter, device, views.cameras, images, out, say)
+        segments = _by_words(words, segmenter, device, views.cameras, images, out, report)
     if settings.size is None:
         settings = replace(settings, size=own_size(editor))
     if splats is None:
@@ -146,24 +145,23 @@ def edit_dataset(
         check_editor(editor, settings)
         Features(editor, settings, "cpu")
         perceptual_net(settings)
-        splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, say)
+        splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, report)
     torch.set_num_threads(thread_count(editor, threads))
-    compile_kernels(splats.kind, say)
-    with reporter(title=out.name, log=say) as report:
-        result = attention_warping(
-            splats,
-            views.cameras,
-            images,
-            editor,
-            instruction,
-            settings,
-            source=index,
-            source_picture=by_hand,
-            segments=segments,
-            folder=out,
-            store=store,
-            report=report,
-        )
+    compile_kernels(splats.kind, report)
+    result = attention_warping(
+        splats,
+        views.cameras,
+        images,
+        editor,
+        instruction,
+        settings,
+        source=index,
+        source_picture=by_hand,
+        segments=segments,
+        folder=out,
+        store=store,
+        report=report,
+    )
     if result.gaussians.kind == "2d":
         # Other programs take no splats of two scales.
         write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
@@ -183,7 +181,7 @@ def run_baseline(
     max_size: int | None,
     device: str,
     threads: int | None,
-    say: Callable[[str], None],
+    report: Reporter,
 ) -> Result:
     """Run a method on the views of a data set.
 
@@ -199,7 +197,7 @@ def run_baseline(
         max_size: larger pictures are averaged down to it.
         device: of the editor.
         threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
-        say: shows a line to the user.
+        report: receives how the work stands.
 
     Raises:
         InputError: no such editor; a folder of another run.
@@ -211,19 +209,18 @@ def run_baseline(
     torch.set_num_threads(thread_count(editor, threads))
     if settings.size is None:
         settings = settings.changed(size=own_size(editor))
-    compile_kernels(splats.kind, say)
-    with reporter(title=out.name, log=say) as report:
-        return METHODS[method](
-            splats,
-            views.cameras,
-            images,
-            editor,
-            instruction,
-            settings,
-            folder=out,
-            budget=budget,
-            report=report,
-        )
+    compile_kernels(splats.kind, report)
+    return METHODS[method](
+        splats,
+        views.cameras,
+        images,
+        editor,
+        instruction,
+        settings,
+        folder=out,
+        budget=budget,
+        report=report,
+    )
 
 
 def _by_words(
@@ -233,19 +230,18 @@ def _by_words(
     cameras: Sequence[Camera],
     images: Sequence[npt.NDArray[Any]],
     out: Path,
-    say: Callable[[str], None],
+    report: Reporter,
 ) -> list[npt.NDArray[np.bool_]]:
     """Masks by a segmenter, whose networks do not stay beside the editor's."""
     segmenter = load_segmenter(name, device=device)
     folder = words_folder(out, segmenter, words)
-    say(f"masks of {words!r} by {name}: {folder}")
-    with reporter(title="masks") as report:
-        masks, kept = masks_by_words(segmenter, words, cameras, images, folder, report)
+    report.log(f"masks of {words!r} by {name}: {folder}")
+    masks, kept = masks_by_words(segmenter, words, cameras, images, folder, report)
     if kept:
-        say(f"{kept} of {len(masks)} masks are those of an earlier run")
-    say(_coverage(masks, cameras))
+        report.log(f"{kept} of {len(masks)} masks are those of an earlier run")
+    report.log(_coverage(masks, cameras))
     # Words may hold braces, so no template of them.
-    _say_empty(masks, cameras, lambda n: f"--where: no {words!r} was detected in {n} views", say)
+    _say_empty(masks, cameras, lambda n: f"--where: no {words!r} was detected in {n} views", report)
     return masks
 
 
@@ -255,7 +251,7 @@ def _fitted(
     plan: FitPlan,
     seed: int,
     folder: Path,
-    say: Callable[[str], None],
+    report: Reporter,
 ) -> Gaussians:
     """Splats fitted to all views; a fit in the folder is resumed."""
     settings = FitSettings.from_dict(
@@ -266,14 +262,11 @@ def _fitted(
             "seed": seed,
         }
     )
-    start = first_splats(dataset, views.cameras, settings, say)
-    say(f"no --ply: fitting splats to {len(views)} views first: {folder}")
-    if len(start) > plan.max_splats:
-        say(progress.more_points(len(start), plan.max_splats))
+    start = first_splats(dataset, views.cameras, settings, report)
+    report.log(f"no --ply: fitting splats to {len(views)} views first: {folder}")
     folder.mkdir(parents=True, exist_ok=True)
-    compile_kernels(settings.kind, say)
-    with asked_to_stop(say) as stop, progress.progress_display(title="fit") as watch:
-        result = fit(start, views, settings, folder=folder, watch=watch, stop=stop)
+    with asked_to_stop(report) as stop:
+        result = fit(start, views, settings, folder=folder, report=report, stop=stop)
     if result.stopped == "asked":
         raise KeyboardInterrupt
     return result.gaussians
@@ -309,7 +302,7 @@ def _spellings(names: list[str]) -> list[list[str]]:
 
 
 def _masks(
-    folder: Path, cameras: Any, pictures: Sequence[Path], say: Callable[[str], None]
+    folder: Path, cameras: Any, pictures: Sequence[Path], report: Reporter
 ) -> list[npt.NDArray[np.bool_]]:
     """(H, W) bool of each view from NAME.png: white is edited."""
     if not folder.is_dir():
@@ -323,7 +316,7 @@ def _masks(
         raise InputError(
             f"--masks: every mask in {folder} is black, so nothing may change; white is edited"
         )
-    _say_empty(masks, cameras, lambda n: f"--masks: {n} are black", say)
+    _say_empty(masks, cameras, lambda n: f"--masks: {n} are black", report)
     return masks
 
 
@@ -331,13 +324,13 @@ def _say_empty(
     masks: list[npt.NDArray[np.bool_]],
     cameras: Any,
     text: Callable[[str], str],
-    say: Callable[[str], None],
+    report: Reporter,
 ) -> None:
     """Name the views whose masks are empty; ``text`` begins the line, with a "2 of 9"."""
     empty = [camera.name for mask, camera in zip(masks, cameras, strict=True) if not mask.any()]
     if empty:
         more = f" and {len(empty) - MOST_NAMES} more" if len(empty) > MOST_NAMES else ""
-        say(
+        report.log(
             f"{text(f'{len(empty)} of {len(masks)}')}, so nothing is edited in"
             f" {', '.join(empty[:MOST_NAMES])}{more}"
         )

@@ -127,7 +127,7 @@ class GaussCtrl(Method):
                 work.instruction + s.suffix,
                 steps=s.steps,
                 latents=latents,
-                watch=lambda *_: step(),
+                on_step=lambda *_: step(),
             )
         about = {"references": [work.scene.cameras[view].name for view in self.references]}
         return [ViewEdit(picture, about) for picture in result.images[count:]]

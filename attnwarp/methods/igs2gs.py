@@ -95,6 +95,6 @@ class IGS2GS(Method):
                 start=start,
                 pictures=[work.render(view, model)],
                 noise=work.noise(number, (view,)),
-                watch=lambda *_: step(),
+                on_step=lambda *_: step(),
             )
         return [ViewEdit(result.images[0], {"start": start, "timesteps": result.timesteps})]

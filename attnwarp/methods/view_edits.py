@@ -292,7 +292,7 @@ class ViewEdits:
         work, s = self.work, self.settings
         if start.replayed is not None:
             picture, task, maps = start.replayed
-            replay(work.editor.schedule, task.predict, maps, watch=lambda *_: step())
+            replay(work.editor.schedule, task.predict, maps, on_step=lambda *_: step())
             return [picture], [work.editor.encode([picture])[0]] * s.steps
         kept: list[Tensor] = []
         shape = (work.editor.unet.config.out_channels, *self.latent_size(start.views[0]))
@@ -306,7 +306,7 @@ class ViewEdits:
             pictures=start.pictures or None,
             noise=self.noise.of(start.views, shape, sights) if start.latents is None else None,
             latents=start.latents,
-            watch=lambda *_: step(),
+            on_step=lambda *_: step(),
             estimate=self.estimates.change(sights, sources, kept if len(sights) == 1 else None),
         )
         return result.images, kept

@@ -81,7 +81,7 @@ def test_the_command_tells_its_version():
 def test_a_signal_that_a_shell_has_a_background_job_ignore_stays_ignored():
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with asked_to_stop(print) as asked:
+        with asked_to_stop() as asked:
             signal.raise_signal(signal.SIGINT)
             assert not asked()
             signal.raise_signal(signal.SIGTERM)

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, progress, resumable
+from attnwarp.reporting import reporter
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, resumable
 
 
 def metrics(
@@ -85,8 +86,8 @@ def metrics(
                 " name another folder"
             )
         kinds: dict[Any, str | None] = {"clip": clip, "dino": dino, "perceptual": perceptual}
-        with progress() as show, resumable(lambda: "finished batches of views are kept"):
-            measured = measure.measure(inputs, kinds, Store(out), device=device, progress=show)
+        with reporter() as report, resumable(lambda: "finished batches of views are kept"):
+            measured = measure.measure(inputs, kinds, Store(out), device=device, report=report)
         paths = write.write(measured, out)
     if as_json:
         typer.echo(write.to_json(measured), nl=False)

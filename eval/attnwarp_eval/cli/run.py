@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progress, resumable, warn
+from attnwarp.reporting import reporter
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, resumable, warn
 
 if TYPE_CHECKING:
     from attnwarp_eval.study.cell import Cell
-    from attnwarp_eval.study.record import Failure
     from attnwarp_eval.study.results import Results
     from attnwarp_eval.study.run import Plan, Summary
     from attnwarp_eval.study.schema import Study
@@ -163,14 +163,14 @@ def _run_on_capture(
         except (FileNotFoundError, ValueError) as error:
             raise InputError(f"--data: {error}") from None
         views = load_views(dataset, max_size=size, damaged="error")
-        with progress(lines=True) as show, resumable(lambda: "finished edits are kept"):
+        with reporter(every=True) as report, resumable(lambda: "finished edits are kept"):
             result = captured.compare(
                 loaded,
                 views,
                 read_ply(ply),
                 captured.Words(words[0], words[1], words[2]),
                 folder,
-                show,
+                report,
                 editors=by_guide,
             )
     for what, why in result.left_out.items():
@@ -331,30 +331,13 @@ def _watch(
     """Run with a progress bar on a terminal, or a line a cell where there is none."""
     from attnwarp_eval.study.run import execute
 
-    total, finished = len(planned.cells), planned.reused
-    with progress(total, done=finished, lines=True) as show:
+    with reporter(every=True) as report:
         reused = f", {planned.reused} already done" if planned.reused else ""
-        show.line(f"study {planned.study.name}: {total} cells{reused} -> {store.root}")
-
-        def listen(cell: Cell, event: str, failure: Failure | None) -> None:
-            nonlocal finished
-            if event == "start":
-                show.step(cell.title)
-                return
-            finished += 1
-            error = "" if failure is None else f" FAILED: {failure.error}"
-            show(finished, total, cell.title + error)
-            if error and show.console.is_terminal:
-                show.line(cell.title + error)
-
+        report.log(
+            f"study {planned.study.name}: {len(planned.cells)} cells{reused} -> {store.root}"
+        )
         return execute(
-            planned,
-            store,
-            jobs=jobs,
-            scheduler=scheduler,
-            keep_going=keep_going,
-            listen=listen,
-            notice=show.line,
+            planned, store, jobs=jobs, scheduler=scheduler, keep_going=keep_going, report=report
         )
 
 

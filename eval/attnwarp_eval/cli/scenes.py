@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progress, resumable
+from attnwarp.reporting import reporter
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, resumable
 
 if TYPE_CHECKING:
     from attnwarp_eval.scene.scene import Scene
@@ -72,10 +73,8 @@ def render(
         loaded = load_scene(scene).with_size(size, size)
         _say_open_bounces(loaded)
         folder = out or Path("runs") / "scenes" / loaded.name
-        with progress() as show:
-            written = list(
-                render_views(loaded, folder, views=names(views), spp=spp, progress=show.step)
-            )
+        with reporter() as report:
+            written = list(render_views(loaded, folder, views=names(views), spp=spp, report=report))
     typer.echo(written[-1])
 
 
@@ -104,10 +103,10 @@ def export(
         loaded = load_scene(scene)
         _check_no_capture(out)
         _say_open_bounces(loaded)
-        with progress() as show:
+        with reporter(title=loaded.name) as report:
             attnwarp_eval.splats.export.export(
                 loaded, out, views=views, size=size, spp=spp, points=points, noise=noise, seed=seed,
-                progress=lambda text: show.step(f"{loaded.name}: {text}"),
+                report=report,
             )  # fmt: skip
     typer.echo(out / "transforms.json")
 
@@ -171,7 +170,7 @@ def calibrate(
 
     A scene takes some ten seconds, minutes where light goes far, as through glass.
     """
-    with clear_errors(), progress() as show:
+    with clear_errors(), reporter() as report:
         from attnwarp.errors import InputError
         from attnwarp.io.text import read_text
         from attnwarp_eval.files import write_atomic
@@ -181,7 +180,7 @@ def calibrate(
 
         path, numbers = scene_file(scene), {}
         for which, world in worlds(load_scene(scene)):
-            show.step(f"{world.name}: measuring how often its light bounces")
+            report.step(0, 0, f"{world.name}: measuring how often its light bounces")
             found = search(world)
             numbers[which] = found.bounces
             # After each, so that what was measured outlives an interruption.
@@ -262,10 +261,10 @@ def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
 
         scenes = list_scenes()
         with (
-            progress(len(scenes), lines=True) as show,
+            reporter(every=True) as report,
             resumable(lambda: "finished scenes are kept"),
         ):
-            entries = collect(scenes, out, Settings(prove=prove, budget=budget), show)
+            entries = collect(scenes, out, Settings(prove=prove, budget=budget), report)
     for name in ("effects.md", "effects.html"):
         typer.echo(out / name)
     doubtful = [f"{e['scene']}: {proof_words(e['proof'])}" for e in entries if "proof" in e
@@ -293,8 +292,8 @@ def accuracy(
         from attnwarp_eval.experiments.accuracy import measure
         from attnwarp_eval.experiments.accuracy.write import write
 
-        with progress() as show, resumable(lambda: "finished panels are kept"):
-            panels = list(measure(scenes or (), out=out, rounds=rounds, progress=show))
+        with reporter() as report, resumable(lambda: "finished panels are kept"):
+            panels = list(measure(scenes or (), out=out, rounds=rounds, report=report))
         for path in write(panels, out):
             typer.echo(path)
 
@@ -330,11 +329,11 @@ def flow(
                 raise InputError(f"--yaws: got {angle}, expected degrees such as 5,20")
         options = flow.Options(size, spp, cast(flow.Method, method), pictures)
         with (
-            progress(lines=True) as show,
+            reporter(every=True) as report,
             resumable(lambda: "finished pairs are kept"),
         ):
             chosen = scenes or list(flow.SCENES)
-            rows = list(flow.measure(chosen, angles, out, options, progress=show))
+            rows = list(flow.measure(chosen, angles, out, options, report=report))
         if not rows:
             raise InputError("--yaws: got none, expected degrees such as 5,20")
         typer.echo(markdown_table(flow_report.table(rows)))
@@ -368,18 +367,18 @@ def time_(
         from attnwarp_eval.scene.file import list_scenes
 
         times = []
-        with progress() as show:
+        with reporter() as report:
             for taken in suite.measure(
                 scenes or list_scenes(),
                 views=views,
                 size=size,
                 spp=spp,
                 geometry_size=geometry_size,
-                progress=show,
+                report=report,
             ):
                 times.append(taken)
                 # All of them take minutes, so each is printed as soon as it is measured.
-                show.line(f"{taken.scene}: {sum(taken.wall.values()):.1f} s")
+                report.log(f"{taken.scene}: {sum(taken.wall.values()):.1f} s")
     if as_json:
         typer.echo(json.dumps(suite.to_dict(times), indent=1))
         return

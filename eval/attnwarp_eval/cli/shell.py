@@ -1,25 +1,18 @@
-"""What every command shares: exit codes, errors in one line, and one progress bar."""
+"""What every command shares: exit codes, and errors in one line."""
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
 from attnwarp.cli import shell
 from attnwarp.cli.shell import STOPPED, USAGE, closed_pipe
 from attnwarp.process import stops_interrupt
-from attnwarp.reporting import LINE_SECONDS, Pace
-
-if TYPE_CHECKING:
-    import rich.progress
-    from rich.console import Console
-    from rich.progress import TaskID
 
 PASS, REGRESSION, TOO_LITTLE, CRASH = 0, 1, 3, 70
 """Exit codes beside those of attnwarp. 1 is reserved for a regression. A run that measured too
@@ -141,99 +134,3 @@ def resumable(state: Callable[[], str]) -> Iterator[None]:
 def names(text: str | None) -> list[str] | None:
     """The parts of a comma-separated option; None if the option was left out."""
     return None if text is None else [part.strip() for part in text.split(",") if part.strip()]
-
-
-class Progress:
-    """Progress of one command on stderr: a bar on a terminal, else lines, now and then or for every
-    call.
-
-    Attributes:
-        console: stderr.
-    """
-
-    def __init__(
-        self, console: Console, bar: rich.progress.Progress, task: TaskID, lines: bool
-    ) -> None:
-        self.console = console
-        self._bar = bar
-        self._task = task
-        self._lines = lines
-        self._pace = Pace()
-        self._told = time.monotonic()
-
-    def __call__(self, done: int, total: int, step: str) -> None:
-        """Show how far the work is.
-
-        Args:
-            done: steps finished.
-            total: steps in all; 0 while their number is unknown.
-            step: what is at work, or has just ended.
-        """
-        self._bar.update(self._task, description=step, completed=done, total=total or None)
-        if not self.console.is_terminal and (self._lines or self._due()):
-            left = self._pace.left(done, total)
-            self.line(f"[{done}/{total}] {step}{left}" if total else step)
-
-    def step(self, text: str) -> None:
-        """Name what is at work, without a count."""
-        self._bar.update(self._task, description=text)
-        if not self.console.is_terminal and self._due():
-            self.line(text)
-
-    def _due(self) -> bool:
-        """Whether a log file has had no line for a while."""
-        now = time.monotonic()
-        if now - self._told < LINE_SECONDS:
-            return False
-        self._told = now
-        return True
-
-    def line(self, text: str) -> None:
-        """Print a line above the bar; a log file gets it whole, so that it can be searched."""
-        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
-
-
-@contextmanager
-def progress(total: int = 0, *, done: int = 0, lines: bool = False) -> Iterator[Progress]:
-    """The progress bar of a command.
-
-    Args:
-        total: number of steps; 0 while it is unknown.
-        done: steps finished before.
-        lines: without a terminal, print a line for every call, not every ten seconds alone.
-    """
-    import rich.progress
-    from rich.console import Console, RenderableType
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        ProgressColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-    from rich.text import Text
-
-    class Known(ProgressColumn):
-        """A column for work whose steps are counted; empty for any other."""
-
-        def __init__(self, inner: ProgressColumn) -> None:
-            super().__init__()
-            self.inner = inner
-
-        def render(self, task: rich.progress.Task) -> RenderableType:
-            return Text() if task.total is None else self.inner(task)
-
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=20),
-        Known(MofNCompleteColumn()),
-        TimeElapsedColumn(),
-        Known(TextColumn("left")),
-        Known(TimeRemainingColumn()),
-    )
-    with rich.progress.Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        yield Progress(
-            console, bar, bar.add_task("starting", total=total or None, completed=done), lines
-        )

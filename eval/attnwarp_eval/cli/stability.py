@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from attnwarp_eval.cli.shell import Regression, clear_errors, progress
+from attnwarp.reporting import reporter
+from attnwarp_eval.cli.shell import Regression, clear_errors
 
 if TYPE_CHECKING:
     from attnwarp_eval.stability import Case
@@ -66,9 +67,9 @@ def _show(chosen: list[Case], quick: bool) -> list[str]:
         levels = hard.quick if quick else hard.levels
         offered = [way for way in hard.ways if way.backend != "cuda" or has_cuda()]
         swept = []
-        with progress(len(offered)) as show:
+        with reporter() as report:
             for done, way in enumerate(offered):
-                show(done, len(offered), f"{hard.name} / {way.name}")
+                report.step(done, len(offered), f"{hard.name} / {way.name}")
                 swept.append(Swept(hard, way, tuple(hard.outcome(level, way) for level in levels)))
         about = case_table(swept).caption.replace("`", "")
         for line in textwrap.wrap(about, width=min(console.width, 100)):

@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.errors import InputError
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.effects.detect import detect
 from attnwarp_eval.effects.saving import measure
-from attnwarp_eval.progress import Tell, untold
 from attnwarp_eval.scene.materials import NOT_SIMULATED
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.transport import called_for
@@ -60,13 +60,13 @@ class Settings:
     pictures: bool = True
 
 
-def measure_entry(scene: Scene, settings: Settings, tell: Tell = untold) -> dict[str, Any]:
+def measure_entry(scene: Scene, settings: Settings, report: Reporter = SILENT) -> dict[str, Any]:
     """A scene's effects, the cost of its plan, and the proof, as JSON.
 
     Args:
         scene: the scene.
         settings: how the entry is made; pictures are apart, see :func:`side_by_side`.
-        tell: told what is at work.
+        report: receives what is at work.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -94,10 +94,10 @@ def measure_entry(scene: Scene, settings: Settings, tell: Tell = untold) -> dict
         "picture": f"{scene.name}.jpg",
     }
     if settings.rounds:
-        tell(f"{scene.name}: time against everything on")
+        report.step(0, 0, f"{scene.name}: time against everything on")
         entry["cost"] = measure(scene, rounds=settings.rounds).to_dict()
     if settings.prove:
-        tell(f"{scene.name}: proof")
+        report.step(0, 0, f"{scene.name}: proof")
         entry["proof"] = prove(scene, seconds=settings.budget).to_dict()
     return entry
 

@@ -19,11 +19,11 @@ import numpy.typing as npt
 from attnwarp.editing.small import guide_of
 from attnwarp.encoders._weights import device_of
 from attnwarp.errors import InputError
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.document import write
 from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.files import write_atomic, write_picture
-from attnwarp_eval.progress import Progress, silent
 from attnwarp_eval.study.editing_methods import (
     EDITING_METHODS,
     EditedScene,
@@ -148,7 +148,7 @@ def compare(
     splats: Gaussians,
     words: Words,
     out: Path,
-    progress: Progress = silent,
+    report: Reporter = SILENT,
     *,
     editors: Editors = Editors(),
 ) -> Comparison:
@@ -160,7 +160,7 @@ def compare(
         splats: the scene before the edit.
         words: the edit.
         out: folder of ``captured.json``, ``.md`` and ``.html``, and of a folder for each variant.
-        progress: told of each variant.
+        report: receives each variant.
         editors: what edits single views.
 
     Raises:
@@ -197,7 +197,7 @@ def compare(
     originals = _originals(views, out / "originals")
     seconds: dict[str, float] = {}
     for place, name in enumerate(usable):
-        progress(place, len(usable), name)
+        report.step(place, len(usable), name)
         folder = out / f"variant-{names.index(name) + 1}"
         editor = editing.load(
             parts[name].name, editing.editor_identity(parts[name]), editors.device
@@ -214,7 +214,7 @@ def compare(
             "edited_views": len(edited.edited),
             "cut": edited.cut,
         }
-    progress(len(usable), len(usable), "report")
+    report.step(len(usable), len(usable), "report")
     _write(study, words, views.cameras, result, out)
     return result
 

@@ -6,14 +6,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.canonical_json import write_json
 from attnwarp_eval.cost import environment
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.effects import table
-from attnwarp_eval.effects.table import Settings, measure_entry, report, side_by_side
+from attnwarp_eval.effects.table import Settings, measure_entry, side_by_side
 from attnwarp_eval.experiments.distinct_scenes import distinct_scenes
 from attnwarp_eval.experiments.overwriting import check_nothing_is_lost
-from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.store import Store
@@ -27,7 +27,7 @@ Part = tuple[str, dict[str, Any]]
 
 
 def collect(
-    names: Sequence[str], out: Path, settings: Settings, progress: Progress = silent
+    names: Sequence[str], out: Path, settings: Settings, report: Reporter = SILENT
 ) -> list[dict[str, Any]]:
     """Make the table's entries and write them, with their pictures, below ``out``.
 
@@ -39,7 +39,7 @@ def collect(
         names: scenes' names or paths.
         out: folder of ``effects.json``, the report, ``<scene>.jpg`` and ``cells/``.
         settings: how an entry is made.
-        progress: told of each step of each scene.
+        report: receives each step of each scene.
 
     Returns:
         The entries, as they stand in ``effects.json``.
@@ -55,7 +55,7 @@ def collect(
     tasks, parts = _tasks(scenes, store, settings), 1 + settings.pictures
     entries: dict[str, dict[str, Any]] = {}
     for done, (name, part) in enumerate(
-        results(store, tasks, len(scenes) * parts, progress), start=1
+        results(store, tasks, len(scenes) * parts, report), start=1
     ):
         entries.setdefault(name, {}).update(part)
         if not stored <= {(scene.name,) for scene in scenes[: done // parts]}:
@@ -64,7 +64,7 @@ def collect(
         about = environment()
         data = {"environment": about, "scenes": [entries[name] for name in sorted(entries)]}
         write_json(out / "effects.json", data, sort_keys=False)
-        write_files(report(list(entries.values()), about), out, "effects")
+        write_files(table.report(list(entries.values()), about), out, "effects")
     return list(entries.values())
 
 
@@ -83,8 +83,8 @@ def _entry(scene: Scene, settings: Settings) -> Task[Part]:
     spec = {"probe": "effects", "prove": settings.prove, "budget": settings.budget}
     spec |= {"rounds": settings.rounds}
 
-    def compute(tell: Tell) -> Json:
-        return {"entry": measure_entry(scene, settings, tell)}
+    def compute(report: Reporter) -> Json:
+        return {"entry": measure_entry(scene, settings, report)}
 
     return Task(
         f"{scene.name}: effects", _common(scene) | spec, compute, lambda r: (scene.name, r["entry"])
@@ -95,7 +95,7 @@ def _pictures(scene: Scene, store: Store) -> Task[Part]:
     spec = {"probe": "effects, pictures", "size": table.PICTURE_SIZE, "plan": table.PLAN_SAMPLES}
     spec |= {"everything_on": table.FULL_SAMPLES}
 
-    def compute(tell: Tell) -> Json:
+    def compute(report: Reporter) -> Json:
         path = store.root / f"{scene.name}.jpg"
         about = side_by_side(scene, path)
         saved = store.keep_picture(path, view=scene.source.name, what="side by side")

@@ -19,10 +19,10 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp.errors import InputError
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.experiments.overwriting import check_nothing_is_lost
 from attnwarp_eval.files import write_picture
-from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.store import Store
@@ -111,7 +111,7 @@ def measure(
     out: Path,
     options: Options,
     *,
-    progress: Progress = silent,
+    report: Reporter = SILENT,
 ) -> Iterator[Row]:
     """The rows of scenes and yaws, in this order.
 
@@ -122,7 +122,7 @@ def measure(
         yaws: degrees from the source.
         out: the run's folder, which also takes the pictures.
         options: how each row is measured.
-        progress: told of each row.
+        report: receives each row.
 
     Raises:
         InputError: another scene than :data:`SCENES`; another run is writing to ``out``, or rows of
@@ -139,7 +139,7 @@ def measure(
     check_nothing_is_lost(out / "flow.json", None, ("scene", "yaw", "method"), asked)
     store = Store(out)
     tasks = (_task(store, name, float(yaw), options) for name in scenes for yaw in yaws)
-    yield from results(store, tasks, len(scenes) * len(yaws), progress)
+    yield from results(store, tasks, len(scenes) * len(yaws), report)
 
 
 def _task(store: Store, name: str, yaw: float, options: Options) -> Task[Row]:
@@ -157,7 +157,7 @@ def _task(store: Store, name: str, yaw: float, options: Options) -> Task[Row]:
         **asdict(options),
     }
 
-    def compute(tell: Tell) -> Json:
+    def compute(report: Reporter) -> Json:
         pictures = []
 
         def keep(kind: str, image: npt.NDArray[np.float64]) -> None:

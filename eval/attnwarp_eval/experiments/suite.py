@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from attnwarp.reporting import SILENT, Part, Reporter
 from attnwarp_eval.cost import Meter
 from attnwarp_eval.document.model import Table
 from attnwarp_eval.experiments.distinct_scenes import distinct_scenes
-from attnwarp_eval.progress import Progress, silent
 from attnwarp_eval.scene.file import load_scene
 
 STAGES = ("meshes", "geometry", "first picture", "other pictures")
@@ -59,7 +59,7 @@ def measure(
     geometry_size: int = 512,
     size: int = 256,
     spp: int = 64,
-    progress: Progress = silent,
+    report: Reporter = SILENT,
 ) -> Iterator[SceneTime]:
     """Make each scene's truth from an empty cache, one after the other, and time it.
 
@@ -69,7 +69,7 @@ def measure(
             fewer.
         geometry_size, size: of the square images of depth and ids, and of the pictures.
         spp: samples a pixel of the pictures.
-        progress: told of each step of each scene.
+        report: receives each step of each scene.
 
     Raises:
         InputError: a scene that cannot be used, or two scenes of one name.
@@ -85,17 +85,14 @@ def measure(
     appearance(warm, warm.source, spp=1)
     for number, name in enumerate(names):
         meter = Meter()
-
-        def tell(step: str, number: int = number) -> None:
-            progress(number, len(names), step)
-
-        tell(f"{name}: meshes")
+        part = Part(report, number, len(names))
+        part.step(0, 0, f"{name}: meshes")
         with empty_cache():
             with meter.stage("meshes"):
                 scene = load_scene(name)
                 scene.shapes()
             cameras = scene.with_size(geometry_size, geometry_size).cameras[:views]
-            tell(f"{name}: geometry of {len(cameras)} views")
+            part.step(0, 0, f"{name}: geometry of {len(cameras)} views")
             with meter.stage("geometry"):
                 geometry = Geometry(scene)
                 for camera in cameras:
@@ -103,7 +100,7 @@ def measure(
             del geometry
             small = scene.with_size(size, size)
             for k, camera in enumerate(small.cameras[:views]):
-                tell(f"{name}: picture {k + 1} of {len(cameras)}")
+                part.step(0, 0, f"{name}: picture {k + 1} of {len(cameras)}")
                 with meter.stage("other pictures" if k else "first picture"):
                     appearance(small, camera, spp=spp)
         forget()

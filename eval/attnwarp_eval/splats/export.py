@@ -16,8 +16,8 @@ import numpy.typing as npt
 from attnwarp.camera import Camera
 from attnwarp.fit.views import HELD_OUT_EVERY
 from attnwarp.gaussians import SH_C0
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.progress import Tell, untold
 from attnwarp_eval.scene.scene import Scene, SceneError
 from attnwarp_eval.scene.spec import SkySpec
 from attnwarp_eval.splats.surface import surface_splats
@@ -222,7 +222,7 @@ def export(
     points: int = 5000,
     noise: float = 0.5,
     seed: int = 0,
-    progress: Tell = untold,
+    report: Reporter = SILENT,
 ) -> Dataset:
     """Write a scene as a data set: transforms.json, images/*.png, masks/OBJECT/*.png, points.ply.
 
@@ -237,7 +237,7 @@ def export(
         views, size: number of views, and the edge of their images in px.
         spp: samples a pixel.
         points, noise, seed: see :func:`first_points`.
-        progress: told in words what is done next.
+        report: receives what is done next.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -251,14 +251,14 @@ def export(
     folder = Path(folder)
     # It is written last: until then nothing may pass for the cameras of what is written here.
     (folder / "transforms.json").unlink(missing_ok=True)
-    progress("points")
+    report.step(0, views, "points")
     geometry = Geometry(scene)
     cloud = first_points(scene, points, noise=noise, seed=seed, geometry=geometry)
     cameras = orbit(scene, views, size)
     paths: list[Path | None] = []
     shown = []
     for k, camera in enumerate(cameras):
-        progress(f"view {k + 1} of {views}")
+        report.step(k, views, f"view {k + 1}")
         path = folder / "images" / f"{camera.name}.png"
         paths.append(write_picture(path, picture(scene, camera, spp)))
         shown.append(geometry.trace(camera).object_id)

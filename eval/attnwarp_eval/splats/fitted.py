@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval import metrics
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats.export import first_points, held_out, orbit, picture
 from attnwarp_eval.truth import Geometry
 
 if TYPE_CHECKING:
-    from attnwarp.fit import Fit, FitSettings, Step
+    from attnwarp.fit import Fit, FitSettings
     from attnwarp.gaussians import Gaussians
     from attnwarp.warp import Surface, WarpSettings
     from attnwarp_eval.two_view import Hits
@@ -33,7 +33,7 @@ def fit_scene(
     noise: float = 0.5,
     seed: int = 0,
     geometry: Geometry | None = None,
-    watch: Callable[[Step], object] | None = None,
+    report: Reporter = SILENT,
 ) -> Fit:
     """Fit splats to a scene's true pictures; the curve of the fit has the errors of depth and
     normals in it.
@@ -48,7 +48,7 @@ def fit_scene(
         folder: of the fit's files; a fit that was stopped there is resumed.
         views, spp, points, noise, seed: see :func:`attnwarp_eval.splats.export.export`.
         geometry: ``Geometry(scene)``, if there is one already.
-        watch: as in :func:`attnwarp.fit.fit`.
+        report: as in :func:`attnwarp.fit.fit`.
 
     Example:
         >>> from attnwarp.fit import FitSettings
@@ -87,7 +87,7 @@ def fit_scene(
         }
 
     return fit(
-        start, parts[0], settings, held_out=parts[1], folder=folder, measure=errors, watch=watch
+        start, parts[0], settings, held_out=parts[1], folder=folder, measure=errors, report=report
     )
 
 

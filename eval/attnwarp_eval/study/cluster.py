@@ -12,7 +12,7 @@ import signal
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping
+from collections.abc import Collection, Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -33,6 +33,7 @@ from attnwarp_eval.study.remote import (
     this_code,
     unpack,
 )
+from attnwarp_eval.study.reporting import CellReporter
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.work import compute_and_write, failure
 
@@ -144,7 +145,7 @@ class _Remote(Workplace):
 
 
 def run_on_workers(
-    cells: list[Cell], root: Path, jobs: int, started: Callable[[Cell], None]
+    cells: list[Cell], root: Path, jobs: int, report: CellReporter
 ) -> Generator[Ended]:
     """Compute and write cells on this machine, one process a worker.
 
@@ -152,7 +153,7 @@ def run_on_workers(
         cells: what to compute.
         root: the run's folder.
         jobs: number of workers.
-        started: called with each cell as it is handed out.
+        report: receives each cell as it is handed out.
 
     Yields:
         Each cell as it ends, with what went wrong.
@@ -177,7 +178,7 @@ def run_on_workers(
         stack.enter_context(_silent())
         stack.enter_context(dask.config.set(settings))
         client = stack.enter_context(_local_client(jobs))
-        yield from _Runner(client, cells, _Local(root, threads), started).run()
+        yield from _Runner(client, cells, _Local(root, threads), report).run()
 
 
 @contextlib.contextmanager
@@ -231,8 +232,7 @@ def run_on_scheduler(
     store: Store,
     scenes: Mapping[str, Scene],
     scheduler: str,
-    started: Callable[[Cell], None],
-    notice: Callable[[str], None],
+    report: CellReporter,
 ) -> Generator[Ended]:
     """Compute cells on the workers of the user's own scheduler, and write them here.
 
@@ -241,8 +241,8 @@ def run_on_scheduler(
         store: the run's folder, which no worker needs to see.
         scenes: by the names that cells give them.
         scheduler: its address, such as ``tcp://host:8786``, or its scheduler file.
-        started: called with each cell as it is handed out.
-        notice: called with a line about a worker that joins, is refused or is lost.
+        report: receives each cell as it is handed out, and a line about a worker that is refused
+            or lost.
 
     Yields:
         Each cell as it ends, with what went wrong.
@@ -255,7 +255,7 @@ def run_on_scheduler(
         stack.enter_context(_silent())
         client = stack.enter_context(_closed(_connect(scheduler)))
         place = _Remote(store, scenes)
-        yield from _Runner(client, cells, place, started, notice, this_code()).run()
+        yield from _Runner(client, cells, place, report, this_code()).run()
 
 
 def _connect(scheduler: str) -> Client:
@@ -350,8 +350,7 @@ class _Runner:
         client: of the cluster.
         cells: what to compute.
         place: how a cell travels.
-        started: called with each cell as it is handed out.
-        notice: called with a line about a worker.
+        report: receives each cell as it is handed out, and lines about workers.
         code: that a worker must have; workers are not asked if None.
     """
 
@@ -360,14 +359,12 @@ class _Runner:
         client: Client,
         cells: list[Cell],
         place: Workplace,
-        started: Callable[[Cell], None],
-        notice: Callable[[str], None] = lambda line: None,
+        report: CellReporter,
         code: Code | None = None,
     ) -> None:
         self.client = client
         self.place = place
-        self.started = started
-        self.notice = notice
+        self.report = report
         self.code = code
         self.cells = _Queue(cells)
         self.ended: queue.SimpleQueue[Future] = queue.SimpleQueue()
@@ -434,7 +431,9 @@ class _Runner:
         future.cancel()
         self.lost[cell.id] += 1
         if self.lost[cell.id] < ATTEMPTS:
-            self.notice(f"worker {worker} was lost at {cell.title}; the cell is tried once more")
+            self.report.report.log(
+                f"worker {worker} was lost at {cell.title}; the cell is tried once more"
+            )
             self.cells.put_back(cell)
         else:
             error = RuntimeError(
@@ -451,7 +450,7 @@ class _Runner:
             if cell is None:
                 break
             self.scene[worker] = cell.scene
-            self.started(cell)
+            self.report.start(cell)
             future = self.place.submit(self.client, worker, cell)
             self.running[worker] = (self._watched(worker, future), cell)
         if self.place.adaptive:
@@ -544,7 +543,7 @@ class _Runner:
             name = f"{code.worker} ({worker})" if code.worker != worker else worker
         if difference:
             self.refused[worker] = f"worker {name}: {difference}"
-            self.notice(f"worker {name} is refused: {difference}")
+            self.report.report.log(f"worker {name} is refused: {difference}")
         else:
             self.accepted.add(worker)
 

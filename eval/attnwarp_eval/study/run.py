@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from attnwarp.errors import InputError
 from attnwarp.process import core_count
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.cost import environment
 from attnwarp_eval.scene.base import silence_notices
 from attnwarp_eval.scene.file import load_scene
@@ -22,6 +23,7 @@ from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
 from attnwarp_eval.study.plugins import VARIABLE, load_plugins, plugin_modules
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.record import Environment, Failure
+from attnwarp_eval.study.reporting import CellReporter
 from attnwarp_eval.study.schema import Study, StudyError, did_you_mean
 from attnwarp_eval.study.store import Problems, Store, StoreError
 from attnwarp_eval.study.study import cells_of, explain_errors, parse_study
@@ -276,10 +278,6 @@ def _entry(cell: Cell) -> dict[str, Any]:
     }
 
 
-Listener = Callable[[Cell, str, Failure | None], None]
-"""Called with a cell, one of "start", "done" and "failed", and what went wrong."""
-
-
 def execute(
     plan: Plan,
     store: Store,
@@ -287,8 +285,7 @@ def execute(
     jobs: int = 1,
     scheduler: str | None = None,
     keep_going: bool = True,
-    listen: Listener = lambda cell, event, failure: None,
-    notice: Callable[[str], None] = lambda line: None,
+    report: Reporter = SILENT,
 ) -> Summary:
     """Compute the cells that are still to do, writing each as soon as it is finished.
 
@@ -299,8 +296,7 @@ def execute(
             numbers do not depend on it.
         scheduler: address or file of a dask scheduler, whose workers compute instead.
         keep_going: go on after a failed cell; else stop at the first.
-        listen: called at every start and end.
-        notice: called with a line about a worker of the scheduler.
+        report: receives every beginning and end of a cell, and lines about failures and workers.
 
     Raises:
         ClusterError: the scheduler cannot be reached, or every worker is refused.
@@ -311,34 +307,31 @@ def execute(
     store.write_study(expected(plan))
     summary = Summary(expected=len(plan.cells), reused=plan.reused)
 
-    def started(cell: Cell) -> None:
-        listen(cell, "start", None)
-
+    cells = CellReporter(plan.todo, plan.reused, report)
     if scheduler is not None:
-        work = run_on_scheduler(plan.todo, store, plan.scenes, scheduler, started, notice)
+        work = run_on_scheduler(plan.todo, store, plan.scenes, scheduler, cells)
     elif jobs > 1:
-        work = run_on_workers(plan.todo, store.root, jobs, started)
+        work = run_on_workers(plan.todo, store.root, jobs, cells)
     else:
-        work = _in_this_process(plan, store, started)
+        work = _in_this_process(plan, store, cells)
     # Closed here and now: an interrupt must end the workers before the command ends.
     with contextlib.closing(work):
         for cell, failure in work:
             if failure is None:
                 summary.computed += 1
-                listen(cell, "done", None)
-                continue
-            store.write_failure(cell.id, asdict(failure))
-            summary.failures.append(failure)
-            listen(cell, "failed", failure)
-            if not keep_going:
+            else:
+                store.write_failure(cell.id, asdict(failure))
+                summary.failures.append(failure)
+            cells.end(cell, failure)
+            if failure is not None and not keep_going:
                 break
     summary.seconds = time.perf_counter() - start
     return summary
 
 
 def _in_this_process(
-    plan: Plan, store: Store, started: Callable[[Cell], None]
+    plan: Plan, store: Store, cells: CellReporter
 ) -> Generator[tuple[Cell, Failure | None]]:
     for cell in plan.todo:
-        started(cell)
+        cells.start(cell)
         yield cell, compute_and_write(probe(cell.probe), cell, str(store.root))

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
+from attnwarp.reporting import SILENT, Part, Reporter
 from attnwarp_eval.canonical_json import digest
-from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.store import Store
 
@@ -27,12 +27,12 @@ class Task(Generic[T]):
 
     title: str
     spec: Json
-    compute: Callable[[Tell], Json]
+    compute: Callable[[Reporter], Json]
     read: Callable[[Json], T]
 
 
 def results(
-    store: Store, tasks: Iterable[Task[T]], total: int, progress: Progress = silent
+    store: Store, tasks: Iterable[Task[T]], total: int, report: Reporter = SILENT
 ) -> Iterator[T]:
     """The results of tasks, in their order. After an interruption only missing ones are computed.
 
@@ -40,14 +40,14 @@ def results(
         store: of the folder, which is locked meanwhile.
         tasks: taken one by one, so that what one of them holds can be freed.
         total: how many there are.
-        progress: told of each task and of its steps.
+        report: receives each task, and what is at work in it.
 
     Raises:
         StoreError: another run is writing to the folder.
 
     Example:
         >>> squares = [
-        ...     Task(f"{x} squared", {"x": x}, lambda tell, x=x: {"y": x * x}, lambda r: r["y"])
+        ...     Task(f"{x} squared", {"x": x}, lambda report, x=x: {"y": x * x}, lambda r: r["y"])
         ...     for x in (2, 3)
         ... ]
         >>> list(results(Store("run"), squares, 2))
@@ -55,15 +55,13 @@ def results(
     """
     with store.lock():
         for number, task in enumerate(tasks):
-
-            def tell(step: str, number: int = number) -> None:
-                progress(number, total, step)
-
-            tell(task.title)
+            report.step(number, total, task.title)
             cell_id = digest(task.spec)
             result = store.whole(cell_id, task.read)
             if result is None:
-                store.write({"id": cell_id, "spec": task.spec, **task.compute(tell)})
+                store.write(
+                    {"id": cell_id, "spec": task.spec, **task.compute(Part(report, number, total))}
+                )
                 result = store.read_as(cell_id, task.read)  # as a resumed run reads it
             yield result
-    progress(total, total, "done")
+    report.step(total, total, "done")

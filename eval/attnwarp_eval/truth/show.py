@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp.errors import InputError
-from attnwarp_eval.progress import Tell, untold
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.scene.extent import extent
 from attnwarp_eval.scene.meshes import read_mesh_file
 from attnwarp_eval.scene.scene import Scene
@@ -71,7 +71,7 @@ def pictures_made(scene: Scene) -> str:
 
 def render_views(
     scene: Scene, out: Path, *, views: list[str] | None = None, spp: int | None = None,
-    progress: Tell = untold,
+    report: Reporter = SILENT,
 ) -> Iterator[Path]:  # fmt: skip
     """Write each view's picture, depth and normals as PNG, and one sheet of them all.
 
@@ -80,7 +80,7 @@ def render_views(
         out: folder, made if it is missing.
         views: names of cameras; all of them if left out.
         spp: samples a pixel; the scene's own number if left out.
-        progress: told the name of the view at work.
+        report: receives each view at work.
 
     Yields:
         The files, as they are written; the sheet, ``sheet.png``, last.
@@ -97,8 +97,8 @@ def render_views(
         raise InputError("views: got none, expected names of cameras; leave it out for all of them")
     geometry = Geometry(scene)
     rows = []
-    for camera in cameras:
-        progress(camera.name)
+    for number, camera in enumerate(cameras):
+        report.step(number, len(cameras), camera.name)
         image = to_srgb(appearance(scene, camera, spp=spp))
         hits = geometry.trace(camera)
         pictures = {

@@ -21,9 +21,9 @@ from attnwarp.encoders import EncoderInfo, Kind, check_kind, load_encoder
 from attnwarp.encoders._weights import device_of
 from attnwarp.errors import InputError
 from attnwarp.io.find import name_key
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
-from attnwarp_eval.progress import Progress, silent
 from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.task import Task, results
@@ -167,7 +167,7 @@ def measure(
     store: Store,
     *,
     device: str = "cpu",
-    progress: Progress = silent,
+    report: Reporter = SILENT,
 ) -> Measured:
     """Compute every figure of the paper's table that the pictures and prompts allow.
 
@@ -179,7 +179,7 @@ def measure(
         store: finished batches are read from there and written there, so that a killed call
             goes on where it was. Views are known by the content of their files.
         device: "cpu" or "cuda", for real encoders.
-        progress: told of each batch of views.
+        report: receives each batch of views.
 
     Raises:
         InputError: nothing can be computed (the message says why, figure by figure), a picture that
@@ -230,7 +230,7 @@ def measure(
     gathered = _Gathered()
     needed = [name for name in folders["renders"] if any(name in names for names in views.values())]
     tasks = _tasks(inputs, folders, views, needed, loaded, device)
-    for batch in results(store, tasks, math.ceil(len(needed) / BATCH), progress):
+    for batch in results(store, tasks, math.ceil(len(needed) / BATCH), report):
         gathered.add(batch)
     _rows(inputs, source, views, loaded, gathered, done)
     return done

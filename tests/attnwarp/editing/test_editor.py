@@ -125,7 +125,7 @@ def test_a_start_at_t_begins_at_the_views_noised_latents():
         "a bear",
         steps=4,
         start=700,
-        watch=lambda step, steps, x: seen.append((step, steps)),
+        on_step=lambda step, steps, x: seen.append((step, steps)),
     )
     assert result.timesteps == [700, 525, 349, 174]
     assert seen == [(k, 4) for k in range(4)]

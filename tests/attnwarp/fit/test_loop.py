@@ -9,6 +9,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from edit_folders import Watched
 
 from attnwarp import Camera, Gaussians
 from attnwarp.errors import InputError, InputWarning
@@ -177,9 +178,21 @@ def test_a_fit_that_is_stopped_leaves_its_splats_and_a_checkpoint(scene, tmp_pat
 def test_the_last_step_that_is_shown_has_the_results_own_evaluation(scene):
     start, settings = begin(scene, iterations=3, evaluate_every=1000, **FAST)
     shown = []
-    result = fit(start, scene[0], settings, held_out=scene[1], watch=shown.append)
-    assert [step.evaluated for step in shown] == [0, 0, 3]
-    assert shown[-1].held_out == result.history[-1].psnr != result.history[0].psnr
+    report = Watched(step=lambda *step: shown.append(step))
+    result = fit(start, scene[0], settings, held_out=scene[1], report=report)
+    assert [step[:2] for step in shown] == [(1, 3), (2, 3), (3, 3)]
+    first, last = (f"held out {result.history[k].psnr:.2f} dB" for k in (0, -1))
+    assert f", {first} at 0, " in shown[1][2] and f", {last}, " in shown[2][2] and first != last
+    assert shown[2][2].startswith(f"loss {result.history[-1].loss:.4f}, PSNR ")
+    assert shown[2][2].endswith(f", {len(result.gaussians)} splats")
+
+
+def test_more_splats_than_a_fit_may_grow_to_are_told(scene):
+    start, settings = begin(scene, iterations=1, max_splats=2, **FAST)
+    said = []
+    result = fit(start, scene[0], settings, report=Watched(log=said.append))
+    expected = f"{len(start)} first splats, more than max_splats 2: the fit keeps them all"
+    assert said == [f"{expected} and adds none"] and len(result.gaussians) == len(start)
 
 
 def test_a_seed_decides_every_bit(scene):
@@ -415,12 +428,12 @@ def test_a_second_fit_into_a_folder_is_refused_while_the_first_goes_on(scene, tm
     start, settings = begin(scene, iterations=2, sh_degree=0)
     refusals = []
 
-    def again(state):
+    def again(*state):
         with pytest.raises(InputError, match="another run writes to this folder") as caught:
             fit(start, scene[0], settings, folder=tmp_path)
         refusals.append(caught)
 
-    result = fit(start, scene[0], settings, folder=tmp_path, watch=again)
+    result = fit(start, scene[0], settings, folder=tmp_path, report=Watched(step=again))
     assert refusals
     after = fit(start, scene[0], settings, folder=tmp_path)
     assert same_bits(after.gaussians, result.gaussians)
@@ -461,11 +474,11 @@ def test_a_restart_that_is_stopped_before_its_first_save_loses_nothing(scene, tm
     fit(start, scene[0], settings, folder=tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
-    def stop(state):
+    def stop(*state):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit(start, scene[0], settings, folder=tmp_path, restart=True, watch=stop)
+        fit(start, scene[0], settings, folder=tmp_path, restart=True, report=Watched(step=stop))
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     assert fit(start, scene[0], settings, folder=tmp_path).iteration == 2
 

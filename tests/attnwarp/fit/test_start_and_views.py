@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from edit_folders import Watched
 from PIL import Image
 
 from attnwarp import Camera
@@ -386,7 +387,7 @@ def test_points_far_astray_begin_no_splats_and_are_told(unit):
     ]
     data = Dataset(cameras, ["a.png", "b.png"], points=points, colors=colors)
     said = []
-    splats = first_splats(data, cameras, FitSettings(sh_degree=0), said.append)
+    splats = first_splats(data, cameras, FitSettings(sh_degree=0), Watched(log=said.append))
     (line,) = said
     assert line.startswith("2 of 100 points are left out, over 100 times as far")
     expected = from_points(

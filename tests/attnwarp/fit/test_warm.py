@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from edit_folders import Watched
 
 from attnwarp.fit import FitSettings, fit, loop, warm
 
@@ -19,7 +20,7 @@ def cold(monkeypatch):
 def test_seconds_of_a_fit_hold_no_compilation(scene, monkeypatch):
     now = [0.0]
 
-    def compiled(kind):
+    def compiled(kind, report):
         now[0] += 60
 
     clock = SimpleNamespace(perf_counter=lambda: now[0], process_time=lambda: now[0])
@@ -39,10 +40,10 @@ def test_a_long_compilation_is_told_once(cold, monkeypatch):
         time.sleep(0.3)
         return real(*args, **more)
 
-    monkeypatch.setattr(warm, "SILENT_SECONDS", 0.01)
+    monkeypatch.setattr(warm, "QUIET_SECONDS", 0.01)
     monkeypatch.setattr(warm, "render", slow)
-    warm.compile_kernels("2d", said.append)
-    warm.compile_kernels("2d", said.append)
+    warm.compile_kernels("2d", Watched(log=said.append))
+    warm.compile_kernels("2d", Watched(log=said.append))
     (line,) = said
     assert line.startswith("waiting for the renderer, which is compiled once")
 
@@ -55,7 +56,7 @@ def test_it_works_where_gradients_are_switched_off(cold, off):
 
 
 def test_quick_kernels_are_not_worth_a_word(cold, monkeypatch):
-    monkeypatch.setattr(warm, "SILENT_SECONDS", 600)
+    monkeypatch.setattr(warm, "QUIET_SECONDS", 600)
     said = []
-    warm.compile_kernels("3d", said.append)
+    warm.compile_kernels("3d", Watched(log=said.append))
     assert said == []

@@ -663,7 +663,7 @@ def test_a_view_that_does_not_show_the_words_is_named_and_has_an_empty_mask(tmp_
         assert again == kept
         assert [int(mask.sum()) for mask in masks] == [0, 10, 0]
     said = []
-    command._say_empty(masks, views, lambda n: f"{n} views", said.append)
+    command._say_empty(masks, views, lambda n: f"{n} views", Watched(log=said.append))
     assert said == [f"2 of 3 views, so nothing is edited in {views[0].name}, {views[2].name}"]
 
 

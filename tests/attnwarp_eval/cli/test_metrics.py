@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import tiny_models
+from edit_folders import Watched
 from PIL import Image, ImageOps
 from torch_threads import on_one_thread
 from typer.testing import CliRunner
@@ -818,14 +819,14 @@ def test_a_picture_rewritten_during_the_run_is_stored_under_its_new_hash(tmp_pat
     monkeypatch.setattr(measure, "BATCH", 1)
     told = []
 
-    def rewrite(number, total, step):
+    def rewrite(number, total, *_):
         told.append((number, total))
         if number == 0:
             write(tmp_path / "edited" / "v1.png", rewritten)
 
     inputs = measure.Inputs(renders=tmp_path / "renders", edited=tmp_path / "edited")
     off = dict.fromkeys(("clip", "dino", "perceptual"), "none")
-    measure.measure(inputs, off, Store(tmp_path / "out"), progress=rewrite)
+    measure.measure(inputs, off, Store(tmp_path / "out"), report=Watched(step=rewrite))
     assert told == [(0, 2), (1, 2), (2, 2)]
     records = [json.loads(path.read_text()) for path in (tmp_path / "out/cells").rglob("*.json")]
     (record,) = (r for r in records if "v1" in r["spec"]["files"]["edited"])

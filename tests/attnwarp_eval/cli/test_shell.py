@@ -1,17 +1,14 @@
 """Signals and output that cannot be written. Oracles: exit codes of processes, lines on stderr."""
 
 import errno
-import io
 import os
 import subprocess
 import sys
-import types
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
-from attnwarp_eval.cli.shell import file_error, progress
+from attnwarp_eval.cli.shell import file_error
 
 PRINTS = [sys.executable, "-m", "attnwarp_eval", "cache", "info"]
 
@@ -95,53 +92,3 @@ def test_an_error_of_a_connection_does_not_blame_the_disk():
     assert file_error(missing) == str(missing)
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/study.json")
     assert file_error(full).startswith("run/study.json: No space left on device; check the path")
-
-
-def test_a_log_file_gets_each_line_whole(capsys):
-    lost = "worker tcp://127.0.0.1:39003 was lost at spheres / calibration / calibration; " * 3
-    with progress(18, lines=True) as show:
-        show.line(lost)
-        show(1, 18, lost)
-    assert capsys.readouterr().err == f"{lost}\n[1/18] {lost}\n"
-
-
-def test_a_log_file_gets_a_line_every_ten_seconds_of_work_that_is_only_named(capsys, monkeypatch):
-    seconds = iter((0.0, 4.0, 11.0, 12.0, 30.0))
-    monkeypatch.setattr(
-        "attnwarp_eval.cli.shell.time", types.SimpleNamespace(monotonic=lambda: next(seconds))
-    )
-    with progress() as show:
-        show.step("points")
-        show.step("view 1 of 9")
-        show.step("view 2 of 9")
-        show(3, 9, "view 3")
-    assert capsys.readouterr().err.splitlines() == ["view 1 of 9", "[3/9] view 3"]
-
-
-def test_a_bar_says_left_only_where_that_is_known(monkeypatch):
-    shown = io.StringIO()
-    console = Console(file=shown, force_terminal=True, width=100)
-    monkeypatch.setattr("rich.console.Console", lambda stderr: console)
-    with progress() as show:
-        show.step("points")
-    assert "points" in shown.getvalue()
-    assert "left" not in shown.getvalue() and "/?" not in shown.getvalue()
-    with progress(9) as show:
-        show(3, 9, "view 3")
-    assert "3/9" in shown.getvalue() and "left" in shown.getvalue()
-
-
-def test_a_log_file_gets_the_time_left_by_the_mean_of_the_cells_so_far(capsys, monkeypatch):
-    seconds = iter((0.0, 20.0, 70.0, 90.0))
-    fake = types.SimpleNamespace(perf_counter=lambda: next(seconds))
-    monkeypatch.setattr("attnwarp.reporting.time", fake)
-    with progress(9, done=5, lines=True) as show:
-        for done in (6, 7, 8, 9):
-            show(done, 9, "cell")
-    # After 20 s a cell is done and two are left; after 70 s two are, and one is left.
-    assert capsys.readouterr().err.splitlines() == [
-        "[6/9] cell",
-        "[7/9] cell, 40 s left",
-        "[8/9] cell, 35 s left",
-        "[9/9] cell",
-    ]

@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from edit_folders import Watched
 from effect_scenes import FLOOR, PLAIN, SKY, SUN, ball, make
 from typer.testing import CliRunner
 
@@ -231,11 +232,13 @@ def test_the_suites_time_is_that_of_an_empty_cache_and_leaves_the_cache_alone(
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path / "mine"))
     told = []
 
-    def tell(done, total, step):
+    def step(done, total, text, left=None):
         assert (done, total) == (0, 1)
-        told.append(step)
+        told.append(text)
 
-    (first,) = suite.measure(["spheres"], views=2, geometry_size=16, size=16, spp=1, progress=tell)
+    (first,) = suite.measure(
+        ["spheres"], views=2, geometry_size=16, size=16, spp=1, report=Watched(step=step)
+    )
     assert os.environ["ATTNWARP_CACHE"] == str(tmp_path / "mine")
     assert (
         first.views == 2
@@ -263,12 +266,12 @@ def test_panels_that_are_finished_are_read_and_not_measured_again(tmp_path, monk
     def short(name, failing=False):
         real = getattr(accuracy, name)
 
-        def question(scene, *, rounds, tell):
+        def question(scene, *, rounds, report):
             asked.append(name)
             if failing and asked.count(name) == 1:
                 raise KeyboardInterrupt
             size = {"depth": {"rays": 20}, "visibility": {"points": 20, "maps": (8,)}}[name]
-            return real(scene, size=16, rounds=rounds, tell=tell, **size)
+            return real(scene, size=16, rounds=rounds, report=report, **size)
 
         question.__name__ = name
         monkeypatch.setattr(accuracy, name, question)

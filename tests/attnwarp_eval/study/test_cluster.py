@@ -18,9 +18,11 @@ from typer.testing import CliRunner
 import attnwarp
 import attnwarp_eval
 import attnwarp_eval.study.cluster
+from attnwarp.reporting import SILENT
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import write_report
 from attnwarp_eval.study.record import Failure
+from attnwarp_eval.study.reporting import CellReporter
 from attnwarp_eval.study.store import Store
 
 ROOT = pathlib.Path(attnwarp.__file__).parents[1]
@@ -278,7 +280,7 @@ def test_a_worker_gets_a_scenes_files_again_when_it_comes_back_or_a_cell_of_it_f
     cell = cluster.Cell({}, "ball", "v", "warp", 0)
     place, sent = cluster._Remote(Store("none"), {"ball": None}), []
     client = SimpleNamespace(submit=lambda do, probe, cell, files, **_: sent.append(files))
-    runner = cluster._Runner(client, [], place, lambda cell: None)
+    runner = cluster._Runner(client, [], place, CellReporter([], 0, SILENT))
     for worker in ("tcp://a:1", "tcp://a:1", "tcp://b:1"):
         place.submit(client, worker, cell)
     assert sent == ["files", None, "files"]

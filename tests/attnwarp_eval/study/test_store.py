@@ -19,7 +19,7 @@ from attnwarp_eval.study.store import Store, StoreError
 from attnwarp_eval.study.task import Task, results
 
 SPEC = {"probe": "depth", "scene": "abc", "seed": 0}
-TASK = Task("depth", SPEC, lambda tell: {"summary": {"x": 1.5}}, lambda record: record["summary"])
+TASK = Task("depth", SPEC, lambda report: {"summary": {"x": 1.5}}, lambda record: record["summary"])
 
 
 def record(**extra):

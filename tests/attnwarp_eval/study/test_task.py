@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from edit_folders import Watched
 
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.study.store import Store, StoreError
@@ -13,10 +14,10 @@ def squares(computed, interrupted=None):
     """Of 2, 3 and 4, with a picture each; computing ``interrupted`` is stopped."""
 
     def task(store, x):
-        def compute(tell):
+        def compute(report):
             if x == interrupted:
                 raise KeyboardInterrupt
-            tell(f"{x} times {x}")
+            report.step(0, 0, f"{x} times {x}")
             computed.append(x)
             path = store.root / f"{x}.png"
             path.write_bytes(bytes(x))
@@ -38,7 +39,9 @@ def test_tasks_that_were_interrupted_go_on_and_leave_the_bytes_of_a_whole_run(tm
     assert computed == [2, 3]
     for folder, expected in (("a", [2, 3, 4]), ("b", [2, 3, 4, 2, 3, 4])):
         store = Store(tmp_path / folder)
-        values = results(store, squares(computed)(store), 3, lambda *step: told.append(step))
+        values = results(
+            store, squares(computed)(store), 3, Watched(lambda *step: told.append(step))
+        )
         assert list(values) == [4, 9, 16] and computed == expected
     files = [p.relative_to(tmp_path / "b") for p in (tmp_path / "b").rglob("*") if p.is_file()]
     assert len(files) == 7  # three records, three pictures and the lock

@@ -13,6 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from attnwarp.errors import InputError
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.experiments.accuracy.earlier import check_overwriting
 from attnwarp_eval.experiments.accuracy.geometry import depth, triangles
@@ -20,7 +21,6 @@ from attnwarp_eval.experiments.accuracy.images import pictures
 from attnwarp_eval.experiments.accuracy.panel import Panel, panel_spec
 from attnwarp_eval.experiments.accuracy.point_visibility import visibility
 from attnwarp_eval.experiments.distinct_scenes import distinct_scenes
-from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.store import Store
@@ -33,7 +33,7 @@ Question = Callable[..., Panel]
 
 
 def measure(
-    names: Sequence[str] = (), *, out: Path, rounds: int = 7, progress: Progress = silent
+    names: Sequence[str] = (), *, out: Path, rounds: int = 7, report: Reporter = SILENT
 ) -> Iterator[Panel]:
     """Every question on every scene that it makes sense for.
 
@@ -44,7 +44,7 @@ def measure(
             out. Of those without a triangle depth and visibility are closed forms, and left out.
         out: the run's folder.
         rounds: of every timing.
-        progress: told of each step of each panel.
+        report: receives each step of each panel.
 
     Raises:
         InputError: a scene that cannot be used, or two of one name; another run is writing to
@@ -55,7 +55,7 @@ def measure(
     cells = _cells(distinct_scenes(names))
     check_overwriting(out, {(question.__name__, scene.name) for question, scene in cells})
     tasks = (_task(question, scene, rounds) for question, scene in cells)
-    for panel in results(Store(out), tasks, len(cells), progress):
+    for panel in results(Store(out), tasks, len(cells), report):
         yield panel
         forget()
 
@@ -78,7 +78,7 @@ def _cells(scenes: Sequence[Scene]) -> list[tuple[Question, Scene]]:
 def _task(question: Question, scene: Scene, rounds: int) -> Task[Panel]:
     spec = panel_spec(question.__name__, scene.name, scene.content_hash, rounds)
 
-    def compute(tell: Tell) -> Json:
-        return {"panel": without_nan(asdict(question(scene, rounds=rounds, tell=tell)))}
+    def compute(report: Reporter) -> Json:
+        return {"panel": without_nan(asdict(question(scene, rounds=rounds, report=report)))}
 
     return Task(f"{scene.name}: {question.__name__}", spec, compute, Panel.from_record)

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from attnwarp.errors import InputError
 from attnwarp.numba_cache import CACHE
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.cost import in_turn
 from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
-from attnwarp_eval.progress import Tell, untold
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.shapes import Box, Mesh
 
@@ -81,7 +81,7 @@ def depth(
     size: int = 512,
     rays: int = 500,
     rounds: int = 9,
-    tell: Tell = untold,
+    report: Reporter = SILENT,
 ) -> Panel:
     """Error of depth with the hit as Open3D has it (float32) and refined on its triangle's plane in
     float64.
@@ -90,7 +90,7 @@ def depth(
         size: of the square image that is traced.
         rays: pixels held against every triangle in float64.
         rounds: of the timing.
-        tell: told what is at work.
+        report: receives what is at work.
     """
     from attnwarp_eval._open3d import open3d
     from attnwarp_eval.truth.raycast import Geometry
@@ -125,9 +125,11 @@ def depth(
 
         return work
 
-    tell(
+    report.step(
+        0,
+        0,
         f"{scene.name}: {sum(len(m.faces) for m in meshes)} triangles against {rays} rays in"
-        " float64"
+        " float64",
     )
     valid = np.flatnonzero(refined.trace(camera).valid.ravel())
     chosen = np.sort(np.random.default_rng(0).choice(valid, min(rays, len(valid)), replace=False))
@@ -139,7 +141,7 @@ def depth(
         np.zeros_like(directions), np.ascontiguousarray(directions), corners, limit
     )
 
-    tell(f"{scene.name}: depth at {size} x {size}, {rounds} rounds")
+    report.step(0, 0, f"{scene.name}: depth at {size} x {size}, {rounds} rounds")
     works = [traced(refined), traced(unrefined), unmoved]
     names = ["refined in float64", "float32 hit, recentred", "float32 hit, world coordinates"]
     turns = in_turn(works, rounds)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.cost import in_turn
 from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
-from attnwarp_eval.progress import Tell, untold
 from attnwarp_eval.scene.scene import Scene
 
 SAMPLES = (1, 4, 16, 64)
@@ -22,7 +22,7 @@ def pictures(
     samples: Sequence[int] = SAMPLES,
     rounds: int = 7,
     reference: tuple[int, int] = (16, 256),
-    tell: Tell = untold,
+    report: Reporter = SILENT,
 ) -> Panel:
     """Error of the source's picture against a converged one, by samples a pixel, plan and Mitsuba's
     variant.
@@ -33,7 +33,7 @@ def pictures(
         rounds: pictures of each contestant.
         reference: how many pictures of how many samples the converged one is the mean of. Its own
             noise is estimated from their spread and taken out of the errors.
-        tell: told what is at work.
+        report: receives what is at work.
     """
     from attnwarp_eval.truth.llvm import LLVM, SCALAR, variant
     from attnwarp_eval.truth.mitsuba import render_plan, use
@@ -50,7 +50,7 @@ def pictures(
     # The baseline is the plan at the second largest number of samples.
     contestants.insert(0, contestants.pop(len(samples) - 2))
 
-    tell(f"{scene.name}: converged picture")
+    report.step(0, 0, f"{scene.name}: converged picture")
     count, spp = reference
     made = np.stack(
         [
@@ -65,7 +65,7 @@ def pictures(
         _, planned, by = contestants[k]
         return lambda turn: render_plan(small, small.source, planned, 100 + turn, made_by=by)
 
-    tell(f"{scene.name}: {len(contestants)} kinds of pictures, {rounds} rounds")
+    report.step(0, 0, f"{scene.name}: {len(contestants)} kinds of pictures, {rounds} rounds")
     turns = in_turn(
         [work(k) for k in range(len(contestants))], rounds, before=lambda k: use(contestants[k][2])
     )

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.cost import in_turn
 from attnwarp_eval.experiments.accuracy.geometry import every_triangle, triangles
 from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
-from attnwarp_eval.progress import Tell, untold
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.two_view import Hits
 
@@ -30,7 +30,7 @@ def visibility(
     points: int = 500,
     rounds: int = 5,
     maps: Sequence[int] = MAPS,
-    tell: Tell = untold,
+    report: Reporter = SILENT,
 ) -> Panel:
     """Whether surface points of the middle target are seen by the source: by rays, and by depth
     maps of the source.
@@ -45,7 +45,7 @@ def visibility(
         points: how many of them are held against every triangle.
         rounds: of the timing, which covers all points and the making of the depth map.
         maps: sizes of the depth maps.
-        tell: told what is at work.
+        report: receives what is at work.
 
     Returns:
         A panel without contestants where no point can be asked about.
@@ -79,9 +79,11 @@ def visibility(
 
         return work
 
-    tell(
+    report.step(
+        0,
+        0,
         f"{scene.name}: {sum(len(m.faces) for m in meshes)} triangles against {points} points in"
-        " float64"
+        " float64",
     )
     chosen = np.sort(
         np.random.default_rng(1).choice(
@@ -104,7 +106,7 @@ def visibility(
             names.append(
                 f"depth map {pixels}, {'bilinear in 1/z, 2 %' if bilinear else 'nearest, 1 %'}"
             )
-    tell(f"{scene.name}: visibility of {len(points_asked)} points, {rounds} rounds")
+    report.step(0, 0, f"{scene.name}: visibility of {len(points_asked)} points, {rounds} rounds")
     turns = in_turn(works, rounds)
     out = []
     for name, got, took in zip(names, turns.results, turns.seconds, strict=True):
