@@ -14,9 +14,7 @@ import struct
 import tempfile
 import threading
 import warnings
-import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -95,8 +93,8 @@ def orientation(path: str | os.PathLike[str]) -> int:
         return 1
 
     path = existing_file(path)
-    tiff = _tiff(path)  # Pillow does not open all of them
-    turn: Any = _with_pillow(path, asked) if tiff is None else tiff.short(_ORIENTATION)
+    tags = _tiff_tags(path)  # Pillow does not open the pixels of all of them
+    turn: Any = _with_pillow(path, asked) if tags is None else tags.get(_ORIENTATION)
     return int(turn) if turn in range(1, 9) else 1
 
 
@@ -179,7 +177,9 @@ def read_image(
     tiff = _unturned(path)
     rgba: npt.NDArray[Any] | None = _with_pillow(path, _alpha_lost_by_opencv, tiff)
     data = path.read_bytes() if tiff is None else tiff
-    _check_png(path, data)
+    # Not every decoder looks at the checksum of each part of a PNG, and damage would be pixels.
+    if data.startswith(_PNG) and not _with_pillow(path, lambda image: image.verify() or True):
+        raise FileFormatError(path, "the picture is damaged; replace it or leave it out")
     if rgba is not None:
         return rgba
     flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
@@ -337,66 +337,35 @@ def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8 | np.uint16] | Non
 _ORIENTATION, _BITS, _SAMPLES = 274, 258, 277
 """TIFF's tags that ask for a turn, that hold the bits of each channel, and their number."""
 
+_BIG = 43
+"""What a BigTIFF has in place of 42."""
+
 _FLIPS = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}
 """Axes to flip by EXIF's orientation, after rows and columns have changed places from 5 on."""
 
 
-@dataclass(frozen=True)
-class _Tiff:
-    """A TIFF's bytes, and the tags of its first picture.
-
-    Attributes:
-        data: of the file.
-        order: of its bytes, as ``struct`` has it.
-        places: where the value of each tag begins, or where a pointer to it stands.
+def _tiff_tags(path: Path) -> dict[int, Any] | None:
+    """The tags of a TIFF's first picture that concern its reading, and under 0 where its directory
+    begins; None for any other file.
     """
+    from PIL.TiffImagePlugin import PREFIXES, ImageFileDirectory_v2
 
-    data: bytes
-    order: str
-    places: dict[int, int]
-
-    def short(self, tag: int) -> int | None:
-        """The first number of a tag whose numbers have two bytes and need no pointer."""
-        place = self.places.get(tag)
-        if place is None or place + 2 > len(self.data):
-            return None
-        return int(struct.unpack_from(f"{self.order}H", self.data, place)[0])
-
-    def unturned(self) -> bytes:
-        """The bytes with a tag that asks for no turn, if there is one."""
-        if self.short(_ORIENTATION) in (None, 1):
-            return self.data
-        place = self.places[_ORIENTATION]
-        one = struct.pack(f"{self.order}H", 1)
-        return self.data[:place] + one + self.data[place + 2 :]
-
-
-def _tiff(path: Path) -> _Tiff | None:
-    """A TIFF; None for any other file."""
+    tags: dict[int, Any] = {}
     with path.open("rb") as stream:
-        head = stream.read(4)
-        order = {b"II": "<", b"MM": ">"}.get(head[:2])
-        layouts = {42: ("H", "I", 4), 43: ("Q", "Q", 8)}  # 43 is BigTIFF
-        if order is None or len(head) < 4:
+        head = stream.read(8)
+        if not head.startswith(tuple(PREFIXES)):
             return None
-        layout = layouts.get(struct.unpack(f"{order}2xH", head)[0])
-        if layout is None:
-            return None
-        data = head + stream.read()
-    count_type, offset_type, begin = layout
-    entry = struct.Struct(f"{order}HH{offset_type}{offset_type}")  # tag, type, count, value
-    places: dict[int, int] = {}
-    try:
-        (place,) = struct.unpack_from(f"{order}{offset_type}", data, begin)
-        (count,) = struct.unpack_from(f"{order}{count_type}", data, place)
-        place += struct.calcsize(count_type)
-        for start in range(place, place + count * entry.size, entry.size):
-            tag, *_ = entry.unpack_from(data, start)
-            # A short stands at the beginning of the field for the value.
-            places.setdefault(tag, start + entry.size - struct.calcsize(offset_type))
-    except (struct.error, OverflowError):
-        pass  # damaged, as the decoders will find
-    return _Tiff(data, order, places)
+        # What is damaged the decoders find; Pillow raises whatever it leads to.
+        with warnings.catch_warnings(), contextlib.suppress(Exception):
+            warnings.simplefilter("ignore")
+            header = head
+            if _BIG in head[2:4]:  # Pillow knows it by a third byte alone, which is II's
+                header = b"II" + bytes([_BIG, 0]) + head[4:] + stream.read(8)
+            directory = ImageFileDirectory_v2(header, head[:2])
+            tags[0] = stream.seek(directory.next)
+            directory.load(stream)
+            tags |= {t: directory[t] for t in (_ORIENTATION, _BITS, _SAMPLES) if t in directory}
+    return tags
 
 
 def _unturned(path: Path) -> bytes | None:
@@ -406,35 +375,19 @@ def _unturned(path: Path) -> bytes | None:
     Raises:
         FileFormatError: grey of 16 bits with alpha, which OpenCV reads as 8 bits without alpha.
     """
-    tiff = _tiff(path)
-    if tiff is None:
+    tags = _tiff_tags(path)
+    if tags is None:
         return None
-    if tiff.short(_SAMPLES) == 2 and (tiff.short(_BITS) or 0) > 8:
+    if tags.get(_SAMPLES) == 2 and max(tags.get(_BITS, (8,))) > 8:
         raise FileFormatError(
             path, "grey of 16 bits with alpha, which cannot be read as TIFF; convert it to PNG"
         )
-    return tiff.unturned()
-
-
-def _check_png(path: Path, data: bytes) -> None:
-    """Check the CRC of each chunk of a PNG: not every decoder does, and damage would be pixels."""
-    if not data.startswith(_PNG):
-        return
-    start = len(_PNG)
-    while start < len(data):
-        length = int.from_bytes(data[start : start + 4], "big")
-        end = start + 8 + length
-        if end + 4 > len(data):
-            break
-        if zlib.crc32(data[start + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            raise FileFormatError(
-                path,
-                f"the picture is damaged (checksum of the part at byte {start}); replace it or"
-                " leave it out",
-            )
-        if data[start + 4 : start + 8] == b"IEND":
-            return
-        start = end + 4
-    raise FileFormatError(
-        path, "the picture is damaged (it breaks off); replace it or leave it out"
-    )
+    data = path.read_bytes()
+    if tags.get(_ORIENTATION, 1) not in range(2, 9):
+        return data
+    order = "<" if data.startswith(b"II") else ">"
+    entry = struct.Struct(
+        f"{order}HH{'Q' if _BIG in data[2:4] else 'I'}H"
+    )  # tag, type, count, value
+    turned, upright = (entry.pack(_ORIENTATION, 3, 1, v) for v in (tags[_ORIENTATION], 1))
+    return data[: tags[0]] + data[tags[0] :].replace(turned, upright, 1)

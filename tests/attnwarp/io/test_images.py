@@ -67,7 +67,7 @@ def tiff(pixels, turn, order, big):
 @pytest.mark.parametrize("turn", range(1, 9))
 @pytest.mark.parametrize("shape", [(4, 6, 3), (5, 5, 4)])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-@pytest.mark.parametrize(("order", "big"), [("<", False), (">", False), ("<", True)])
+@pytest.mark.parametrize(("order", "big"), [("<", False), (">", False), ("<", True), (">", True)])
 def test_a_tiff_that_asks_to_be_turned_comes_as_it_is_stored(
     tmp_path, turn, shape, dtype, order, big
 ):
