@@ -289,7 +289,7 @@ def test_gradients_gathered_in_small_groups_of_tiles_are_the_same(
     def gradient() -> torch.Tensor:
         means = start.means.clone().requires_grad_()
         view = render(dataclasses.replace(start, means=means), camera)
-        (view.color.sum() + view.depth.nan_to_num().sum()).backward()
+        (view.color.sum() + view.depth.nan_to_num().sum() + view.distortion_l1.sum()).backward()
         assert means.grad is not None
         return means.grad
 
@@ -481,7 +481,7 @@ def test_a_deep_scene_worked_off_from_the_front_is_the_same(
         monkeypatch.setattr(binned, "ENTRIES", entries)
         means = start.means.clone().requires_grad_()
         view = render(dataclasses.replace(start, means=means), camera)
-        (view.color.sum() + view.depth.nan_to_num().sum()).backward()
+        (view.color.sum() + view.depth.nan_to_num().sum() + view.distortion_l1.sum()).backward()
         assert means.grad is not None
         results.append(
             [getattr(view, name).detach().nan_to_num(-1) for name in OUTPUTS] + [means.grad]
