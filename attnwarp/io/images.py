@@ -364,7 +364,8 @@ def _tiff_tags(path: Path) -> dict[int, Any] | None:
             directory = ImageFileDirectory_v2(header, head[:2])
             tags[0] = stream.seek(directory.next)
             directory.load(stream)
-            tags |= {t: directory[t] for t in (_ORIENTATION, _BITS, _SAMPLES) if t in directory}
+            tags |= {t: directory[t] for t in (_ORIENTATION, _SAMPLES) if t in directory}
+            tags[_BITS] = int(max(directory[_BITS]))
     return tags
 
 
@@ -378,7 +379,7 @@ def _unturned(path: Path) -> bytes | None:
     tags = _tiff_tags(path)
     if tags is None:
         return None
-    if tags.get(_SAMPLES) == 2 and max(tags.get(_BITS, (8,))) > 8:
+    if tags.get(_SAMPLES) == 2 and tags.get(_BITS, 8) > 8:
         raise FileFormatError(
             path, "grey of 16 bits with alpha, which cannot be read as TIFF; convert it to PNG"
         )
@@ -386,8 +387,6 @@ def _unturned(path: Path) -> bytes | None:
     if tags.get(_ORIENTATION, 1) not in range(2, 9):
         return data
     order = "<" if data.startswith(b"II") else ">"
-    entry = struct.Struct(
-        f"{order}HH{'Q' if _BIG in data[2:4] else 'I'}H"
-    )  # tag, type, count, value
+    entry = struct.Struct(f"{order}HH{'Q' if _BIG in data[2:4] else 'I'}H")  # and the turn
     turned, upright = (entry.pack(_ORIENTATION, 3, 1, v) for v in (tags[_ORIENTATION], 1))
     return data[: tags[0]] + data[tags[0] :].replace(turned, upright, 1)

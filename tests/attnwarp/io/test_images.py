@@ -316,3 +316,9 @@ def test_a_grey_tiff_of_16_bits_with_alpha_is_refused(tmp_path):
     assert cv2.imread(str(tmp_path / "la.tiff"), cv2.IMREAD_UNCHANGED).dtype == np.uint8
     with pytest.raises(FileFormatError, match="grey of 16 bits with alpha"):
         read_image(tmp_path / "la.tiff")
+    # Text in place of the bits of each channel is damage.
+    text = struct.pack("<HHII", 258, 2, 2, 16 | 16 << 16)
+    damaged = directory.replace(struct.pack("<HHII", 258, 3, 2, 16 | 16 << 16), text)
+    (tmp_path / "la.tiff").write_bytes(data + damaged + bytes(4))
+    with pytest.raises(FileFormatError, match="damaged|cannot be read"):
+        read_image(tmp_path / "la.tiff")
