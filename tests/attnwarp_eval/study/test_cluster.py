@@ -202,7 +202,7 @@ def test_workers_without_a_shared_disk_give_the_bytes_of_one_process_though_one_
     text = log.read_text()
     assert "was lost at" in text and "the cell is tried once more" in text
     assert "worker stranger (tcp://" in text and "is refused: source" in text
-    assert text.count("\n[") == CELLS
+    assert all(text.count(f"\n[{n}/{CELLS}] ") == 1 for n in range(1, CELLS + 1))
 
     alone, log = run(home, "near")
     assert alone.wait(300) == 0, log.read_text()

@@ -90,7 +90,7 @@ def call(*arguments):
 
 def start(*arguments, **options):
     """A command in a process of its own."""
-    command = [sys.executable, "-m", "attnwarp_eval", map(str, arguments)]
+    command = [sys.executable, "-m", "attnwarp_eval", *map(str, arguments)]
     return subprocess.Popen(command, text=True, **options)
 
 
