@@ -10,7 +10,7 @@ from pathlib import Path
 
 import typer
 
-from attnwarp.cli.shell import echo
+from attnwarp.reporting import Reporter
 
 VIEWS, SIZE = 24, 128
 """Pictures of a bundled scene, and their edge in px: the larger size of the bundled editors."""
@@ -23,14 +23,14 @@ def is_scene(name: str) -> bool:
     return any((Path(folder) / "scenes" / f"{name}.yaml").is_file() for folder in folders or ())
 
 
-def capture(name: str, folder: Path) -> Path:
+def capture(name: str, folder: Path, report: Reporter) -> Path:
     """Render a scene's pictures, points and exact masks into a folder; what is there is kept.
 
     Raises:
         typer.Exit: the harness failed, and said why.
     """
     if not (folder / "transforms.json").is_file():  # it is written last
-        echo(f"{name}: a bundled scene; rendering {VIEWS} pictures of it: {folder}")
+        report.log(f"{name}: a bundled scene; rendering {VIEWS} pictures of it: {folder}")
         # The library does not import the instrument: its command runs beside this one.
         command = [sys.executable, "-m", "attnwarp_eval", "scenes", "export", name, str(folder)]
         options = ["--views", str(VIEWS), "--size", str(SIZE)]
@@ -40,7 +40,7 @@ def capture(name: str, folder: Path) -> Path:
     return folder
 
 
-def exact_masks(folder: Path, instruction: str) -> Path | None:
+def exact_masks(folder: Path, instruction: str, report: Reporter) -> Path | None:
     """Exact masks of the object that an instruction names, in a folder of :func:`capture`.
 
     Returns:
@@ -50,7 +50,9 @@ def exact_masks(folder: Path, instruction: str) -> Path | None:
     words = f" {' '.join(re.findall(r'[a-z0-9]+', instruction.lower()))} "
     named = [name for name in objects if f" {name.replace('_', ' ')} " in words]
     if not named:
-        echo(f"the whole picture is edited: {instruction!r} names none of {', '.join(objects)}")
+        report.log(
+            f"the whole picture is edited: {instruction!r} names none of {', '.join(objects)}"
+        )
         return None
-    echo(f"nothing but the {named[0]} is edited, inside its exact mask: {folder / 'masks'}")
+    report.log(f"nothing but the {named[0]} is edited, inside its exact mask: {folder / 'masks'}")
     return folder / "masks" / named[0]

@@ -166,9 +166,9 @@ def edit(
         settings = methods.preset("attention_warping", preset, **changes)
         use_threads(threads)
         if bundled:
-            data = capture(str(data), out / "scene")
+            data = capture(str(data), out / "scene", report)
             if masks is None and words is None:
-                masks = exact_masks(data, instruction)
+                masks = exact_masks(data, instruction, report)
         dataset = read_views(data, reading)
         splats = None if ply is None else read_splats(ply, kind, antialiased, screen_filter)
         if ply is not None and splats is not None:

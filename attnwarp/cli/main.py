@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-
 import typer
 
+from attnwarp.cli import shell
 from attnwarp.cli.baseline import baseline
 from attnwarp.cli.convert import convert, undistort
 from attnwarp.cli.edit import edit
@@ -14,8 +13,6 @@ from attnwarp.cli.fit import fit
 from attnwarp.cli.inspect import inspect
 from attnwarp.cli.options import program_options
 from attnwarp.cli.render import render
-from attnwarp.cli.shell import CLOSED_PIPE, clear_errors, closed_pipe, fail, file_error
-from attnwarp.process import resend_lost_interrupts, skip_last_collection
 
 app = typer.Typer(
     name="attnwarp",
@@ -40,33 +37,12 @@ app.command()(convert)
 app.command()(undistort)
 app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})(inspect)
 app.command()(baseline)
-app.command("edit-image")(clear_errors()(edit_image))
+app.command("edit-image")(shell.clear_errors()(edit_image))
 
 
 def main() -> None:
     """Entry point of the console script."""
-    from attnwarp.errors import missing_extra
-
-    skip_last_collection()
-    resend_lost_interrupts()
-    try:
-        try:
-            app()
-        finally:
-            sys.stdout.flush()
-    except ImportError as error:
-        explained = missing_extra(error)
-        if explained is None:
-            raise
-        sys.exit(fail(str(explained)).exit_code)
-    except BrokenPipeError:
-        sys.exit(closed_pipe().exit_code)
-    except OSError as error:  # help that cannot be written
-        closed_pipe()
-        sys.exit(fail(file_error(error)).exit_code)
-    except SystemExit as done:
-        # Typer's own code for a pipe that is closed; no command of ours gives 1.
-        sys.exit(CLOSED_PIPE if done.code == 1 else done.code)
+    shell.run(app)
 
 
 if __name__ == "__main__":

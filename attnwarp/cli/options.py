@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from attnwarp import __version__
+from attnwarp.cli.shell import begin
 
 
 class Kind(StrEnum):
@@ -151,6 +152,7 @@ def _print_version(context: typer.Context, asked: bool) -> None:
 
 
 def program_options(
+    context: typer.Context,
     version: Annotated[
         bool,
         typer.Option(
@@ -159,3 +161,4 @@ def program_options(
     ] = False,
 ) -> None:
     """Options without a command, of either program."""
+    begin(str(context.command.name))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import traceback
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -14,8 +15,13 @@ from typing import Any
 import typer
 
 from attnwarp.cli.entry import STOPPED
-from attnwarp.errors import InputWarning
-from attnwarp.process import core_count, stops_interrupt
+from attnwarp.errors import InputError, InputWarning, missing_extra
+from attnwarp.process import (
+    core_count,
+    resend_lost_interrupts,
+    skip_last_collection,
+    stops_interrupt,
+)
 
 USAGE = 2
 """Exit code of everything that a person can mend: arguments, files, folders."""
@@ -25,64 +31,100 @@ CLOSED_PIPE = 141
 """Exit code when nobody reads the output any more (128 + SIGPIPE, as shells have it)."""
 
 
-def fail(message: str) -> typer.Exit:
-    """Say what went wrong on stderr; raise what this returns."""
-    typer.echo(f"attnwarp: {message}", err=True)
-    return typer.Exit(USAGE)
-
-
-def echo(text: str) -> None:
-    """Say something on stderr."""
-    typer.echo(text, err=True)
-
+CRASH = 70
+"""Exit code of a fault of the program, as in sysexits. Python's own is 1, which is a regression."""
 
 NOTHING = "stopped; nothing was written"
 
 
+_program = "attnwarp"
+_printed: set[str] = set()
+
+
+def begin(name: str) -> None:
+    """Take the name with which a command's messages begin."""
+    global _program
+    _program = name
+    _printed.clear()
+
+
+def fail(message: str, code: int = USAGE) -> typer.Exit:
+    """Say what went wrong on stderr; raise what this returns."""
+    log(message)
+    return typer.Exit(code)
+
+
+def log(message: str) -> None:
+    """Print a line on stderr that begins with the command's name."""
+    typer.echo(f"{_program}: {message}", err=True)
+
+
+def warn(text: str) -> None:
+    """Print a warning on stderr, once a command: inputs are read more than once."""
+    if text not in _printed:
+        _printed.add(text)
+        log(f"warning: {text}")
+
+
 @contextmanager
-def clear_errors(stopped: str = NOTHING, out: Path | None = None) -> Iterator[None]:
+def clear_errors(
+    stopped: str = NOTHING, out: Path | None = None, *, strict: bool = False
+) -> Iterator[None]:
     """Turn errors about a person's input into one clear line and exit code 2.
 
     Args:
         stopped: what is said after Ctrl-C, a polite kill or the terminal's end.
         out: folder of the results that it speaks of, if it does; nothing was written while it is
             not there.
+        strict: errors but InputError are faults of the program, and leave as they are; Python's
+            warnings are shown.
     """
-    printed: set[str] = set()
+    show_others = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
-        if issubclass(category, InputWarning) and str(message) not in printed:
-            printed.add(str(message))
-            typer.echo(f"attnwarp: warning: {message}", err=True)
+        if issubclass(category, InputWarning):
+            warn(str(message))
+        elif strict:
+            show_others(message, category, *rest, **more)
 
     try:
         with stops_interrupt(), warnings.catch_warnings():
-            warnings.simplefilter("always", InputWarning)
+            if not strict:
+                warnings.simplefilter("always", InputWarning)
             warnings.showwarning = show
             yield
     except typer.Exit:  # a RuntimeError too
         raise
     except KeyboardInterrupt:
-        said = stopped if out is None or out.exists() else NOTHING
-        typer.echo(f"attnwarp: {said}", err=True)
-        raise typer.Exit(STOPPED) from None
+        raise fail(stopped if out is None or out.exists() else NOTHING, STOPPED) from None
     except BrokenPipeError:
         raise closed_pipe() from None
-    except ImportError as error:
-        package = error.name or str(error)
-        raise fail(f"needs the package {package}: pip install {package.split('.')[0]}") from None
+    except InputError as error:
+        raise fail(str(error)) from None
     except MemoryError:
         raise fail("the memory does not suffice; use smaller pictures or fewer splats") from None
-    except (ValueError, RuntimeError) as error:
-        raise fail(str(error)) from None
     except OSError as error:
-        if error.strerror is None:  # the library's own, which says what to do
-            raise fail(str(error)) from None
         raise fail(file_error(error)) from None
+    except ImportError as error:
+        if strict:
+            raise
+        package = error.name or str(error)
+        raise fail(f"needs the package {package}: pip install {package.split('.')[0]}") from None
+    except (ValueError, RuntimeError) as error:
+        loop = "Symlink loop" in str(error)  # of Path.resolve() before Python 3.13
+        if strict and not loop:
+            raise
+        raise fail(f"{error}; name another path" if loop else str(error)) from None
 
 
 def file_error(error: OSError) -> str:
-    """One line about a file that the system refused."""
+    """One line about a file that the system refused, with the remedy."""
+    text = str(error)
+    if isinstance(error, TimeoutError | ConnectionError) and not error.filename:  # such as dask's
+        text = f"{type(error).__name__}: {text}".removesuffix(": ")
+        return f"a connection between processes failed ({text}); run the same command again"
+    if error.strerror is None:  # the library's own, which says what to do
+        return text
     name = f"{error.filename}: " if error.filename else ""
     if isinstance(error, FileExistsError) and Path(error.filename or "").is_symlink():
         target = Path(error.filename).readlink()
@@ -140,3 +182,29 @@ def assignments(changes: list[str], options: dict[str, str]) -> dict[str, Any]:
         except (ValueError, RecursionError):
             values[name] = text
     return values
+
+
+def run(app: typer.Typer) -> None:
+    """Run a command line to its exit code: the entry point of either program."""
+    skip_last_collection()
+    resend_lost_interrupts()
+    begin(str(app.info.name))
+    try:
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        sys.exit(closed_pipe().exit_code)
+    except OSError as error:  # output that cannot be written
+        closed_pipe()
+        sys.exit(fail(file_error(error)).exit_code)
+    except SystemExit as done:
+        # Typer's own code for a closed pipe is 1; a regression has a type of its own.
+        sys.exit(CLOSED_PIPE if done.code == 1 and type(done) is SystemExit else done.code)
+    except Exception as error:
+        explained = missing_extra(error) if isinstance(error, ImportError) else None
+        if explained is None:
+            traceback.print_exc()
+            sys.exit(CRASH)
+        sys.exit(fail(str(explained)).exit_code)

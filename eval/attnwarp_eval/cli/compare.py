@@ -7,14 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from attnwarp_eval.cli.shell import (
-    TOO_LITTLE,
-    Regression,
-    check_not_of_run,
-    clear_errors,
-    fail,
-    warn,
-)
+from attnwarp.cli.shell import fail, log, warn
+from attnwarp_eval.cli.shell import TOO_LITTLE, Regression, check_not_of_run, clear_errors
 
 if TYPE_CHECKING:
     from attnwarp_eval.compare import Snapshot
@@ -90,21 +84,16 @@ def compare(
     if result.incomplete:
         lacking = "; ".join(fault.name for fault in result.faults[:MOST_NAMED])
         more = len(result.faults) - MOST_NAMED
-        typer.echo(
-            f"attnwarp-eval: {run}: lacks {lacking}{f' and {more} more' if more > 0 else ''}, which"
-            f" {baseline} has; measure them, or compare what both have with --common",
-            err=True,
+        log(
+            f"{run}: lacks {lacking}{f' and {more} more' if more > 0 else ''}, which"
+            f" {baseline} has; measure them, or compare what both have with --common"
         )
         raise Regression
     if result.regressed:
         accept = "accept it with --update"
         if baseline.is_dir():
             accept = f"name {run} in its place, or keep a file: BASELINE.jsonl {run} --update"
-        typer.echo(
-            f"attnwarp-eval: {run}: a regression against {baseline}; if the change is meant,"
-            f" {accept}",
-            err=True,
-        )
+        log(f"{run}: a regression against {baseline}; if the change is meant, {accept}")
         raise Regression
     if result.too_little:
         raise fail(f"{run}: {result.too_little}", TOO_LITTLE)

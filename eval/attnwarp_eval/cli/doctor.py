@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from attnwarp.cli.shell import USAGE
-from attnwarp_eval.cli.shell import clear_errors, fail
+from attnwarp.cli.shell import USAGE, fail
+from attnwarp_eval.cli.shell import clear_errors
 
 if TYPE_CHECKING:
     from attnwarp_eval.cli.machine import Check

@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
+from attnwarp.cli.shell import fail
 from attnwarp.reporting import reporter
-from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, resumable
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, resumable
 
 
 def metrics(

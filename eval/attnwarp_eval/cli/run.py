@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from attnwarp.cli.shell import fail, log, warn
 from attnwarp.reporting import reporter
-from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, resumable, warn
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, names, resumable
 
 if TYPE_CHECKING:
     from attnwarp_eval.study.cell import Cell
@@ -231,10 +232,9 @@ def _name_untabulated(study: Study) -> None:
     }
     listed = "; ".join(f"{name} of {', '.join(own)}" for name, own in untabulated.items() if own)
     if listed:
-        typer.echo(
-            f"attnwarp-eval: in no table of the report: {listed}; a table under 'ablations' shows"
-            " them, results.jsonl has them anyway",
-            err=True,
+        log(
+            f"in no table of the report: {listed}; a table under 'ablations' shows"
+            " them, results.jsonl has them anyway"
         )
 
 
@@ -288,19 +288,17 @@ def run_study(
             _name_notices(planned)
             with store.lock():
                 if planned.other_code:
-                    typer.echo(
-                        f"attnwarp-eval: {planned.other_code} of the cells in {store.root} were"
+                    log(
+                        f"{planned.other_code} of the cells in {store.root} were"
                         " computed by other code than this; they are kept, and the report names"
-                        " it. To judge this code, name another folder with --out.",
-                        err=True,
+                        " it. To judge this code, name another folder with --out."
                     )
                 others = len(store.done() - {cell.id for cell in planned.cells})
                 if others:
-                    typer.echo(
-                        f"attnwarp-eval: {others} of the cells in {store.root} are of other sizes,"
+                    log(
+                        f"{others} of the cells in {store.root} are of other sizes,"
                         " scenes, seeds or settings than this run; they are kept, and the report is"
-                        " of this run alone. Name another folder with --out to keep the former.",
-                        err=True,
+                        " of this run alone. Name another folder with --out to keep the former."
                     )
                 try:
                     summary = _watch(planned, store, jobs, scheduler, keep_going)
@@ -387,10 +385,9 @@ def report(
             TOO_LITTLE,
         )
     if missing:
-        typer.echo(
-            f"attnwarp-eval: {run}: {missing} of {len(results.cells)} cells are missing, as the run"
-            f" is unfinished; attnwarp-eval verify {run} names them",
-            err=True,
+        log(
+            f"{run}: {missing} of {len(results.cells)} cells are missing, as the run"
+            f" is unfinished; attnwarp-eval verify {run} names them"
         )
 
 

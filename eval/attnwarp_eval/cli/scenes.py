@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from attnwarp.cli.shell import fail, log
 from attnwarp.reporting import reporter
-from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, resumable
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, names, resumable
 
 if TYPE_CHECKING:
     from attnwarp_eval.scene.scene import Scene
@@ -116,7 +117,7 @@ def _say_open_bounces(scene: Scene) -> None:
     from attnwarp_eval.truth.plan import open_bounces
 
     for line in open_bounces(scene):
-        typer.echo(f"attnwarp-eval: {scene.name}: {line}", err=True)
+        log(f"{scene.name}: {line}")
 
 
 def _check_no_capture(folder: Path) -> None:

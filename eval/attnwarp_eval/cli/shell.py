@@ -1,23 +1,19 @@
-"""What every command shares: exit codes, and errors in one line."""
+"""The shell of both commands, and what the harness adds to it: exit codes, and runs."""
 
 from __future__ import annotations
 
-import warnings
+import functools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-
-import typer
 
 from attnwarp.cli import shell
-from attnwarp.cli.shell import STOPPED, USAGE, closed_pipe
+from attnwarp.cli.shell import STOPPED, fail
 from attnwarp.process import stops_interrupt
 
-PASS, REGRESSION, TOO_LITTLE, CRASH = 0, 1, 3, 70
+REGRESSION, TOO_LITTLE = 1, 3
 """Exit codes beside those of attnwarp. 1 is reserved for a regression. A run that measured too
-little, or with an instrument that is not calibrated, is 3. A fault of this program is 70, as in
-sysexits."""
+little, or with an instrument that is not calibrated, is 3."""
 
 
 class Regression(SystemExit):
@@ -29,12 +25,6 @@ class Regression(SystemExit):
 
     def __init__(self) -> None:
         super().__init__(REGRESSION)
-
-
-def fail(message: str, code: int = USAGE) -> typer.Exit:
-    """Print an error on stderr; raise what this returns."""
-    typer.echo(f"attnwarp-eval: {message}", err=True)
-    return typer.Exit(code)
 
 
 def check_not_of_run(out: Path, run: Path) -> None:
@@ -60,60 +50,7 @@ def check_not_of_run(out: Path, run: Path) -> None:
         check_other(out, run / name, f"a file of the run {run}")
 
 
-_printed: set[str] = set()
-"""What was said of scenes by this process: they are built more than once."""
-
-
-def warn(text: str) -> None:
-    """Print a warning on stderr, once a process."""
-    if text not in _printed:
-        _printed.add(text)
-        typer.echo(f"attnwarp-eval: warning: {text}", err=True)
-
-
-@contextmanager
-def clear_errors() -> Iterator[None]:
-    """Turn errors about a person's input into one clear line and exit code 2, and what a scene's
-    meshes give notice of into one line each.
-    """
-    from attnwarp.errors import InputError
-
-    show_others = warnings.showwarning
-
-    def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
-        # By name: the class is imported with all that reads scenes.
-        if any(base.__name__ == "SceneNotice" for base in category.__mro__):
-            warn(str(message))
-        else:
-            show_others(message, category, *rest, **more)
-
-    try:
-        with warnings.catch_warnings():
-            warnings.showwarning = show
-            yield
-    except InputError as error:
-        raise fail(str(error)) from None
-    except RuntimeError as error:
-        if "Symlink loop" not in str(error):  # of Path.resolve() before Python 3.13
-            raise
-        raise fail(f"{error}; name another path") from None
-    except KeyboardInterrupt:
-        raise fail("interrupted", STOPPED) from None
-    except BrokenPipeError:
-        raise closed_pipe() from None
-    except OSError as error:
-        raise fail(file_error(error)) from None
-
-
-def file_error(error: OSError) -> str:
-    """An error of the file system, with the remedy."""
-    if isinstance(error, FileNotFoundError | FileExistsError | IsADirectoryError):
-        if error.errno is None:  # raised by the library, whose message has the remedy
-            return str(error)
-    elif error.errno is None:  # such as dask's timeouts, which have no text: no file is at fault
-        text = f"{type(error).__name__}: {error}".removesuffix(": ")
-        return f"a connection between processes failed ({text}); run the same command again"
-    return shell.file_error(error)
+clear_errors = functools.partial(shell.clear_errors, "stopped", strict=True)
 
 
 @contextmanager
@@ -127,7 +64,7 @@ def resumable(state: Callable[[], str]) -> Iterator[None]:
         with stops_interrupt():
             yield
     except KeyboardInterrupt:
-        message = f"interrupted; {state()}, the same command goes on from here"
+        message = f"stopped; {state()}, the same command goes on from here"
         raise fail(message, STOPPED) from None
 
 

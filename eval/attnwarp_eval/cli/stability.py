@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from attnwarp.cli.shell import log
 from attnwarp.reporting import reporter
 from attnwarp_eval.cli.shell import Regression, clear_errors
 
@@ -47,7 +48,7 @@ def stability(
                 raise InputError(f"{option}: --case prints here and writes nothing; leave it out")
     failed = _show(chosen, quick) if chosen else _study(quick, out, jobs)
     for line in failed:
-        typer.echo(f"attnwarp-eval: {line}", err=True)
+        log(line)
     if failed:
         raise Regression
 

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from attnwarp_eval.cli.shell import TOO_LITTLE, check_not_of_run, clear_errors, fail, names
+from attnwarp.cli.shell import fail
+from attnwarp_eval.cli.shell import TOO_LITTLE, check_not_of_run, clear_errors, names
 
 app = typer.Typer(
     help="Ask people which edited scene they prefer, and score their answers.",

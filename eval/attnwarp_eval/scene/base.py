@@ -14,6 +14,7 @@ from pydantic import (
     Field,
 )
 
+from attnwarp.errors import InputWarning
 from attnwarp_eval.colors import to_linear
 
 FARTHEST = 1e9
@@ -21,7 +22,7 @@ FARTHEST = 1e9
 products of much larger ones overflow the float32 of what renders them."""
 
 
-class SceneNotice(UserWarning):
+class SceneNotice(InputWarning):
     """What a person should know of a scene that can be used all the same."""
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from attnwarp_eval.cli.shell import file_error
+from attnwarp.cli.shell import file_error
 
 PRINTS = [sys.executable, "-m", "attnwarp_eval", "cache", "info"]
 
@@ -24,16 +24,16 @@ with clear_errors(), resumable(lambda: "3 cells are kept"):
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_polite_kill_says_what_is_kept_as_ctrl_c_does(name):
-    program = "import typer\napp = typer.Typer()\n@app.command()\ndef main():\n"
+    program = "import typer\nfrom attnwarp.cli.options import program_options\napp = typer.Typer(name='attnwarp-eval')\napp.callback()(program_options)\n@app.command()\ndef main():\n"
     program += "".join(f"    {line}\n" for line in INTERRUPTED.format(name=name).splitlines())
     done = subprocess.run(
-        [sys.executable, "-c", f"{program}\napp()"],
+        [sys.executable, "-c", f"{program}\napp(['main'])"],
         capture_output=True,
         text=True,
         timeout=60,
     )
     assert done.returncode == 130
-    expected = "attnwarp-eval: interrupted; 3 cells are kept, the same command goes on from here\n"
+    expected = "attnwarp-eval: stopped; 3 cells are kept, the same command goes on from here\n"
     assert done.stderr == expected
 
 

@@ -7,7 +7,6 @@ import trimesh
 import yaml
 from typer.testing import CliRunner
 
-from attnwarp_eval.cli import shell
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.notices import notices
@@ -50,7 +49,6 @@ def place(tmp_path, monkeypatch):
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(SCENE))
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(STUDY))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(shell, "_printed", set())
     return tmp_path
 
 

@@ -247,7 +247,7 @@ def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(folder):
     assert done.exit_code == 130
     count = len(list((run / "cells").rglob("*.json")))
     assert 1 <= count < CELLS
-    last = f"interrupted; {count} cells are kept, the same command goes on from here"
+    last = f"stopped; {count} cells are kept, the same command goes on from here"
     assert done.stderr.splitlines()[-1] == f"attnwarp-eval: {last}"
     assert "Traceback" not in done.stderr
 
@@ -265,7 +265,7 @@ def test_ctrl_c_that_native_code_turns_into_its_own_error_still_ends_the_run(fol
     monkeypatch.setattr(probe("warp"), "compute", interrupted)
     done = call("run", "study.yaml", "--out", run)
     assert done.exit_code == 130
-    assert "interrupted; " in done.stderr.splitlines()[-1]
+    assert "stopped; " in done.stderr.splitlines()[-1]
     assert not (run / "failed").exists() or not list((run / "failed").iterdir())
 
 

@@ -137,7 +137,7 @@ def test_a_stop_of_a_run_on_workers_says_what_is_kept_and_leaves_none_of_them(
     message = process.communicate(timeout=120)[1]
     assert process.returncode == 130
     kept = {path.name: path.stat().st_mtime_ns for path in (run / "cells").rglob("*.json")}
-    last = f"interrupted; {len(kept)} cells are kept, the same command goes on from here\n"
+    last = f"stopped; {len(kept)} cells are kept, the same command goes on from here\n"
     assert message.endswith(f"attnwarp-eval: {last}") and "Traceback" not in message
     assert started and not any(map(is_worker, started))
     assert len(own) <= min(core_count(), 4)  # cells
