@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import math
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -41,7 +42,8 @@ class Reporter:
             done: steps.
             total: steps in all; 0 while their number is unknown.
             text: what is at work, or has just ended.
-            left: seconds, where the work knows more of them than its pace tells.
+            left: seconds, where the work knows more of them than its pace tells; NaN while it
+                does not know them.
         """
 
     def log(self, text: str) -> None:
@@ -124,7 +126,8 @@ class _Shown(Reporter):
 
     def step(self, done: int, total: int, text: str, left: float | None = None) -> None:
         paced = self._pace.left(done, total)
-        self.show(done, total, text, paced if left is None else left)
+        known = paced if left is None else None if math.isnan(left) else left
+        self.show(done, total, text, known)
 
     def show(self, done: int, total: int, text: str, left: float | None) -> None:
         raise NotImplementedError

@@ -1,6 +1,7 @@
 """Lines of progress in a log file. Oracle: work of a known pace, whose end follows by hand."""
 
 import io
+import math
 import types
 
 import pytest
@@ -108,9 +109,9 @@ def test_work_that_is_only_named_gets_a_line_every_ten_seconds(clock):
 def test_every_step_that_is_done_gets_a_line_and_the_time_left_that_its_work_knows(clock):
     text = io.StringIO()
     with reporter(Console(file=text), every=True) as report:
-        for done, left in ((0, None), (0, None), (1, 95.0), (1, 90.0), (2, None)):
+        for done, left in ((0, None), (0, None), (1, 95.0), (1, 90.0), (2, math.nan)):
             report.step(done, 3, "cell", left)
-            clock.seconds += 1
+            clock.seconds += 9
     assert text.getvalue().splitlines() == ["[1/3] cell, 2 min left", "[2/3] cell"]
 
 

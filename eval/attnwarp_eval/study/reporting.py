@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Hashable, Sequence
 
@@ -50,12 +51,12 @@ class CellReporter:
     def _step(self, cell: Cell) -> None:
         self.report.step(self.done, self.total, cell.title, self.left())
 
-    def left(self) -> float | None:
-        """Seconds; None while they cannot be told."""
+    def left(self) -> float:
+        """Seconds; NaN while they cannot be told."""
         rest = self._rest.values()
         unseen = sum(cell.probe not in self._spent for cell in rest)
         if not self._spent or 2 * unseen > len(rest) or not rest:
-            return None
+            return math.nan
         now = time.perf_counter()
         seconds = sum(
             max(0.0, self._expected(cell) - (now - self._since.get(cell.id, now))) for cell in rest

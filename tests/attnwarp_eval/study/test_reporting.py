@@ -1,5 +1,6 @@
 """Time left of a run. Oracle: cells of known seconds, whose end follows by hand."""
 
+import math
 import types
 
 import pytest
@@ -9,6 +10,8 @@ from attnwarp_eval.study import reporting
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.record import Failure
 from attnwarp_eval.study.reporting import CellReporter
+
+UNKNOWN = pytest.approx(math.nan, nan_ok=True)
 
 
 @pytest.fixture
@@ -42,14 +45,14 @@ def test_cells_that_are_left_take_the_mean_of_their_kind(clock):
     seconds = {("warp", "x"): 10, ("warp", "y"): 1}
     # After x: y, x, y at 10 each; then each kind is known.
     todo = cells("warp x", "warp y")
-    assert lefts(clock, todo, seconds) == [30, 11, 1, None]
+    assert lefts(clock, todo, seconds) == [30, 11, 1, UNKNOWN]
 
 
 def test_nothing_is_told_while_most_is_of_probes_that_never_finished(clock):
     seconds = {("calibration", "c"): 60, ("warp", "x"): 1, ("warp", "y"): 1}
     todo = cells("calibration c", "warp x", "warp y")
     # A mean of all would have told 300 s after the first; 64 are left.
-    assert lefts(clock, todo, seconds) == [None, 63, 62, 2, 1, None]
+    assert lefts(clock, todo, seconds) == [UNKNOWN, 63, 62, 2, 1, UNKNOWN]
 
 
 def test_workers_share_what_is_left_and_what_they_are_at_is_partly_done(clock):
@@ -62,7 +65,7 @@ def test_workers_share_what_is_left_and_what_they_are_at_is_partly_done(clock):
     clock.seconds += 6
     reporter.end(todo[0], None)
     # 8 s a cell: of one 2 s are left, and two wait, for two workers.
-    assert said == [(5, 9, todo[0].title, None), (5, 9, todo[1].title, None),
+    assert said == [(5, 9, todo[0].title, UNKNOWN), (5, 9, todo[1].title, UNKNOWN),
                     (6, 9, todo[0].title, 9.0)]  # fmt: skip
 
 
