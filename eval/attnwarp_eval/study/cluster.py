@@ -206,8 +206,14 @@ def _local_client(jobs: int) -> Iterator[Client]:
                 scheduler_kwargs={"dashboard": False},
             )
         try:
-            with _errors_of_dask("the worker processes could not be started"):
+            try:
                 client = Client(starting.result())
+            except (OSError, RuntimeError) as error:  # dask's have no file
+                text = " ".join(str(error).split()) or type(error).__name__
+                raise ClusterError(
+                    f"the worker processes could not be started ({text}); run again, or with"
+                    " --jobs 1"
+                ) from None
             with _closed(client):
                 yield client
         except BaseException:
@@ -313,16 +319,6 @@ def _closed(resource: Any) -> Iterator[Any]:
     finally:
         with contextlib.suppress(OSError, RuntimeError):
             resource.close()
-
-
-@contextlib.contextmanager
-def _errors_of_dask(what: str) -> Iterator[None]:
-    """dask's errors of connections are OSErrors without a file: name what failed instead."""
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
-        text = " ".join(str(error).split()) or type(error).__name__
-        raise ClusterError(f"{what} ({text}); run again, or with --jobs 1") from None
 
 
 @contextlib.contextmanager
