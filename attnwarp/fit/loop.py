@@ -463,7 +463,7 @@ class _Run:
             loss = loss + s.normal_weight * losses.normal_consistency(view)
         if s.distortion_weight and done >= s.distortion_from:
             loss = loss + s.distortion_weight * losses.depth_distortion(
-                view, s.distortion_form, scale=self.extent
+                view, s.distortion_sum, scale=self.extent
             )
         return loss
 

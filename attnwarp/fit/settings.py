@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from attnwarp.gaussians import Kind
-from attnwarp.losses import Distortion
+from attnwarp.losses import Distortion, distortion_form
 from attnwarp.settings import Count, Number, Range, Settings, Share, Weight
 
 Background = Literal["auto", "random", "black", "white"]
@@ -36,8 +36,8 @@ class FitSettings(Settings):
         normal: weight of normal consistency. None: 0.05 for "2d" (published), 0 for "3d".
         distortion: weight of depth distortion. None: 0.01 for "2d", 0 for "3d".
         distortion_form: "l1" or "ordered" (in units of the scene's extent), or "l2_ndc"; see
-            :func:`attnwarp.losses.depth_distortion`. With weights far above the default, "ordered"
-            becomes negative and ruins a fit; "l1" does not.
+            :func:`attnwarp.losses.depth_distortion`. None: "ordered" up to the default weight, "l1"
+            above it, where "ordered" becomes negative and ruins a fit.
         normal_from, distortion_from: share of the iterations after which these begin (2DGS: 7,000
             and 3,000 of 30,000).
         background: colour behind the splats and behind transparent pixels of the images: "black",
@@ -97,7 +97,7 @@ class FitSettings(Settings):
     ssim: Share = 0.2
     normal: Weight | None = None
     distortion: Weight | None = None
-    distortion_form: Distortion = "ordered"
+    distortion_form: Distortion | None = None
     normal_from: Share = 0.23
     distortion_from: Share = 0.1
     background: Background = "auto"
@@ -135,6 +135,11 @@ class FitSettings(Settings):
     def distortion_weight(self) -> float:
         """``distortion``, or its default for the kind."""
         return (0.01 if self.kind == "2d" else 0.0) if self.distortion is None else self.distortion
+
+    @property
+    def distortion_sum(self) -> Distortion:
+        """``distortion_form``, or its default for the weight."""
+        return self.distortion_form or distortion_form(self.distortion_weight)
 
     @property
     def opacity_floor(self) -> float:

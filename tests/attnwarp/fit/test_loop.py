@@ -576,3 +576,6 @@ def test_defaults_that_depend_on_the_kind_follow_it():
     solid = dataclasses.replace(flat, kind="3d")
     assert (flat.normal_weight, flat.opacity_floor) == (0.05, 0.05)
     assert (solid.normal_weight, solid.distortion_weight, solid.opacity_floor) == (0.0, 0.0, 0.005)
+    # A weight above the default needs a sum that is never negative.
+    assert (flat.distortion_sum, FitSettings(distortion=0.02).distortion_sum) == ("ordered", "l1")
+    assert FitSettings(distortion=0.02, distortion_form="ordered").distortion_sum == "ordered"
