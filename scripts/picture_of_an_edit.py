@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib import pyplot
@@ -22,31 +22,30 @@ SIZE = 128
 """Side of the pictures; the bundled editor `small-plain` was trained at this size."""
 
 
-def draw(out: Path, scene: str, instruction: str, seed: int) -> None:
-    """Rows: before the edit, then alone or warped, each with own or with the same noise in every
-    view, and last the preset `extended`. Columns: the source view and targets.
+def draw(out: Path, scene: str, thing: str, instruction: str, seed: int) -> None:
+    """Rows: before the edit, each view edited alone, attention warped, and the preset `extended`.
+    Columns: the source view and targets. Every view has noise of its own; nothing changes outside
+    the thing's exact mask.
     """
     truth = world(scene, SIZE)
     cameras = [truth.source, *(truth.targets[view] for view in VIEWS)]
     before = [np.clip(truth.image(camera.name, 8), 0, 1) for camera in cameras]
+    number = truth.scene.object_names.index(thing)
+    segments = [truth.geometry.trace(camera).object_id == number for camera in cameras]
     model = splats(scene, SIZE, 0, kind="2d", count=20_000, position_noise=0.1, normal_noise=3.0)
-    editor = load_editor("small-plain")
+    given = (model, cameras, before, load_editor("small-plain"), instruction)
     # The row shows edited views, so the splats need no tuning.
-    noises: dict[Literal["fresh", "shared"], str] = {"fresh": "own noise", "shared": "same noise"}
-    few: dict[str, Any] = {"iterations": 1, "seed": seed}
-    stage: dict[str, Any] = {"stages": 1, "views_per_stage": len(VIEWS)}
-    scene_and_words = (model, cameras, before, editor, instruction)
-    rows: dict[str, Mapping[int, Any]] = {"before": dict(enumerate(before))}
-    for noise, words in noises.items():
-        alone = by_view(*scene_and_words, ByViewSettings(noise=noise, **few))
-        rows[f"each view alone,\n{words}"] = alone.edited
-        warped = attention_warping(
-            *scene_and_words, preset("attention_warping", noise=noise, **stage, **few)
-        )
-        rows[f"attention warped,\n{words}"] = warped.edited
-    beyond = preset("attention_warping", "extended", **stage, **few)
-    rows["extended"] = attention_warping(*scene_and_words, beyond).edited
-    figure, axes = pyplot.subplots(len(rows), len(cameras), figsize=(11, 13.5), dpi=80)
+    few: dict[str, Any] = {"iterations": 1, "seed": seed, "noise": "fresh"}
+    alone = by_view(*given, ByViewSettings(**few), segments=segments)
+    rows: dict[str, Mapping[int, Any]] = {
+        "before": dict(enumerate(before)),
+        "each view alone": alone.edited,
+    }
+    few |= {"stages": 1, "views_per_stage": len(VIEWS)}
+    for title, name in (("attention warped", "corrected"), ("extended", "extended")):
+        settings = preset("attention_warping", name, **few)
+        rows[title] = attention_warping(*given, settings, segments=segments).edited
+    figure, axes = pyplot.subplots(len(rows), len(cameras), figsize=(11, 9), dpi=80)
     for axis, title in zip(axes[0], ("source view", *VIEWS), strict=True):
         axis.set_title(title)
     for row, (title, pictures) in zip(axes, rows.items(), strict=True):
@@ -63,7 +62,8 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--scene", default="bear")
+    parser.add_argument("--thing", default="bear")
     parser.add_argument("--instruction", default="make the bear another color")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    draw(options.out, options.scene, options.instruction, options.seed)
+    draw(options.out, options.scene, options.thing, options.instruction, options.seed)

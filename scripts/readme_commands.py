@@ -1,4 +1,4 @@
-"""Call every command of the README in an environment, such as that of `make demo`.
+"""Call every command of the README and docs/commands.md in an environment, as of `make demo`.
 
     python scripts/readme_commands.py BIN [RUN]
 
@@ -51,8 +51,9 @@ def problem(words: list[str], folder: Path, run: str | None) -> str | None:
 
 def main(folder: str, run: str | None = None) -> int:
     """Call them all; the number of those that fail."""
-    readme = Path(__file__).parents[1] / "README.md"
-    found = commands(readme.read_text(encoding="utf-8"))
+    root = Path(__file__).parents[1]
+    pages = (root / name for name in ("README.md", "docs/commands.md"))
+    found = [words for page in pages for words in commands(page.read_text(encoding="utf-8"))]
     problems = [text for words in found if (text := problem(words, Path(folder), run))]
     print("\n".join([*problems, f"{len(found) - len(problems)} of {len(found)} commands work"]))
     return len(problems)

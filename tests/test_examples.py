@@ -114,10 +114,6 @@ def test_examples_of_the_docstrings_give_what_they_print(name, folder):
 
 
 NAMES = {
-    "README.md": """
-features = torch.rand(8, 64, 64)
-source_tokens, new_tokens = torch.rand(2, 1, 64 * 64, 8)
-""",
     "docs/edits.md": """
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.truth import Geometry
