@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import os
 import signal
@@ -10,6 +11,9 @@ from typing import Any
 
 STOPPED = 130
 """Exit code after Ctrl-C, a polite kill or the terminal's end, as shells have it for Ctrl-C."""
+
+interrupted = False
+"""True after a Ctrl-C. An import that it meets may end in an error of its own, such as numpy's."""
 
 
 def enter(name: str, module: str) -> None:
@@ -26,6 +30,11 @@ def enter(name: str, module: str) -> None:
         os.write(2, f"{name}: stopped; nothing was written\n".encode())
         os._exit(STOPPED)
 
+    def interrupt(*_: Any) -> None:
+        global interrupted
+        interrupted = True
+        raise KeyboardInterrupt
+
     before = signal.getsignal(signal.SIGINT)
     heeds = before is signal.default_int_handler  # a shell's background job ignores Ctrl-C
     if heeds:
@@ -33,11 +42,17 @@ def enter(name: str, module: str) -> None:
     sys.argv[1:] = [expanded(argument) for argument in sys.argv[1:]]
     main = importlib.import_module(module).main
     if heeds:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, interrupt)
     try:
         main()
     except KeyboardInterrupt:
         leave()
+    except SystemExit as done:
+        if interrupted and isinstance(done.code, int):
+            # Libraries whose import was cut end the interpreter with codes of their own.
+            atexit._run_exitfuncs()
+            os._exit(done.code)
+        raise
     finally:
         if heeds:
             signal.signal(signal.SIGINT, lambda *_: os._exit(STOPPED))

@@ -14,6 +14,7 @@ from typing import Any
 
 import typer
 
+from attnwarp.cli import entry
 from attnwarp.cli.entry import STOPPED
 from attnwarp.errors import InputError, InputWarning, missing_extra
 from attnwarp.process import (
@@ -203,6 +204,8 @@ def run(app: typer.Typer) -> None:
         # Typer's own code for a closed pipe is 1; a regression has a type of its own.
         sys.exit(CLOSED_PIPE if done.code == 1 and type(done) is SystemExit else done.code)
     except Exception as error:
+        if entry.interrupted:
+            sys.exit(fail(NOTHING, STOPPED).exit_code)
         explained = missing_extra(error) if isinstance(error, ImportError) else None
         if explained is None:
             traceback.print_exc()
