@@ -203,25 +203,24 @@ def first_splats(
 ) -> Gaussians:
     """First splats at a data set's points, or at random ones where it has none.
 
-        Args:
-            dataset: whose points and colours are taken.
-            cameras: of the views that are fitted on.
-            settings: kind, degree and seed of the splats.
-            report: receives a line where random points are taken, and of points that lie too far
-            away (:func:`within_reach`).
-            random: their number.
+    Args:
+        dataset: whose points and colours are taken.
+        cameras: of the views that are fitted on.
+        settings: kind, degree and seed of the splats.
+        report: receives a line where random points are taken, and of points that lie too far
+        away (:func:`within_reach`).
+        random: their number.
 
-        Example:
-            >>> from attnwarp import Camera
-            >>> from attnwarp.fit import FitSettings, first_splats
-            >>> from attnwarp.io import Dataset
-    from attnwarp.reporting import SILENT, Reporter
-            >>> view = dict(width=64, height=48, fov_y=40)
-            >>> cameras = [Camera.look_at(eye, (0, 0, 0), **view) for eye in ((3, 0, 0), (0, 3, 0))]
-            >>> data = Dataset(cameras, ["a.png", "b.png"])
-            >>> splats = first_splats(data, cameras, FitSettings(), random=50)
-            >>> len(splats), splats.kind
-            (50, '2d')
+    Example:
+        >>> from attnwarp import Camera
+        >>> from attnwarp.fit import FitSettings, first_splats
+        >>> from attnwarp.io import Dataset
+        >>> view = dict(width=64, height=48, fov_y=40)
+        >>> cameras = [Camera.look_at(eye, (0, 0, 0), **view) for eye in ((3, 0, 0), (0, 3, 0))]
+        >>> data = Dataset(cameras, ["a.png", "b.png"])
+        >>> splats = first_splats(data, cameras, FitSettings(), random=50)
+        >>> len(splats), splats.kind
+        (50, '2d')
     """
     points, colors = dataset.points, dataset.colors
     if points is None or not len(points):
