@@ -26,7 +26,7 @@ SUFFIX = "_cam.txt"
 
 
 def is_blendedmvs(path: Path) -> bool:
-    """Whether a folder is a scene of BlendedMVS."""
+    """Return True if a folder is a scene of BlendedMVS."""
     return (path / CAMERAS).is_dir() and (path / IMAGES).is_dir()
 
 

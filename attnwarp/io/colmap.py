@@ -70,7 +70,7 @@ ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE
 """Models with one focal length for both axes."""
 
 MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
-"""Where a sparse model is looked for in a folder, first hit first."""
+"""Places in a folder where a sparse model is looked for, first hit first."""
 
 
 def find_model(path: str | os.PathLike[str]) -> Path | None:
@@ -206,8 +206,9 @@ class _Pose:
 
 
 def _warn_of_larger(model: Path, count: int, images: Path) -> None:
-    """Where photographs do not hang together COLMAP leaves several models, numbered in the order in
-    which it began them: the first need not be the best.
+    """Warn if another model beside this one has more images. If photographs do not hang together,
+    COLMAP leaves several models, numbered in the order in which it began them: the first need not
+    be the best.
     """
     others = {
         other: _image_count(other)
@@ -490,8 +491,8 @@ def _text_pose(line: str) -> _Pose:
 
 
 def _is_image(line: str) -> bool:
-    """Whether a line in the place of keypoints is the next image. As nothing reads keypoints, all
-    else may stand there.
+    """Return True if a line in the place of keypoints is the next image. As nothing reads
+    keypoints, all else may stand there.
     """
     try:
         name = _text_pose(line).name
@@ -503,16 +504,16 @@ def _is_image(line: str) -> bool:
 
 
 def _holds_image(line: str) -> bool:
-    """Whether keypoints are followed by the next image, for want of a line end: numbers, more than
-    stand before an image's name, and then a name.
+    """Return True if keypoints are followed by the next image, for want of a line end: numbers,
+    more than stand before an image's name, and then a name.
     """
     leading = len(list(itertools.takewhile(_is_number, line.split())))
     return leading >= 8 and leading < len(line.split())
 
 
 def _ends_in_keypoints(name: str) -> bool:
-    """Whether keypoints follow an image's name, for want of a line end: X Y POINT3D_ID in threes,
-    the first X perhaps at one with the name.
+    """Return True if keypoints follow an image's name, for want of a line end: X Y POINT3D_ID in
+    threes, the first X perhaps at one with the name.
     """
     _, *others = name.split()
     return len(others) >= 2 and len(others) % 3 != 1 and all(map(_is_number, others))

@@ -1,4 +1,4 @@
-"""What readers and writers share: the error for a bad file, and a write that is whole or not."""
+"""Parts of readers and writers: the error for a bad file, and a write that is whole or not."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class FileFormatError(InputError):
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file; False too for a name that no file system can hold."""
+    """Return True if there is such a file; False too for a name that no file system can hold."""
     try:
         return path.is_file()
     except (OSError, ValueError):

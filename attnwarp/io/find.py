@@ -13,7 +13,7 @@ from attnwarp.io.file import is_file
 
 
 def name_key(name: str) -> str:
-    """What the spellings of one name have in common: backslashes are slashes, URL escapes their
+    """Key that all spellings of one name share: backslashes are slashes, URL escapes their
     characters, and neither case nor the form of accents (NFC, NFD) counts.
 
     Example:

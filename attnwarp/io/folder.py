@@ -17,7 +17,7 @@ from attnwarp.io.transforms import SPLITS, read_transforms
 Format = Literal["transforms", "colmap", "blendedmvs"]
 
 SCALES = (1, 2, 4, 8)
-"""Of image folders, as nerfstudio and Mip-NeRF 360 have them: images, images_2 and so on."""
+"""Scales of image folders, as nerfstudio and Mip-NeRF 360 have them: images, images_2 and so on."""
 
 
 def read_dataset(

@@ -37,7 +37,7 @@ IMAGE_SUFFIXES = (
     ".tiff",
     ".exr",
 )
-"""Of images, in the order in which they are looked for."""
+"""Suffixes of images, in the order in which they are looked for."""
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
@@ -242,7 +242,7 @@ def weighted_by_alpha(
 
 
 def _with_pillow(path: Path, use: Callable[[Any], Any], data: bytes | None = None) -> Any:
-    """What ``use`` makes of the picture opened by Pillow, with its errors in one line.
+    """Open a picture with Pillow and return ``use`` of it; an error takes one line.
 
     None for a format that Pillow does not know, such as TIFF of 16 bits and three channels.
 
@@ -338,7 +338,7 @@ _ORIENTATION, _BITS, _SAMPLES = 274, 258, 277
 """TIFF's tags that ask for a turn, that hold the bits of each channel, and their number."""
 
 _BIG = 43
-"""What a BigTIFF has in place of 42."""
+"""Number that a BigTIFF has in place of 42."""
 
 _FLIPS = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}
 """Axes to flip by EXIF's orientation, after rows and columns have changed places from 5 on."""

@@ -75,7 +75,7 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether it changes nothing. A fisheye lens without coefficients is no pinhole."""
+        """True if it changes nothing. A fisheye lens without coefficients is no pinhole."""
         return self.kind == "brown" and not any(self.coefficients)
 
     def distort(self, xy: npt.ArrayLike) -> Array:
@@ -166,7 +166,8 @@ class Lens:
         return here, dx, dy, dx[..., 0] * dy[..., 1] - dx[..., 1] * dy[..., 0]
 
     def folds(self, xy: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Where :meth:`distort` mirrors, beyond a fold that shows the same points again.
+        """Mask of the points that :meth:`distort` mirrors, beyond a fold that shows the same points
+        again.
 
         Args:
             xy: (..., 2) undistorted normalised coordinates.

@@ -11,7 +11,7 @@ from pathlib import Path
 from attnwarp.errors import InputError
 
 WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EBADF, errno.EINVAL)
-"""What a file system without locks of folders answers."""
+"""Error numbers of a file system without locks of folders."""
 
 
 @contextmanager

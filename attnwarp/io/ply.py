@@ -39,8 +39,8 @@ whose third scales are all exactly this is read back as 2D.
 """
 
 WORLD_TOLERANCE = 0.01
-"""How far float32 world coordinates may move a splat, as a share of its largest scale: a hundredth
-of a standard deviation changes no pixel by more than 0.6 % of the splat's peak.
+"""Largest distance by which float32 world coordinates may move a splat, as a share of its largest
+scale: a hundredth of a standard deviation changes no pixel by more than 0.6 % of the splat's peak.
 """
 
 Coordinates = Literal["auto", "world", "relative"]
@@ -576,7 +576,7 @@ def _read_sh(path: Path, columns: Columns, n: int) -> npt.NDArray[np.float32]:
 
 
 class _Header:
-    """What the comments of a header say about the splats; contradictions are kept until someone
+    """Statements of a header's comments about the splats; contradictions are kept until someone
     asks.
     """
 
@@ -776,7 +776,7 @@ def _logit(opacities: npt.NDArray[np.floating[Any]]) -> Array:
 
 
 def _not_ascii(content: bytes) -> str:
-    """What is wrong with a file whose header is not ASCII text."""
+    """Describe the fault of a file whose header is not ASCII text."""
     lines, _ = split_ply(content) or ([], 0)
     if lines and lines[0].strip() == b"ply":
         for number, line in enumerate(lines, 1):

@@ -38,7 +38,7 @@ DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Keys of the distortion coefficients, in the order of OpenCV's vector."""
 
 DISTORTION_LIST = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""What the six numbers of nerfstudio's ``distortion_params`` are."""
+"""Names of the six numbers of nerfstudio's ``distortion_params``."""
 
 PINHOLE_MODELS = (
     "OPENCV",
@@ -456,7 +456,7 @@ def _warn_of_own_intrinsics(path: Path, data: dict[str, Any], frames: list[dict[
 
 
 def _replaces(frame: dict[str, Any], data: dict[str, Any], key: str) -> bool:
-    """Whether a frame's value of ``key`` puts another value out of use."""
+    """Return True if a frame's value of ``key`` puts another value out of use."""
     if key not in frame:
         return False
     if key in data:
