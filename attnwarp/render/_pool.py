@@ -39,7 +39,7 @@ _taken = 0
 
 
 class _Lease:
-    """What an array taken from the pool keeps alive; the block returns when it dies."""
+    """Owner that an array taken from the pool keeps alive; the block returns when it dies."""
 
     __slots__ = ("__array_interface__", "raw")
 

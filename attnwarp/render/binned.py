@@ -44,7 +44,7 @@ def aligned(size: int) -> np.ndarray:
 
 
 def aligned_doubles(size: int) -> np.ndarray:
-    """As :func:`aligned`, of float64."""
+    """Float64 numbers on a 64-byte boundary."""
     return aligned(2 * size).view(np.float64)
 
 
@@ -154,8 +154,8 @@ class BinnedSplats:
             order.break_ties(self.order, depth, content, ties)
 
     def front(self) -> int:
-        """How many of the nearest splats to begin with: all, unless they would make lists far
-        longer than needed.
+        """Number of the nearest splats to begin with: all, unless they would make lists far longer
+        than needed.
         """
         length, count = self._listed / self.tile_count, len(self.order)
         return count if length < 4 * FRONT else -(-count * FRONT // int(length))

@@ -20,7 +20,7 @@ from attnwarp.render.threads import ranges, run_jobs, thread_count
 def normal_consistency(
     depth: Tensor, alpha: Tensor, normal: Tensor, camera: Camera, rotation: Tensor
 ) -> Tensor:
-    """What :func:`attnwarp.losses.normal_consistency` computes, for float32 in the host's memory.
+    """Compute :func:`attnwarp.losses.normal_consistency` for float32 in the host's memory.
 
     Args:
         depth: (H, W) depth along the optical axis, NaN where undefined.

@@ -66,7 +66,7 @@ def _as_tensor(array: np.ndarray, shape: torch.Size, dtype: torch.dtype) -> torc
 
 @dataclass(frozen=True)
 class _Drawn:
-    """What the forward pass leaves to the backward pass."""
+    """State that the forward pass leaves to the backward pass."""
 
     binned: BinnedSplats
     pictures: layout.Pictures

@@ -39,7 +39,7 @@ def _type_key(value: Any) -> Any:
 
 
 def machine_code(kernel: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
-    """What ``kernel`` is compiled to for arguments of such types; it is compiled if need be.
+    """Machine code of ``kernel`` for arguments of such types; it is compiled if need be.
 
     Where numba was told to compile nothing, a kernel is a plain function: itself.
     """

@@ -1,4 +1,4 @@
-"""What a backend of the renderer gets and returns."""
+"""Inputs and outputs of a backend of the renderer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a backend gets from the door: checked, and free of defaults. N splats, C channels.
+    """Inputs of a backend: checked, and free of defaults. N splats, C channels.
 
     ``values`` is (N, K, 3) spherical harmonics if ``harmonic``, else (N, C) features. ``K`` is (3,
     3) and ``pose`` the (4, 4) world-to-camera transform, both float64; ``pose`` and ``background``
@@ -44,7 +44,7 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Outputs:
-    """What a backend returns; the outputs are those of :class:`attnwarp.render.Render`."""
+    """Outputs of a backend; they are those of :class:`attnwarp.render.Render`."""
 
     color: Tensor
     alpha: Tensor

@@ -101,7 +101,7 @@ def buffer_floats(channels: int) -> int:
 
 
 class WorkRegions(NamedTuple):
-    """Where parts of the work on a splat begin, in float32."""
+    """Offsets of parts of the work on a splat, in float32."""
 
     row: int = 0  # see lay_out
     sums: int = ROW  # (24) over the tile, see DiscSums and EllipsoidSums
@@ -266,7 +266,7 @@ def _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream):
 
 @inlined
 def _load_tile(buffer, tile, background, scale, pictures, upstream):
-    """As :func:`_load_whole_tile`, of any size and any number of channels."""
+    """Outputs and gradients of a tile of any size and any number of channels to its buffer."""
     state = pictures.state
     for r in range(tile.rows):
         for k in range(tile.columns):

@@ -57,7 +57,7 @@ class Pieces(NamedTuple):
 
 @inlined
 def _overlaps(row, x1, x2, y1, y2, cut, w_most, filtered):
-    """Whether a 2D splat of any outline may show in a rectangle, by interval arithmetic.
+    """Return True if a 2D splat of any outline may show in a rectangle, by interval arithmetic.
 
     Args:
         row: (ROW_DOUBLES,) float64 of the table.
@@ -271,8 +271,9 @@ def place_cursors(
     starts,  # (tiles,) int64
     counts,  # (tiles,) int64
 ):
-    """Where each group of splats puts its entries, to ``cursors``, and the tiles' lists, to
-    ``starts`` and ``counts``; nothing goes to tiles that are not live."""
+    """Write the place of each group's entries to ``cursors``, and the tiles' lists, to ``starts``
+    and ``counts``; nothing goes to tiles that are not live.
+    """
     total = 0
     groups, tiles = changes.shape[0], starts.shape[0]
     running = cursors[:, tiles]
@@ -296,7 +297,7 @@ def _row_bits(interval, begin):
 
 @inlined
 def _tile_bits(interval, column):
-    """Of a row of a run, the bits of SIDE columns of squares from ``column`` on."""
+    """Bits of SIDE columns of squares from ``column`` on, in a row of a run."""
     begin, end = max((interval & 0xFFFF) - column, 0), min((interval >> 16) - column, SIDE - 1)
     return ((2 << end) - (1 << begin)) if end >= begin else 0
 

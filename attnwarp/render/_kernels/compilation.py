@@ -1,4 +1,4 @@
-"""How the kernels are compiled: decorators, casts, and prefetches."""
+"""Compilation of the kernels: decorators, casts, and prefetches."""
 
 from __future__ import annotations
 
@@ -100,7 +100,8 @@ def exact(function: Any) -> Any:
 
 
 def exact_inlined(function: Any) -> Any:
-    """As :func:`exact`, for what kernels call for each pixel: LLVM puts it into its callers.
+    """Compile as :func:`exact` does, for functions that kernels call for each pixel: LLVM puts it
+    into its callers.
 
     By itself LLVM leaves the larger ones apart, and each call then hands over 50 fields.
     """

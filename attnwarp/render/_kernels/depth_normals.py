@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
-"""How far splats' normals lie from those of the depth that they draw, and its gradient.
+"""Distance of splats' normals from those of the depth that they draw, and its gradient.
 
 The definition is :func:`attnwarp.losses.normal_consistency` in torch. A pixel's surface normal is
 the cross product of the differences of its neighbours' points, so all is done in one pass over the
@@ -30,7 +30,7 @@ class Lens(NamedTuple):
 
 
 class Maps(NamedTuple):
-    """What was rendered: (H, W), (H, W), (H, W, 3) float32; normals in world axes, not unit."""
+    """Rendered maps: (H, W), (H, W), (H, W, 3) float32; normals in world axes, not unit."""
 
     depth: np.ndarray
     alpha: np.ndarray

@@ -87,7 +87,7 @@ PAST = 80
 
 
 class WorkRegions(NamedTuple):
-    """Where parts of the work on a splat begin, in float32."""
+    """Offsets of parts of the work on a splat, in float32."""
 
     row: int = 0  # see lay_out
     linear: int = ROW  # at the quarter at hand
@@ -110,7 +110,7 @@ class Workspace(NamedTuple):
 
 
 def bits(squares):
-    """How many squares these are; each is a bit."""
+    """Number of these squares; each is a bit."""
     pairs = squares - (squares >> 1 & 0x5555)
     fours = (pairs & 0x3333) + (pairs >> 2 & 0x3333)
     eights = (fours + (fours >> 4)) & 0x0F0F

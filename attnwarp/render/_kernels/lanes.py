@@ -147,7 +147,7 @@ for _numbers, _truths in ((lanes, mask), (wide, wide_mask)):
 
 
 def _kind(*args: Any) -> Any:
-    """What numbers are broadcast to."""
+    """Type that numbers are broadcast to."""
     return wide if wide in args or wide_mask in args else lanes
 
 
@@ -269,7 +269,7 @@ def fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 def _has_avx512(context: Any) -> bool:
-    """Whether numba compiles for a processor with AVX-512, which need not be this one: see
+    """Return True if numba compiles for a processor with AVX-512, which need not be this one: see
     NUMBA_CPU_NAME, NUMBA_CPU_FEATURES and NUMBA_ENABLE_AVX.
     """
     _, _, features = context.codegen().magic_tuple()
@@ -477,7 +477,7 @@ def sum_each(a, b, c, d, e, f, g, h, i, j, k, m, n, o, p, q):  # type: ignore[no
 
 @register_jitable(inline="always")
 def sum_each8(a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
-    """As :func:`sum_each` of eight; the sums stand twice."""
+    """Sums of the lanes of eight vectors, as :func:`sum_each`; the sums stand twice."""
     low = _fold2(_fold4(_fold8(a, b), _fold8(c, d)), _fold4(_fold8(e, f), _fold8(g, h)))
     return _fold1(low, low)
 
@@ -488,7 +488,7 @@ def _as_bits(builder: Any, chosen: Any) -> Any:
 
 @intrinsic
 def count_true(typing: Any, chosen: Any) -> Any:
-    """How many lanes are chosen."""
+    """Number of chosen lanes."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.zext(builder.ctpop(_as_bits(builder, args[0])), ir.IntType(64))
@@ -498,7 +498,7 @@ def count_true(typing: Any, chosen: Any) -> Any:
 
 @intrinsic
 def any_true(typing: Any, chosen: Any) -> Any:
-    """Whether any lane is chosen."""
+    """True if any lane is chosen."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         bits = _as_bits(builder, args[0])

@@ -171,8 +171,9 @@ TILE_ROW = RowColumns()
 
 
 class LinearTerms(NamedTuple):
-    """What is linear in a pixel's position: of 2D splats u, v, w and the screen's, of 3D splats u,
-    v, l (along), p and q; see :class:`EllipsoidColumns`."""
+    """Terms that are linear in a pixel's position: of 2D splats u, v, w and the screen's, of 3D
+    splats u, v, l (along), p and q; see :class:`EllipsoidColumns`.
+    """
 
     u: int = 0
     v: int = 1
@@ -252,7 +253,7 @@ class Lists(NamedTuple):
 
 
 class Pictures(NamedTuple):
-    """What is drawn, and what the backward pass needs of it; H x W pixels, float32."""
+    """Drawn pictures, and the state that the backward pass needs; H x W pixels, float32."""
 
     color: np.ndarray  # (H, W, C)
     alpha: np.ndarray  # (H, W)
@@ -278,7 +279,7 @@ STATE = StatePlanes()
 
 
 class Progress(NamedTuple):
-    """What was done in each tile, and the weights of the lists' entries."""
+    """Counts of the work done in each tile, and the weights of the lists' entries."""
 
     processed: np.ndarray  # (tiles,) int64, entries of its list
     tested: np.ndarray  # (tiles,) int64, pairs whose intersection was computed

@@ -192,7 +192,8 @@ def _all_wanted(wanted):
 
 @inlined
 def _reaches(view, c0, c1, c2, size, wanted):
-    """Whether a splat may show in a wanted tile, by a rectangle that holds it at any rotation.
+    """Return True if a splat may show in a wanted tile, by a rectangle that holds it at any
+    rotation.
 
     Args:
         c0, c1, c2: its centre in camera axes.

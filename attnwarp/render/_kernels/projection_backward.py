@@ -115,7 +115,7 @@ def _direction_backward(degree, x, y, z, d_basis):
 
 @inlined
 def _quaternion_backward(quats, i, size, d_Q, d_quats):
-    """Of the rotation of quaternion i, which has the length ``size``."""
+    """Backward of the rotation of quaternion i, which has the length ``size``."""
     w, x, y, z = (
         f64(quats[i, 0]) / size,
         f64(quats[i, 1]) / size,
@@ -168,7 +168,7 @@ def workspace() -> Workspace:
 
 @inlined
 def _disc_backward(g, inverse, ahead, length, work):
-    """Of a disc's plane; returns the gradient in ``length``, the distance of the centre."""
+    """Backward of a disc's plane; returns the gradient in the distance of its centre."""
     kx, ky, kxy = inverse
     a, c, s = work.axes, work.center, work.scales
     ga, gc, g_s = work.g_axes, work.g_center, work.g_scales
@@ -226,7 +226,8 @@ def _disc_backward(g, inverse, ahead, length, work):
 
 @inlined
 def _ellipsoid_backward(view, g, row, opacities, i, work):
-    """Of an ellipsoid's footprint, ``row`` of the table; returns the gradient in the opacity.
+    """Backward of an ellipsoid's footprint, ``row`` of the table; returns the gradient in the
+    opacity.
 
     The opacity is read where it is used: as a number handed in, LLVM multiplies in another order.
     """
@@ -315,7 +316,7 @@ def _ellipsoid_backward(view, g, row, opacities, i, work):
 
 @inlined
 def _peak_backward(g, kx, work):
-    """Of an ellipsoid's depth where it is largest along a pixel's ray."""
+    """Backward of an ellipsoid's depth where it is largest along a pixel's ray."""
     a, c, s = work.axes, work.center, work.scales
     ga, gc, g_s = work.g_axes, work.g_center, work.g_scales
     T, H, D = work.matrices[0], work.matrices[1], work.matrices[2]
@@ -365,7 +366,7 @@ def _peak_backward(g, kx, work):
 
 @inlined
 def _extent_backward(g, count, by_center, near, work):
-    """Of the nearest and the farthest depth of a splat with ``count`` scales."""
+    """Backward of the nearest and the farthest depth of a splat with ``count`` scales."""
     a, c, s = work.axes, work.center, work.scales
     ga, gc, g_s = work.g_axes, work.g_center, work.g_scales
     spread = (s[0] * a[2, 0]) ** 2 + (s[1] * a[2, 1]) ** 2
@@ -391,7 +392,7 @@ def _extent_backward(g, count, by_center, near, work):
 
 @inlined
 def _normal_backward(g, discs, work):
-    """Of the normal: a disc's axis or that of the smallest scale, turned to the camera."""
+    """Backward of the normal: a disc's axis or that of the smallest scale, turned to the camera."""
     a, c, s, gQ = work.axes, work.center, work.scales, work.g_splat
     axis = 2
     if not discs:
@@ -408,7 +409,7 @@ def _normal_backward(g, discs, work):
 
 @inlined
 def _harmonics_backward(g, degree, length, values, i, d_values, work):
-    """Of the colour in splat i's harmonics and in the direction to the splat."""
+    """Backward of the colour in splat i's harmonics and in the direction to the splat."""
     R, c, Y = work.camera, work.center, work.basis
     gR, gc, gY, h = work.g_camera, work.g_center, work.g_basis, work.vectors[0]
     x = (R[0, 0] * c[0] + R[1, 0] * c[1] + R[2, 0] * c[2]) / length

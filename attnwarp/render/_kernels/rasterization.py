@@ -70,7 +70,7 @@ WEIGHT_UNIT = 2.0**-36
 
 
 class BlockRegions(NamedTuple):
-    """Where parts of the work on a block of splats begin, in float32."""
+    """Offsets of parts of the work on a block of splats, in float32."""
 
     rows: int = 0  # BLOCK rows; see lay_out
     weights: int = BLOCK * ROW  # of each splat, at the 16 pixels of all squares
