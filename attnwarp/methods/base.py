@@ -1,4 +1,4 @@
-"""How a method runs: its edits and its tuning, resumed after a kill, within a budget.
+"""Loop of a method: its edits and its tuning, resumed after a kill, within a budget.
 
 manifest.json         method, settings, rounds, hashes of the inputs
 rounds/N/NAME.png     each edited view of a round; NAME.json: its record
@@ -179,7 +179,7 @@ Edit = Callable[[Gaussians, Callable[[], None]], list[ViewEdit]]
 
 
 class Loop(Protocol):
-    """What a method does, one step after another, in the order that its ``run`` gives."""
+    """Steps of a method, one after another, in the order that its ``run`` gives."""
 
     def edit(self, number: int, views: Sequence[int], edit: Edit, *, rows: int) -> None:
         """Edit views together.
@@ -243,13 +243,13 @@ class Plan:
         method.run(self)
 
     def edit(self, number: int, views: Sequence[int], edit: Edit, *, rows: int) -> None:
-        """See :class:`Loop`."""
+        """Plan an edit of views together."""
         self._change(number, views=(*self._round(number).views, *views))
 
     def tune(
         self, number: int, views: Sequence[int], iterations: int, order: Order | None = None
     ) -> None:
-        """See :class:`Loop`."""
+        """Plan a round of tuning."""
         self._change(number, training=tuple(views), iterations=iterations)
 
     def _round(self, number: int) -> Round:
@@ -407,7 +407,7 @@ class _Run:
     # --- editing
 
     def edit(self, number: int, views: Sequence[int], edit: Edit, *, rows: int) -> None:
-        """See :class:`Loop`."""
+        """Edit views together, as :class:`Loop` tells."""
         place = self.places[number]
         self.places[number] += 1
         if all([self.folder.made(self._picture(number, view)) for view in views]):
@@ -461,7 +461,7 @@ class _Run:
     def tune(
         self, number: int, views: Sequence[int], iterations: int, order: Order | None = None
     ) -> None:
-        """See :class:`Loop`."""
+        """Tune the splats, as :class:`Loop` tells."""
         cut = self.cut
         # A round without an edit would tune on those before once more.
         edited = number in self.latest.values() or not self.rounds[number].views

@@ -55,8 +55,8 @@ named as a mask by mistake."""
 
 @dataclass(frozen=True)
 class FitPlan:
-    """How a scene is fitted before it is edited. ``reports/editing/time.md`` has what the defaults
-    take, and what half and twice as much time buys.
+    """Settings of the fit before an edit. ``reports/editing/time.md`` has what the defaults take,
+    and what half and twice as much time buys.
 
     Args:
         iterations: of the fit.

@@ -144,7 +144,7 @@ class DGE(Method):
         return starts[min(number, len(starts) - 1)]
 
     def _with_keys(self, number: int) -> list[bool]:
-        """Of each step of a round, whether views take the outputs of key views there."""
+        """Flags of a round's steps, True where views take the outputs of key views there."""
         published = steps_from(self._start(number), self.settings.steps)
         return [timestep >= self.settings.plain_below for timestep in published]
 

@@ -18,7 +18,9 @@ from torch import Tensor
 from attnwarp import check
 
 FRESH = 4
-"""What a view's own noise is drawn for, beside the purposes of :mod:`attnwarp.methods.work`."""
+"""Purpose of the draw of a view's own noise, beside the purposes of
+:mod:`attnwarp.methods.work`.
+"""
 
 
 def own_seed(*numbers: int) -> int:

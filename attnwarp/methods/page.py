@@ -141,7 +141,7 @@ def _chain(
 
 
 def _shares(about: dict[str, Any]) -> str:
-    """How much of a view gets features, and of which sources."""
+    """Sentence on the part of a view that gets features, and on their sources."""
     if "sources" not in about:
         return f"{about['injected']:.0%} of the pixels get features of the source"
     each = ", ".join(

@@ -160,7 +160,7 @@ def mask_picture(mask: Tensor) -> Bytes:
 SOURCE_COLORS = (
     (255, 255, 255), (240, 180, 60), (80, 170, 240), (90, 200, 110), (220, 110, 190), (200, 90, 70),
 )  # fmt: skip
-"""Of the sources in a picture of masks, the first white; they repeat."""
+"""Colours of the sources in a picture of masks, the first white; they repeat."""
 
 
 def sight_picture(sight: Sight) -> Bytes:

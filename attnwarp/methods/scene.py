@@ -1,4 +1,4 @@
-"""What an edit is given: cameras, pictures before the edit, and segments."""
+"""Inputs of an edit: cameras, pictures before the edit, and segments."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def editor_digest(editor: Any) -> str:
 
 
 def _configuration(network: Any) -> list[tuple[str, str]]:
-    """What a network's configuration says beside where it came from and what wrote it."""
+    """Entries of a network's configuration, without its origin and its writer."""
     config = getattr(network, "config", {})
     # transformers' configurations have hundreds of defaults, which its versions change.
     said = config.to_diff_dict() if hasattr(config, "to_diff_dict") else dict(config)
@@ -201,7 +201,7 @@ def _configuration(network: Any) -> list[tuple[str, str]]:
 
 
 def _tokens(editor: Any) -> Any:
-    """What makes tokens of a text: vocabulary, merges, rules, what pads it, and to which length."""
+    """Identity of a tokenizer: vocabulary, merges, rules, padding, and length."""
     tokenizer = getattr(editor, "tokenizer", None)
     if tokenizer is None:
         return None

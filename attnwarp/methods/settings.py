@@ -28,7 +28,8 @@ MOST_VIEWS = 40
 
 @dataclass(frozen=True)
 class MethodSettings(Settings):
-    """What all methods have. Each has a class of its own with its published numbers.
+    """Settings that all methods share. Each method has a class of its own with its published
+    numbers.
 
     Timesteps are Stable Diffusion's, in [0, 999]. On the editor's own schedule each becomes the
     step that leaves as much of the picture

@@ -1,4 +1,4 @@
-"""How well each source sees each pixel of a target: which source it takes, and with what weight."""
+"""Visibility of each pixel of a target from each source: the source it takes, and its weight."""
 
 from __future__ import annotations
 
@@ -284,7 +284,7 @@ class SoftWarp:
         return self.hard.mask
 
     def warp_tokens(self, source: Tensor) -> Tensor:
-        """See :meth:`attnwarp.warp.FeatureWarp.warp_tokens`."""
+        """Warp tokens as :meth:`attnwarp.warp.FeatureWarp.warp_tokens` tells."""
         return self.hard.warp_tokens(source)
 
     def blend_tokens(self, source: Tensor, new: Tensor, alpha: float) -> Tensor:

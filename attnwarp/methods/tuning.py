@@ -41,7 +41,7 @@ class PerceptualLoss(Protocol):
         ...
 
     def features(self, picture: Tensor) -> list[Tensor]:
-        """What is compared of a picture (H, W, 3) in [0, 1]."""
+        """Features that are compared, of a picture (H, W, 3) in [0, 1]."""
         ...
 
     def between(self, image: list[Tensor], target: list[Tensor]) -> Tensor:
@@ -76,7 +76,7 @@ class TrainingView:
 
 
 HELD_BYTES = 2**31
-"""Of pictures that :class:`DrawnViews` keeps: 164 of 1297 x 840 px."""
+"""Bytes of pictures that :class:`DrawnViews` keeps: 164 of 1297 x 840 px."""
 
 
 class DrawnViews(Sequence[TrainingView]):
@@ -110,7 +110,7 @@ class DrawnViews(Sequence[TrainingView]):
 
 
 FEATURE_BYTES = 2**30
-"""Of pictures' features that :class:`DistanceToViews` keeps: 80 views of 256 px."""
+"""Bytes of pictures' features that :class:`DistanceToViews` keeps: 80 views of 256 px."""
 
 
 class DistanceToViews:

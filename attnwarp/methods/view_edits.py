@@ -62,7 +62,7 @@ class RecordedSource:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """What edits of views start from.
+    """Start of views' edits.
 
     Attributes:
         views: their numbers.
@@ -247,7 +247,7 @@ class ViewEdits:
     # --- an edit
 
     def start(self, views: Sequence[int], model: Gaussians, *, by_hand: bool = False) -> Start:
-        """What edits of views start from, before features are recorded or injected.
+        """Start of views' edits, before features are recorded or injected.
 
         Args:
             views: their numbers.

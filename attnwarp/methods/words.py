@@ -108,7 +108,7 @@ def masks_by_words(
 
 
 def words_folder(out: Path, segmenter: Segmenter, words: str) -> Path:
-    """Where an edit keeps masks by these words and this segmenter."""
+    """Folder in which an edit keeps masks by these words and this segmenter."""
     plain = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")[:24] or "masks"
     return out / WORDS_FOLDER / f"{plain}-{digest([words, segmenter_digest(segmenter)])[:8]}"
 

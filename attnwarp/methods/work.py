@@ -26,7 +26,7 @@ Guide = npt.NDArray[Any]
 """(h, w, 3) picture or (h, w) depth, as an editor takes it."""
 
 NOISE, TIMESTEP, KEYS, VIEWS = range(4)
-"""What a random number is drawn for: no two draws share their seed."""
+"""Purposes of random numbers: no two draws share their seed."""
 
 
 class Work:
