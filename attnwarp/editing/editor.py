@@ -25,7 +25,7 @@ Guide = Literal["picture", "depth"]
 STEPS = 20
 
 LATENT_CHANNELS = 4
-"""Of Stable Diffusion, where an autoencoder's configuration names none."""
+"""Channels of Stable Diffusion's latents, used where an autoencoder's configuration names none."""
 
 MOST_GUIDANCE = 1000.0
 """Bound of guidance weights; those in use are below 20."""
@@ -58,7 +58,7 @@ class Editor(Protocol):
     factor: int
     """Pixels along the side of a latent."""
     guide: Guide
-    """What :meth:`task` takes of a view: its picture or its depth map."""
+    """Kind of guide that :meth:`task` takes: a view's picture or its depth map."""
 
     @property
     def branches(self) -> tuple[str, ...]:

@@ -18,10 +18,10 @@ from attnwarp.io.text import read_text
 
 WEIGHTS = ("diffusion_pytorch_model", "model", "pytorch_model")
 ENDINGS = {None: (".safetensors", ".bin"), "fp16": (".fp16.safetensors",)}
-"""Of weights in one file, by diffusers' variant; None is the plain one."""
+"""Endings of weights in one file, by diffusers' variant; None is the plain one."""
 
 INDICES = {None: "*.index.json", "fp16": "*.index.fp16.json"}
-"""Of weights that are split."""
+"""Patterns for the index of weights that are split over files."""
 
 
 def require_diffusers() -> None:

@@ -34,8 +34,7 @@ class TokenWarp(Protocol):
 
 
 class LayerWarp(Protocol):
-    """What leads from a source view to a target view, such as
-    :class:`attnwarp.warp.WarpedView`."""
+    """A warp from a source view to a target view, such as :class:`attnwarp.warp.WarpedView`."""
 
     def at(self, size: Size, *, source_size: Size | None = None) -> TokenWarp:
         """The warp of an (h, w) grid of the target from a grid of the source."""
@@ -64,7 +63,7 @@ def decay(a0: float = 0.9) -> Callable[[int, int], float]:
 
 
 def constant(a: float) -> Callable[[int, int], float]:
-    """The same weight at every step.
+    """Constant schedule: one weight at every step.
 
     Args:
         a: in [0, 1].

@@ -136,7 +136,7 @@ def inversion_steps(editor: Editor, steps: int) -> tuple[list[int], int | None]:
 
 @dataclass(frozen=True, eq=False)
 class NoiseMaps:
-    """What leads DDPM sampling to a given picture.
+    """Start and noise by which DDPM sampling arrives at a given picture.
 
     Attributes:
         timesteps: falling.

@@ -26,7 +26,7 @@ PIX2PIX_BRANCHES = ("text", "image", "uncond")
 """Order of the guidance branches in the batch of diffusers' InstructPix2Pix pipeline."""
 
 CONTROLNET_BRANCHES = ("uncond", "text")
-"""The same of its ControlNet and plain pipelines."""
+"""Order of the guidance branches in the batch of diffusers' ControlNet and plain pipelines."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class Call:
 
     @functools.cached_property
     def timestep(self) -> float:
-        """Of the pass. Reading it waits for a GPU, so only hooks that need it do."""
+        """Timestep of the pass. Reading it waits for a GPU, so only hooks that need it do."""
         return float(torch.as_tensor(self.timesteps).reshape(-1)[0])
 
 

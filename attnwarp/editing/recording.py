@@ -20,7 +20,7 @@ from attnwarp.editing.layers import Call, Layer, Size, hooked
 
 @dataclass(frozen=True)
 class RecordingPlan:
-    """What is recorded, and the memory it takes, before anything runs.
+    """Plan of a recording: features to keep, and the memory they take, before anything runs.
 
     Args:
         layers: to record, see :func:`choose_layers`.
@@ -96,7 +96,7 @@ class RecordingPlan:
 
     @property
     def bytes(self) -> int:
-        """Of all features together."""
+        """Bytes of all features together."""
         values = 0
         for layer in self.layers:
             h, w = layer.size(self.latent_size)

@@ -20,7 +20,7 @@ PUBLISHED_STEPS = 1000
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """What a diffusion model was trained with.
+    """Noise schedule that a diffusion model was trained with.
 
     Steps of half precision are computed in float32 and rounded once: float16 has no number between
     0.9995 and 1, where alpha-bar of the last steps lies, and 1 - alpha-bar would be 0.

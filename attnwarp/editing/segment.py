@@ -233,7 +233,9 @@ class GroundedSam:
         return cls(*parts, **thresholds)
 
     def segment(self, image: Image, words: str) -> Mask:
-        """See :meth:`Segmenter.segment`. Several things are separated by a period: "bear. mug"."""
+        """Segment as :meth:`Segmenter.segment` tells. Several things are separated by a period:
+        "bear. mug".
+        """
         import torch
 
         pixels = np.rint(255 * checked_image(image)).astype(np.uint8)
@@ -360,7 +362,7 @@ class ClipSegmenter:
         return cls(encoder)
 
     def segment(self, image: Image, words: str) -> Mask:
-        """See :meth:`Segmenter.segment`."""
+        """Segment as :meth:`Segmenter.segment` tells."""
         import cv2
 
         picture: Image = checked_image(image)

@@ -32,7 +32,9 @@ TEXT_GUIDANCE, IMAGE_GUIDANCE = 1.5, 1.0
 """At higher text guidance a few colours take most answers, and colours saturate."""
 
 DEPTH_GUIDANCE = 2.0
-"""Of a bundled editor that takes depth; ControlNet's own 5 to 7.5 saturates its colours."""
+"""Guidance weight of a bundled editor that takes depth; ControlNet's own 5 to 7.5 saturates its
+colours.
+"""
 
 
 def bundled(folder: Path = WEIGHTS) -> list[str]:
@@ -137,7 +139,7 @@ def unknown_words(editor: Any, text: str) -> list[str]:
 
 
 def guide_of(name_or_folder: str) -> Guide:
-    """What an editor is guided by, without loading it: a ControlNet means depth maps.
+    """Tell the guide of an editor without loading it: a ControlNet means depth maps.
 
     Args:
         name_or_folder: of the editor, as :func:`load_editor` takes it.

@@ -17,7 +17,7 @@ from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from torch import Tensor
 
 ANSWERS = 64
-"""How many answers a noise can draw."""
+"""Number of answers that a noise can draw."""
 
 
 SETTLED, OPEN = 850, 920
@@ -61,7 +61,7 @@ class EditUNet(UNet2DConditionModel):
         self, sample: Tensor, timestep: Any, encoder_hidden_states: Tensor, *args: Any,
         return_dict: bool = True, **more: Any,
     ) -> Any:  # fmt: skip
-        """As the base class, with the source's latents (the second half of ``sample``) added.
+        """Run the base class with the source's latents (the second half of ``sample``) added.
 
         Args:
             sample: (B, 2C, h, w).

@@ -105,7 +105,7 @@ class TextImageEncoder(ImageEncoder, Protocol):
 
 @runtime_checkable
 class PlaceEncoder(Protocol):
-    """What each place of a picture shows, by words.
+    """An encoder that tells, by words, which things each place of a picture shows.
 
     Example:
         >>> import numpy as np

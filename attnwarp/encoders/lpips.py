@@ -191,7 +191,7 @@ class Lpips:
         return self.between(self.features(image), self.features(target))
 
     def features(self, picture: torch.Tensor) -> list[torch.Tensor]:
-        """What :meth:`between` compares of a picture (H, W, 3) in [0, 1], differentiable."""
+        """Features for :meth:`between` of a picture (H, W, 3) in [0, 1], differentiable."""
         return [x[0] for x in self._units(picture.permute(2, 0, 1)[None])]
 
     def between(self, image: list[torch.Tensor], target: list[torch.Tensor]) -> torch.Tensor:

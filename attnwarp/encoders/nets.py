@@ -205,7 +205,7 @@ class ClipSmall(nn.Module):
 
 
 class ClipParts(ClipSmall):
-    """The same, and a vector for each place of 8 x 8 px in the space of texts.
+    """:class:`ClipSmall` with a vector for each place of 8 x 8 px in the space of texts.
 
     Args:
         vocabulary: of the tokenizer.
@@ -299,8 +299,8 @@ class PerceptualSmall(nn.Module):
         return self.between(self.stack(a), self.stack(b))
 
     def stack(self, x: Tensor) -> list[Tensor]:
-        """What is compared of pictures: themselves averaged over 4 x 4 px, then their unit
-        features.
+        """Features that are compared of pictures: the pictures averaged over 4 x 4 px, then their
+        unit features.
         """
         size = 4 if min(x.shape[-2:]) >= 4 else 1
         return [functional.avg_pool2d(x, size), *(_unit(y) for y in self.features(x))]

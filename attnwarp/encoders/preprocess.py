@@ -27,8 +27,9 @@ _FILTERS = {0: "nearest", 1: "Lanczos", 2: "bilinear", 3: "bicubic", 4: "box", 5
 """Pillow's numbers of its filters, as the file stores them."""
 
 LEAST, MOST = 1e-4, 1e4
-"""Of deviations, and of any number here: those of published encoders are 0.2 to 1, or 255 times so
-much. Beyond, all pictures look alike in float32."""
+"""Limits of deviations, and of any number here: those of published encoders are 0.2 to 1, or 255
+times so much. Beyond, all pictures look alike in float32.
+"""
 
 
 @dataclass(frozen=True)

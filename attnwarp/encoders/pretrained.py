@@ -32,7 +32,9 @@ BATCH = 8
 """
 
 MOST_EPSILON = 1e-3
-"""Of a normalisation: published networks have 1e-12 to 1e-5, and their variances are about 1."""
+"""Largest epsilon of a normalisation: published networks have 1e-12 to 1e-5, and their variances
+are about 1.
+"""
 
 _ASK = {
     "clip": (
@@ -311,7 +313,7 @@ def check_config(path: Path, defaults: Mapping[str, Any]) -> None:
 
 
 def _expected(key: str, default: Any) -> tuple[str, Callable[[Any], bool]] | None:
-    """What a value must be, in words and as a test; None where anything goes."""
+    """Requirement on a value, in words and as a test; None where anything goes."""
     if isinstance(default, bool):
         return "true or false", lambda value: isinstance(value, bool)
     if key == "eps" or key.endswith("_eps"):
