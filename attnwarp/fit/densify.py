@@ -85,7 +85,7 @@ class Density:
         self.seen += visible
 
     def active(self, iteration: int) -> bool:
-        """Whether splats may still be added after so many iterations."""
+        """True if splats may still be added after so many iterations."""
         return self.settings.densify and 0 < iteration < self.last
 
     def refine(self, model: Model, iteration: int, random: torch.Generator) -> bool:

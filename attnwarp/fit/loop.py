@@ -34,7 +34,7 @@ CHECKPOINT = "checkpoint.pt"
 SPLATS = "splats.ply"
 
 NAMED = {"start": "first splats", "held_out": "held-out views"}
-"""What messages call parts of a fit's identity."""
+"""Names, in messages, of parts of a fit's identity."""
 
 SMOOTHING = 0.98
 """Share of the past in the loss and the PSNR that are shown while a fit runs."""
@@ -74,7 +74,7 @@ class Record:
 
 @dataclass(eq=False)
 class Fit:
-    """What a fit came to.
+    """Result of a fit.
 
     Attributes:
         gaussians: the splats, float32, outside autograd.
@@ -392,7 +392,7 @@ class _Run:
         return f"loss {self.loss:.4f}, PSNR {psnr}{held}, {len(self.model)} splats"
 
     def background(self, *, fitting: bool) -> Tensor:
-        """What is behind everything; for pictures that are looked at or measured, never random."""
+        """Colour behind everything; for pictures that are looked at or measured, never random."""
         choice = self.settings.background
         if choice == "auto":
             choice = "random" if self.views.transparent else "black"

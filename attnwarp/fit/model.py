@@ -1,4 +1,4 @@
-"""What is optimised: the splats as free numbers, and Adam's memory of each."""
+"""State of the optimisation: the splats as free numbers, and Adam's memory of each."""
 
 from __future__ import annotations
 

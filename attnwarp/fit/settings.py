@@ -14,8 +14,7 @@ Background = Literal["auto", "random", "black", "white"]
 
 @dataclass(frozen=True)
 class FitSettings(Settings):
-    """What a fit optimises and how. Equal settings, views, first splats and threads give equal
-    bits.
+    """Settings of a fit. Equal settings, views, first splats and threads give equal bits.
 
     Learning rates, thresholds and intervals are those published for 3DGS and 2DGS, whose fits take
     30,000 iterations on a GPU. What they fix in iterations and what has to scale with a shorter fit

@@ -69,7 +69,7 @@ def extent_of(cameras: Sequence[Camera], points: Array | None = None) -> float:
 
 
 def _at_one_place(centers: Array) -> bool:
-    """Whether positions, (N, 3), differ by no more than their float64 rounding.
+    """Return True if positions, (N, 3), differ by no more than their float64 rounding.
 
     The size of the world's unit says nothing about it.
     """

@@ -92,7 +92,7 @@ class Views:
 
     @cached_property
     def transparent(self) -> bool:
-        """Whether any picture has pixels that are not opaque."""
+        """True if any picture has pixels that are not opaque."""
         return any(
             image.shape[2] == 4 and bool((image[..., 3] < _top(image)).any())
             for image in self.images
@@ -322,8 +322,8 @@ def _named(again: dict[int, int], fitted: Sequence[Camera], held_out: Sequence[C
 
 
 def _file_keys(paths: Sequence[Path | None]) -> list[set[Hashable]]:
-    """What tells the file of each picture: the file itself, under whatever name, and its content,
-    which is read where another file has the same size.
+    """Keys that identify the file of each picture: the file itself, under whatever name, and its
+    content, which is read where another file has the same size.
     """
     stats = [path.stat() if path is not None and is_file(path) else None for path in paths]
     sizes = Counter({(s.st_dev, s.st_ino): s.st_size for s in stats if s is not None}.values())
@@ -343,7 +343,7 @@ def _file_keys(paths: Sequence[Path | None]) -> list[set[Hashable]]:
 
 
 def _pixel_keys(image: npt.NDArray[Any]) -> set[Hashable]:
-    """What tells a picture by its pixels; nothing where it has one colour, as blank views have."""
+    """Keys that identify a picture by its pixels; none for one colour, as blank views have."""
     if (image == image[0, 0]).all():
         return set()
     return {hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()}

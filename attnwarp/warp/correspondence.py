@@ -1,4 +1,4 @@
-"""Where each pixel of a target lies in the source image.
+"""Position of each pixel of a target in the source image.
 
 Coordinates are pixels with centres at +0.5, so an image spans [0, W] x [0, H], and a coordinate u
 of an image becomes exactly u * s in the image resized by s. A correspondence is worked out once for
@@ -23,7 +23,7 @@ from attnwarp.warp.settings import DepthInterpolation, PixelCenters
 
 @dataclass(frozen=True, eq=False)
 class Correspondence:
-    """Where each pixel of a target grid lies in the source image.
+    """Position of each pixel of a target grid in the source image.
 
     Made by :func:`correspond`. Every tensor is float64.
 
@@ -95,7 +95,7 @@ class Correspondence:
 
 
 def share_of(mask: Tensor) -> str:
-    """How much of a mask is True, such as "48 %"."""
+    """Share of a mask that is True, such as "48 %"."""
     return f"{100 * float(mask.double().mean()):.0f} %"
 
 
@@ -107,7 +107,7 @@ def correspond(
     pixel_centers: PixelCenters = "half",
     in_front: bool = True,
 ) -> Correspondence:
-    """Where each target pixel's surface point lies in the source image.
+    """Locate each target pixel's surface point in the source image.
 
     The pixel is unprojected with its depth, moved by the relative pose of the cameras, and
     projected. The pose is formed from the difference of the cameras' centres, so that far-away

@@ -40,7 +40,7 @@ def correspond_and_mask(
     settings: WarpSettings,
     target_segment: Tensor | None,
 ) -> tuple[Correspondence, dict[str, Tensor], Tensor]:
-    """What :func:`attnwarp.warp.warp_surfaces` computes, in one pass over the target's pixels.
+    """Compute :func:`attnwarp.warp.warp_surfaces` in one pass over the target's pixels.
 
     Pictures and ``target_segment``, (H, W) bool on the CPU, were checked there.
 
@@ -382,7 +382,7 @@ def _parts(
     settings: WarpSettings,
     size: tuple[int, int],
 ) -> tuple[pair.View, pair.View]:
-    """What the rules read of both surfaces: all float32, or all float64."""
+    """Maps of both surfaces that the rules read: all float32, or all float64."""
     wanted: dict[str, tuple[Array, tuple[int | str, ...]]] = {"target_depth": (target.depth, size)}
     if settings.opaque is not None:
         if target.alpha is not None:

@@ -14,7 +14,7 @@ from attnwarp.warp.settings import DepthInterpolation
 from attnwarp.warp.taps import bilinear_taps, clamp_index
 
 Array: TypeAlias = Tensor | npt.NDArray[Any]
-"""What the doors take: a tensor on any device, or a numpy array."""
+"""Input of the public functions: a tensor on any device, or a numpy array."""
 
 
 TAP_SPREAD = 0.02

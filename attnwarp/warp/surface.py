@@ -1,4 +1,4 @@
-"""What a view knows of the surface before it."""
+"""Surface before a view: its depth, opacity, picture and normals."""
 
 from __future__ import annotations
 

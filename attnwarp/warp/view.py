@@ -39,7 +39,9 @@ from attnwarp.warp.settings import PRESETS, NormalTest, WarpSettings
 from attnwarp.warp.surface import Surface, needed
 
 OVERSHOOT = 0.1
-"""How far beyond [0, 1] a picture may reach: cubic resampling overshoots an edge by a tenth."""
+"""Largest distance beyond [0, 1] that a picture may reach: cubic resampling overshoots an edge by a
+tenth.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -420,7 +422,7 @@ def _check_pair(source: Camera, target: Camera, settings: WarpSettings) -> None:
 def _check_pictures(
     source: Camera, target: Camera, target_surface: Surface, source_surface: Surface | None
 ) -> None:
-    """What the photometric test reads: pictures of their views, in [0, 1]."""
+    """Check the pictures that the photometric test reads: of their views, in [0, 1]."""
     first = needed(source_surface, "source_surface", "image", "photometric")
     second = needed(target_surface, "target_surface", "image", "photometric")
     check.shape(first, ("H", "W", "C"), "source_image")

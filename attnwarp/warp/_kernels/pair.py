@@ -21,7 +21,7 @@ from numba.extending import intrinsic
 from attnwarp.render._kernels.compilation import exact, exact_inlined
 
 INVERSE, BILINEAR, NEAREST = range(3)
-"""How depth is interpolated."""
+"""Ways to interpolate depth."""
 FACING, SOURCE_INCIDENCE, CAMERA_FRAME = range(3)
 """Tests of normals."""
 
@@ -60,7 +60,7 @@ class Positions(NamedTuple):
 
 
 class View(NamedTuple):
-    """What a view sees; (0, 0) or (0, 0, 0) arrays for what no rule needs."""
+    """Maps of a view; (0, 0) or (0, 0, 0) arrays for those that no rule needs."""
 
     depth: np.ndarray
     alpha: np.ndarray

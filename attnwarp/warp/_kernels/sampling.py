@@ -25,8 +25,8 @@ HALF, BRAIN = types.uint16, types.int16
 
 
 def _converts_half(context: Any) -> bool:
-    """Whether the processor that numba compiles for converts float16: all do but for x86 without
-    F16C. LLVM would call functions there that this process need not have.
+    """Return True if the processor that numba compiles for converts float16: all do but for x86
+    without F16C. LLVM would call functions there that this process need not have.
     """
     triple, _, features = context.codegen().magic_tuple()
     return not triple.startswith(("x86", "i686", "i386")) or "+f16c" in features.split(",")
