@@ -20,8 +20,8 @@ from attnwarp import check
 Array = npt.NDArray[np.float64]
 
 ORTHONORMAL_TOLERANCE = 1e-5
-"""How far R R^T may be from the identity (largest entry). Poses read from float32 files stay well
-below it.
+"""Largest entry by which R R^T may differ from the identity. Poses read from float32 files stay
+well below it.
 """
 
 EXACT_ROTATION = 1e-12
@@ -185,8 +185,8 @@ class Camera:
         return self.rotation[2].copy()
 
     def resize(self, width: int, height: int) -> Camera:
-        """The same camera with its image resampled to ``width`` x ``height``; u' = u * s exactly on
-        each axis.
+        """Resample the image: a camera with its image resampled to ``width`` x ``height``; u' = u *
+        s exactly on each axis.
         """
         sx, sy = width / self.width, height / self.height
         return Camera(
@@ -194,8 +194,9 @@ class Camera:
         )
 
     def moved(self, offset: Sequence[float]) -> Camera:
-        """The same camera in a world whose origin was moved: world points p become p +
-        ``offset``."""
+        """Move the origin of the world: the camera in a world whose origin was moved: world points
+        p become p + ``offset``.
+        """
         pose = self.world_to_camera.copy()
         pose[:3, 3] = self.translation - self.rotation @ np.asarray(offset, dtype=np.float64)
         return Camera(self.K, pose, self.width, self.height, self.name)

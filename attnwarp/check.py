@@ -103,7 +103,8 @@ LARGEST = sys.float_info.max
 
 
 def is_number(value: Any, *, whole: bool = False) -> bool:
-    """Whether ``value`` is a number of Python or numpy, of a whole type if asked; no bool is.
+    """Return True if ``value`` is a number of Python or numpy, of a whole type if asked; no bool
+    is.
 
     Example:
         >>> from attnwarp import check

@@ -48,7 +48,7 @@ EXTRAS = {
 
 
 def install_command(*extras: str) -> str:
-    """What installs extras. The package is not published, so a checkout is what there is.
+    """Command that installs extras. The package is not published, so a checkout is what there is.
 
     Example:
         >>> print(install_command("edit", "eval"))

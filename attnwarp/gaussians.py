@@ -216,7 +216,7 @@ class Gaussians:
         return digest(self.kind, self.antialiased, self.screen_filter, self.origin, *arrays)
 
     def detach(self) -> Gaussians:
-        """The same values, outside autograd."""
+        """Detach the splats: their values, outside autograd."""
         return self._map(torch.Tensor.detach)
 
     def _map(self, change: Any) -> Gaussians:

@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept: beside their modules, or where this user can write."""
+"""Place of compiled kernels: beside their modules, or where this user can write."""
 
 from __future__ import annotations
 

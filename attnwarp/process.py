@@ -1,4 +1,4 @@
-"""What the processes of both commands do: attnwarp and attnwarp-eval."""
+"""Process-wide parts of both commands: attnwarp and attnwarp-eval."""
 
 from __future__ import annotations
 
@@ -70,8 +70,9 @@ def resend_lost_interrupts() -> None:
 
 
 STOPS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
-"""What asks a program to end besides Ctrl-C: a polite kill, and the terminal's end where it has
-one (not on Windows)."""
+"""Signals that ask a program to end, besides Ctrl-C: a polite kill, and the terminal's end where it
+has one (not on Windows).
+"""
 
 
 def heeded(numbers: tuple[int, ...]) -> list[int]:
@@ -98,8 +99,8 @@ def stops_interrupt() -> Iterator[None]:
 
 @contextmanager
 def asked_to_stop(report: Reporter = SILENT) -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C, a polite kill or the terminal's end came; a second one stops at once, as it
-    would without this.
+    """Yield a function that is True once Ctrl-C, a polite kill or the terminal's end came; a second
+    one stops at once, as it would without this.
 
     Args:
         report: receives a line at the first.

@@ -1,4 +1,4 @@
-"""How long work is reported to people: a bar on a terminal, a line now and then elsewhere."""
+"""Reports of long work to people: a bar on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 

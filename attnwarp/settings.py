@@ -78,7 +78,7 @@ class Settings:
         return cls(**data)
 
     def changed(self: S, **changes: Any) -> S:
-        """The same settings with some fields changed.
+        """Copy the settings with some fields changed.
 
         Raises:
             ValueError: no such field, or a value out of range; the message names it.

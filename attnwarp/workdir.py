@@ -300,7 +300,8 @@ class Workdir:
         write_atomically(self.path / name, write)
 
     def load(self, name: str, remedy: str = "remove it to begin again") -> dict[str, Any]:
-        """What :meth:`save` wrote. Only tensors and plain values are read; a file cannot run code.
+        """Load a file that :meth:`save` wrote. Only tensors and plain values are read; a file
+        cannot run code.
 
         Args:
             name: of the file.
@@ -340,8 +341,8 @@ _MAGIC = b"attnwarp checkpoint"
 
 
 class CheckpointClock:
-    """When the next checkpoint is due: ``seconds`` after the last, and later where one takes long,
-    so that checkpoints take at most :data:`CHECKPOINT_SHARE` of the time.
+    """Clock of the next checkpoint: ``seconds`` after the last, and later where one takes long, so
+    that checkpoints take at most :data:`CHECKPOINT_SHARE` of the time.
     """
 
     def __init__(self, seconds: float) -> None:
@@ -426,7 +427,7 @@ def record_of(picture: str) -> str:
 
 
 def _differences(stored: Any, now: Any, name: str = "") -> list[str]:
-    """What differs between two JSON values, by the path of its key."""
+    """Differences between two JSON values, by the path of its key."""
     if isinstance(stored, dict) and isinstance(now, dict):
         return [
             line

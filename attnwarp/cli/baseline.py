@@ -31,7 +31,7 @@ from attnwarp.reporting import reporter
 
 
 class BaselineMethod(StrEnum):
-    """What a person may type for a method that edits are compared with."""
+    """Values of the option for the method that edits are compared with."""
 
     by_view = "by_view"
     igs2gs = "igs2gs"

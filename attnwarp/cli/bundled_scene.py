@@ -17,7 +17,7 @@ VIEWS, SIZE = 24, 128
 
 
 def is_scene(name: str) -> bool:
-    """Whether the evaluation harness, where it is installed, ships a scene of that name."""
+    """Return True if the evaluation harness, where it is installed, ships a scene of that name."""
     package = find_spec("attnwarp_eval")
     folders = package.submodule_search_locations if package is not None else None
     return any((Path(folder) / "scenes" / f"{name}.yaml").is_file() for folder in folders or ())

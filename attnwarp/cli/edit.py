@@ -47,7 +47,7 @@ NO_FEATURES = 0.001
 """Share of the targets' pixels below which each view was, in effect, edited alone."""
 
 FIT_ITERATIONS, FIT_SPLATS = 3_000, 30_000
-"""Of the fit that begins an edit without splats."""
+"""Limits of the fit that begins an edit without splats."""
 
 
 @reading_options()

@@ -26,7 +26,7 @@ MOST_STRETCH = 0.03
 """Change of a picture's shape that is not worth a word."""
 
 SEGMENTER = "clip-parts"
-"""What ``--where`` asks if ``--segmenter`` is left out."""
+"""Segmenter of ``--where`` if ``--segmenter`` is left out."""
 
 InstructionOption = Annotated[str, typer.Option(help='What to change, such as "make it red".')]
 EditorOption = Annotated[

@@ -1,4 +1,4 @@
-"""What commands read and write."""
+"""Files that commands read and write."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ UNSEEN = (
     "check that the splats and the cameras are of one scene, in the same coordinates and the same"
     " units"
 )
-"""What a person checks where cameras do not see splats."""
+"""Remedy in messages where cameras do not see splats."""
 
 
 def read_views(path: Path, reading: Reading, **options: Any) -> Dataset:

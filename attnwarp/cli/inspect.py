@@ -21,7 +21,7 @@ def inspect(
     ],
     data: DataArgument,
 ) -> None:
-    """See a scene, its cameras and its warps in 3D; takes the options of attnwarp-eval inspect."""
+    """View a scene, its cameras and its warps in 3D; takes the options of attnwarp-eval inspect."""
     from importlib.util import find_spec
 
     if find_spec("attnwarp_eval") is None:

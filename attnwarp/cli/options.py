@@ -1,4 +1,4 @@
-"""What a person may type, of which several commands have some."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from attnwarp.cli.shell import begin
 
 
 class Kind(StrEnum):
-    """What a person may type for the kind of splats."""
+    """Values of the option for the kind of splats."""
 
     two = "2dgs"
     three = "3dgs"
 
 
 class Format(StrEnum):
-    """What a person may type for the format of a data set."""
+    """Values of the option for the format of a data set."""
 
     transforms = "transforms"
     colmap = "colmap"
 
 
 class MissingImages(StrEnum):
-    """What a person may type for what happens to cameras without a picture."""
+    """Values of the option for cameras without a picture."""
 
     error = "error"
     none = "none"
 
 
 class Store(StrEnum):
-    """What a person may type for the place of recorded features."""
+    """Values of the option for the place of recorded features."""
 
     cpu = "cpu"
     device = "device"
@@ -46,7 +46,7 @@ class Store(StrEnum):
 
 
 class Coordinates(StrEnum):
-    """What a person may type for the coordinates in a file of splats."""
+    """Values of the option for the coordinates in a file of splats."""
 
     auto = "auto"
     world = "world"
@@ -93,7 +93,7 @@ AntialiasedOption = Annotated[
 
 @dataclass(frozen=True)
 class Reading:
-    """How a data set is read: the keywords of `attnwarp.io.read_dataset`, each an option."""
+    """Options of reading a data set: the keywords of `attnwarp.io.read_dataset`, each an option."""
 
     format: Annotated[
         Format | None, typer.Option(help="What DATA is, where its folder holds both formats.")

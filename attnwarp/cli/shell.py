@@ -1,4 +1,4 @@
-"""How every command ends: exit codes, errors as one line, Ctrl-C; and the threads that it uses."""
+"""End of every command: exit codes, errors as one line, Ctrl-C; and the threads that it uses."""
 
 from __future__ import annotations
 
