@@ -39,7 +39,7 @@ class BudgetPart(Part):
 
 @dataclass(frozen=True)
 class Spent:
-    """What came of a budget.
+    """Outcome of a budget.
 
     Attributes:
         seconds: that the method was given; None for no limit.
@@ -55,12 +55,12 @@ class Spent:
 
     @property
     def by_seconds(self) -> bool:
-        """Whether the result depends on the machine."""
+        """True if the result depends on the machine."""
         return self.seconds is not None
 
 
 def timed(spec: Mapping[str, Any]) -> bool:
-    """Whether a cell's result depends on how fast the machine is.
+    """Return True if a cell's result depends on how fast the machine is.
 
     Args:
         spec: of the cell.

@@ -47,7 +47,7 @@ class Cell:
 
     @property
     def scene_file(self) -> str:
-        """What :func:`attnwarp_eval.scene.file.load_scene` takes for the cell's scene."""
+        """Name or path of the cell's scene, for :func:`attnwarp_eval.scene.file.load_scene`."""
         return self.sources.get("scene", self.scene)
 
     @property

@@ -51,7 +51,7 @@ CONNECT_SECONDS = 30
 """Until a scheduler counts as unreachable, at the start and when its connection breaks."""
 
 REFUSED_SECONDS = 60
-"""How long a run waits beside workers that were all refused, as others may be starting."""
+"""Time that a run waits beside workers that were all refused, as others may be starting."""
 
 MOST_REQUESTS = 1000
 """Tasks that ask an adaptive cluster for workers; more would only load its scheduler."""
@@ -69,10 +69,10 @@ class ClusterLost(Exception):  # noqa: N818  the field's word for it
 
 
 class Workplace(ABC):
-    """What the runner does with one cluster: hand a cell to a worker, and take its result."""
+    """A cluster as the runner uses it: hand a cell to a worker, and take its result."""
 
     adaptive = False
-    """Whether the cluster may start workers when there is work for them."""
+    """True if the cluster may start workers when there is work for them."""
 
     @abstractmethod
     def submit(self, client: Client, worker: str, cell: Cell) -> Future:
@@ -407,7 +407,7 @@ class _Runner:
             yield from self._give_up(worker)
 
     def _addresses(self) -> set[str]:
-        """Of the workers that the scheduler has."""
+        """Addresses of the workers that the scheduler has."""
         try:
             if self.client.status != "running":
                 raise ClusterLost
@@ -478,7 +478,7 @@ class _Runner:
         return future
 
     def _end(self, future: Future) -> Iterator[Ended]:
-        """What a future that is done brings: a cell's result, or a worker's code."""
+        """Outcome of a future that is done: a cell's result, or a worker's code."""
         from distributed.scheduler import KilledWorker
 
         worker = self.workers.pop(future.key)
@@ -505,7 +505,7 @@ class _Runner:
             yield cell, self.place.receive(cell, result[0])
 
     def _result(self, worker: str, future: Future) -> tuple[Any] | None:
-        """What a future holds; None where its worker is lost before it could be fetched.
+        """Result that a future holds; None where its worker is lost before it could be fetched.
 
         A result stays on its worker until then, and goes with it.
         """

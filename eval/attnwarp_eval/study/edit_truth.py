@@ -45,11 +45,11 @@ class EditTruth:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether there is more than one right answer."""
+        """True if there is more than one right answer."""
         return len(self.answers) > 1
 
     def of(self, views: Sequence[str]) -> EditTruth:
-        """The same for some of the views."""
+        """Restrict the truth to some of the views."""
         return EditTruth(
             {v: self.originals[v] for v in views},
             {name: {v: pictures[v] for v in views} for name, pictures in self.answers.items()},
@@ -58,7 +58,7 @@ class EditTruth:
         )
 
     def judge(self, pictures: Mapping[str, Any]) -> Judgement:
-        """Whether pictures of some views show an edit that was done, and which answer.
+        """Judge whether pictures of some views show an edit that was done, and which answer.
 
         Args:
             pictures: (H, W, 3) sRGB in [0, 1] by view.
@@ -76,7 +76,7 @@ class EditTruth:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What edited views show.
+    """Judgement of edited views.
 
     Attributes:
         answer: the nearest; None where nothing of the object is in the pictures.

@@ -32,7 +32,9 @@ SOURCE_WORDS = "{source}"
 
 
 def needs_source_words(settings: Mapping[str, Any]) -> bool:
-    """Whether a method's settings have a place for the words that describe the scene before."""
+    """Return True if a method's settings have a place for the words that describe the scene
+    before.
+    """
     return SOURCE_WORDS in (settings.get("source_prompt") or "")
 
 
@@ -109,7 +111,7 @@ def _reads_all(settings: Mapping[str, Any]) -> Set[str]:
 
 @dataclass(frozen=True)
 class Method:
-    """How a method is configured and run.
+    """Settings and run of a method.
 
     Attributes:
         settings: complete settings as JSON, from a preset's name (None where the study names none),

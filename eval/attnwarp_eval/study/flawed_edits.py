@@ -23,14 +23,15 @@ from attnwarp_eval.truth.edits import edit_mask, touched
 from attnwarp_eval.world import World, changed
 
 ANSWERS = 3
-"""Of an edit with several right answers, the first that are rendered: one right, one wrong, and a
-third for views that do not agree."""
+"""Number of rendered answers, from the first, of an edit with several right ones: one right, one
+wrong, and a third for views that do not agree.
+"""
 
 RIGHT_ANSWERS = 2
-"""Of these, how many are the right one in turn: more would only repeat what these show."""
+"""Number of these that are the right one in turn: more would only repeat what these show."""
 
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Of the edit, as a blend of the pictures before and after in linear light."""
+"""Strengths of the edit, as a blend of the pictures before and after in linear light."""
 
 UNEVEN = (0.5, 0.75)
 """Strengths that the views of an inconsistent result take in turn, where the edit has one answer
@@ -38,7 +39,7 @@ alone.
 """
 
 SATURATION = 0.75
-"""Of a wrong colour (HSV): enough to be one on white marble too."""
+"""Saturation of a wrong colour (HSV): enough to be one on white marble too."""
 
 BLUR = 2.0 / 256
 """Standard deviation of the blur, of the picture's side."""
@@ -202,7 +203,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Condition:
-    """What a method may have given for a view.
+    """Result that a method may have given for a view.
 
     Attributes:
         name: the last part of a figure's key.

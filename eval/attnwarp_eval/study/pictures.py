@@ -39,7 +39,7 @@ DEPTH_RANGE = 0.02
 
 
 ORDER = ("warped", "mask", "endpoint-error", "render", "depth-error")
-"""How pictures of one row stand side by side; others follow."""
+"""Order of pictures side by side in a row; others follow."""
 
 SHARED = ("source", "target")
 """Pictures that are the same for every variant, and stand once above their rows."""

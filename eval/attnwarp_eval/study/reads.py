@@ -150,7 +150,7 @@ def _overridden(
 
 
 def _has(variant: Variant, key: str, path: Path) -> bool:
-    """Whether a variant has a setting of its own in place of the study's."""
+    """Return True if a variant has a setting of its own in place of the study's."""
     own = getattr(variant, key)
     return path[0] in own if isinstance(own, Mapping) else own is not None
 
@@ -171,7 +171,7 @@ def _of_pictures(study: Study, measuring: Sequence[Probe[Any]]) -> Iterator[tupl
 
 
 def _named(part: Part | Mapping[str, Any]) -> Iterator[tuple[Path, Any]]:
-    """What differs from the default, by its place; each entry of a mapping."""
+    """Settings that differ from the default, by its place; each entry of a mapping."""
     if isinstance(part, Mapping):
         yield from (((key,), value) for key, value in part.items())
         return

@@ -1,4 +1,4 @@
-"""What a cell gives, typed from the probe to the report. JSON appears only in ``to_json`` and
+"""Result of a cell, typed from the probe to the report. JSON appears only in ``to_json`` and
 ``from_json``.
 """
 
@@ -16,7 +16,7 @@ Json = dict[str, Any]
 
 
 class Extra(Protocol):
-    """What the records of one probe hold beside figures."""
+    """Entries that the records of one probe hold beside figures."""
 
     def to_json(self) -> Json:
         """Entries of the record; those of the key ``cost`` go into the record's own cost."""
@@ -28,7 +28,7 @@ E = TypeVar("E", bound=Extra)
 
 @dataclass(frozen=True)
 class NoExtra:
-    """Of a record that holds figures alone."""
+    """Extra of a record that holds figures alone."""
 
     def to_json(self) -> Json:
         """No entry."""
@@ -50,7 +50,7 @@ class View:
     metrics: Mapping[str, float]
 
     def to_json(self) -> Json:
-        """As a record's file has it: null where undefined, integers as integers."""
+        """Entry of a record's file: null where undefined, integers as integers."""
         return {"view": self.name, "yaw": self.yaw, "metrics": finite(self.metrics)}
 
     @classmethod
@@ -76,7 +76,7 @@ class PictureFile:
     sha256: str
 
     def to_json(self) -> Json:
-        """As a record's file has it."""
+        """Entry of a record's file."""
         return {
             "view": self.view,
             "what": self.content,
@@ -92,7 +92,7 @@ class PictureFile:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a cell cost.
+    """Cost of a cell.
 
     Attributes:
         seconds: by stage; None where there was nothing to time.
@@ -108,7 +108,7 @@ class Cost:
     threads: int
 
     def to_json(self) -> Json:
-        """As a record's file has it."""
+        """Entry of a record's file."""
         return {
             "seconds": dict(self.seconds),
             "counters": dict(self.counters),
@@ -128,7 +128,7 @@ _environments: dict[tuple[Any, ...], Environment] = {}
 
 @dataclass(frozen=True)
 class Environment:
-    """Where a cell was computed.
+    """Environment in which a cell was computed.
 
     Attributes:
         versions: of Python and packages.
@@ -145,7 +145,7 @@ class Environment:
     source: str
 
     def to_json(self) -> Json:
-        """As a record's file has it, and as :func:`attnwarp_eval.cost.environment` gives it."""
+        """Entry of a record's file, as :func:`attnwarp_eval.cost.environment` gives it."""
         return {
             "versions": dict(self.versions),
             "machine": dict(self.machine),
@@ -164,7 +164,7 @@ class Environment:
         return _environments[key]
 
     def same_code(self, other: Environment) -> bool:
-        """Whether both were computed by the same state of the source and the same packages.
+        """Return True if both were computed by the same state of the source and the same packages.
 
         The hash of the source decides: revisions that differ in documents alone are the same code.
         """

@@ -26,7 +26,7 @@ from attnwarp_eval.study.work import compute, failure
 
 @dataclass(frozen=True)
 class Code:
-    """What a process computes with.
+    """Code that a process computes with.
 
     Attributes:
         source: SHA-256 of the source files of both packages and of the plugins.
@@ -112,7 +112,7 @@ def _absolute(path: Path) -> Path:
 
 @dataclass(frozen=True)
 class Parcel:
-    """What a worker sends back of a cell.
+    """Parcel that a worker sends back of a cell.
 
     Attributes:
         record: as :meth:`attnwarp_eval.study.store.Store.write` takes it.

@@ -1,4 +1,4 @@
-"""How a run's cells are reported, and the time left that they tell."""
+"""Reports of a run's cells, and of the time left that they tell."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ class Results:
 
     @property
     def measured(self) -> int:
-        """How many of the expected cells are done."""
+        """Number of the expected cells that are done."""
         return len(self.all_records())
 
     def all_records(self) -> list[Record[Any]]:

@@ -57,7 +57,7 @@ class Plan:
 
 @dataclass
 class Summary:
-    """How a run ended."""
+    """Outcome of a run."""
 
     expected: int
     reused: int
@@ -67,7 +67,7 @@ class Summary:
 
     @property
     def complete(self) -> bool:
-        """Whether every expected cell has a record."""
+        """True if every expected cell has a record."""
         return not self.failures and self.reused + self.computed == self.expected
 
 
@@ -171,7 +171,7 @@ def verify(store: Store) -> Problems:
 
 @dataclass(frozen=True)
 class Stored:
-    """What ``study.json`` says of a run.
+    """Contents of ``study.json`` of a run.
 
     Attributes:
         study: resolved.

@@ -58,7 +58,7 @@ class Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     def part(self, kind: type[P]) -> P:
-        """The same object as one of the parts that it was joined from.
+        """Cast the object to one of the parts that it was joined from.
 
         Raises:
             TypeError: it was not; only a study that was read through
@@ -172,7 +172,7 @@ class Study(Part):
 
     @property
     def scene_names(self) -> list[str]:
-        """What cells and reports call the scenes: two files of one name by their paths."""
+        """Names of the scenes in cells and reports: two files of one name by their paths."""
         names = [scene_name(where) for where in self.scenes]
         return [
             where if names.count(name) > 1 else name

@@ -37,7 +37,7 @@ class StoreError(InputError):
 
 @dataclass
 class Problems:
-    """What is wrong with a run; see :meth:`Store.verify`."""
+    """Faults of a run; see :meth:`Store.verify`."""
 
     missing: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
@@ -47,7 +47,7 @@ class Problems:
 
     @property
     def ok(self) -> bool:
-        """Whether every expected cell has a whole record."""
+        """True if every expected cell has a whole record."""
         return not (self.missing or self.failed or self.damaged)
 
 
@@ -238,7 +238,7 @@ class Store:
         return record
 
     def read_as(self, cell_id: str, read: Callable[[dict[str, Any]], T]) -> T:
-        """What ``read`` makes of the record of a finished cell.
+        """Apply ``read`` to the record of a finished cell.
 
         Raises:
             StoreError: as :meth:`read`, or the record is not one that ``read`` takes.
@@ -253,8 +253,8 @@ class Store:
             ) from None
 
     def whole(self, cell_id: str, read: Callable[[dict[str, Any]], T]) -> T | None:
-        """What ``read`` makes of the record of a cell; None where the record or one of its pictures
-        is missing or damaged.
+        """Apply ``read`` to the record of a cell; None where the record or one of its pictures is
+        missing or damaged.
         """
         with contextlib.suppress(StoreError):
             result, pictures = self.read_as(cell_id, lambda r: (read(r), r.get("pictures", [])))
@@ -263,7 +263,7 @@ class Store:
         return None
 
     def keep_picture(self, path: Path, **about: str) -> dict[str, str]:
-        """What a record says of a picture that was written below the folder: ``about``, its path
+        """Entry of a record for a picture that was written below the folder: ``about``, its path
         and its SHA-256.
         """
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -315,7 +315,7 @@ class Store:
         return bad
 
     def _is_inside(self, name: object) -> bool:
-        """Whether a relative path stays in the folder, whatever links there are."""
+        """Return True if a relative path stays in the folder, whatever links there are."""
         if not isinstance(name, str) or "\0" in name:
             return False
         path = PurePosixPath(name)
@@ -333,7 +333,7 @@ minute later; a record that a power cut damages fails its checksum and is comput
 """
 
 _flushed = -FLUSH_SECONDS
-"""When this process last flushed a cell."""
+"""Time at which this process last flushed a cell."""
 
 
 def _flush_is_due() -> bool:

@@ -96,8 +96,8 @@ def compute_and_write(
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
-    """Whether an error began as Ctrl-C: native code that it lands in raises one of its own, such as
-    "returned a result with an exception set".
+    """Return True if an error began as Ctrl-C: native code that it lands in raises one of its own,
+    such as "returned a result with an exception set".
     """
     seen: set[int] = set()
     while error is not None and id(error) not in seen:

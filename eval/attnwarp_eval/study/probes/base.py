@@ -1,4 +1,6 @@
-"""What a probe is: everything that a study, its runner, its store and its report ask of one."""
+"""Definition of a probe: everything that a study, its runner, its store and its report ask of
+one.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ E = TypeVar("E", bound=Extra)
 
 
 class Place(IntEnum):
-    """Where in the report a probe's section stands; probes of one place stand in their order."""
+    """Place of a probe's section in the report; probes of one place stand in their order."""
 
     INSTRUMENT = 0
     """Before the tables of variants: whether the instrument can be trusted."""
@@ -40,7 +42,7 @@ class Place(IntEnum):
 
 @dataclass(frozen=True)
 class Layout:
-    """What a report is made with.
+    """Layout of a report.
 
     Attributes:
         root: the run's folder; figures go below it.
@@ -51,7 +53,7 @@ class Layout:
     timings: bool = True
 
     def figure(self, name: str) -> Path:
-        """Where a figure is drawn; its link is ``figures/name``."""
+        """Path of a figure's file; its link is ``figures/name``."""
         return self.root / "figures" / name
 
 
@@ -94,14 +96,14 @@ class Work:
 
     @property
     def world(self) -> World:
-        """Of the scene. LookupError: the probe needs no scenes, so it has none."""
+        """World of the scene. LookupError: the probe needs no scenes, so it has none."""
         if self.scene_world is None:
             raise LookupError(f"probe {self.cell.probe!r} needs no scenes, so it has no world")
         return self.scene_world
 
     @property
     def spec(self) -> Json:
-        """Of the cell."""
+        """Spec of the cell."""
         return self.cell.spec
 
     def add(
@@ -241,7 +243,7 @@ class Probe(ABC, Generic[E]):
                     yield Cell(spec, name, label, self.name, seed, (label,), pictures)
 
     def common_spec(self, study: Study, scene: Scene, seed: int) -> Json:
-        """What the spec of every cell of this probe has."""
+        """Entries that the spec of every cell of this probe has."""
         return {
             "probe": self.name,
             "protocol": self.protocol,
@@ -252,17 +254,17 @@ class Probe(ABC, Generic[E]):
         }
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """What of a study and a variant decides the figures of this probe, and nothing else: two
-        variants that differ elsewhere share a cell.
+        """Entries of a study and a variant that decide the figures of this probe, and nothing else:
+        two variants that differ elsewhere share a cell.
         """
         return {}
 
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
-        """What two variants must share to mean the same to a claim about this probe."""
+        """Key that two variants share if they mean the same to a claim about this probe."""
         return variant.settings(), variant.geometry, study.splats_of(variant)
 
     def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:
-        """Whether a variant is of the kind of ``wanted``, for a claim about kinds.
+        """Return True if a variant is of the kind of ``wanted``, for a claim about kinds.
 
         A probe of methods leaves a method's own settings out, but for those that ``wanted`` names.
         """
@@ -287,17 +289,19 @@ class Probe(ABC, Generic[E]):
         return self.metrics[key]
 
     def repeatable(self, record: Record[E]) -> bool:
-        """Whether another machine gives the same figures; else no comparison of runs reads them."""
+        """Return True if another machine gives the same figures; else no comparison of runs reads
+        them.
+        """
         return True
 
     # From records to the report
 
     def problems(self, results: Results) -> list[str]:
-        """What is wrong with the instrument by this probe's records, one line each."""
+        """Faults of the instrument by this probe's records, one line each."""
         return []
 
     def findings(self, results: Results) -> Iterator[Finding]:
-        """What a reader should know first, where no table of variants tells it."""
+        """Findings that a reader should know first, where no table of variants tells it."""
         return iter(())
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
@@ -339,5 +343,5 @@ def mean_values(results: Results, probe: str, name: str, metrics: Iterable[str])
 
 
 def is_mse(metric: str) -> bool:
-    """Whether a figure is the mean squared error behind a PSNR."""
+    """Return True if a figure is the mean squared error behind a PSNR."""
     return "mse" in metric.split(".")[1].split("_")

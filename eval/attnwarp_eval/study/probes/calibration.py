@@ -35,8 +35,8 @@ from attnwarp_eval.two_view import TwoView
 from attnwarp_eval.world import World
 
 MITSUBA_TOLERANCE = 1e-4
-"""Of the distance: Mitsuba's positions are float32, so a point 10 m away is exact to about 1e-6 of
-that.
+"""Tolerance, as a share of the distance: Mitsuba's positions are float32, so a point 10 m away is
+exact to about 1e-6 of that.
 """
 
 SMALL = 256
@@ -48,8 +48,8 @@ LARGEST_EPE = 1e-3
 """Pixels: the largest median endpoint error of the truth's own depth through the warp."""
 
 SMALLEST_SHARE = 0.99
-"""Of pixels whose surface point Mitsuba must find where the ray caster does. Rays on outlines may
-fall either way.
+"""Least share of pixels whose surface point Mitsuba must find where the ray caster does. Rays on
+outlines may fall either way.
 """
 
 EXACT = dataclasses.replace(

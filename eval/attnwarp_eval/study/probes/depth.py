@@ -111,7 +111,7 @@ class Depth(Probe[NoExtra]):
             yield Finding(sentence, count, "their `depth.coverage` is 0", "fails")
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """The same in words; none where every view has a depth."""
+        """Section on views without depth; none where every view has a depth."""
         sentence, count = self._without_depth(results)
         if sentence:
             yield Place.RESULT, Section("Views without depth", [f"{sentence} That is {count}."])

@@ -94,7 +94,7 @@ EDITS = frozenset({"editing", "editing-timing", "variability"})
 """Probes of methods that edit."""
 
 CHOSEN_BY = ("multiview.delta_e_above.edit_inside", "fidelity.mse.edit_inside")
-"""What the variant for a given time is chosen by; less is better."""
+"""Figures that choose the variant for a given time; less is better."""
 
 
 class EditorPart(Part):
@@ -109,7 +109,7 @@ class EditorPart(Part):
 
 
 class Editing(Part):
-    """What all variants share.
+    """Settings that all variants share.
 
     ``edits``: by scene, an edit's name, or ``edit=answer`` for one of its answers alone, with the
     words that the editor is given; the edit's own words where they are null. Scenes that are left
@@ -154,7 +154,7 @@ class VariantPart(Part):
 
 @dataclass(frozen=True)
 class EditResult:
-    """What a cell's record has beside the figures of its views.
+    """Entries of a cell's record beside the figures of its views.
 
     Attributes:
         name, instruction: of the edit.
@@ -396,8 +396,8 @@ class EditingProbe(Probe[EditResult]):
         )  # fmt: skip
 
     def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:
-        """Whether method, editor, splats, warp and budget are the same. Of the method's other
-        settings, only those count that ``wanted`` names.
+        """Return True if method, editor, splats, warp and budget are the same. Of the method's
+        other settings, only those count that ``wanted`` names.
         """
         if variant.part(VariantPart).method != wanted.part(VariantPart).method:
             return False  # the study's options need not fit the other method
@@ -465,11 +465,11 @@ class EditingProbe(Probe[EditResult]):
         return EditResult.from_json(data["edit"])
 
     def repeatable(self, record: Record[EditResult]) -> bool:
-        """Not where seconds limited the method."""
+        """False when a time budget limited the method."""
         return not timed(record.spec)
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """What the editor can do, budgets, figures by yaw, time by part."""
+        """Sections on the editor's abilities, budgets, figures by yaw, time by part."""
         if not results.finished(self.name):
             return
         abilities = editing_sections.abilities(results, self.name)
@@ -662,8 +662,9 @@ class _Measure:
         }
 
     def _agreement(self, kind: str, name: str, answer: str | None) -> dict[str, float]:
-        """Of a target with the source, and with its neighbour; NaN where it was not edited or the
-        source's edit is not one."""
+        """Agreement of a target with the source, and with its neighbour; NaN where it was not
+        edited or the source's edit is not one.
+        """
         keys = ("same_answer", "delta_e", "delta_e_floor", "delta_e_above")
         row = dict.fromkeys(
             [
@@ -699,7 +700,9 @@ class _Measure:
     def _above(
         self, images: Mapping[str, Image], answer: str, first: str, second: str, mask: Any
     ) -> dict[str, float]:
-        """Of two views; NaN where fewer than :data:`LEAST_PIXELS` are compared."""
+        """Disagreement of two views above its floor; NaN where fewer than :data:`LEAST_PIXELS` are
+        compared.
+        """
         true = self.truth.answers[answer]
         figures = metrics.above_floor(
             (images[first], images[second]),
@@ -807,7 +810,7 @@ _SHARED = ("probe", "protocol", "scene", "size", "views", "seed", "edit", "encod
 
 
 def _decisive(spec: Json) -> Json:
-    """What of a cell's spec decides its method's run; the encoders measure it afterwards."""
+    """Entries of a cell's spec that decide its method's run; the encoders measure it afterwards."""
     return {key: value for key, value in spec.items() if key != "encoders"}
 
 
@@ -821,7 +824,7 @@ def editor_of(study: Study, variant: Variant) -> EditorPart:
 
 
 def editor_identity(editor: EditorPart) -> Json:
-    """What of an editor decides its pictures: its files and its guidance, not its folder."""
+    """Parts of an editor that decide its pictures: its files and its guidance, not its folder."""
     guidance = {"text": editor.text_guidance, "image": editor.image_guidance}
     return {"sha256": _files_digest(editor.name), "guidance": guidance}
 
@@ -882,7 +885,7 @@ def load(name: str, planned: Json, device: str = "cpu") -> InstructPix2Pix | Dep
 
 
 def edits_of(study: Study, scene: Scene) -> Iterator[Json]:
-    """What of a scene's edits decides a cell.
+    """Entries for a cell's spec, one for each of a scene's edits.
 
     Raises:
         StudyError: the study names an edit or an answer that the scene lacks.

@@ -60,7 +60,7 @@ ONE_SOURCE = frozenset({"attention_warping", "true pictures"})
 
 
 def abilities(results: Results, probe: str) -> Section:
-    """What the editor does in the source view, and in every view by itself."""
+    """Section on what the editor does in the source view, and in every view by itself."""
     names = controls(results, probe)
     section = Section("What the editor can do")
     section.text = [
@@ -109,7 +109,9 @@ def abilities(results: Results, probe: str) -> Section:
 
 
 def _done_by_method(results: Results, probe: str) -> list[Table]:
-    """How many source edits each variant of a comparison does; none for a study of one method."""
+    """Tables of the source edits that each variant of a comparison does; none for a study of one
+    method.
+    """
     records = {
         name: [record for _, _, record in results.records(probe, name)]
         for name in results.study.variants
@@ -139,7 +141,9 @@ def controls(results: Results, probe: str) -> list[str]:
 
 
 def is_alone(spec: Mapping[str, Any]) -> bool:
-    """Whether a variant's spec says that it edits each view by itself, and as long as it likes."""
+    """Return True if a variant's spec says that it edits each view by itself, and as long as it
+    likes.
+    """
     itself = spec["method"] == FLOOR or spec["settings"].get("method") == OWN
     return itself and "budget" not in spec
 
@@ -441,7 +445,7 @@ def choice(results: Results, probe: str, names: Sequence[str], metrics: Sequence
 
 
 def budgets(results: Results, probe: str) -> Section | None:
-    """What methods with a budget did with it; None where no method has one."""
+    """Section on what methods with a budget did with it; None where no method has one."""
     columns = [
         "variant",
         "budget, s",

@@ -40,7 +40,7 @@ COUNTERS = ("network_rows", "iterations")
 
 
 class EditingTiming(Part):
-    """How many of the study's scenes, from the first on, have their first edit timed."""
+    """Number of the study's scenes, from the first on, whose first edit is timed."""
 
     scenes: int = Field(default=1, ge=1)
 
@@ -53,7 +53,7 @@ class StudyPart(Part):
 
 @dataclass(frozen=True)
 class Rounds:
-    """What the contestants took and did.
+    """Times and work of the contestants.
 
     Attributes:
         seconds: stage -> contestant -> round; the first contestant's second run comes last.

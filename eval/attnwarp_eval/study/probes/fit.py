@@ -89,7 +89,7 @@ class Point:
     measures: Mapping[str, float]
 
     def to_json(self) -> Json:
-        """As the record's ``curve`` has it: null where undefined."""
+        """Entry of the record's ``curve``: null where undefined."""
         numbers = finite({"loss": self.loss, "psnr": self.psnr, "psnr_pooled": self.psnr_pooled})
         return {**asdict(self), **numbers, "measures": finite(self.measures)}
 
@@ -233,7 +233,7 @@ class Fit(Probe[Curve]):
         return Curve(tuple(map(Point.from_json, data["curve"])))
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """What each fit came to, and its curves."""
+        """Sections on the result of each fit, and its curves."""
         by_content: dict[str, str] = {}
         for cell, record in results.finished(self.name):
             # Variants that read one fit in different ways share its curve; the first names it.
@@ -340,7 +340,7 @@ def settings_of(study: Study, variant: Variant, seed: int) -> FitSettings:
 
 
 def fit_spec(study: Study, variant: Variant, seed: int) -> Json:
-    """What decides a fit of one scene."""
+    """Spec of a fit of one scene."""
     fits = study.part(StudyPart).fit
     return {**fits.model_dump(), "settings": settings_of(study, variant, seed).to_dict()}
 

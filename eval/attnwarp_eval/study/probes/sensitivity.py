@@ -257,8 +257,8 @@ class Sensitivity(Probe[Seconds]):
         return Seconds({key: [float(v) for v in values] for key, values in rounds.items()})
 
     def findings(self, results: Results) -> Iterator[Finding]:
-        """Of the metrics that need no truth, what one sees best, and what one misses most, of the
-        flaws that each is meant to see.
+        """Find what the metrics that need no truth see best, and what they miss most, of the flaws
+        that each is meant to see.
         """
         records = [(cell.scene, record) for cell, record in results.finished(self.name)]
         seen = [
@@ -282,7 +282,9 @@ class Sensitivity(Probe[Seconds]):
             )
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """What each metric sees, how it follows the strength of an edit, and what it costs."""
+        """Sections on what each metric sees, how it follows the strength of an edit, and what it
+        costs.
+        """
         records = [(cell.scene, record) for cell, record in results.finished(self.name)]
         if not records:
             return
@@ -331,7 +333,7 @@ def _views(records: Records) -> Iterator[tuple[str, str, Values]]:
 
 
 def identity(name: str, kind: Kind) -> dict[str, Any]:
-    """What of an encoder decides its figures: its weights and its preprocessing, not its path.
+    """Parts of an encoder that decide its figures: its weights and its preprocessing, not its path.
 
     Raises:
         InputError: see :func:`attnwarp.encoders.load_encoder`.
@@ -391,7 +393,9 @@ class _View:
         }
 
     def consistency(self, source: Array | None, picture: Array) -> dict[str, float]:
-        """Of the edited object in the picture and in the source view of the same result."""
+        """Consistency of the edited object in the picture and in the source view of the same
+        result.
+        """
         return metrics.cross_view(
             source, picture, self.pair, mask=self.mask, exclude=self.exclude
         ).figures()
@@ -504,7 +508,7 @@ def beats(key: str, right: float, flawed: float) -> float:
 
 
 def share(records: Records, key: str, condition: str) -> Interval:
-    """Of the edits and views, those in which a metric ranks the right result above one with a flaw;
+    """Share of the edits and views in which a metric ranks the right result above one with a flaw;
     ties are half.
 
     A mean over scenes with its interval. 1: it sees the flaw every time; 0.5: blind; below: it
@@ -518,7 +522,7 @@ def share(records: Records, key: str, condition: str) -> Interval:
 
 
 def curve(values: Values, key: str) -> tuple[float, float]:
-    """How a metric follows the strength of an edit in one view.
+    """Course of a metric with the strength of an edit in one view.
 
     Returns:
         Spearman's rank correlation of strength and metric, signed so that 1 is the right way, 0 for

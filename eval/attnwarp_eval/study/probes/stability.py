@@ -81,7 +81,7 @@ class Swept:
 
 
 def must_hold(outcome: Outcome) -> bool:
-    """Whether a level is required, as a result or as a refusal."""
+    """Return True if a level is required, as a result or as a refusal."""
     return outcome.required or outcome.must_refuse
 
 
@@ -384,7 +384,7 @@ def _panel(axes: Any, swept: Sequence[Swept]) -> None:
 
 
 def _every_error(swept: Sequence[Swept]) -> Section:
-    """What each case is, and every error."""
+    """Section on each case, with every error."""
     tables = []
     for name in dict.fromkeys(sweep.case.name for sweep in swept):
         own = [sweep for sweep in swept if sweep.case.name == name]

@@ -60,7 +60,7 @@ class Timed:
         return time_ratio(self.rounds(None), self.rounds(self.baseline))
 
     def ratio(self, name: str) -> Ratio:
-        """Of a contestant to the baseline within a round."""
+        """Ratio of a contestant's time to the baseline's within a round."""
         both = [turn for turn in self.turns if name in turn.names]
         return time_ratio(self.rounds(name), Timed(both, self.stage).rounds(self.baseline))
 

@@ -47,7 +47,7 @@ WITHIN, FLOOR, BETWEEN, CHANGE = (
 
 @dataclass(frozen=True)
 class Varied:
-    """What a cell's record has beside the figures of its views.
+    """Entries of a cell's record beside the figures of its views.
 
     Attributes:
         name, instruction: of the edit.
@@ -127,7 +127,7 @@ class VariabilityProbe(Probe[Varied]):
         return editing.EditingProbe().meaning(study, variant)
 
     def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:
-        """As for editing: a claim may leave a method's own settings out."""
+        """Compare as the editing probe does: a claim may leave a method's own settings out."""
         return editing.EditingProbe().alike(study, variant, wanted)
 
     def compute(self, work: Work) -> Varied:
@@ -171,7 +171,7 @@ class VariabilityProbe(Probe[Varied]):
         view: str,
         other: str,
     ) -> dict[str, float]:
-        """Of one view, means over the seeds; NaN where a method did not edit the views."""
+        """Figures of one view, means over the seeds; NaN where a method did not edit the views."""
         mask = truth.union[view]
         pair = work.world.between(other, view)
         both = [views for views in edited.values() if view in views and other in views]
@@ -271,7 +271,7 @@ class VariabilityProbe(Probe[Varied]):
 
 
 def described(change: Interval, between: Interval, excess: Interval) -> str:
-    """What a method does, in words, as far as the intervals tell.
+    """Describe in words what a method does, as far as the intervals tell.
 
     Args:
         change: CIEDE2000 of the views before and after the edit.

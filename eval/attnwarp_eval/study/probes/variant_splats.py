@@ -15,14 +15,14 @@ from attnwarp_eval.world import splats
 
 
 def splats_spec(study: Study, variant: Variant, seed: int) -> Json:
-    """What decides a variant's splats, as a cell's spec has it: an entry ``fit`` or ``splats``."""
+    """Spec of a variant's splats in a cell's spec: an entry ``fit`` or ``splats``."""
     if variant.part(fit.VariantPart).fitted:
         return {"fit": fit.fit_spec(study, variant, seed)}
     return {"splats": study.splats_of(variant).model_dump()}
 
 
 def surface_spec(study: Study, variant: Variant, seed: int) -> Json:
-    """Where a variant's depth comes from: the truth, or splats."""
+    """Source of a variant's depth: the truth, or splats."""
     if variant.geometry == "truth":
         return {"geometry": "truth"}
     if variant.part(fit.VariantPart).fitted:
@@ -57,17 +57,19 @@ def surface_reads(variant: Variant) -> set[str]:
 
 
 def splats_meaning(study: Study, variant: Variant) -> str:
-    """What variants of the same splats share, for claims."""
+    """Key that variants of the same splats share, for claims."""
     return canonical_json(splats_spec(study, variant, 0))
 
 
 def surface_meaning(study: Study, variant: Variant) -> tuple[Any, ...]:
-    """What variants of the same depth and rules share, for claims."""
+    """Key that variants of the same depth and rules share, for claims."""
     return variant.settings(), variant.geometry, splats_meaning(study, variant)
 
 
 def is_fitted(spec: Mapping[str, Any]) -> bool:
-    """Whether a cell's splats are fitted: the seconds of that are the fit's own, in no cell."""
+    """Return True if a cell's splats are fitted: the seconds of that are the fit's own, in no
+    cell.
+    """
     return "fit" in spec
 
 
