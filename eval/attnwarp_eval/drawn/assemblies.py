@@ -460,7 +460,7 @@ PART_NOUNS: dict[str, tuple[str, ...]] = {
     "cushion": ("cushion", "seat"), "lampshade": ("lampshade", "shade"), "lamp foot": ("foot of the lamp", "lamp stand"),
     "trunk": ("trunk",), "apples": ("apples", "fruit"), "bananas": ("bananas",), "cap": ("cap", "mushroom cap"), "stem": ("stem",),
 }  # fmt: skip
-"""What sentences call each part."""
+"""Nouns of each part in sentences."""
 
 WHOLE_NOUNS: dict[str, tuple[str, ...]] = {
     "person": ("person", "man", "woman", "human figure", "walker"), "bust": ("bust of a man", "bust", "head", "man"),

@@ -27,7 +27,9 @@ TWO_COLORED = ("striped", "checked")
 STATUES = ("golden", "silver", "bronze", "stone", "marble", "wooden")
 
 ATTRIBUTES = ("object", "finish", "color", "second", "ground", "time")
-"""What a picture is described by, each an index into its words; -1 where it has none, or a caption does not say."""
+"""Attributes that describe a picture, each an index into its words; -1 where it has none, or a
+caption does not say.
+"""
 
 HSV: dict[str, tuple[float, float, float]] = {
     "red": (2, 0.82, 0.78), "orange": (25, 0.88, 0.93), "yellow": (51, 0.80, 0.94), "green": (122, 0.60, 0.55),
@@ -41,13 +43,17 @@ HELD_OUT_SHAPE = 100_000
 
 
 def held_out(thing: int, color: int) -> bool:
-    """Whether an object in a colour is kept from training: one pair of ten, every object and every colour alike."""
+    """Return True if an object in a colour is kept from training: one pair of ten, every object and
+    every colour alike.
+    """
     return (3 * thing + 7 * color) % 10 == 4
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a world appears; indices into the words of each attribute, and a seed for shades and light."""
+    """Appearance of a world: indices into the words of each attribute, and a seed for shades and
+    light.
+    """
 
     finish: int
     color: int
@@ -58,7 +64,7 @@ class Look:
 
     @property
     def statue(self) -> bool:
-        """Whether the details have no colours of their own."""
+        """True if the details have no colours of their own."""
         return FINISHES[self.finish] in STATUES
 
     @cached_property

@@ -25,7 +25,7 @@ from attnwarp_eval.truth.plan import bounces_of, everything_on, plan
 
 @dataclass(frozen=True)
 class Finding:
-    """Whether a scene calls for an effect.
+    """Need of a scene for an effect.
 
     Attributes:
         needed: whether the scene calls for it.
@@ -108,8 +108,8 @@ def detect(scene: Scene) -> dict[Effect, Finding]:
 
 
 def _caustic_simulated(scene: Scene) -> bool:
-    """Whether the plan renders the caustic. Camera paths miss it for small lights, and ptracer has
-    neither media nor our lens.
+    """Return True if the plan renders the caustic. Camera paths miss it for small lights, and
+    ptracer has neither media nor our lens.
     """
     if small_lights(scene) is None:
         return True
@@ -137,7 +137,7 @@ _ABSENT: dict[Effect, str] = {
 
 
 def _checked_textures(scene: Scene) -> bool:
-    """Whether no mesh has vertex colours, which the scene's file does not name."""
+    """Return True if no mesh has vertex colours, which the scene's file does not name."""
     return all(getattr(shape, "tint", None) is None for shape in scene.shapes())
 
 

@@ -103,7 +103,7 @@ class Level:
 
     @property
     def differs(self) -> bool:
-        """Whether this level refuses."""
+        """True if this level refuses."""
         return self.least < self.threshold
 
 
@@ -206,7 +206,7 @@ class Proof:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
+        """Fields as JSON."""
         return asdict(self)
 
     def lines(self) -> Iterator[str]:
@@ -431,7 +431,7 @@ def _samples(pictures: Pictures, seed: int, seeds: int, seconds: float) -> int:
 
 
 def _structural(scene: Scene, ours: Plan) -> Rung:
-    """Whether the file and Mitsuba's graphs lack what the plan leaves out."""
+    """Check that the file and Mitsuba's graphs lack what the plan leaves out."""
     findings = detect(scene)
     blind: list[str] = [
         name for name in findings if findings[name].needed and not findings[name].simulated

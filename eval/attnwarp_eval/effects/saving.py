@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Cap:
-    """What a scene's cap on bounces cuts off, and what everything on costs.
+    """Loss by a scene's cap on bounces, and cost of everything on.
 
     Attributes:
         bounces: the cap.
@@ -93,8 +93,8 @@ class Cost:
 
     @property
     def at_equal_noise(self) -> float:
-        """How many times longer everything on takes for the same noise; infinite where the plan has
-        none.
+        """Factor by which everything on takes longer for the same noise; infinite where the plan
+        has none.
         """
         return (
             self.faster * self.variance[1] / self.variance[0]
@@ -103,7 +103,7 @@ class Cost:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON, where infinity is null."""
+        """Fields as JSON, where infinity is null."""
         fields: dict[str, Any] = without_nan(asdict(self) | {"at_equal_noise": self.at_equal_noise})
         return fields
 

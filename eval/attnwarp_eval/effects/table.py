@@ -37,15 +37,17 @@ TIMED = (
 """Columns that come from timing."""
 
 AMPLIFIED = 8.0
-"""How much stronger the difference of two pictures is shown."""
+"""Factor that amplifies the shown difference of two pictures."""
 
 PICTURE_SIZE, PLAN_SAMPLES, FULL_SAMPLES = 160, 64, 256
-"""Of the pictures side by side. Enough samples that the difference shows more than noise."""
+"""Width and samples of the pictures side by side. Enough samples that the difference shows more
+than noise.
+"""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How an entry is made.
+    """Settings of an entry.
 
     Attributes:
         prove: climb the ladder of :mod:`attnwarp_eval.effects.proof`.

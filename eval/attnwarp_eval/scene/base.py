@@ -1,4 +1,4 @@
-"""What every part of a scene file is made of: the base of its models, colours, vectors."""
+"""Elements of every part of a scene file: the base of its models, colours, vectors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ products of much larger ones overflow the float32 of what renders them."""
 
 
 class SceneNotice(InputWarning):
-    """What a person should know of a scene that can be used all the same."""
+    """Notice on a scene that can be used all the same."""
 
 
 def silence_notices() -> None:
@@ -47,7 +47,7 @@ Number = Annotated[float, BeforeValidator(_no_truth)]
 """A number, which true is not."""
 
 Seed = Annotated[int, Field(ge=-(2**62), le=2**62)]
-"""What the noise is hashed with: a 64-bit number, with room for octaves."""
+"""Seed that the noise is hashed with: a 64-bit number, with room for octaves."""
 
 Coordinate = Annotated[Number, Field(ge=-FARTHEST, le=FARTHEST)]
 

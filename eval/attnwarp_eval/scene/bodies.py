@@ -43,7 +43,7 @@ class RingSpec(Spec):
 
 
 class _PartSpec(Spec):
-    """What every part may say.
+    """Fields that every part may have.
 
     ``color`` multiplies the object's texture; ``mirror`` doubles the part across y = 0; ``blend:
     false`` is a sharp joint, a number a joint of that width; ``carve`` takes the part away from the
@@ -192,7 +192,7 @@ class BodySpec(Spec):
         return solids.mesh_body(self.solid(), self.blend, self.resolution, self.surface())
 
     def contains(self, point: npt.NDArray[np.float64]) -> bool:
-        """Whether a (3,) point in the body's own coordinates is inside; needs no meshing."""
+        """Return True if a (3,) point in the body's own coordinates is inside; needs no meshing."""
         return bool(
             solids.body_distance(self.solid(), self.blend, point[None], self.surface())[0] < 0
         )

@@ -151,7 +151,7 @@ def _hex(linear: npt.NDArray[np.float64]) -> str:
 
 
 def problems(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]]]:
-    """What is wrong with a scene's edits: message, and where in the file it stands."""
+    """Faults of a scene's edits: the message, and its place in the file."""
     seen: dict[str, int] = {}
     for k, edit in enumerate(spec.edits):
         if edit.name in seen:

@@ -93,7 +93,7 @@ def _follow(loc: Sequence[int | str], model: type[BaseModel]) -> tuple[str, type
 
 
 def _tags(model: type[BaseModel]) -> tuple[Any, ...]:
-    """What a member of a union may have as its type."""
+    """Values that a member of a union may have as its type."""
     field = model.model_fields.get("type")
     return () if field is None else get_args(field.annotation)
 

@@ -1,4 +1,4 @@
-"""How far a scene reaches, and by which of its objects."""
+"""Extent of a scene, and the objects that set it."""
 
 from __future__ import annotations
 

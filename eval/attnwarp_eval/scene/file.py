@@ -22,8 +22,8 @@ from attnwarp_eval.scene.yaml import Place, YamlError, line_of, read_yaml
 
 
 def scene_folders() -> list[Path]:
-    """Where scenes are looked for by name: ``./scenes``, then those of the package (in a checkout:
-    its ``scenes``).
+    """Folders in which scenes are looked for by name: ``./scenes``, then those of the package (in a
+    checkout: its ``scenes``).
 
     Example:
         >>> [folder.name for folder in scene_folders()][-1]
@@ -44,7 +44,7 @@ def list_scenes() -> list[str]:
 
 
 def is_scene_file(name: object) -> bool:
-    """Whether :func:`load_scene` takes this for a file, not for a name to look up.
+    """Return True if :func:`load_scene` takes this for a file, not for a name to look up.
 
     Example:
         >>> is_scene_file("my/scene.yaml"), is_scene_file("bear")
@@ -56,7 +56,7 @@ def is_scene_file(name: object) -> bool:
 
 
 def scene_name(name_or_path: str) -> str:
-    """What a scene is called wherever its file may lie: its name, or its file's without a suffix.
+    """Name of a scene wherever its file may lie: the name itself, or its file's without a suffix.
 
     Example:
         >>> scene_name("my/room.yaml"), scene_name("bear")
@@ -146,8 +146,8 @@ def _read(path: Path) -> Scene:
 
 
 def _check(scene: Scene, lines: dict[Place, int]) -> None:
-    """What no single field can say: names that clash, files that are missing, cameras that cannot
-    be.
+    """Check what no single field can tell: names that clash, files that are missing, cameras that
+    cannot be.
     """
 
     def refuse(message: str, *loc: int | str) -> None:

@@ -1,5 +1,5 @@
-"""What a scene file may say about light beyond sun, sky and diffuse surfaces: materials, lamps,
-fog, lens, effects.
+"""Parts of a scene file about light beyond sun, sky and diffuse surfaces: materials, lamps, fog,
+lens, effects.
 
 All of it is a description; :mod:`attnwarp_eval.scene.transport` says what light transport it calls
 for.
@@ -60,7 +60,7 @@ class PlasticMaterial(Spec):
 
 
 class InteriorSpec(Spec):
-    """What fills a glass object: light is scattered and absorbed inside (subsurface scattering).
+    """Filling of a glass object: light is scattered and absorbed inside (subsurface scattering).
 
     ``sigma_t`` is the extinction per scene unit, ``albedo`` times ``tint`` the share that is
     scattered, ``g`` the mean cosine of the scattering angle (Henyey-Greenstein).

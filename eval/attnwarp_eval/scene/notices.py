@@ -1,4 +1,4 @@
-"""What a person should know of the meshes in a scene before its figures are read."""
+"""Notices on the meshes in a scene, to be read before its figures."""
 
 from __future__ import annotations
 

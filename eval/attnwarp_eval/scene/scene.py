@@ -101,7 +101,7 @@ class Scene:
 
     @property
     def description(self) -> str:
-        """What the scene is for."""
+        """Purpose of the scene."""
         return self.spec.description
 
     @property
@@ -183,8 +183,9 @@ class Scene:
             raise SceneError(str(error), self.path) from error
 
     def with_size(self, width: int, height: int) -> Scene:
-        """The same scene with images of ``width`` x ``height``; the vertical field of view
-        stays."""
+        """Copy of the scene with images of ``width`` x ``height``; the vertical field of view
+        stays.
+        """
         cameras = self.spec.cameras.model_copy(update={"size": (int(width), int(height))})
         return Scene(self.spec.model_copy(update={"cameras": cameras}), self.path)
 
@@ -264,7 +265,7 @@ class Scene:
         return lambda xy: np.full(len(xy), spec.center[2])
 
     def mesh_path(self, spec: MeshSpec) -> Path:
-        """Where the mesh file of an object lies."""
+        """Path of the mesh file of an object."""
         base = self.path.parent if self.path else Path()
         return FileFinder(base).find(str(Path(spec.file).expanduser()))
 

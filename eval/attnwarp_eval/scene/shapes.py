@@ -1,4 +1,4 @@
-"""What a scene is made of: spheres, rectangles and boxes in closed form, and triangle meshes.
+"""Shapes of a scene: spheres, rectangles and boxes in closed form, and triangle meshes.
 
 Everything is float64 and in world coordinates.
 """
@@ -45,7 +45,7 @@ class Sphere:
         return np.stack([self.center - self.radius, self.center + self.radius])
 
     def contains(self, point: Array) -> bool:
-        """Whether the (3,) ``point`` lies inside."""
+        """Return True if the (3,) ``point`` lies inside."""
         return bool(np.linalg.norm(point - self.center) < self.radius)
 
 
@@ -106,7 +106,7 @@ class Box:
         return np.stack([self.center - reach, self.center + reach])
 
     def contains(self, point: Array) -> bool:
-        """Whether the (3,) ``point`` lies inside."""
+        """Return True if the (3,) ``point`` lies inside."""
         return bool((np.abs((point - self.center) @ self.axes) < self.half).all())
 
     def rectangles(self) -> list[Rectangle]:
@@ -123,7 +123,7 @@ class Box:
         return faces
 
     def mesh(self) -> Mesh:
-        """The same surface as 12 triangles, facing outward."""
+        """Surface of the box as 12 triangles, facing outward."""
         vertices: list[list[Array]] = []
         faces: list[list[int]] = []
         for side in self.rectangles():
@@ -176,8 +176,8 @@ class Mesh:
         return np.stack([corners.min(0), corners.max(0)])
 
     def contains(self, point: Array) -> bool:
-        """Whether the (3,) ``point`` lies inside, by the generalised winding number; never outside
-        the bounding box.
+        """Return True if the (3,) ``point`` lies inside, by the generalised winding number; never
+        outside the bounding box.
 
         A solid angle of more than half the sphere counts as inside, so small holes and a few
         duplicated faces do not change the answer (Jacobson et al. 2013; triangle angles after Van

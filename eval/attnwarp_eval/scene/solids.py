@@ -35,7 +35,7 @@ BLOCK = 8
 
 @dataclass(frozen=True)
 class _Part:
-    """What every part of a body has.
+    """Fields that every part of a body has.
 
     Attributes:
         color: linear RGB.
@@ -49,8 +49,8 @@ class _Part:
     carve: bool = field(default=False, kw_only=True)
 
     def row(self) -> list[float]:
-        """What the kernels read: kind, mode (0 sharp, 1 blended, 2 carved), width (negative for the
-        body's), shape.
+        """Row that the kernels read: kind, mode (0 sharp, 1 blended, 2 carved), width (negative for
+        the body's), shape.
         """
         mode = 2.0 if self.carve else float(bool(self.blend))
         width = -1.0 if isinstance(self.blend, bool) else float(self.blend)

@@ -1,4 +1,4 @@
-"""What may stand in a scene file: objects, lights, cameras, edits, as pydantic models.
+"""Models of pydantic for a scene file: objects, lights, cameras, edits.
 
 docs/scenes.md describes the format. Positions are in scene units (metres in the scenes that come
 with the package), angles in degrees, colours sRGB '#rrggbb', z up.
@@ -190,7 +190,7 @@ Bounces = Annotated[
 
 
 class AppearanceSpec(Spec):
-    """How pictures are made: light bounces (1 is direct light only) and samples a pixel.
+    """Settings of the pictures: light bounces (1 is direct light only) and samples a pixel.
 
     ``bounces: unlimited`` follows light until it is gone, and so does a file without a number.
     ``attnwarp-eval scenes calibrate`` writes the fewest bounces that hold every view's light within
@@ -202,7 +202,7 @@ class AppearanceSpec(Spec):
 
 
 class ObjectChange(Spec):
-    """What an edit does to one object. Its shape stays.
+    """Change of one object by an edit. Its shape stays.
 
     ``recolor`` replaces colours by others wherever the object says them; ``paint`` makes all its
     colours shades of one, but for those of its parts that ``keep`` lists.
@@ -269,7 +269,7 @@ class EditSpec(Spec):
 
     @property
     def ambiguous(self) -> bool:
-        """Whether more than one result is right."""
+        """True if more than one result is right."""
         return bool(self.answers)
 
 

@@ -21,7 +21,7 @@ Height = Callable[[Array], Array]
 """(N, 2) places to (N,) heights."""
 
 FOCUS = 2.2
-"""How much finer the middle of a terrain is meshed than its rim: cosh of it, 4.6 times."""
+"""Factor by which the middle of a terrain is meshed finer than its rim: cosh of it, 4.6 times."""
 
 
 class TerrainSpec(Spec):
@@ -60,7 +60,7 @@ class TerrainSpec(Spec):
         return self.center[2] + self.height * rise * noise
 
     def below(self, point: Array) -> bool:
-        """Whether a (3,) point lies under the ground."""
+        """Return True if a (3,) point lies under the ground."""
         here = (np.abs(point[:2] - np.array(self.center[:2])) <= np.array(self.size) / 2).all()
         return bool(here and point[2] < self.height_at(point[None, :2])[0])
 

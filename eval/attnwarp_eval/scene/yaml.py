@@ -162,7 +162,7 @@ BARE_COLOR = re.compile(
 
 
 def _bare_color(text: str) -> str:
-    """What to add to an error where the text has a colour without quotes."""
+    """End of an error's message where the text has a colour without quotes; else empty."""
     for number, line in enumerate(text.splitlines(), 1):
         if BARE_COLOR.search(line):
             return f"; line {number} has a colour without quotes, which YAML takes for a comment"

@@ -1,6 +1,4 @@
-"""What is exactly known about a scene: geometry by ray casting and closed forms, appearance by
-Mitsuba.
-"""
+"""Exact knowledge of a scene: geometry by ray casting and closed forms, appearance by Mitsuba."""
 
 from __future__ import annotations
 

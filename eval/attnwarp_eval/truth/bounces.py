@@ -1,4 +1,4 @@
-"""How many bounces of light a scene calls for, measured: `attnwarp-eval scenes calibrate`.
+"""Number of bounces of light that a scene calls for, measured: `attnwarp-eval scenes calibrate`.
 
 The fewest bounces whose pictures are shown to have, in every view, the light of pictures without
 an end of bounces within :data:`MARGIN`: |d| + t SE of the mean over pairs of pictures of one seed,
@@ -78,13 +78,13 @@ class Shortfall:
 
     @property
     def holds(self) -> bool:
-        """Whether the light is shown to be complete within the margin."""
+        """True if the light is shown to be complete within the margin."""
         return self.bound < MARGIN
 
 
 @dataclass(frozen=True)
 class Answer:
-    """How many bounces hold a scene's pictures, and the evidence.
+    """Number of bounces that hold a scene's pictures, and the evidence.
 
     Attributes:
         bounces: the number; "unlimited" where none up to :data:`MOST` is shown to suffice.
@@ -210,7 +210,7 @@ def worlds(scene: Scene) -> Iterator[tuple[Which, Scene]]:
 
 
 def shortfall(pictures: Pictures, bounces: int, view: Camera) -> Shortfall:
-    """What a number of bounces leaves out of a view, with as many samples as it takes to tell.
+    """Shortfall of a number of bounces in a view, with as many samples as it takes to tell.
 
     Example:
         >>> def pictures(bounces, view, spp):

@@ -1,4 +1,4 @@
-"""Where the edits of a scene show: objects and pixels, and in words."""
+"""Places where the edits of a scene show: objects and pixels, and in words."""
 
 from __future__ import annotations
 

@@ -36,8 +36,9 @@ PLACES = (
     "/opt/homebrew/opt/llvm*/lib/libLLVM*",
     "/usr/local/opt/llvm*/lib/libLLVM*",
 )
-"""Where distributions, conda and Homebrew put the library. Dr.Jit's own search takes the first name
-that it finds, which may be an old one beside a newer."""
+"""Patterns of the paths at which distributions, conda and Homebrew put the library. Dr.Jit's own
+search takes the first name that it finds, which may be an old one beside a newer.
+"""
 
 PROBE = """
 try:
@@ -96,7 +97,7 @@ def libraries() -> list[str]:
 
 
 def version(path: str) -> tuple[int, ...] | None:
-    """What a library's file name says of its version: ``libLLVM-19.so``, ``libLLVM.so.19.1``,
+    """Version in a library's file name: ``libLLVM-19.so``, ``libLLVM.so.19.1``,
     ``llvm-19/lib/libLLVM.so``.
 
     None for a name that is none of a shared library of LLVM, or that has no number.
@@ -115,8 +116,8 @@ def version(path: str) -> tuple[int, ...] | None:
 
 
 def works(library: str | None) -> bool:
-    """Whether a child process rendered a known picture with ``library`` (None: whichever Dr.Jit
-    finds) and lived.
+    """Return True if a child process rendered a known picture with ``library`` (None: whichever
+    Dr.Jit finds) and lived.
     """
     environment = os.environ | ({"DRJIT_LIBLLVM_PATH": library} if library else {})
     try:

@@ -83,7 +83,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class Plan:
-    """How a picture is made, and why that suffices.
+    """Plan of a picture, and why it suffices.
 
     Attributes:
         passes: the renderings that are added up; none where ray casting alone gives what is wanted.
@@ -110,14 +110,14 @@ class Plan:
         return "thinlens" if self.lens else "perspective"
 
     def identity(self) -> dict[str, Any]:
-        """What decides the picture, without the reasons; goes into cache keys."""
+        """Entries that decide the picture, without the reasons; goes into cache keys."""
         data = asdict(replace(self, reasons=()))
         # Pictures of such passes were stratified once.
         few = any(p.integrator == "volpath" and p.spp < FEWEST_STRATIFIED for p in self.passes)
         return {**data, "sampler": "independent"} if few else data
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON, for ``scenes effects --json``."""
+        """Plan as JSON, for ``scenes effects --json``."""
         return {
             "integrator": self.integrator,
             "sensor": {"type": self.sensor} | (asdict(self.lens) if self.lens else {}),
@@ -302,8 +302,8 @@ def plan_passes(
 
 
 def convex(scene: Scene) -> bool:
-    """Whether a scene is a single convex surface, which never lights itself. Glass does: light
-    passes through it.
+    """Return True if a scene is a single convex surface, which never lights itself. Glass does:
+    light passes through it.
     """
     alone = len(scene.spec.objects) == 1 and not isinstance(
         scene.spec.objects[0].material, materials.GlassMaterial
@@ -346,8 +346,8 @@ def small_lamps(scene: Scene) -> list[int]:
 
 
 BEAM_MARGIN = 1.05
-"""How much wider than the sphere about the smooth objects a beam upon them is; Mitsuba's spots fall
-off at their rim.
+"""Factor by which a beam upon the smooth objects is wider than the sphere about them; Mitsuba's
+spots fall off at their rim.
 """
 
 

@@ -17,7 +17,7 @@ Image = npt.NDArray[np.float32]
 
 
 def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int = 0) -> Image:
-    """What ``camera`` sees, in linear RGB.
+    """Render what ``camera`` sees, in linear RGB.
 
     Args:
         camera: square pixels and no skew; any principal point.

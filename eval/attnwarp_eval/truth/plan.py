@@ -1,4 +1,4 @@
-"""How a scene's pictures are made, with the number of bounces that its file names.
+"""Plan of a scene's pictures, with the number of bounces that its file names.
 
 :func:`plan` needs no loading. docs/effects.md has the reasons.
 """
@@ -96,7 +96,7 @@ def open_bounces(scene: Scene) -> list[str]:
 
 
 def everything_on(scene: Scene, spp: int | None = None, *, capped: bool = True) -> Plan:
-    """What a renderer does that knows nothing of the scene: volpath for all lights at once, a lens
+    """Plan of a renderer that knows nothing of the scene: volpath for all lights at once, a lens
     where one is said.
 
     Where a caustic is called for ptracer is added: volpath alone would miss it, so "full" would not

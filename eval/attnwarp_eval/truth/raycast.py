@@ -37,7 +37,7 @@ seen edge on, and there Open3D's own answer is the better one."""
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
-    """What N rays hit first.
+    """First hits of N rays.
 
     Attributes:
         t: (N,) where along the ray, in units of the direction's length; NaN on a miss.
@@ -341,7 +341,7 @@ class Geometry:
     def reached(
         self, eyes: npt.ArrayLike, points: npt.ArrayLike, primitive_id: npt.ArrayLike
     ) -> Mask:
-        """Whether the way from an eye to a surface point is free.
+        """Mask of points, True where the way from an eye to a surface point is free.
 
         The ray is cast from the eye to the point, without any offset. The way is free if the first
         hit is the point's own primitive, or lies at 1 +- ``REACH_TOLERANCE`` of the way.
@@ -366,7 +366,7 @@ class Geometry:
         primitive_id: npt.ArrayLike,
         eye: Camera | npt.ArrayLike,
     ) -> Mask:
-        """Whether surface points can be seen from ``eye``: reached, and on the side that
+        """Mask of surface points that can be seen from ``eye``: reached, and on the side that
         ``normals`` point to.
 
         Args:

@@ -24,7 +24,7 @@ Image = npt.NDArray[Any]
 
 
 def contents(scene: Scene) -> str:
-    """What a scene holds, in words: objects, lights and cameras."""
+    """Contents of a scene, in words: objects, lights and cameras."""
     spec = scene.spec
     lines = [
         f"{scene.name}: {scene.title}",
@@ -58,7 +58,7 @@ def contents(scene: Scene) -> str:
 
 
 def pictures_made(scene: Scene) -> str:
-    """How a scene's pictures are planned, in words."""
+    """Plan of a scene's pictures, in words."""
     spec = scene.spec
     lines = ["pictures are made by"]
     planned = plan(scene)

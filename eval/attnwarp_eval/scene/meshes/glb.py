@@ -31,7 +31,7 @@ POINTS, LINES, TRIANGLES, STRIP, FAN = 0, (1, 2, 3), 4, 5, 6
 
 
 class _Part(BaseModel):
-    """What is not listed plays no part for the geometry."""
+    """Part of a glTF file; what is not listed plays no part for the geometry."""
 
     model_config = ConfigDict(strict=True, extra="ignore", frozen=True)
 

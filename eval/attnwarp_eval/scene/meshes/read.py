@@ -136,7 +136,7 @@ _recent: dict[tuple[str, str], MeshFile] = {}
 
 
 def _read(path: Path, reader: Callable[[bytes], Surface], data: bytes) -> MeshFile:
-    """What a file holds."""
+    """Mesh that a file holds."""
     try:
         surface = reader(data)
         if not len(surface.sizes):
@@ -189,8 +189,8 @@ def _read(path: Path, reader: Callable[[bytes], Surface], data: bytes) -> MeshFi
 
 
 def _inside_out(mesh: Mesh) -> bool:
-    """Whether a surface is closed but for small holes, and its volume by the divergence theorem is
-    negative by more than a thousandth of a ball's of the same area.
+    """Return True if a surface is closed but for small holes, and its volume by the divergence
+    theorem is negative by more than a thousandth of a ball's of the same area.
     """
     corners = mesh.vertices[mesh.faces]
     corners = corners - corners.mean((0, 1))

@@ -1,4 +1,4 @@
-"""What a reader of one format hands over, and parsing that all text formats share."""
+"""Surface that a reader of one format hands over, and parsing that all text formats share."""
 
 from __future__ import annotations
 

@@ -220,7 +220,7 @@ def load_world(
 
 
 def interior(item: ObjectSpec) -> InteriorSpec | None:
-    """What fills a glass object, None for any other object."""
+    """Filling of a glass object, None for any other object."""
     return item.material.interior if isinstance(item.material, GlassMaterial) else None
 
 
@@ -670,7 +670,7 @@ def load_sensor(
 
 
 def focus_distance(scene: Scene, camera: Camera) -> float:
-    """How far along the optical axis the point lies that the cameras look at; the orbit's radius if
+    """Distance along the optical axis of the point that the cameras look at; the orbit's radius if
     it is behind.
     """
     depth = float((camera.world_to_camera @ np.array([*scene.center, 1.0]))[2])

@@ -128,7 +128,7 @@ def _part(
     seed: int,
     loaded: tuple[Any, Array, Any],
 ) -> Image:
-    """What the camera rays see that meet something smooth, a lamp or nothing first, or else all the
+    """Light of the camera rays that meet something smooth, a lamp or nothing first, or of all the
     others; zero elsewhere.
 
     Each camera ray gets a pixel of its own in a picture of
@@ -175,7 +175,7 @@ def comparable(scene: Scene) -> str:
 
 
 def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray[np.int64]]:
-    """What Mitsuba's own ray tracer hits at the pixel centres, to hold the exact geometry against.
+    """Hits of Mitsuba's own ray tracer at the pixel centres, to hold the exact geometry against.
 
     Returns:
         position: (H, W, 3) world, float32 precision about the scene's middle; NaN where nothing is
