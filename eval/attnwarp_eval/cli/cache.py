@@ -13,7 +13,7 @@ app = typer.Typer(
 
 @app.command()
 def info() -> None:
-    """Where the derived files lie, how many, how large."""
+    """Show the folder of the derived files, their number and their size."""
     from attnwarp_eval import cache
 
     with clear_errors():

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from attnwarp_eval.cli.machine import Check
 
 WIDTH = 79
-"""Of a line, for a terminal of 80 columns."""
+"""Width of a line, for a terminal of 80 columns."""
 
 
 def doctor(
     json: Annotated[bool, typer.Option("--json", help="Every check as JSON.")] = False,
 ) -> None:
-    """What this machine has, and what each lack costs.
+    """Check what this machine has, and tell what each lack costs.
 
     Exit code 2 if something needed is broken.
     """

@@ -1,4 +1,4 @@
-"""What this machine has, and what each lack costs: the checks of ``attnwarp-eval doctor``.
+"""Abilities of this machine, and the cost of each lack: the checks of ``attnwarp-eval doctor``.
 
 What takes a heavy import runs in a child process, so that a library that ends its process cannot
 end this one, and the checks run side by side.
@@ -28,7 +28,7 @@ LONGEST = 120
 """Seconds after which a child process is given up."""
 
 WORKER_GB = 3
-"""What a worker of a run needs at most."""
+"""Memory that a worker of a run needs at most."""
 
 
 @dataclass(frozen=True)
@@ -118,14 +118,14 @@ def threads() -> Check:
 
 
 def _free_memory_gb() -> float:
-    """What the system can still give, in GB."""
+    """Memory that the system can still give, in GB."""
     lines = Path("/proc/meminfo").read_text().splitlines()
     kilobytes = next(line.split()[1] for line in lines if line.startswith("MemAvailable"))
     return int(kilobytes) * 1024 / 1e9
 
 
 def kernels() -> Check:
-    """Whether the renderer's kernels have been compiled before."""
+    """Check that the renderer's kernels have been compiled before."""
     spec = util.find_spec("attnwarp")
     assert spec is not None and spec.submodule_search_locations
     folder = Path(next(iter(spec.submodule_search_locations))) / "render" / "_kernels"

@@ -42,7 +42,7 @@ def list_() -> None:
 def show(
     scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
 ) -> None:
-    """What a scene contains, and how its pictures are made."""
+    """Show what a scene contains, and how its pictures are made."""
     with clear_errors():
         from attnwarp_eval.scene.file import load_scene
         from attnwarp_eval.truth.show import contents, pictures_made
@@ -315,7 +315,7 @@ def flow(
     ] = Path("runs/flow"),
     pictures: Annotated[bool, typer.Option(help="Keep the pictures of each pair.")] = True,
 ) -> None:
-    """How far consistency along optical flow is from that at exact correspondences."""
+    """Measure how far consistency along optical flow is from that at exact correspondences."""
     with clear_errors():
         from attnwarp.errors import InputError
         from attnwarp_eval.document.write import markdown_table
@@ -357,7 +357,7 @@ def time_(
         bool, typer.Option("--json", help="JSON, with every scene's stages.")
     ] = False,
 ) -> None:
-    """How long meshes, geometry and pictures take from nothing (an empty cache)."""
+    """Time meshes, geometry and pictures from nothing (an empty cache)."""
     import json
 
     from rich.console import Console

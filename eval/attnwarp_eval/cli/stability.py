@@ -109,7 +109,7 @@ def _study(quick: bool, out: Path | None, jobs: int) -> list[str]:
 
 
 def has_cuda() -> bool:
-    """Whether backend cuda can run here: a GPU, and gsplat for its kernels."""
+    """Return True if backend cuda can run here: a GPU, and gsplat for its kernels."""
     import importlib.util
 
     import torch

@@ -85,7 +85,9 @@ class Capture:
         return self.source if name == self.source.name else self.targets[name]
 
     def surface(self, name: str, settings: WarpSettings) -> Surface:
-        """What the splats show of a view, rendered once for all settings that render alike."""
+        """Surface that the splats show to a view, rendered once for all settings that render
+        alike.
+        """
         return self._rendered(name, settings.depth, settings.depth_statistic)
 
     def _render(self, name: str, depth: SplatDepth, depth_statistic: DepthStatistic) -> Surface:
@@ -158,7 +160,7 @@ def read_picture(path: Path) -> Image:
 
 
 def is_edit(path: Path) -> bool:
-    """Whether a folder holds an edit."""
+    """Return True if a folder holds an edit."""
     return (path / _manifest()).is_file()
 
 

@@ -38,7 +38,7 @@ class Tap:
 
 @dataclass(frozen=True)
 class CellReport:
-    """What is known of a cell of the target's feature grid.
+    """Report on a cell of the target's feature grid.
 
     Attributes:
         column, row: of the cell.

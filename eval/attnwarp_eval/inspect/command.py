@@ -16,7 +16,7 @@ def inspect_command(
     color: str | None = None,
     pixel: str | None = None,
 ) -> str:
-    """What to type to see a view of a run in 3D.
+    """Command that shows a view of a run in 3D.
 
     Args:
         run: folder of the run.

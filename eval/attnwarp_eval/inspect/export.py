@@ -1,4 +1,6 @@
-"""What is on show as a file to share: .glb for viewers, .vtp with every number, .html a page."""
+"""Export of what is on show to a file to share: .glb for viewers, .vtp with every number, .html a
+page.
+"""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ WITHOUT_DRAWING = "--export FILE.glb or FILE.vtp needs no OpenGL, --pixel prints
 
 
 def has_display() -> bool:
-    """Whether this machine names a display for windows."""
+    """Return True if this machine names a display for windows."""
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 

@@ -54,8 +54,9 @@ COLORINGS = (
     "covered by",
     EDIT_DISAGREEMENT,
 )
-"""What the surface that the target sees can be coloured by; :attr:`Pair.colorings` has those that
-a pair can show."""
+"""Colourings of the surface that the target sees; :attr:`Pair.colorings` has those that a pair can
+show.
+"""
 
 NEEDS_TRUTH = ("endpoint error", "depth error", "covered by")
 
@@ -157,7 +158,7 @@ class Pair:
 
     @cached_property
     def surfaces(self) -> tuple[Surface, Surface]:
-        """What source and target know of the surface, as the warp takes it."""
+        """Surfaces of source and target, as the warp takes them."""
         source, target = self.cameras
         if isinstance(self.views, Capture):
             return (

@@ -12,7 +12,7 @@ from attnwarp_eval.inspect.pair import LABELS, Pair
 Vector = npt.NDArray[np.float64]
 
 NEARER = 1e-6
-"""What stands in the way is nearer than the point by at least this share of the distance."""
+"""Least share of the distance by which an obstacle is nearer than the point."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Exact:
 
 @dataclass(frozen=True)
 class PixelReport:
-    """What is known of a target pixel.
+    """Report on a target pixel.
 
     Attributes:
         column, row: of the pixel.
@@ -204,7 +204,7 @@ def _truth(pair: Pair, pixel: tuple[int, int]) -> tuple[Exact | None, Vector | N
 
 
 def _nearer(pair: Pair, pixel: tuple[int, int]) -> Vector | None:
-    """What the source's own depth says stands before the point."""
+    """Point that stands before the target's point by the source's own depth."""
     correspondence = pair.view.correspondence
     depth, z = float(pair.source_depth[pixel]), float(correspondence.z[pixel])
     if not depth < z - float(pair.tolerance[pixel]):  # NaN too

@@ -1,5 +1,5 @@
-"""What a run's folder has of one variant of a scene: the settings of its warp, its fitted splats,
-and pictures of edited views.
+"""Contents of a run's folder for one variant of a scene: the settings of its warp, its fitted
+splats, and pictures of edited views.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class RunEdit:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """What the records of one variant of a scene say of its warp.
+    """Records of one variant of a scene, as far as they tell of its warp.
 
     Attributes:
         edited: whether an editing method was measured, else a fit alone.
@@ -108,7 +108,7 @@ def measured(
     *,
     content: str,
 ) -> dict[str, Measured]:
-    """What a run has of its variants: those that edit the scene, or fit splats to it.
+    """Variants of a run: those that edit the scene, or fit splats to it.
 
     Args:
         folder: of the run.

@@ -273,7 +273,7 @@ class Part:
 
 @dataclass(frozen=True)
 class State:
-    """What the window shows.
+    """State of the window.
 
     Attributes:
         variant, target: names.
@@ -294,7 +294,7 @@ class State:
 
 
 def title(subject: Subject, pair: Pair, state: State) -> str:
-    """What a state shows, in a line: scene, variant, views, grid, step and colours."""
+    """Title of a state, in a line: scene, variant, views, grid, step and colours."""
     layer = "" if state.layer is None else f", grid {state.layer[1]} x {state.layer[0]}"
     step = f", {state.step}" if pair.edit is not None else ""
     return (

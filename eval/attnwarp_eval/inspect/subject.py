@@ -1,4 +1,4 @@
-"""What there is to inspect: a run, a scene, or a user's own splats and cameras."""
+"""Subjects to inspect: a run, a scene, or a user's own splats and cameras."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class Subject:
 
     @property
     def steps(self) -> tuple[str, ...]:
-        """Of the edits; one without a name where there is none."""
+        """Steps of the edits; one without a name where there is none."""
         if self.edit is not None:
             return self.edit.steps
         return (BEFORE, EDITED) if any(own.edits for own in self.measured.values()) else ("",)
@@ -250,7 +250,7 @@ def of_run(
 
 
 def _elsewhere(folder: Path, variants: Sequence[str], views: Sequence[str]) -> str:
-    """What to open for an edited view that a run has no pictures of."""
+    """Advice on what to open for an edited view that a run has no pictures of."""
     other = "edit the scene with attnwarp edit, and open its folder with --data"
     if not views:
         return (

@@ -42,13 +42,13 @@ LARGEST_TITLE = 14
 """Height of an inset's title, in pixels."""
 
 LETTER_WIDTH = 0.56
-"""Of a title in Arial, as a share of its height; 0.5 on average."""
+"""Width of a letter of a title in Arial, as a share of its height; 0.5 on average."""
 
 FLIGHT = 40
 """Pictures of a flight from the source to the target."""
 
 PICKING_TOLERANCE = 5e-4
-"""Of a click on the surface, as a share of the window's diagonal: about a pixel."""
+"""Tolerance of a click on the surface, as a share of the window's diagonal: about a pixel."""
 
 PIXELS = "pixels"
 """Name of the layer that is no feature grid."""
@@ -212,7 +212,7 @@ class Window:
     # --- keys, sliders, clicks
 
     def actions(self) -> dict[str, Callable[[], None]]:
-        """What each key does, by VTK's name of the key."""
+        """Action of each key, by VTK's name of the key."""
         state = lambda: self.state  # noqa: E731
         return {
             "n": lambda: self.show(target=_next(self.targets, state().target)),
@@ -451,7 +451,7 @@ class Window:
             self.plotter.remove_actor(self._lighter.pop(name))
 
     def _make_lighter(self, name: str) -> Any:
-        """What stands for a large mesh while the view moves, made once it first does."""
+        """Stand-in for a large mesh while the view moves, made once it first does."""
         actor, make = self._large[name]
         self._main()
         before, self.plotter.suppress_rendering = self.plotter.suppress_rendering, True

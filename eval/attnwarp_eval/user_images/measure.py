@@ -124,7 +124,7 @@ class Measured:
 
     @property
     def any_value(self) -> bool:
-        """Whether any figure has a value."""
+        """True if any figure has a value."""
         return any(not np.isnan(row.value) for row in self.rows)
 
 
@@ -444,7 +444,7 @@ def _is_turned(path: Path) -> bool:
 
 @dataclass
 class _Gathered:
-    """What the figures need of each view, so that its pictures can be freed."""
+    """Parts of each view that the figures need, so that its pictures can be freed."""
 
     errors: dict[str, tuple[float, float]] = field(default_factory=dict)  # MSE and PSNR
     distances: dict[str, float] = field(default_factory=dict)
@@ -453,7 +453,9 @@ class _Gathered:
     before: dict[str, Embedding] = field(default_factory=dict)  # CLIP, of the originals
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON, where an undefined number is null; an infinite PSNR follows from its MSE, 0."""
+        """Values as JSON, where an undefined number is null; an infinite PSNR follows from its MSE,
+        0.
+        """
         return {
             "errors": without_nan({name: mse for name, (mse, _) in self.errors.items()}),
             "psnr": without_nan({name: psnr for name, (_, psnr) in self.errors.items()}),

@@ -156,7 +156,7 @@ def _value(row: Row, value: float) -> str:
 
 
 def _number(value: float) -> Any:
-    """As JSON: NaN is null, and an infinite PSNR, of equal pictures, is "inf"."""
+    """Number as JSON: NaN is null, and an infinite PSNR, of equal pictures, is "inf"."""
     return "inf" if math.isinf(value) else without_nan(value)
 
 

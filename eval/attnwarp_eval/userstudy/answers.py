@@ -35,12 +35,12 @@ class Answer(BaseModel):
 
     @property
     def is_check(self) -> bool:
-        """Whether it is an attention check."""
+        """True if it is an attention check."""
         return SCRAMBLED in (self.left, self.right)
 
     @property
     def comparison(self) -> tuple[object, ...]:
-        """What was compared under which question, whatever the sides."""
+        """Key of what was compared under which question, whatever the sides."""
         return (self.scene, self.edit, self.seed, self.question, *sorted(self.pair))
 
 

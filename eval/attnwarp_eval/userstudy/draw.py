@@ -29,7 +29,7 @@ class Choice:
 
     @property
     def is_check(self) -> bool:
-        """Whether it is an attention check."""
+        """True if it is an attention check."""
         return SCRAMBLED in (self.left, self.right)
 
     def mirrored(self) -> Choice:

@@ -1,4 +1,4 @@
-"""What people are shown: pictures of edited scenes, from the folders of runs."""
+"""Material that people are shown: pictures of edited scenes, from the folders of runs."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ QUESTIONS = {
     "consistency": "Which one looks like the same object from all sides?",
     "quality": "Which one looks better?",
 }
-"""What people are asked, by the name that answers have."""
+"""Questions that people are asked, by the name that answers have."""
 
 FORMAT = 1
 """Version of the answers' file."""
@@ -26,7 +26,7 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class Design:
-    """How a study of people is drawn.
+    """Design of a study of people.
 
     Attributes:
         questions: names of :data:`QUESTIONS`.

@@ -26,7 +26,7 @@ OVERALL = "overall"
 
 @dataclass(frozen=True)
 class Score:
-    """What people prefer.
+    """Preferences of people.
 
     Attributes:
         title: of the page.
