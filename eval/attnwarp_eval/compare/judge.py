@@ -41,7 +41,7 @@ FaultKind = Literal["missing", "unmeasured", "redefined", "counter"]
 
 @dataclass(frozen=True)
 class Fault:
-    """What fails without a figure.
+    """A failure that is not a metric regression.
 
     Attributes:
         kind: ``missing``: the baseline has it and the run lacks it; ``unmeasured``: scenes,
@@ -112,13 +112,13 @@ class Comparison:
 
     @property
     def incomplete(self) -> bool:
-        """Whether the run measured less than the baseline, and nothing else is wrong."""
+        """True if the run measured less than the baseline, and nothing else is wrong."""
         worse = any(row.verdict == "worse" for row in self.rows)
         return bool(self.faults) and not worse and {f.kind for f in self.faults} == {"unmeasured"}
 
     @property
     def regressed(self) -> bool:
-        """Whether anything got worse, is missing, or is no longer the same."""
+        """True if anything got worse, is missing, or is no longer the same."""
         return bool(self.faults) or any(row.verdict == "worse" for row in self.rows)
 
     @property
@@ -209,7 +209,7 @@ def _of_seeds(side: Snapshot, seeds: Set[int]) -> Snapshot:
 
 
 def _has_gates(name: str) -> bool:
-    """Whether any gate is a figure of a probe."""
+    """Return True if any gate is a figure of a probe."""
     return not GATES.keys().isdisjoint(m.name for m in probe_of(name).metrics.values())
 
 
@@ -266,8 +266,8 @@ _NOT_FAILED = ("", NOT_IN_STUDY, NOT_MEASURED)
 
 
 def _lacking(lacking: Mapping[Key, str], there: Mapping[Key, object]) -> list[Fault]:
-    """What a side lacks: scenes, probes, variants and seeds of which it has nothing, then single
-    cells. A cell that failed has a line of its own, with its error.
+    """Faults for all that a side lacks: scenes, probes, variants and seeds of which it has nothing,
+    then single cells. A cell that failed has a line of its own, with its error.
 
     Args:
         lacking: keys -> the reason.
@@ -468,7 +468,7 @@ class _Group:
         return "better" if gained and not lost else None
 
     def _lost(self) -> bool:
-        """Whether the run defines the figure nowhere, or in none of several views of a scene.
+        """True if the run defines the figure nowhere, or in none of several views of a scene.
 
         Which single views define it is a matter of the seeds.
         """

@@ -59,7 +59,7 @@ def pictures_of_run(results: Results, root: Path) -> Pictures:
 
 
 def folder_of(baseline: Path) -> Path:
-    """Where the pictures of a baseline's file lie: beside it."""
+    """Folder of the pictures of a baseline's file: beside it."""
     return baseline.with_suffix(".pictures")
 
 
@@ -106,7 +106,9 @@ def write_pictures(baseline: Path, pictures: Pictures) -> None:
 
 
 def _folder(pictures: Path, cell: str, seed: int, view: str) -> Path:
-    """Of the pictures of a view, which may have a slash in its name, such as ``edit/yaw030``."""
+    """Folder of the pictures of a view, which may have a slash in its name, such as
+    ``edit/yaw030``.
+    """
     return pictures / f"{cell}-{seed}" / view.replace("/", "__")
 
 

@@ -1,4 +1,6 @@
-"""What of a run a comparison reads: gated figures view by view, counters, and what each cell is."""
+"""Parts of a run that a comparison reads: gated figures view by view, counters, and what each cell
+is.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,7 @@ class Measured:
 
     @property
     def key(self) -> tuple[str, str, tuple[str, ...], int]:
-        """What sorts cells, and tells them apart."""
+        """Key that sorts cells, and tells them apart."""
         return self.scene, self.probe, self.variants, self.seed
 
 
@@ -85,7 +87,7 @@ class Snapshot:
 
     @property
     def seeds(self) -> frozenset[int]:
-        """Of the expected cells."""
+        """Seeds of the expected cells."""
         own = (cell.seeds or (cell.seed,) for cell in self.cells)
         return frozenset(chain.from_iterable(own)) | {key[3] for key in self.missing}
 

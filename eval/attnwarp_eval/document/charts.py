@@ -253,7 +253,9 @@ def heatmap(
 
 
 MOST_NAMES = 12
-"""Of points in a figure of a front; more would cover one another's bars."""
+"""Largest number of points with a name in a figure of a front; more names would cover one another's
+bars.
+"""
 
 
 def cost_front(

@@ -30,7 +30,7 @@ class Table:
     glossary: bool = False
 
     def without_timings(self) -> Table:
-        """The same table without its columns of seconds and memory."""
+        """Copy of the table without its columns of seconds and memory."""
         keep = [i for i, name in enumerate(self.columns) if name not in self.timed]
         rows = [[row[i] for i in keep] for row in self.rows]
         columns = [self.columns[i] for i in keep]
@@ -66,7 +66,7 @@ class Slider:
 
     @property
     def caption(self) -> str:
-        """What lies on the left and on the right of the handle."""
+        """Captions of the pictures on the left and on the right of the handle."""
         return f"{self.before.caption} | {self.after.caption}"
 
 
@@ -108,7 +108,8 @@ class Section:
 
 @dataclass
 class Finding:
-    """What a reader of a page sees first: a sentence, a number with its interval, and a picture.
+    """First thing that a reader of a page sees: a sentence, a number with its interval, and a
+    picture.
 
     Attributes:
         text: one sentence.

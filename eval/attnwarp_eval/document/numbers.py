@@ -1,4 +1,4 @@
-"""How numbers are written in a document."""
+"""Notation of numbers in a document."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def ratio_text(value: Ratio) -> str:
 
 
 def _note(value: Interval, scenes: int | None) -> str:
-    """What a mean leaves out, in brackets."""
+    """Note, in brackets, of what a mean leaves out."""
     notes = [f"{value.undefined} undefined"] if value.undefined else []
     if scenes is not None and value.scenes < scenes:
         notes.append(f"{value.scenes} of {scenes} scenes")

@@ -88,7 +88,9 @@ def _pictures(report: Report) -> set[str]:
 
 
 def _embedder(report: Report, root: Path) -> Callable[[str], str]:
-    """What writes a file into the page; pictures are made smaller where all are too large."""
+    """Return the function that writes a file into the page; pictures are made smaller where all are
+    too large.
+    """
     pictures = _pictures(report)
     scale = reduction(sum((root / path).stat().st_size for path in pictures))
 
@@ -135,7 +137,9 @@ def reduced(data: bytes, scale: float) -> bytes:
 
 
 def _drawer(root: Path) -> Callable[[str], Markup]:
-    """What puts a figure into the page as SVG, with ids that no other figure has."""
+    """Return the function that puts a figure into the page as SVG, with ids that no other figure
+    has.
+    """
     count = itertools.count(1)
 
     def draw(path: str) -> Markup:
@@ -149,7 +153,7 @@ def _drawer(root: Path) -> Callable[[str], Markup]:
 
 
 def _linker(report: Report) -> Callable[[str], Markup]:
-    """What writes a cell of a table; names of metrics link to their meaning."""
+    """Return the function that writes a cell of a table; names of metrics link to their meaning."""
     names = {
         row[0]
         for section in report.sections

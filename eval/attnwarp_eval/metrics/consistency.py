@@ -45,7 +45,7 @@ VIEW_DEPENDENT = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Disagreement:
-    """How far two pictures disagree, pixel by pixel of the target, and where that was counted.
+    """Disagreement of two pictures, pixel by pixel of the target, and the pixels that were counted.
 
     Attributes:
         counted: (H, W) bool, pixels that were compared.
@@ -220,7 +220,7 @@ class Flow:
 
 
 def optical_flow(source_srgb: Any, target_srgb: Any, method: FlowMethod = "dis") -> Flow:
-    """Where OpenCV's optical flow finds each target pixel in the source picture.
+    """Find each target pixel in the source picture by OpenCV's optical flow.
 
     Args:
         source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of one size; the UNEDITED pictures, as
@@ -296,7 +296,7 @@ def flow_consistency(
 
 
 def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, float]:
-    """How far a flow is from the exact correspondences.
+    """Distance of a flow from the exact correspondences.
 
     Args:
         flow: from :func:`optical_flow` on the pictures of ``pair``.
@@ -348,7 +348,7 @@ def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, floa
 
 
 def approximation_error(exact: Disagreement, flow: Disagreement) -> dict[str, float]:
-    """What flow in place of exact correspondences does to the figures: flow minus exact, and mean
+    """Effect on the figures of flow in place of exact correspondences: flow minus exact, and mean
     DeltaE as a ratio.
 
     NaN where either side counted nothing; the ratio too where the exact one is 0.
@@ -409,7 +409,7 @@ def _sample(image: Array, xy: Array) -> Array:
 def _disagreement(
     source: Array, target: Array, xy: Array, pixels: Mask, candidates: int
 ) -> Disagreement:
-    """Of sRGB pictures, at the pixels of ``pixels`` whose position has taps."""
+    """Disagreement of sRGB pictures, at the pixels of ``pixels`` whose position has taps."""
     from skimage.color import deltaE_ciede2000, rgb2lab
 
     counted = pixels & _has_taps(xy, source.shape)

@@ -41,12 +41,12 @@ class Similarity:
 
     @property
     def undefined(self) -> int:
-        """How many views have no value."""
+        """Number of views without a value."""
         return int(np.isnan(self.values).sum())
 
     @property
     def defined(self) -> int:
-        """How many views have one."""
+        """Number of views with a value."""
         return len(self.values) - self.undefined
 
     @property
@@ -192,5 +192,7 @@ def _unit(rows: npt.NDArray[np.float64], tiny: float = TINY_NORM) -> npt.NDArray
 
 
 def _cosine(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Of unit rows; one row of either stands for all. Rounding past 1 is cut off, NaN stays."""
+    """Cosines of unit rows; one row of either stands for all. Rounding past 1 is cut off, NaN
+    stays.
+    """
     return np.asarray(np.clip((a * b).sum(axis=1), -1, 1))

@@ -76,7 +76,7 @@ EDITED = frozenset(
     (*(kind + of for kind in ("edit", "render") for of in ("", "_inside", "_next", "_seen")),
      "edit_render", "after")
 )  # fmt: skip
-"""What stands behind a metric where an edit is measured: edited views, renders of edited splats,
+"""Endings of a metric's name where an edit is measured: edited views, renders of edited splats,
 their edited object, their neighbours, what the source saw.
 """
 
@@ -91,7 +91,7 @@ splat reaches a tile: another processor counts a few more or less. All others mu
 
 
 def same_count(counter: str, before: int, now: int) -> bool:
-    """Whether two counts of a cell are the same work.
+    """Return True if two counts of a cell are the same work.
 
     Example:
         >>> same_count("pairs", 966_432, 966_416), same_count("taps", 300_672, 300_671)
@@ -101,9 +101,9 @@ def same_count(counter: str, before: int, now: int) -> bool:
 
 
 def gated(key: str) -> bool:
-    """Whether a result's key is gated: a metric of :data:`GATES`, over the whole picture, on a
-    feature grid or of an edit (:data:`EDITED`). Regions of a picture follow from the whole; keys of
-    known flaws rate a metric, not the code.
+    """Return True if a result's key is gated: a metric of :data:`GATES`, over the whole picture, on
+    a feature grid or of an edit (:data:`EDITED`). Regions of a picture follow from the whole; keys
+    of known flaws rate a metric, not the code.
 
     Example:
         >>> [gated(key) for key in ("depth.abs_rel", "warp.epe_median_layer.64", "depth.rmse")]

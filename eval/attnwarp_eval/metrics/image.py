@@ -1,4 +1,4 @@
-"""How alike two pictures are: MSE, PSNR, SSIM, MS-SSIM, and the Edit PSNR of a set of views.
+"""Likeness of two pictures: MSE, PSNR, SSIM, MS-SSIM, and the Edit PSNR of a set of views.
 
 Pictures are (H, W, 3) float32 or float64 in [0, 1], masks (H, W) bool. The functions take values as
 they come: whether they are sRGB or linear is the caller's to name, and :func:`image_error` names it
@@ -265,7 +265,7 @@ def image_error(image_srgb: Any, target_srgb: Any, mask: Any = None) -> dict[str
 
 @dataclass(frozen=True)
 class EditPsnr:
-    """How closely the views of an edited scene follow the edited pictures that it was made from.
+    """Fidelity of an edited scene's views to the edited pictures that it was made from.
 
     Attributes:
         views: the views that were measured, by name and in order. Methods that edit different views

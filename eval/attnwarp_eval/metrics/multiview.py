@@ -33,7 +33,7 @@ BELOW_FLOOR = (
     " true edited views. Something that differs between true views, such as shine, a shadow's edge"
     " or fine texture, is lost there. Less is no gain there."
 )
-"""What a negative disagreement above the floor means, in words for a report."""
+"""Meaning of a negative disagreement above the floor, in words for a report."""
 
 
 def above_floor(

@@ -39,7 +39,7 @@ class Metric:
 
     @property
     def is_count(self) -> bool:
-        """Whether it only describes how much was measured, and is no figure of quality."""
+        """True if it only describes how much was measured, and is no figure of quality."""
         return self.unit in ("pixels", "views") and self.direction == "none"
 
 
@@ -236,7 +236,7 @@ def metric(key: str) -> Metric:
 
 
 def at_size(figures: Mapping[str, float], size: int) -> dict[str, float]:
-    """The same figures, named for a feature size: ``warp.epe_median`` becomes ``warp.epe_median.64``.
+    """Name figures for a feature size: ``warp.epe_median`` becomes ``warp.epe_median.64``.
 
     Example:
         >>> from attnwarp_eval import metrics

@@ -56,7 +56,7 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
 
 
 def wrong_results(store: Store) -> list[str]:
-    """What is wrong with a run's ``results.jsonl``, one line. It may not be there yet.
+    """Faults of a run's ``results.jsonl``, at most one line. It may not be there yet.
 
     Args:
         store: the run.
@@ -77,7 +77,7 @@ def _sum_of(path: Path) -> Path:
 
 
 def _sum_line(path: Path, content: bytes) -> bytes:
-    """As sha256sum writes it, which can check it too."""
+    """Line of a checksum as sha256sum writes it, which can check it too."""
     return f"{hashlib.sha256(content).hexdigest()}  {path.name}\n".encode()
 
 

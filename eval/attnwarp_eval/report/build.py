@@ -87,7 +87,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
 
 
 def problems(results: Results) -> list[str]:
-    """What is wrong with the instrument in this run, one line each; empty when it is calibrated.
+    """Faults of the instrument in this run, one line each; empty when it is calibrated.
 
     Example:
         >>> from attnwarp_eval.study import parse_study

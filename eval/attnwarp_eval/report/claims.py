@@ -137,11 +137,11 @@ class JudgedClaim:
     here: Here
     verdict: Verdict
     p: float
-    """Of the contrast, adjusted over the claims."""
+    """p-value of the contrast, adjusted over the claims."""
     below_floor: tuple[str, ...] = ()
     """Scenes in which both sides disagree less than true views do."""
     parts: Parts | None = None
-    """What the contrast's spread between scenes is made of."""
+    """Parts of the contrast's spread between scenes."""
 
 
 Comparison = tuple[str, str, frozenset[str]]
@@ -241,7 +241,7 @@ def together(findings: Sequence[JudgedClaim], editors: Sequence[str]) -> tuple[H
 
 
 def _here(claim: Claim, measured: Measured, scenes: int) -> Here:
-    """Whether the mean difference has the expected sign in every scene.
+    """Tell whether the mean difference has the expected sign in every scene.
 
     ``scenes``: how many the study has. One without values cannot show what is expected.
     """

@@ -1,4 +1,6 @@
-"""What a reader should know first: three to six sentences, each with a number and a picture."""
+"""First things that a reader should know: three to six sentences, each with a number and a
+picture.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,8 @@ RENDERED = {"render", "render_inside", "after"}
 
 
 def findings(results: Results, problems: list[str], *, pictures: bool = True) -> list[Finding]:
-    """Whether the instrument is calibrated, then claims, then the largest effects of the tables.
+    """Findings of a run: whether the instrument is calibrated, then claims, then the largest
+    effects of the tables.
 
     Args:
         results: of the run.

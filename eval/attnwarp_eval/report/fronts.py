@@ -1,4 +1,4 @@
-"""What accuracy costs in time: error against seconds, taken in turn where a probe has done so."""
+"""Cost of accuracy in time: error against seconds, taken in turn where a probe has done so."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
 
 
 def _probabilities(timed: Timed, shared: Shared, names: Sequence[str]) -> dict[str, str]:
-    """How probably each variant is on the front; a dash for one scene, which says nothing of
+    """Probability that each variant is on the front; a dash for one scene, which says nothing of
     others.
     """
     means = np.array(

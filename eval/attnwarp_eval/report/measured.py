@@ -1,4 +1,4 @@
-"""How a run was measured: metrics, code, machine, seconds; and the cells that failed."""
+"""Measurement of a run: metrics, code, machine, seconds; and the cells that failed."""
 
 from __future__ import annotations
 

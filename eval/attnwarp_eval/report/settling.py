@@ -1,4 +1,6 @@
-"""What would settle the claims that cannot be told: more scenes or more seeds, and their cost."""
+"""Measurements that would settle the claims that cannot be told: more scenes or more seeds, and
+their cost.
+"""
 
 from __future__ import annotations
 
@@ -99,8 +101,8 @@ def _count(scenes: int) -> str:
 
 
 def _hours_a_scene(results: Results) -> float:
-    """Of one worker, at the cells of a scene whose cells are all done; NaN where there is none, or
-    where splats were fitted, whose seconds no cell has.
+    """Hours of one worker for the cells of a scene whose cells are all done; NaN where there is
+    none, or where splats were fitted, whose seconds no cell has.
     """
     scenes: dict[str, list[Record[Any] | None]] = {}
     for cell in results.cells:
@@ -117,8 +119,8 @@ def _hours_a_scene(results: Results) -> float:
 
 
 def _seconds(record: Record[Any]) -> float:
-    """Of a cell, each counted once: the first view and the others are within the rest, and parts of
-    an edit within its whole.
+    """Seconds of a cell, each counted once: the first view and the others are within the rest, and
+    parts of an edit within its whole.
     """
     inner = ("warm", "steady", "method: ") if "whole" in record.cost.seconds else ("warm", "steady")
     return sum(

@@ -1,4 +1,5 @@
-"""Whether two means differ, and whether they are equal within a margin. Pure functions.
+"""Tests of two means: whether they differ, and whether they are equal within a margin. Pure
+functions.
 
 A test that finds no difference says nothing of equality: it may only lack samples. Equality is
 shown by two one-sided tests (:func:`equivalence`).
@@ -173,14 +174,14 @@ class Equivalence:
 
     @property
     def equal(self) -> bool:
-        """Whether the means are shown to be equal within the margin."""
+        """True if the means are shown to be equal within the margin."""
         return self.bound < self.margin
 
 
 def equivalence(a: npt.ArrayLike, b: npt.ArrayLike, *, margin: float) -> Equivalence:
-    """Whether two means are equal within ``margin`` of the mean of ``b``, the reference (Schuirmann
-    1987, "A comparison of the two one-sided tests procedure and the power approach", Journal of
-    Pharmacokinetics and Biopharmaceutics 15).
+    """Test whether two means are equal within ``margin`` of the mean of ``b``, the reference
+    (Schuirmann 1987, "A comparison of the two one-sided tests procedure and the power approach",
+    Journal of Pharmacokinetics and Biopharmaceutics 15).
 
     Args:
         a, b: (n, ...) and (m, ...) independent samples, such as pictures; each counts by its mean.

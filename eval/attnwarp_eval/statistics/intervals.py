@@ -51,7 +51,7 @@ class Interval:
 
     @property
     def bounded(self) -> bool:
-        """Whether both bounds are finite: of one scene there is no interval, nor of a few equal
+        """True if both bounds are finite: of one scene there is no interval, nor of a few equal
         differences.
         """
         return bool(np.isfinite(self.low) and np.isfinite(self.high))
@@ -184,7 +184,7 @@ def common(tables: Sequence[ByView]) -> list[dict[str, dict[str, float]]]:
 
 @dataclass(frozen=True)
 class Ratio:
-    """How much longer one thing took than another.
+    """Ratio of the times that two things took.
 
     Attributes:
         ratio: median over rounds of the ratio within a round, geometric mean over groups (scenes).
@@ -204,7 +204,7 @@ class Ratio:
 
     @property
     def bounded(self) -> bool:
-        """Whether there is an interval."""
+        """True if there is an interval."""
         return bool(np.isfinite(self.low) and np.isfinite(self.high))
 
 
@@ -215,7 +215,7 @@ RATIO_INTERVAL = (
     "the interval is that of the median at 95 %, by order statistics, and needs"
     f" {FEWEST_ROUNDS} rounds."
 )
-"""What :func:`time_ratio` gives, for the text of a report."""
+"""Description, for a report, of what :func:`time_ratio` gives."""
 
 
 def time_ratio(a: Sequence[Sequence[float]], b: Sequence[Sequence[float]]) -> Ratio:

@@ -1,5 +1,5 @@
-"""How much must be measured before a difference can be told: more scenes, or more seeds? Pure
-functions: numbers in, numbers out.
+"""Measurements needed before a difference can be told: more scenes, or more seeds? Pure functions:
+numbers in, numbers out.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from attnwarp_eval.statistics.intervals import ROUNDING, ByView
 
 MOST_SCENES = 1000
-"""Where :func:`scenes_needed` stops counting."""
+"""Number at which :func:`scenes_needed` stops counting."""
 
 
 def scenes_needed(mean: float, deviation: float, *, power: float = 0.8, level: float = 0.95) -> int:
@@ -106,7 +106,7 @@ def effect_interval(
 
 @dataclass(frozen=True)
 class Parts:
-    """What the spread of a difference between scenes is made of.
+    """Parts of the spread of a difference between scenes.
 
     Attributes:
         scenes: standard deviation of the scenes' means.
@@ -169,7 +169,7 @@ Seeds = dict[str, dict[str, float]]
 
 
 def _variance_of_seeds(scene: Seeds) -> float | None:
-    """What few seeds add to the variance of a scene's mean, from the views that all have."""
+    """Variance that few seeds add to a scene's mean, from the views that all have."""
     shared = set.intersection(*(set(views) for views in scene.values()))
     if len(scene) < 2 or not shared:
         return None

@@ -24,7 +24,7 @@ or lost every choice; it moves a share of n choices by about 1e-6 / n."""
 RESAMPLES = 500
 
 LARGEST_STEP = 2.0
-"""Of Newton's method in a strength; the likelihood is flat far from its maximum."""
+"""Largest step of Newton's method in a strength; the likelihood is flat far from its maximum."""
 
 
 def strengths(wins: npt.ArrayLike) -> Array:
@@ -222,7 +222,7 @@ def _interval(
 
 
 def _logit(p: Array, choices: float) -> Array:
-    """Of probabilities, those of 0 and 1 taken for half of one choice of so many.
+    """Logits of probabilities, those of 0 and 1 taken for half of one choice of so many.
 
     Draws without the one person who chose otherwise have 0 or 1. Their logit is infinite, and that
     of the ridge's 1e-6 would make a single other choice of a hundred outweigh the rest.
@@ -243,7 +243,7 @@ def _connected(wins: Array) -> npt.NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How often people choose alike.
+    """Agreement of people's choices.
 
     Attributes:
         share: of pairs of people who chose the same, mean over pairs of choices; NaN without any.
