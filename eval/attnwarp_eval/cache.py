@@ -112,7 +112,7 @@ DEFAULT_LIMIT_GB = 10.0
 
 
 def limit_bytes() -> int:
-    """How large the folder may grow: ``$ATTNWARP_CACHE_GB``, else :data:`DEFAULT_LIMIT_GB`.
+    """Limit of the folder's size: ``$ATTNWARP_CACHE_GB``, else :data:`DEFAULT_LIMIT_GB`.
 
     Raises:
         InputError: the variable is not a number of gigabytes.

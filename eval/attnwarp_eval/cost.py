@@ -1,4 +1,4 @@
-"""What a figure cost: seconds by stage, work counters, peak memory, and the machine it was measured
+"""Cost of a figure: seconds by stage, work counters, peak memory, and the machine it was measured
 on.
 """
 
@@ -41,7 +41,7 @@ PACKAGES = (
     "transformers",
     "tokenizers",
 )
-"""What figures depend on, beside the source."""
+"""Packages that figures depend on, beside the source."""
 
 
 class Meter:
@@ -106,7 +106,7 @@ class Meter:
 
 @dataclass(frozen=True)
 class Turns(Generic[T]):
-    """What contestants that ran in turn gave and took.
+    """Results and seconds of contestants that ran in turn.
 
     Attributes:
         results: contestant -> round -> what it returned.

@@ -18,7 +18,7 @@ NONE, VISIBLE, HIDDEN, AMBIGUOUS = 0, 1, 2, 3
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What the central rays of a camera's pixels hit first.
+    """First hits of the central rays of a camera's pixels.
 
     Attributes:
         depth: (H, W) float64 z along the optical axis; NaN where nothing is hit.

@@ -31,7 +31,7 @@ Samples = tuple[SurfaceSamples, npt.NDArray[np.float64]]
 
 
 class World:
-    """What all variants share of a scene: truth, memoised by view.
+    """Parts of a scene that all variants share: truth, memoised by view.
 
     Args:
         scene: as it was loaded.

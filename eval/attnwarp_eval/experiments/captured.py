@@ -57,7 +57,7 @@ PICTURED = 4
 
 @dataclass(frozen=True)
 class Words:
-    """What is asked for.
+    """Words of an edit.
 
     Attributes:
         instruction: for editors that are told what to change.
@@ -74,7 +74,7 @@ class Words:
 
 @dataclass(frozen=True)
 class Editors:
-    """What edits single views.
+    """Editors of single views.
 
     Attributes:
         picture, depth: in place of the study's editors that take a picture, or depth maps: a name

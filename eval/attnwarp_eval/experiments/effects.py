@@ -110,7 +110,7 @@ def _pictures(scene: Scene, store: Store) -> Task[Part]:
 
 
 def _common(scene: Scene) -> Json:
-    """What decides both: the scene and this version of Mitsuba."""
+    """Entries of both specs: the scene and this version of Mitsuba."""
     import mitsuba
 
     from attnwarp_eval.truth.llvm import variant

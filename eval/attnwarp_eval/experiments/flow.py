@@ -1,4 +1,4 @@
-"""How far figures of consistency along optical flow are from those at exact correspondences.
+"""Distance of figures of consistency along optical flow from those at exact correspondences.
 
 For each scene and yaw: the disagreement of two views on the edited object, exact and along optical
 flow, of four pairs of pictures whose consistency is known. The unedited truth and an edit with one
@@ -44,8 +44,9 @@ little out of place.
 """
 
 PAIRS = ("truth", "one_answer", "slip", "two_answers")
-"""What the two views show: the scene unedited; edited with one answer; the same, the target moved
-by :data:`SLIP`; the source with one answer, the target with another."""
+"""Contents of the two views: the scene unedited; edited with one answer; the same, the target moved
+by :data:`SLIP`; the source with one answer, the target with another.
+"""
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def turned(scene: Scene, yaw: float) -> Camera:
 
 @dataclass(frozen=True)
 class Options:
-    """How a row is measured.
+    """Settings of a row's measurement.
 
     Attributes:
         size: of the square pictures, px.

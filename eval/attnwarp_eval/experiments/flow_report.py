@@ -18,7 +18,7 @@ TITLES = {
     "slip": f"{SLIP} px slip",
     "two_answers": "two answers",
 }
-"""What tables call the pairs."""
+"""Titles of the pairs in tables."""
 
 
 def table(rows: Sequence[Row]) -> Table:

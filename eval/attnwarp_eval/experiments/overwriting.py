@@ -10,7 +10,7 @@ from attnwarp.errors import InputError
 from attnwarp_eval.study.store import Store
 
 Key = tuple[str, ...]
-"""What names a row, such as a question and a scene."""
+"""Key of a row, such as a question and a scene."""
 
 
 def check_nothing_is_lost(

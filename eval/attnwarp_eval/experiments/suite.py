@@ -1,4 +1,4 @@
-"""What the truth of the scenes costs from an empty cache: meshes, geometry and pictures."""
+"""Cost of the scenes' truth from an empty cache: meshes, geometry and pictures."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def measure(
 
 
 def to_dict(times: Sequence[SceneTime]) -> dict[str, Any]:
-    """As JSON: every scene, and the sums over scenes."""
+    """Times as JSON: every scene, and the sums over scenes."""
     total = {
         kind: {stage: sum(getattr(t, kind)[stage] for t in times) for stage in STAGES}
         for kind in ("wall", "cpu")

@@ -127,7 +127,7 @@ def orbit_name(index: int, count: int) -> str:
 
 
 def held_out(count: int) -> list[bool]:
-    """Whether each of ``count`` views is held out: the first of every eight.
+    """Flags of ``count`` views, True where held out: the first of every eight.
 
     Example:
         >>> [index for index, held in enumerate(held_out(20)) if held]

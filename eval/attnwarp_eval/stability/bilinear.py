@@ -16,11 +16,11 @@ import torch
 from attnwarp.warp.taps import SNAP
 
 Extended = npt.NDArray[Any]
-"""Of type ``numpy.longdouble``."""
+"""Array of type ``numpy.longdouble``."""
 
 
 def extended(values: torch.Tensor) -> Extended:
-    """As long doubles: float64 is itself a type that is judged."""
+    """Convert to long doubles: float64 is itself a type that is judged."""
     return values.detach().double().numpy().astype(np.longdouble)
 
 

@@ -1,4 +1,4 @@
-"""What a hard case is, and its outcome at one level of hardness."""
+"""Definition of a hard case, and its outcome at one level of hardness."""
 
 from __future__ import annotations
 
@@ -69,13 +69,13 @@ def ways(*backends: str, precisions: tuple[str, ...] = ("float64", "float32")) -
 
 
 def both_directions(forward: tuple[Way, ...]) -> tuple[Way, ...]:
-    """The same ways with their gradients."""
+    """Add to each way the way of its gradients."""
     return forward + tuple(Way(way.backend, way.precision, "backward") for way in forward)
 
 
 @dataclass(frozen=True)
 class Bound:
-    """How large an error may be.
+    """Largest error that is allowed.
 
     Attributes:
         unit: of the error.
@@ -173,7 +173,7 @@ class Case:
                 raise ValueError(f"{self.name}: no bound for {way.name}")
 
     def is_required(self, level: float, direction: Direction = "forward") -> bool:
-        """Whether this level must hold."""
+        """Return True if this level must hold."""
         return self.levels.index(level) <= self.levels.index(self._required(direction))
 
     def _required(self, direction: Direction) -> float:
@@ -217,7 +217,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one way gives at one level.
+    """Outcome of one way at one level.
 
     Attributes:
         level: of hardness.

@@ -26,12 +26,12 @@ FIELDS = ("means", "quats", "scales", "opacities")
 Number = Any  # mpmath.mpf
 Vector = list[Number]
 Drawn = tuple[Number, Number, Number]
-"""Of one splat at one pixel: depth of its centre, alpha before the cut-offs, depth."""
+"""A splat at one pixel: depth of its centre, alpha before the cut-offs, depth."""
 
 
 @dataclass(frozen=True)
 class Pixel:
-    """What is drawn at one pixel.
+    """Values drawn at one pixel.
 
     Attributes:
         alpha: sum of the weights.

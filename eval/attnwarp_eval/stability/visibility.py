@@ -23,7 +23,7 @@ UNDECIDED = 1e-12
 
 @dataclass(frozen=True)
 class Labels:
-    """What each rule says of the target's pixels.
+    """Labels of the target's pixels by each rule.
 
     Attributes:
         rules: (H, W) bool by the rule's name; the pixel passes.

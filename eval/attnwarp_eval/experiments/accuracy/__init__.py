@@ -1,4 +1,4 @@
-"""What accuracy of the truth itself costs in time: error against seconds of pictures, depth and
+"""Cost in time of the accuracy of the truth itself: error against seconds of pictures, depth and
 visibility.
 
 Every contestant is held against an answer that it does not share: pictures against the mean of many

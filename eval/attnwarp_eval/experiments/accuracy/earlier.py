@@ -82,7 +82,7 @@ def _stored(store: Store) -> dict[Key, list[tuple[Json, Panel]]]:
 
 
 def _is_current(spec: Json, content: Callable[[str], str | None]) -> bool:
-    """Whether a panel would have the same spec if it was measured now."""
+    """Return True if a panel would have the same spec if it was measured now."""
     name = spec["name"]
     return spec == panel_spec(
         spec["question"], name, content(name) or spec["scene"], spec["rounds"]

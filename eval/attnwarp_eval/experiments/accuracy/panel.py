@@ -1,4 +1,4 @@
-"""What contestants for one question on one scene got, and what it took."""
+"""Errors and times of the contestants for one question on one scene."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ QUESTIONS = ("pictures", "depth", "visibility")
 
 @dataclass(frozen=True)
 class Contestant:
-    """What one way to the truth got, and what it took.
+    """Error and time of one way to the truth.
 
     Attributes:
         name: for a person.
@@ -95,7 +95,7 @@ class Panel:
 
 
 def panel_spec(question: str, name: str, content: str, rounds: int) -> Json:
-    """What decides a panel.
+    """Spec of a panel: everything that decides its figures.
 
     Args:
         question: "pictures", "depth" or "visibility".

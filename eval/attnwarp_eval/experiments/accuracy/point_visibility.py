@@ -1,4 +1,4 @@
-"""What visibility costs: rays against depth maps, with exact visibility as the judge."""
+"""Cost of visibility: rays against depth maps, with exact visibility as the judge."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def visibility(
     maps: Sequence[int] = MAPS,
     report: Reporter = SILENT,
 ) -> Panel:
-    """Whether surface points of the middle target are seen by the source: by rays, and by depth
-    maps of the source.
+    """Visibility of the middle target's surface points from the source: by rays, and by depth maps
+    of the source.
 
     A point is asked about when it faces the source and falls inside its image. A depth map answers
     with its nearest pixel (visible when not more than 1 % behind it), or bilinearly in 1 / z (and

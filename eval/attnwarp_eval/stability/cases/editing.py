@@ -92,7 +92,7 @@ def _outside(share: float, way: Way) -> float:
 
 
 class Unet(torch.nn.Module):
-    """What hooks need of a UNet: an attention module by its name, called with latents and a
+    """Least UNet that hooks need: an attention module by its name, called with latents and a
     timestep.
     """
 

@@ -90,8 +90,8 @@ def _of_maps(
 def _gradient_error(
     xy: torch.Tensor, size: tuple[int, int], upstream: torch.Tensor, way: Way
 ) -> float:
-    """Of features of which those that no position reads are infinite or NaN; the gradient in what
-    has no position is NaN.
+    """Error of the gradient in features, infinite or NaN where no position reads them; the gradient
+    in what has no position is NaN.
     """
     shares = sampling_matrix(extended(xy), *size)
     undefined = torch.isnan(xy).any(-1)
@@ -124,7 +124,7 @@ def _holes(share: float, way: Way) -> float:
 
 
 def _readers(count: float, way: Way) -> float:
-    """Of the four inner pixels of 4 x 4, which share all positions."""
+    """Error of the gradient in the four inner pixels of 4 x 4, which share all positions."""
     generator = torch.Generator().manual_seed(5)
     xy = 1.5 + torch.rand(int(count), 1, 2, generator=generator, dtype=torch.float64)
     upstream = random_features((CHANNELS, int(count), 1), way, seed=4, magnitude=1 / count)
@@ -132,7 +132,7 @@ def _readers(count: float, way: Way) -> float:
 
 
 def _blend_error(layer: FeatureWarp, weight: float, way: Way, upstream: torch.Tensor) -> float:
-    """Of the gradients in source and target tokens of a blend."""
+    """Error of the gradients in source and target tokens of a blend."""
     source, new = (
         values[None].clone().requires_grad_()
         for values in random_features((2, SIZE**2, CHANNELS), way, seed=6)
@@ -168,7 +168,7 @@ def _mask(share: float, way: Way) -> float:
 
 
 def _near_equal_depth(gap: float, way: Way) -> float:
-    """Of a blend at a = 1 where the source sees a wall before the target's by a share of its
+    """Error of a blend at a = 1 where the source sees a wall before the target's by a share of its
     depth; the cameras stand side by side.
     """
     K = np.array([[20.0, 0, 8], [0, 20.0, 8], [0, 0, 1]])
@@ -191,8 +191,9 @@ def _near_equal_depth(gap: float, way: Way) -> float:
 
 
 def _injected(weight: float, way: Way) -> float:
-    """Of the gradient in a target's latents, through a layer into which features are injected, in
-    steps of the type at the sum of magnitudes; a token that is replaced whole must have none.
+    """Error of the gradient in a target's latents, through a layer into which features are
+    injected, in steps of the type at the sum of magnitudes; a token that is replaced whole must
+    have none.
     """
     unet = Unet(CHANNELS, way.dtype)
     layer = Layer("attn1", "self", 0, CHANNELS)

@@ -343,7 +343,7 @@ def _rules_of_scale(exponent: float, way: Way) -> tuple[tuple[Camera, Surface], 
 
 @cache
 def _labels_of_rules(precision: str) -> Labels:
-    """Of the scene in its own units. Each rule compares lengths with lengths and shares with
+    """Labels of the scene in its own units. Each rule compares lengths with lengths and shares with
     shares, and a power of two scales lengths exactly: in any units the labels are these.
     """
     (source, seen), (target, surface) = _rules_of_scale(0, Way("reference", precision))
