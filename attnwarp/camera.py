@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -163,6 +163,53 @@ class Camera:
         f = height / 2 / np.tan(np.radians(fov_y) / 2)
         K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
         return cls(K, pose, width, height, name)
+
+    @classmethod
+    def from_c2w(
+        cls,
+        camera_to_world: npt.ArrayLike,
+        K: npt.ArrayLike,
+        width: int,
+        height: int,
+        *,
+        axes: Literal["opencv", "opengl"] = "opencv",
+        name: str = "",
+    ) -> Camera:
+        """Camera from a camera-to-world pose, as Nerfstudio, Blender and many loaders give it.
+
+        Args:
+            camera_to_world: (4, 4) or (3, 4) rigid transform.
+            K: (3, 3) intrinsics in pixels.
+            width, height: image size in pixels.
+            axes: "opencv" (x right, y down, z forward) or "opengl" (x right, y up, z backward), in
+                which Nerfstudio and Blender write poses.
+            name: see :class:`Camera`.
+
+        Raises:
+            ValueError: another shape or name of axes, a pose that is singular, and all that
+                :class:`Camera` refuses.
+
+        Example:
+            >>> import numpy as np
+            >>> from attnwarp import Camera
+            >>> pose = np.eye(4)[:3]  # OpenGL's camera at the origin looks along -z
+            >>> K = [[8, 0, 4], [0, 8, 3], [0, 0, 1]]
+            >>> Camera.from_c2w(pose, K, 8, 6, axes="opengl").project([0.0, 1.0, -2.0])[0].tolist()
+            [4.0, -1.0]
+        """
+        check.one_of(axes, ("opencv", "opengl"), "axes")
+        given = np.asarray(camera_to_world, dtype=np.float64)
+        if given.shape not in ((3, 4), (4, 4)):
+            raise ValueError(f"camera_to_world: got shape {given.shape}, expected (4, 4) or (3, 4)")
+        pose = np.eye(4)
+        pose[: len(given)] = given
+        if axes == "opengl":
+            pose = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+        try:
+            world_to_camera = np.asarray(np.linalg.inv(pose), dtype=np.float64)
+            return cls(np.asarray(K), world_to_camera, width, height, name)
+        except np.linalg.LinAlgError:
+            raise ValueError("camera_to_world: is singular, expected a rigid transform") from None
 
     @property
     def rotation(self) -> Array:

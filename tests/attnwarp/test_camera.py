@@ -8,6 +8,7 @@ import cv2
 import mpmath
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from attnwarp import Camera
@@ -208,3 +209,36 @@ def test_a_view_that_cannot_be_looked_along_is_refused(arguments, message):
     position, target, fov = arguments
     with pytest.raises(ValueError, match=message):
         Camera.look_at(position, target, width=4, height=4, fov_y=fov)
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+@pytest.mark.parametrize("tensors", [False, True])
+def test_a_pose_from_camera_to_world_projects_as_opencv_does(rows, tensors):
+    """Oracles: projectPoints with the inverse by hand; OpenGL's axes are turned by hand."""
+    straight = K.copy()
+    straight[0, 1] = 0
+    R, t = pose()[:3, :3], pose()[:3, 3]
+    to_world = np.eye(4)
+    to_world[:3, :3], to_world[:3, 3] = R.T, -R.T @ t
+    gl = to_world.copy()
+    gl[:, 1:3] *= -1
+    points = np.random.default_rng(1).uniform(-1, 1, (20, 3))
+    expected, _ = cv2.projectPoints(points, cv2.Rodrigues(R)[0], t, straight, None)
+    for axes, matrix in (("opencv", to_world), ("opengl", gl)):
+        given = [torch.from_numpy(x) if tensors else x for x in (matrix[:rows], straight)]
+        xy, _ = Camera.from_c2w(*given, 640, 480, axes=axes).project(points)
+        assert np.abs(xy - expected[:, 0]).max() < 1e-8
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    ("matrix", "axes", "message"),
+    [
+        (np.eye(3), "opencv", r"camera_to_world: got shape \(3, 3\)"),
+        (np.zeros((4, 4)), "opencv", "camera_to_world: is singular"),
+        (np.eye(4), "blender", "axes: got 'blender'"),
+    ],
+)
+def test_a_pose_that_is_none_is_refused(matrix, axes, message):
+    with pytest.raises(ValueError, match=message):
+        Camera.from_c2w(matrix, K, 8, 8, axes=axes)
