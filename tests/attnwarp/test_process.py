@@ -93,12 +93,12 @@ def test_a_signal_that_a_shell_has_a_background_job_ignore_stays_ignored():
 
 @pytest.mark.parametrize("number", STOPS)
 def test_what_asks_a_program_to_end_interrupts_it_unless_it_is_ignored(number):
-    former = signal.getsignal(number)
-    with pytest.raises(KeyboardInterrupt), stops_interrupt():
-        signal.raise_signal(number)
-    assert signal.getsignal(number) is former
-    signal.signal(number, signal.SIG_IGN)  # as nohup does
+    former = signal.signal(number, signal.SIG_DFL)  # under nohup it is ignored
     try:
+        with pytest.raises(KeyboardInterrupt), stops_interrupt():
+            signal.raise_signal(number)
+        assert signal.getsignal(number) is signal.SIG_DFL
+        signal.signal(number, signal.SIG_IGN)  # as nohup does
         with stops_interrupt():
             signal.raise_signal(number)
         assert signal.getsignal(number) is signal.SIG_IGN
