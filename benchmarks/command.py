@@ -1,4 +1,4 @@
-"""What the command lines of several benchmarks share: ``--out`` and the file it names."""
+"""Options that several benchmarks share: ``--out`` and the file it names."""
 
 from __future__ import annotations
 

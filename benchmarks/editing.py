@@ -1,4 +1,4 @@
-"""What half and twice the time of `attnwarp edit` buys: fit, editing and tuning of one scene.
+"""Gain from half and twice the time of `attnwarp edit`: fit, editing and tuning of one scene.
 
 Each plan is fitted on seven of eight views, which gives its held-out PSNR, and the edit then takes
 all views. A plan's fit and edit are resumed in --work.

@@ -47,7 +47,7 @@ ITSELF = "plain again"
 
 @dataclass(frozen=True)
 class Seconds:
-    """Of one edit: CPU seconds of all threads, and of the clock."""
+    """Seconds of one edit: CPU seconds of all threads, and of the clock."""
 
     cpu: float
     wall: float

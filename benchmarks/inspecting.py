@@ -1,4 +1,4 @@
-"""How soon `attnwarp-eval inspect` draws a large scene: ``python -m benchmarks.inspecting``.
+"""Time until `attnwarp-eval inspect` draws a large scene: ``python -m benchmarks.inspecting``.
 
 A hollow ball of 200,000 discs, seen from inside by two cameras of 592 x 592 px: the surface that
 the target sees has 700,000 triangles. Each round runs the whole command, from the start of Python
@@ -38,7 +38,7 @@ SPLATS = 200_000
 SIZE = 592
 
 DISCS, FRAMES = 100_000, 15
-"""Of the window whose frames are timed."""
+"""Discs and frames of the window that is timed."""
 
 OBSERVER = """
 import json, resource, subprocess, sys

@@ -35,5 +35,5 @@ def multiply_add(rounds, result):
 
 
 def start():
-    """What ``multiply_add`` takes as ``result``: the factor, then the addend."""
+    """Start of ``result`` for ``multiply_add``: the factor, then the addend."""
     return np.repeat(np.array([0.999999, 1e-6], np.float32), 16)

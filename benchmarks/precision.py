@@ -1,5 +1,5 @@
-"""How far float32 leads from the renderer's definition where scales are mixed:
-``python -m benchmarks.precision``.
+"""Distance of float32 from the renderer's definition where scales are mixed: ``python -m
+benchmarks.precision``.
 
 Pictures of 40 x 30 pixels, focal length 40 px, of 24 splats three units away. Each scale is drawn
 log-uniform about 1 over a ratio, so that needles and sheets meet in one picture. An error is the
@@ -43,7 +43,7 @@ MODES = [
 RATIOS = (1e0, 1e2, 1e3, 1e4, 1e6, 1e8, 1e10, 1e12)
 
 WIDTHS = (1.0, 0.1, 0.03, 0.01, 0.003, 0.001)
-"""Of needles, px."""
+"""Widths of needles, px."""
 
 LIMIT = 1e-4
 
@@ -58,7 +58,7 @@ px.
 
 
 def prepared(splats: Gaussians, camera: Camera, **options: object) -> Inputs:
-    """What a backend gets from the door, with the door's defaults."""
+    """Inputs of a backend, with the defaults of `render`."""
     given = dict.fromkeys(("depth", "background", "features", "sh_degree", "antialiased", "pose"))
     given |= {"near": constants.NEAR, "ndc": (constants.NDC_NEAR, constants.NDC_FAR)}
     return api._prepare(splats, camera, **(given | options), on_cpu=True)  # type: ignore[arg-type]
@@ -127,7 +127,7 @@ def bracket(inputs: Inputs, displacements: int = 0) -> dict[str, tuple[Tensor, T
 
 
 def excess(inputs: Inputs, displacements: int = 0) -> dict[str, float]:
-    """How far each output of the CPU backend lies outside of what it may be.
+    """Distance by which each output of the CPU backend lies outside of its bounds.
 
     Raises:
         AssertionError: an output is NaN where it is defined, or the other way round.

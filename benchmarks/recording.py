@@ -141,7 +141,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def verdict(plan: RecordingPlan, rows: Sequence[Row]) -> str:
-    """What was announced beside what the peak rose by, in a line."""
+    """Line with the announced memory beside the rise of the peak."""
     announced, rose = plan.bytes / 2**20, {row.run: row.above_mib for row in rows}["recorded"]
     return (
         f"announced {announced:.1f} MiB; recorded, the peak rose by {rose:.1f} MiB,"

@@ -1,4 +1,4 @@
-"""How fast splats are rendered on this machine: ``python -m benchmarks.render`` (``make bench``).
+"""Speed at which this machine renders splats: ``python -m benchmarks.render`` (``make bench``).
 
 One process. The cases run in turn (:func:`attnwarp_eval.cost.in_turn`), so that a slow moment of
 the machine falls on all of them; the median over rounds is reported, with the fastest beside it.

@@ -1,4 +1,5 @@
-"""What a study of many cells costs beside them: planning, storing, verifying, reporting, comparing.
+"""Cost of a study of many cells beside the cells themselves: planning, storing, verifying,
+reporting, comparing.
 
 The cells compute nothing, so that only this is measured. Every step runs in a process of its own,
 whose seconds and peak memory are read at its end.
@@ -39,11 +40,13 @@ SCENES = ["spheres", "opposed", "fence", "mirror", "glass", "lens", "stack", "sl
 FIGURES = ("depth.abs_rel", "depth.bias_relative", "depth.coverage")
 
 LIMIT_SECONDS, LIMIT_MB = 120, 2048
-"""Of each step at 100,000 cells."""
+"""Limits of each step at 100,000 cells."""
 
 
 class VariantPart(Part):
-    """What tells the variants apart, and the seconds that their cells wait, as if they worked."""
+    """Key that tells the variants apart, and the seconds that their cells wait, as if they
+    worked.
+    """
 
     level: int = 0
     wait: float = 0.0
@@ -216,7 +219,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 WORKERS = 2
-"""Of the cluster."""
+"""Workers of the cluster."""
 
 
 def cluster(cells: int, folder: Path, wait: float = 0.0) -> str:

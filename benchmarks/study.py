@@ -1,4 +1,4 @@
-"""Where the seconds of a study go, by part: ``python -m benchmarks.study [quick] [--scenes bear]``.
+"""Seconds of a study, by part: ``python -m benchmarks.study [quick] [--scenes bear]``.
 
 The study runs in this process, in a new folder with an empty cache of derived files. A thread looks
 every 20 ms what the main thread is at, and gives that part the CPU seconds of all threads since the

@@ -1,4 +1,4 @@
-"""How fast views and attention features are warped: ``python -m benchmarks.warp``.
+"""Speed at which views and attention features are warped: ``python -m benchmarks.warp``.
 
 One process. All contestants run in turn (:func:`attnwarp_eval.cost.in_turn`), so that a slow moment
 of the machine falls on all of them. The table has the median over rounds. A ratio is the median of

@@ -59,7 +59,7 @@ def consistency_of_normals(splats: Gaussians) -> None:
 
 
 def in_double(splats: Gaussians) -> Gaussians:
-    """The same splats in float64, which has kernels of its own."""
+    """Convert splats to float64, which has kernels of its own."""
     names = ("means", "quats", "scales", "opacities", "sh")
     return dataclasses.replace(splats, **{name: getattr(splats, name).double() for name in names})
 

@@ -20,7 +20,7 @@ COMMANDS = {
 """File -> arguments of attnwarp-eval inspect."""
 
 WIDTH = 1200
-"""Of the pictures, in pixels."""
+"""Width of the pictures, in pixels."""
 
 
 def draw(folder: Path, name: str) -> None:

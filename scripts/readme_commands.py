@@ -32,7 +32,7 @@ def commands(text: str) -> list[list[str]]:
 
 
 def problem(words: list[str], folder: Path, run: str | None) -> str | None:
-    """What goes wrong with a command; None for nothing."""
+    """Describe what goes wrong with a command; None for nothing."""
     here = [run if run and word in ("runs/mine", "runs/demo") else word for word in words[1:]]
     of_run = bool({"runs/mine", "runs/demo"} & {*words})
     soon = " ".join(here).startswith(SOON) and (run is not None or not of_run)

@@ -31,7 +31,7 @@ SIX_DIGITS = 1e-5
 
 @dataclass(frozen=True)
 class Facts:
-    """What two readers must agree on."""
+    """Facts that two readers must agree on."""
 
     triangles: int | None
     area: float

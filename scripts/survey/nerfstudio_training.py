@@ -33,7 +33,7 @@ ANGLE = 1e-5
 
 
 def parsed(data: Path, split: str) -> Any:
-    """What nerfstudio's dataparser makes of one split."""
+    """Parse one split with nerfstudio's dataparser."""
     return NerfstudioDataParserConfig(data=data).setup().get_dataparser_outputs(split)
 
 

@@ -1,4 +1,4 @@
-"""What comes of one file read by two readers."""
+"""Outcome of one file read by two readers."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Reading:
-    """What our reader made of a file: exactly one of ``result`` and ``error`` is set."""
+    """Reading of a file by our reader: exactly one of ``result`` and ``error`` is set."""
 
     result: object | None
     error: Exception | None

@@ -27,8 +27,9 @@ PART = "transforms.json"
 SIZE = (40, 30)
 FRAMES = 4
 TOLERANCE = 1e-6
-"""Of centres in scene units, of directions in radians, of pixels as a share of one: six digits of a
-printed matrix, or a rotation in float32, move none of them by more."""
+"""Tolerance of centres in scene units, of directions in radians, of pixels as a share of one: six
+digits of a printed matrix, or a rotation in float32, move none of them by more.
+"""
 
 Data = dict[str, Any]
 
