@@ -49,8 +49,8 @@ def placed_crops(
     images: npt.NDArray[np.uint8], out: int, rng: np.random.Generator, *, scale: tuple[float, float],
     turn: float = 8.0, tone: float = 0.12, flip: bool = True,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """As :func:`crops`, and where each came from: (N, 2, 3) maps from the crop's [-1, 1] to the
-    picture's.
+    """Crops as :func:`crops` cuts them, and the place of each: (N, 2, 3) maps from the crop's [-1,
+    1] to the picture's.
     """
     n = len(images)
     side = rng.uniform(*scale, n)

@@ -15,7 +15,7 @@ import numpy as np
 from attnwarp.io.file import write_atomically
 
 LAST_EPOCHS = 10
-"""Of whose losses a table gives the mean."""
+"""Number of the last epochs whose mean loss a table gives."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Entry:
 
 
 def log_path(checkpoint: Path) -> Path:
-    """Where the log of a checkpoint lies."""
+    """Path of the log of a checkpoint."""
     return checkpoint.with_suffix(".log.jsonl")
 
 

@@ -30,7 +30,7 @@ Inputs = dict[str, Tensor]
 
 
 def constants() -> dict[str, float]:
-    """What every training's result depends on, by name."""
+    """Constants that every training's result depends on, by name."""
     return {"EMA": EMA, "WARM": WARM, "STEPS_AN_EPOCH": STEPS_AN_EPOCH, "DRAWN": DRAWN}
 
 
@@ -52,11 +52,11 @@ class Task:
 
 
 class Plan(Protocol):
-    """What :func:`train_steps` reads of a stage."""
+    """Stage as :func:`train_steps` reads it."""
 
     @property
     def steps(self) -> int:
-        """Of the whole stage."""
+        """Steps of the whole stage."""
 
     @property
     def peak(self) -> float:
@@ -64,7 +64,7 @@ class Plan(Protocol):
 
     @property
     def seed(self) -> int:
-        """Of everything random."""
+        """Seed of everything random."""
 
 
 def falling_rate(step: int, total: int, peak: float, warm: int = WARM) -> float:

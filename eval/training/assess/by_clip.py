@@ -102,7 +102,7 @@ def judgements(
 
 
 Found = tuple[bool, bool, bool, int]
-"""Of a picture, see :func:`_judged`."""
+"""Verdict on a picture, see :func:`_judged`."""
 
 
 def _drawn(
@@ -117,8 +117,9 @@ def _drawn(
 def _judged(
     answer: Answer, worlds: Worlds, encoder: TextImageEncoder, kind: str, world: int, draw: int, size: int
 ) -> Found:  # fmt: skip
-    """Whether the judge finds the look in the editor's and in the true picture, whether its mean colour is right,
-    and how many looks there were to choose from."""
+    """Tell whether the judge finds the look in the editor's and in the true picture, whether its
+    mean colour is right, and how many looks there were to choose from.
+    """
     from attnwarp_eval.metrics import directional_similarity
 
     pairs = Pictures(worlds, size)
@@ -139,7 +140,9 @@ def _judged(
     shape = (len(choices), len(start))
 
     def found(end: npt.NDArray[np.float32]) -> bool:
-        """Whether the words that were asked for are nearest; an unchanged picture has no nearest."""
+        """Return True if the words that were asked for are nearest; an unchanged picture has no
+        nearest.
+        """
         values = directional_similarity(
             np.broadcast_to(start, shape), np.broadcast_to(end, shape), source, words
         ).values

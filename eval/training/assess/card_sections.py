@@ -44,7 +44,7 @@ def percent(f: Figure) -> str:
 
 
 def asked_for(f: Figure) -> str:
-    """What was asked of a figure, for a table."""
+    """Requirement on a figure, for a table."""
     if f.at_most is not None:
         return f"at most {100 * f.at_most:.0f} %"
     return "" if f.asked is None else f"{100 * f.asked:.0f} %"

@@ -1,4 +1,5 @@
-"""Whether an editor's attention carries the answer, and where: swapped features on worlds that it has never seen.
+"""Test of whether an editor's attention carries the answer, and where: swapped features on worlds
+that it has never seen.
 
 Run A of an open instruction answers one colour, run B of the same picture from other noise another. A's features go
 into B, and the figures say whose colour B then has: everywhere, in a half, from another picture, along a true warp.
@@ -38,13 +39,15 @@ BATCH = 16
 
 PAIRS = 200
 MOST_ROUNDS = 20
-"""Of pictures; an editor that seldom answers two colours would never come to an end."""
+"""Largest number of rounds of pictures; an editor that seldom answers two colours would never come
+to an end.
+"""
 
 CONSTANT = 0.9
 """The weight of features where it does not fall."""
 
 LEAST_SHARE = 0.03
-"""Of the picture: a smaller thing in it, or in a half, is not judged."""
+"""Least share of the picture: a smaller thing in it, or in a half, is not judged."""
 
 EXACT = WarpSettings(opaque=None, normal_test="none", depth_relative=EXACT_DEPTH_TOLERANCE)
 
@@ -156,7 +159,7 @@ QUESTIONS: dict[str, tuple[str, dict[str, float]]] = {
 }
 
 Marks = dict[str, list[tuple[bool, int]]]
-"""Whether each answer was right, and its world, by a key of :data:`QUESTIONS`."""
+"""Marks of answers: right or not, and the world, by a key of :data:`QUESTIONS`."""
 
 
 def swap_figures(

@@ -1,4 +1,6 @@
-"""What ``small-depth`` makes of depth maps and prompts that it has never seen, beside a wrong prompt and another depth map."""
+"""Figures of ``small-depth`` on depth maps and prompts that it has never seen, beside a wrong
+prompt and another depth map.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ from training.worlds.editing_pairs import GROUPS, load_pairs
 STEPS = 20
 
 SHEETS = "../../../../reports/editor"
-"""Where a card finds the pictures of ``python -m training.editors sheet``."""
+"""Folder in which a card finds the pictures of ``python -m training.editors sheet``."""
 
 SHAPES = 10
 """Masks among which a picture has to show its own."""

@@ -1,4 +1,6 @@
-"""What a bundled editor does on worlds that it has never seen, each figure with its interval, beside an editor that changes nothing."""
+"""Figures of a bundled editor on worlds that it has never seen, each figure with its interval,
+beside an editor that changes nothing.
+"""
 
 from __future__ import annotations
 
@@ -104,7 +106,9 @@ def assess(
 
 
 def _open(answer: Answer, pairs: Pictures, noises: int) -> Figure:
-    """How often an open instruction's result is nearer to one of the true answers than to the picture before."""
+    """Share of cases in which an open instruction's result is nearer to one of the true answers
+    than to the picture before.
+    """
     worlds = pairs.worlds
     right, groups = [], []
     for world in range(0, len(worlds), 4):

@@ -65,7 +65,7 @@ class Figure:
 
     @property
     def short(self) -> bool:
-        """Whether it misses what was asked for."""
+        """True if it misses what was asked for."""
         return (self.asked is not None and self.value < self.asked) or (
             self.at_most is not None and self.value > self.at_most
         )
@@ -276,7 +276,7 @@ def _direction(encoder: TextImageEncoder, images: Array, pictures: Pictures) -> 
 
 
 def _viewpoint(images: Array, pictures: Pictures, labels: dict[str, Array]) -> Figure:
-    """Whether both views of a thing get the same name."""
+    """Share of things whose two views get the same name."""
     guess = (images @ labels["object"].T).argmax(axis=1)
     index = {
         (w, v, k): i

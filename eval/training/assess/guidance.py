@@ -1,4 +1,6 @@
-"""Whether another guidance would edit better, on worlds that are neither trained nor reported on."""
+"""Test of whether another guidance would edit better, on worlds that are neither trained nor
+reported on.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ GUIDANCES = ((1.5, 1.0), (2.5, 1.0), (4.0, 1.0), (1.5, 1.5), (2.5, 1.5))
 KINDS = ("color", "material")
 
 LEAST_PIXELS = 250
-"""Of the thing in each view of 128 x 128 px; worlds that show less of it are left out."""
+"""Least pixels of the thing in each view of 128 x 128 px; worlds that show less of it are left
+out.
+"""
 
 
 def shown(worlds: Worlds) -> Worlds:

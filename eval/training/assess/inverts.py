@@ -1,4 +1,6 @@
-"""How well an editor of depth maps rebuilds a picture from its DDIM inversion, on worlds that it has never seen."""
+"""Accuracy with which an editor of depth maps rebuilds a picture from its DDIM inversion, on worlds
+that it has never seen.
+"""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from training.worlds.part_pictures import PARTS, PartPictures
 Array = npt.NDArray[np.float64]
 
 LEAST_SHARE = 0.02
-"""Of a picture that a part covers where it is asked about."""
+"""Least share of a picture that a part covers where it is asked about."""
 
 SCENES = ("bear", "person", "dinosaur", "face", "garden", "stump")
 """The scenes that have edits; no recipe sees them."""

@@ -38,7 +38,7 @@ class Pictures:
         self.worlds, self.size = worlds, size
 
     def corner(self, world: int, view: int, rng: np.random.Generator) -> tuple[int, int, int]:
-        """Where a picture is cut from: (y, x, px of the full picture to one of the cut)."""
+        """Place that a picture is cut from: (y, x, px of the full picture to one of the cut)."""
         step = SIZE // self.size
         if step == 1 or rng.uniform() < 0.5:
             return 0, 0, step

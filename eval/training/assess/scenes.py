@@ -1,4 +1,4 @@
-"""What an editor makes of the package's own scenes and sentences, which no recipe sees.
+"""Figures of an editor on the package's own scenes and sentences, which no recipe sees.
 
 For each edit and view: of the true results of all the scene's edits, the one nearest to the editor's picture has to be
 the one that was asked for.
@@ -27,7 +27,7 @@ LEAST_PIXELS = 12
 
 @dataclass
 class SceneAnswers:
-    """Whether each answer was right, and its scene.
+    """Marks of answers, right or not, and their scenes.
 
     Attributes:
         asked: of the sentence that was given.

@@ -54,7 +54,9 @@ def overlap(mask: Mask, truth: Mask) -> float:
 
 
 def pictures(worlds: Worlds) -> Iterator[tuple[Image, Mask, str, str]]:
-    """Of each world a picture in a random look, the exact mask of its thing, the word for it, and the word for a thing that is absent."""
+    """Yield of each world a picture in a random look, the exact mask of its thing, the word for it,
+    and the word for a thing that is absent.
+    """
     for world in range(len(worlds)):
         rng = np.random.default_rng([5, world])
         view, look = int(rng.integers(2)), int(rng.choice(np.flatnonzero(worlds.valid[world])))
@@ -66,7 +68,9 @@ def pictures(worlds: Worlds) -> Iterator[tuple[Image, Mask, str, str]]:
 
 
 def part_pictures(pictures: PartPictures) -> Iterator[tuple[Image, Mask, str, str]]:
-    """Of each world a picture, the exact mask of one of its parts or of all, the words, and a part that no such thing has."""
+    """Yield of each world a picture, the exact mask of one of its parts or of all, the words, and a
+    part that no such thing has.
+    """
     for row in np.flatnonzero(pictures.look == 0):
         world = int(pictures.world[row])
         if int(pictures.view[row]) != world % 2:
@@ -117,7 +121,9 @@ def assess(segmenter: Segmenter, asked: Iterable[tuple[Image, Mask, str, str]]) 
 
 
 def scene_overlaps(segmenter: Segmenter) -> list[tuple[str, str, float | None, float]]:
-    """Of each scene's source view: name, words, overlap (None without a detection), the mask's share of the picture."""
+    """Row for each scene's source view: name, words, overlap (None without a detection), the mask's
+    share of the picture.
+    """
     from attnwarp_eval.scene.file import load_scene
     from attnwarp_eval.world import World
 

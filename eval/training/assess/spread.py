@@ -1,4 +1,4 @@
-"""How an editor's answers to one open instruction are spread over its noises."""
+"""Spread of an editor's answers to one open instruction over its noises."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LEAST_SHARE = 0.08
 LEAST_ANSWERS = 4
 
 LEAST_THING = 0.03
-"""Of the picture: a smaller thing is not asked about."""
+"""Least share of the picture: a smaller thing is not asked about."""
 
 NONE = "none"
 
@@ -91,7 +91,7 @@ def questions(worlds: Worlds, size: int, kinds: Sequence[str] = KINDS) -> list[Q
 def answered(
     editor: Any, question: Question, noises: int, kept: Kept, *, steps: int = STEPS
 ) -> Counter[str]:
-    """How often each answer comes out, with :data:`NONE` among them.
+    """Count how often each answer comes out, with :data:`NONE` among them.
 
     Args:
         editor: to judge.

@@ -61,7 +61,7 @@ NAMES_PLACE = 0.8
 """Probability that a prompt names the ground, and that it names the time of day, each."""
 
 GUIDANCE = 2.0
-"""Of the bundled editor; ControlNet's own 5 to 7.5 saturates its colours."""
+"""Guidance weight of the bundled editor; ControlNet's own 5 to 7.5 saturates its colours."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from training.worlds.editing_pairs import (
 )
 
 DRAW_STEPS = 3_000
-"""Of the layers alone."""
+"""Steps of training for the layers alone."""
 
 DRAW_GAIN = 12.0
 """By how much, at first, a noise's nearness to an answer's direction counts: the nearest gets nearly all."""
@@ -46,7 +46,7 @@ def _states(net: EditorNet, tokenizer: Tokenizer, texts: list[str]) -> Tensor:
 def differences(
     net: EditorNet, tokenizer: Tokenizer, worlds: Worlds, rng: np.random.Generator
 ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
-    """What a clear sentence has more than an open one.
+    """Differences of a clear sentence from an open one.
 
     Returns:
         (TEXTS, D) last tokens of open sentences, by kind; (N, D) of clear ones and of none;

@@ -20,7 +20,7 @@ from training.editors.recipe import STAGES, tokenizer_of
 
 @dataclass(frozen=True)
 class Spent:
-    """What a stage took so far.
+    """Steps and time that a stage took so far.
 
     Attributes:
         steps: taken.
@@ -41,7 +41,7 @@ def averaged(stage: str, out: Path) -> tuple[EditorNet, Tokenizer, Spent]:
 
 
 def depth_averaged(stage: str, out: Path) -> tuple[DepthNet, Tokenizer, Spent]:
-    """As :func:`averaged`, of a stage of :mod:`training.editors.depth`."""
+    """Averaged network, as :func:`averaged`, of a stage of :mod:`training.editors.depth`."""
     tokenizer = tokenizer_of(out)
     net = DepthNet(tokenizer.get_vocab_size(), DEPTH_STAGES[stage].size)
     return net, tokenizer, _load(net, out / f"{stage}.pt")
@@ -108,7 +108,7 @@ def _write(
 
 
 def facts_of(stage: str, out: Path) -> dict[str, object]:
-    """What an editor's card says about its training."""
+    """Facts in an editor's card about its training."""
     spent, plan = averaged(stage, out)[2], STAGES[stage]
     before, seconds, start = 0, spent.seconds, plan.start
     while start is not None:
@@ -133,7 +133,7 @@ def facts_of(stage: str, out: Path) -> dict[str, object]:
 
 
 def depth_facts_of(stage: str, out: Path) -> dict[str, object]:
-    """What the card of an editor of depth maps says about its training."""
+    """Facts in the card of an editor of depth maps about its training."""
     spent, plan = depth_averaged(stage, out)[2], DEPTH_STAGES[stage]
     done = spent.steps >= plan.steps
     return {

@@ -41,7 +41,7 @@ NO_TEXT = 0.1
 """Share of the pairs whose runs both have no text, as guidance's other branch has."""
 
 WAYS = {"same": 0.35, "mirrored": 0.15, "shifted": 0.15, "other view": 0.25, "unrelated": 0.1}
-"""Where run A's features come from, and how often."""
+"""Sources of run A's features, and the share of each."""
 
 INJECTED_KINDS = {"color": 0.6, "material": 0.25, "ground": 0.15}
 
@@ -64,7 +64,8 @@ def regions(cells: int, count: int, pool: PairPool, generator: torch.Generator) 
 
 
 class Moves:
-    """How features of run A lead to run B's grid, one a pair: an index into A's cells, and where there is one.
+    """Moves of run A's features to run B's grid, one a pair: an index into A's cells, and where
+    there is one.
 
     Args:
         cells: along a side of the latents.

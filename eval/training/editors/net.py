@@ -33,7 +33,9 @@ MOST_WEIGHT = 5.0
 SD_BETAS = (0.00085, 0.012)
 """Stable Diffusion's, first and last."""
 SHIFT = 16.0
-"""How many times the signal-to-noise amplitude of Stable Diffusion's is at a step, see :func:`scheduler`."""
+"""Factor that multiplies the signal-to-noise amplitude of Stable Diffusion at each step, see
+:func:`scheduler`.
+"""
 
 
 class EditorNet(torch.nn.Module):

@@ -44,7 +44,7 @@ MOST_THING_WEIGHT = 8.0
 be learned. The mask depends on the picture before alone, so the best prediction stays the same."""
 
 HALF_PLANES = 0.7
-"""Of the regions of composed results; the others are boxes."""
+"""Share of half planes among the regions of composed results; the others are boxes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ class PicturePool:
     def corner(
         self, world: Tensor, view: Tensor, size: int, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Where pictures are cut from: y, x and zoom, see :class:`Rows`."""
+        """Place that pictures are cut from: y, x and zoom, see :class:`Rows`."""
         count, step = len(world), SIZE // size
         whole = torch.ones(count, dtype=torch.bool, device=self.device)
         if step > 1:
@@ -331,7 +331,7 @@ def cut_regions(thing: Tensor, pool: PicturePool, generator: torch.Generator) ->
 
 
 def tables_of(worlds: Worlds, tokenizer: Tokenizer, sentences: int = SENTENCES) -> dict[str, Tensor]:  # fmt: skip
-    """What pairs are drawn by.
+    """Tables that pairs are drawn by.
 
     Returns:
         ``pairs``: (N, kinds, LOOKS, LOOKS) chance of a pair of looks, 0 where it is none of the kind;

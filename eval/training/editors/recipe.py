@@ -59,13 +59,13 @@ UNCLEAR = 0.35
 """Share of pairs whose instruction leaves the answer to the noise."""
 KINDS = {"color": 0.45, "material": 0.15, "pattern": 0.05, "ground": 0.2, "time": 0.15}
 INJECTED_SHARE = 0.7
-"""Of the steps of a stage with injection; the others are plain."""
+"""Share of injected steps in a stage with injection; the others are plain."""
 
 NET_CONSTANTS = (
     "WIDTHS", "LAYERS", "HEADS", "TEXT_WIDTH", "TEXT_LAYERS", "VOCABULARY", "TOKENS", "T_STEPS", "NOISY_SHARE",
     "MOST_WEIGHT",
 )  # fmt: skip
-"""What every stage's result depends on, of :mod:`training.editors.net`."""
+"""Constants that every stage's result depends on, of :mod:`training.editors.net`."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ def dropped(batch: Batch, empty: Tensor, generator: torch.Generator) -> tuple[Te
 
 
 def constants() -> dict[str, Any]:
-    """What every stage's result depends on, by name."""
+    """Constants that every stage's result depends on, by name."""
     own = {"DROP": DROP, "UNCLEAR": UNCLEAR, "KINDS": KINDS}
     return own | {key: getattr(editor_net, key) for key in NET_CONSTANTS}
 
@@ -255,7 +255,7 @@ def weights_of(out: Path, stage: str) -> dict[str, Tensor]:
 def tasks_of(
     stage: Stage, pool: PairPool, net: EditorNet, alphas: Tensor, empty: Tensor
 ) -> list[Task]:
-    """What a stage's steps are of: plain pairs or injected ones, small pictures or large ones."""
+    """Tasks of a stage's steps: plain pairs or injected ones, small pictures or large ones."""
     tasks = []
     for size, share in ((stage.size, 1 - stage.large), (2 * stage.size, stage.large)):
         if share == 0:

@@ -187,7 +187,7 @@ def shares_of(ids: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
 
 
 def surface_choices() -> list[tuple[int, int, int]]:
-    """What is asked of a part: its colour, or which material it has."""
+    """Choices for a part: its colour, or its material."""
     plain = [(-1, c, -1) for c in range(len(COLORS))]
     return plain + [(FINISHES.index(m), -1, -1) for m in STATUES]
 
@@ -262,7 +262,7 @@ def whole_losses(
     tokenizer: Tokenizer,
     rng: np.random.Generator,
 ) -> Tensor:
-    """What a picture shows, on which ground and at what time, each by its words alone."""
+    """Losses of what a picture shows, on which ground and at what time, each by its words alone."""
     columns = [
         (kind, [f"a photo of {with_article(_one(WHOLE_NOUNS[k], rng))}" for k in KINDS]),
         (ground, [f"something {_one(PLACES[g], rng)}" for g in GROUNDS]),

@@ -121,7 +121,7 @@ def spread(tokens: Tensor) -> Tensor:
 
 
 def places(inner: Tensor, outer: Tensor, size: int) -> Tensor:
-    """Where the patches of one crop lie in another crop of the same picture.
+    """Positions of the patches of one crop in another crop of the same picture.
 
     Args:
         inner, outer: (N, 2, 3) maps of the crops to the picture's [-1, 1].

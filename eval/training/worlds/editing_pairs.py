@@ -69,7 +69,7 @@ GROUPS = {
 edit may lead from any of them to any other."""
 
 THING, GROUND, OTHER, SKY = 0, 1, 2, 255
-"""What a pixel shows."""
+"""Labels of what a pixel shows."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def thing_of(world: World) -> int:
 
 
 def noun_of(thing: int, kind: str, rng: np.random.Generator) -> str:
-    """What a sentence calls it: "it", "the mug", "the jacket", "the jacket of the person".
+    """Noun for a thing in a sentence: "it", "the mug", "the jacket", "the jacket of the person".
 
     Of a thing with parts, an edit of the ground or the light names the whole.
     """
@@ -120,7 +120,7 @@ def noun_of(thing: int, kind: str, rng: np.random.Generator) -> str:
 
 
 def is_part(thing: int) -> bool:
-    """Whether an edit changes a part of something, which no sentence calls a statue."""
+    """Return True if an edit changes a part of something, which no sentence calls a statue."""
     return thing >= len(OBJECTS) and (thing - len(OBJECTS)) % len(PARTS) != PARTS.index(WHOLE)
 
 
@@ -237,7 +237,9 @@ def render_edit_world(index: int, split: PairSplit) -> dict[str, Any]:
 
 
 def shown_things(objects: npt.NDArray[np.integer[Any]], world: World) -> npt.NDArray[np.int64]:
-    """What each pixel shows, of the numbers of a scene's objects: the edited ones, the ground, others, the sky."""
+    """Label each pixel with what it shows, from the numbers of a scene's objects: the edited ones,
+    the ground, others, the sky.
+    """
     edited = world.edited() if isinstance(world, Assembly) else (0,)
     ground = len(world.pieces()) if isinstance(world, Assembly) else 1
     shown = np.where(objects == ground, GROUND, OTHER)

@@ -51,7 +51,7 @@ SOME_HUES = {
 
 @dataclass(frozen=True)
 class Caption:
-    """What a sentence says.
+    """Content of a sentence.
 
     Attributes:
         kind: index into :data:`attnwarp_eval.drawn.assemblies.KINDS`, or -1.
@@ -68,7 +68,7 @@ class Caption:
 
 
 def said(surface: Sequence[int], rng: np.random.Generator) -> Surface:
-    """What a caption says of a surface: plain is never said, shiny seldom."""
+    """Choose what a caption says of a surface: plain is never said, shiny seldom."""
     finish, color, second = (int(v) for v in surface)
     kind = FINISHES[finish]
     if kind == "plain" or (kind == "shiny" and rng.uniform() < 0.5):

@@ -33,7 +33,7 @@ SHARD = 17
 
 OTHER, SKY = 254, 255
 GROUND = 253
-"""What a pixel shows that shows no part: the ground, something else, the sky."""
+"""Label of a pixel that shows no part: the ground, something else, the sky."""
 
 Ints = npt.NDArray[np.int64]
 
@@ -178,7 +178,7 @@ def dresses(world: Assembly) -> list[Dress]:
 
 
 def words_of(look: Look) -> tuple[int, int, int]:
-    """What words can say of a surface: finish, color, second."""
+    """Attributes of a surface that words can tell: finish, color, second."""
     return look.finish, look.color, look.second
 
 
