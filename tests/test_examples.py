@@ -150,7 +150,7 @@ source_features = torch.rand(8, 64, 64)
 source_tokens, own_tokens = torch.rand(2, 1, 64 * 64, 8)
 """,
 }
-"""What a page's blocks take for granted. Blocks of pages that are not here run as they are."""
+"""Code that a page's blocks take for granted. Blocks of pages that are not here run as they are."""
 
 NOT_RUN = {
     "docs/encoders.md": "weights of the user's own",

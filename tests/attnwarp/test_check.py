@@ -1,4 +1,4 @@
-"""What doors take for numbers and sizes, against Python's own values."""
+"""Numbers and sizes that public functions take, against Python's own values."""
 
 import json
 from fractions import Fraction

@@ -41,7 +41,7 @@ def threads_as_before():
 
 
 def in_process(*arguments):
-    """The same command without starting a process, which costs seconds of imports."""
+    """Run the command without starting a process, which costs seconds of imports."""
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 

@@ -169,7 +169,7 @@ def figure():
 
 
 def write_scan(folder, mesh):
-    """As scanners write: float32, vertex colours, faces of any kind."""
+    """Write a mesh as scanners do: float32, vertex colours, faces of any kind."""
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
     head += [f"property float {c}" for c in "xyz"] + [
         f"property uchar {c}" for c in ("red", "green", "blue")

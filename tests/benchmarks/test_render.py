@@ -1,4 +1,4 @@
-"""What the benchmark says of its own figures: the fits, against scipy's, and the table."""
+"""Statements of the benchmark on its own figures: the fits, against scipy's, and the table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the benchmark of the warp measures, and that its contestants compute the same."""
+"""Measurements of the warp's benchmark, whose contestants compute the same."""
 
 from __future__ import annotations
 

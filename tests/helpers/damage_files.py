@@ -35,20 +35,22 @@ NUMBERS = (
     "0", "-0.0", "-1", "1", "255", "256", "65536", "-2147483649", "4294967296", "1e-320", "1e39",
     "-1e308", "1e999", "nan", "NaN", "-inf", "Infinity", "0x10", "1_000", "9" * 30, "7" * 5000,
 )  # fmt: skip
-"""What replaces a number of a text: ends of types, values that are not finite, other spellings."""
+"""Replacements for a number of a text: ends of types, values that are not finite, other
+spellings.
+"""
 
 WORDS = (
     "true", "false", "null", "[]", "{}", '"text"', '"3.5"', "''", "~", "[[[[", "]]]]", "{{", "}}",
     ":", ",", "-", "#", "&a", "*a", "!!int 'x'", "../../outside", "\\u0000", "é", "\t", "\r\n",
 )  # fmt: skip
-"""What stands in for a token or between two tokens of a text."""
+"""Words put in place of a token or between two tokens of a text."""
 
 PATCHES = (
     b"\x00" * 4, b"\xff" * 4, b"\x00" * 8, b"\xff" * 8, struct.pack("<f", float("nan")),
     struct.pack("<f", float("inf")), struct.pack("<d", 1e300), struct.pack("<I", 1 << 31),
     struct.pack("<Q", 1 << 40), b"\n", b" ", b"\r\n", b"end_header\n", b"PK\x03\x04",
 )  # fmt: skip
-"""What overwrites, or is put between, the bytes of a file."""
+"""Bytes that overwrite those of a file, or are put between them."""
 
 
 def mutate_bytes(data: bytes, seed: int) -> bytes:
@@ -205,7 +207,7 @@ _TEXT: tuple[Callable[[str, random.Random], str], ...] = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one input.
+    """Outcome of one input.
 
     Attributes:
         case: its label, such as "ply 17", by which it is made again.
@@ -220,7 +222,7 @@ class Outcome:
 
     @property
     def failed(self) -> bool:
-        """Whether it is neither a result nor a refusal in one line."""
+        """True if it is neither a result nor a refusal in one line."""
         return self.kind not in ("result", "refused")
 
 
@@ -233,7 +235,7 @@ def failures(
     refusals: tuple[type[BaseException], ...],
     text: bool = False,
 ) -> list[str]:
-    """What went wrong with damaged copies of a file, each by its label: the name and the seed.
+    """Failures of damaged copies of a file, each by its label: the name and the seed.
 
     Args:
         name: of the file or of its format.

@@ -1,4 +1,4 @@
-"""How many pictures a run keeps while it tunes on them."""
+"""Number of pictures that a run keeps while it tunes on them."""
 
 import weakref
 from functools import partial

@@ -1,4 +1,4 @@
-"""What a piece of code imports, from the modules of a fresh process."""
+"""Imports of a piece of code, from the modules of a fresh process."""
 
 import subprocess
 import sys

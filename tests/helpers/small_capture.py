@@ -9,7 +9,7 @@ from attnwarp.io import Dataset, write_ply, write_transforms
 from attnwarp.render import render
 
 NAMES = ("my_capture", "my-capture", "DATA", "capture")
-"""What documents call the capture; each is the folder itself."""
+"""Names of the capture in documents; each is the folder itself."""
 
 
 def write(folder):

@@ -67,7 +67,7 @@ ONE_LEVEL = {
 
 @pytest.fixture(scope="session")
 def editor():
-    """Of pictures."""
+    """Editor of pictures."""
     net = unet(8, **ONE_LEVEL)
     loud(net)
     return InstructPix2Pix(net, **parts(), text_guidance=3.0)
@@ -75,7 +75,7 @@ def editor():
 
 @pytest.fixture(scope="session")
 def depth_editor():
-    """Of depth maps."""
+    """Editor of depth maps."""
     net = unet(4, **ONE_LEVEL)
     torch.manual_seed(1)
     control = ControlNetModel.from_unet(net, conditioning_embedding_out_channels=(8, 8)).eval()

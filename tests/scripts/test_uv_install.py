@@ -18,7 +18,7 @@ PIP = [sys.executable, "-m", "pip"]
 
 
 def _of_pip(config: str, tmp_path: Path, **variables: str) -> dict[str, str]:
-    """What the script reads where pip's one file is `config`."""
+    """Settings that the script reads where pip's one file is `config`."""
     (tmp_path / "pip.conf").write_text(config)
     kept = {name: value for name, value in os.environ.items() if not name.startswith("PIP_")}
     kept |= {"PIP_CONFIG_FILE": str(tmp_path / "pip.conf"), "XDG_CONFIG_DIRS": str(tmp_path)}

@@ -1,4 +1,4 @@
-"""What scripts/venv.sh says, without an installation."""
+"""Messages of scripts/venv.sh, without an installation."""
 
 from __future__ import annotations
 

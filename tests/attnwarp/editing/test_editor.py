@@ -602,7 +602,7 @@ def test_a_scheduler_without_ddim_steps_is_refused_with_the_remedy_which_works()
 
 
 def test_a_folder_of_another_scheduler_that_says_nothing_of_clipping_clips_nothing(tmp_path):
-    """As its own scheduler, which cannot clip; a warning would fail this test."""
+    """Its own scheduler is the oracle, which cannot clip; a warning would fail this test."""
     pipe = pix2pix()
     pipe.scheduler = PNDMScheduler.from_config(pipe.scheduler.config)
     pipe.save_pretrained(tmp_path)

@@ -231,8 +231,9 @@ def test_a_views_own_features_at_full_weight_with_the_identity_change_no_bit():
 
 
 def test_a_recorded_branch_that_the_batch_lacks_leaves_the_others_their_features():
-    """Where text and image guidance are equal, the branch of the picture alone does not run.
-    Oracle: a recording without that branch."""
+    """With equal text and image guidance, the branch of the picture alone does not run. Oracle: a
+    recording without that branch.
+    """
     net = unet(8)
     outputs = []
     for keep in (("text", "image"), ("text",)):

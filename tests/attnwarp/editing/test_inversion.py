@@ -66,8 +66,10 @@ def psnr(x, truth):
 
 
 def test_a_picture_that_a_network_drew_is_inverted_and_rebuilt(monkeypatch):
-    """As GaussCtrl and attention warping start. Oracle: the latents that were drawn, from other noise and in other steps. A
-    network of random weights takes no noise away, so its flow is followed where the signal prevails."""
+    """The start of GaussCtrl and attention warping. Oracle: the latents that were drawn, from other
+    noise and in other steps. A network of random weights takes no noise away, so its flow is
+    followed where the signal prevails.
+    """
     from tiny_editors import controlnet
 
     from attnwarp.editing.controlnet import DepthControlNet

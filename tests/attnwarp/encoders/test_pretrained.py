@@ -52,7 +52,7 @@ def dino(request, tmp_path_factory):
 
 
 def pictures(count=11, seed=0):
-    """Of several shapes, and more than go through the network at a time."""
+    """Pictures of several shapes, and more than go through the network at a time."""
     random = np.random.default_rng(seed)
     return [
         random.integers(0, 256, (40 + 3 * (i % 4), 50, 3), dtype=np.uint8) for i in range(count)

@@ -1,4 +1,4 @@
-"""Where splats are added and removed, and what Adam remembers of those that stay."""
+"""Places where splats are added and removed, and Adam's memory of those that stay."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What a fit begins with: first splats, pictures from files, and which of them are held out."""
+"""Start of a fit: first splats, pictures from files, and which of them are held out."""
 
 import json
 
@@ -275,8 +275,8 @@ def test_a_picture_that_is_fitted_on_is_not_held_out(tmp_path, how, split):
 
 
 def test_views_that_are_alike_and_others_stay_held_out(tmp_path, recwarn):
-    """The same place with another lens, and a small step aside; all files have one size. A blank
-    view at another place than a blank one that is fitted.
+    """One place with another lens, and a small step aside; all files have one size. A blank view at
+    another place than a blank one that is fitted.
     """
     for name in ("a.png", "b.png", "c.png", "d.png"):
         pixels = np.random.default_rng(ord(name[0])).integers(0, 256, (6, 8, 3), dtype=np.uint8)
@@ -296,7 +296,7 @@ def test_views_that_are_alike_and_others_stay_held_out(tmp_path, recwarn):
 
 
 def test_copies_among_pictures_without_splits_are_not_held_out(tmp_path):
-    """Of 9 pictures the first and the last are held out, and the last is the second once more."""
+    """The first and the last of 9 pictures are held out, and the last is the second once more."""
     paths = [tmp_path / f"{k}.png" for k in range(9)]
     for k, path in enumerate(paths):
         seed = 1 if k == 8 else k

@@ -275,7 +275,7 @@ def test_an_image_where_keypoints_belong_is_refused_and_not_skipped(tmp_path, na
     ],
 )
 def test_keypoints_of_any_form_are_skipped(tmp_path, keypoints):
-    """As by the readers of COLMAP's own scripts, which split the line and use none of it here."""
+    """Oracle: the readers of COLMAP's own scripts, which split the line and use none of it here."""
     write_text(tmp_path)
     first, second = (f"{n} 1 0 0 0 0 0 1 7 {n}.png" for n in (1, 2))
     (tmp_path / "images.txt").write_text(f"{first}\n{keypoints}\n{second}\n")

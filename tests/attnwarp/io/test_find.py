@@ -23,7 +23,7 @@ from attnwarp.io.names import file_stems
 from attnwarp.methods.command import _view_of, mask_files
 
 NAMES = ["images/left/é one.png", "images/right/B.png", "images/c.png"]
-"""As they lie on the disk."""
+"""Names on the disk."""
 
 SPELLINGS = {
     "windows": lambda name: ".\\" + name.replace("/", "\\"),

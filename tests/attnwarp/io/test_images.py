@@ -291,7 +291,7 @@ def test_what_is_not_there_or_empty_is_said(tmp_path):
 
 
 def test_a_folder_whose_name_is_no_utf8_is_read(tmp_path):
-    """As an old archive leaves it; OpenCV crashes at such a path."""
+    """An old archive leaves such a name; OpenCV crashes at such a path."""
     folder = tmp_path / os.fsdecode(b"caf\xe9")
     try:
         folder.mkdir()

@@ -386,7 +386,7 @@ def test_a_folder_of_another_format_is_refused(scene, editor, tmp_path):
 
 @pytest.mark.door
 def test_a_view_that_renders_as_nan_is_no_picture(finished, scene, editor, monkeypatch):
-    """Of an edit that is complete but for what its folder says of the end."""
+    """The end of an edit that is complete but for what its folder says of the end."""
     render = attnwarp.methods.scene.render
 
     def broken(*args, **options):
@@ -539,7 +539,7 @@ def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(scene, ed
 
 @pytest.mark.door
 def test_a_folder_that_was_tuned_by_other_weights_is_refused(scene, editor, tmp_path):
-    """The same folder of LPIPS weights, with another network in it."""
+    """One folder of LPIPS weights, with another network in it."""
     weights = tmp_path / "lpips"
     weights.mkdir()
     (weights / "alex.pth").write_bytes((tiny_models.linear_layers() / "alex.pth").read_bytes())
@@ -677,7 +677,9 @@ def test_pictures_of_where_features_went_are_drawn_again(
 def test_an_edit_made_again_for_a_picture_beside_it_has_to_be_the_same(
     finished, scene, editor, tmp_path
 ):
-    """As with other threads or on another device: the tuned scene rests on the former edit."""
+    """Other threads or another device give another edit: the tuned scene rests on the former
+    edit.
+    """
     folder = tmp_path / "folder"
     shutil.copytree(finished[1], folder)
     other = np.zeros_like(read_image(folder / "rounds/1/v0.png"))

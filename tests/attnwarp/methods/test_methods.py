@@ -297,8 +297,9 @@ def test_gaussctrl_inverts_without_guidance_and_edits_with_references(run, depth
 
 @pytest.mark.parametrize(("spread", "kind"), [(0.5, "sample"), (2.0, "epsilon")])
 def test_inversion_from_noised_latents_follows_the_exact_flow(spread, kind):
-    """Of latents with a normal distribution of spread s, the network is known and so is the flow:
-    x keeps its ratio to the standard deviation sqrt(a s^2 + 1 - a) (Song et al. 2021, eq. 14)."""
+    """For latents with a normal distribution of spread s, the network is known and so is the flow:
+    x keeps its ratio to the standard deviation sqrt(a s^2 + 1 - a) (Song et al. 2021, eq. 14).
+    """
     alphas = torch.linspace(0.999, 0.001, 1000, dtype=torch.float64)
     schedule = Schedule(alphas, kind, 1.0)
 

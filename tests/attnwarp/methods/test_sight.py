@@ -17,7 +17,7 @@ def camera(position, size=SIZE):
 
 
 def on_plane(view):
-    """What a camera sees of the plane z = 0."""
+    """Surface that a camera sees of the plane z = 0."""
     rays = view.directions() @ view.rotation
     depth = -view.position[2] / rays[..., 2]
     return Surface(depth, np.broadcast_to([0.0, 0, 1], (*depth.shape, 3)))

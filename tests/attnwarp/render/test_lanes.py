@@ -154,7 +154,7 @@ def test_ends_and_neighbours() -> None:
 
 @pytest.mark.parametrize(("begin", "end"), [(0, 0), (2, 9), (5, 55), (0, 55)])
 def test_a_row_of_squares_as_bits(begin, end) -> None:
-    """Of a run from column 40 on, in both ways that lists are filled."""
+    """Bits of a run from column 40 on, in both ways that lists are filled."""
     code = 40 + begin | 40 + end << 16
     row = [begin <= column <= end for column in range(56)]
     assert binning._row_bits(code, 40) == sum(1 << k for k, inside in enumerate(row) if inside)

@@ -417,7 +417,9 @@ assert (result == expected.view(np.uint16))[~undefined].all()
 
 
 def test_a_blend_in_place_is_seen_by_a_graph_that_saved_the_tensor():
-    """As torch's own operations in place are: the gradient would be of other numbers."""
+    """Oracle: torch's own operations in place, which are seen: the gradient would be of other
+    numbers.
+    """
     camera = orbit(0, size=8)
     surface = Surface(torch.full((8, 8), 3.0, dtype=torch.float64))
     layer = warp_surfaces(camera, camera, surface, surface, preset("paper")).at((4, 4))

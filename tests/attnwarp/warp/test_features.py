@@ -78,7 +78,7 @@ def bits(tensor):
 
 
 def both(layer, call):
-    """What the kernels and what the definition gives, each with taps of its own."""
+    """Results of the kernels and of the definition, each with taps of its own."""
     kernels, definition = (
         dataclasses.replace(layer, backend=backend, _taps={}) for backend in ("auto", "reference")
     )

@@ -1,4 +1,4 @@
-"""What a machine has. Oracles: the machine as it is made here, and the exit codes of processes."""
+"""Checks of a machine. Oracles: the machine as it is made here, and the exit codes of processes."""
 
 import json
 import os

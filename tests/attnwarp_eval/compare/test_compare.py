@@ -214,7 +214,7 @@ def test_a_dropped_or_damaged_cell_is_a_regression(stored, run, damage):
 
 
 def test_a_failure_of_a_cell_that_the_study_no_longer_has_is_nobodys(stored, run):
-    """As a run leaves it whose size or seeds were changed after a cell had failed."""
+    """A run leaves such a failure if its size or seeds are changed after a cell failed."""
     store = Store(run)
     cell = next(c for c in store.read_study()["cells"] if c["probe"] == "depth")
     about = {"scene": cell["scene"], "variant": cell["variants"][0], "probe": "depth"}

@@ -49,7 +49,7 @@ def run_study(study, root):
 
 
 def gate_study():
-    """Of one scene, whose world stays in memory from run to run."""
+    """Gate of one scene, whose world stays in memory from run to run."""
     return load_study("gate", scenes=["spheres"])
 
 

@@ -129,8 +129,8 @@ def test_the_stated_smallest_difference_is_found_four_times_in_five():
 
 
 def synthetic(trial, kind="normal", brighter=1.0):
-    """What a renderer hands to the ladder: seeded pictures of mean 1, whose noise falls with the
-    samples.
+    """Pictures that a renderer hands to the ladder: seeded pictures of mean 1, whose noise falls
+    with the samples.
     """
 
     def pictures(side, spp, first, count):

@@ -1,4 +1,4 @@
-"""What the truth's own error and time are measured with, held to errors that are known."""
+"""Measurement of the truth's own error and time, held to errors that are known."""
 
 import json
 import os
@@ -133,7 +133,9 @@ def test_the_bias_of_a_picture_has_students_interval(tmp_path):
 
 
 def store_panel(folder, panel, **changes):
-    """As a call does that measured it; the spec is written out, as former versions' cells are."""
+    """Store a panel as a call does that measured it; the spec is written out, as former versions'
+    cells are.
+    """
     spec = {"probe": "accuracy", "protocol": 1, "question": panel.question, "scene": "a" * 64,
             "name": panel.scene, "rounds": 3, "open3d": open3d().__version__}  # fmt: skip
     spec |= changes

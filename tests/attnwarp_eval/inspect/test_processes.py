@@ -46,7 +46,7 @@ def display():
 
 
 class Screen:
-    """What a person has: a picture of the screen, a keyboard and a mouse."""
+    """Tools of a person: a picture of the screen, a keyboard and a mouse."""
 
     def __init__(self, name):
         from Xlib.display import Display

@@ -56,13 +56,13 @@ def click(window, column, row):
 
 
 def beside_nearer_surface(depth, pixels):
-    """Whether something nearer is within so many pixels."""
+    """Mask of pixels with something nearer within so many pixels."""
     low = scipy.ndimage.minimum_filter(np.nan_to_num(depth, nan=np.inf), 2 * pixels + 1)
     return low < 0.9 * depth
 
 
 def beside_an_edge(hits):
-    """Whether another surface, the sky, or the picture's border is within a pixel."""
+    """Mask of pixels with another surface, the sky, or the picture's border within a pixel."""
     depth = np.pad(np.where(hits.valid, hits.depth, np.inf), 1, constant_values=np.inf)
     owner = np.pad(hits.object_id, 1, mode="edge")
     low, high = (f(depth, 3) for f in (scipy.ndimage.minimum_filter, scipy.ndimage.maximum_filter))
@@ -133,7 +133,9 @@ def test_a_slider_moved_changes_what_is_shown(window):
 
 @pytest.mark.parametrize("key", [*"evpfswri3uq", "Up", "plus"])
 def test_a_key_does_what_is_listed_and_nothing_of_vtks_or_pyvistas(window, key):
-    """Of theirs, e closes the window, v turns the view, w draws wires, 3 is for red-blue glasses."""
+    """Among theirs, e closes the window, v turns the view, w draws wires, 3 is for red-blue
+    glasses.
+    """
     window._replace_keys()
     called, plotter = [], window.plotter
     callbacks = plotter.iren._key_press_event_callbacks
@@ -278,7 +280,9 @@ def test_the_legend_is_read_on_light_and_on_dark(window, background):
 
 
 def test_eight_insets_are_whole_and_their_titles_too(window, monkeypatch):
-    """Of a small window; pictures are plain, so that every pixel tells what it belongs to."""
+    """Insets of a small window; pictures are plain, so that every pixel tells what it belongs
+    to.
+    """
     titles = ["source, not edited", "target, not edited", "scene, stage 10", "source, warped",
               "mask against truth", "features, warped", "true edit", "the last"]  # fmt: skip
     plain = np.tile(np.float32([1, 0, 1]), (24, 32, 1))

@@ -1,4 +1,4 @@
-"""What a page begins with. Oracle: hand-made records whose differences follow by hand."""
+"""Beginning of a page. Oracle: hand-made records whose differences follow by hand."""
 
 import inspect
 import re

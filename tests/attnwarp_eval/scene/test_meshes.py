@@ -304,7 +304,7 @@ def test_a_coff_has_colours_and_colours_of_faces_are_told(tmp_path):
 @pytest.mark.door
 @pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
 def test_an_obj_in_utf_16_is_refused_by_name(tmp_path, encoding):
-    """As assimp's box_UTF16BE.obj is, which begins with a byte order mark."""
+    """An example is assimp's box_UTF16BE.obj, which begins with a byte order mark."""
     text = "\ufeffv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
     (tmp_path / "box.obj").write_bytes(text.encode(encoding))
     with pytest.raises(ValueError, match=r"box.obj: is text in UTF-16.*save it as UTF-8"):

@@ -233,8 +233,8 @@ def test_ratios_taken_in_turn_see_through_a_machine_that_drifts():
 
 
 def covered(rounds, runs, seed, scenes=1):
-    """How often the interval holds the true ratio of 1.25, where a tenth of the rounds has a hiccup
-    on either side.
+    """Share of cases in which the interval holds the true ratio of 1.25, where a tenth of the
+    rounds has a hiccup on either side.
     """
     rng = np.random.default_rng(seed)
 

@@ -228,7 +228,7 @@ def test_a_run_whose_scheduler_is_lost_says_so_and_goes_on_from_there(home, clus
 
 def test_a_cluster_that_closes_badly_does_not_hide_the_interrupt():
     class Stuck:
-        """As dask's cluster on a busy machine."""
+        """A cluster like dask's on a busy machine."""
 
         def close(self):
             raise TimeoutError

@@ -1,4 +1,6 @@
-"""What a mesh file leaves out, or has turned inside out, is said once and stands in the report."""
+"""Notices of what a mesh file leaves out, or has turned inside out: said once, and in the
+report.
+"""
 
 import warnings
 

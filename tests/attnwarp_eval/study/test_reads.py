@@ -1,5 +1,6 @@
-"""What a study names and does not use is refused with its line. Oracles: lines counted by hand; cells
-and results of two values of a setting, which are the same where nothing reads it."""
+"""Refusal, with its line, of what a study names and does not use. Oracles: lines counted by hand;
+cells and results of two values of a setting, which are the same where nothing reads it.
+"""
 
 import dataclasses
 

@@ -31,7 +31,7 @@ def cells(*kinds, scenes=("a", "b")):
 
 
 def lefts(clock, todo, seconds):
-    """What is told at the end of each cell, computed one by one."""
+    """Steps told at the end of each cell, computed one by one."""
     said = []
     reporter = CellReporter(todo, 0, Watched(lambda *step: said.append(step)))
     for cell in todo:

@@ -253,7 +253,7 @@ def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(folder):
 
 
 def test_ctrl_c_that_native_code_turns_into_its_own_error_still_ends_the_run(folder, monkeypatch):
-    """As CPython does where a function of an extension is interrupted in the middle."""
+    """CPython does so if a function of an extension is interrupted in the middle."""
 
     def interrupted(*_):
         try:

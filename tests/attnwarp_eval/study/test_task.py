@@ -11,7 +11,7 @@ from attnwarp_eval.study.task import Task, results
 
 
 def squares(computed, interrupted=None):
-    """Of 2, 3 and 4, with a picture each; computing ``interrupted`` is stopped."""
+    """Squares of 2, 3 and 4, with a picture each; computing ``interrupted`` is stopped."""
 
     def task(store, x):
         def compute(report):

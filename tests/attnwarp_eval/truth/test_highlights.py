@@ -47,7 +47,7 @@ def glossy_balls(scene):
 
 
 def matt(scene):
-    """The same scene without any coat."""
+    """Copy of a scene without any coat."""
     objects = tuple(
         item.model_copy(update={"material": DiffuseMaterial()}) for item in scene.spec.objects
     )

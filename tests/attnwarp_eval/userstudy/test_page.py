@@ -21,7 +21,7 @@ from attnwarp_eval.userstudy.draw import SCRAMBLED
 
 
 class Reader(HTMLParser):
-    """What a browser would load from elsewhere, and the page's data."""
+    """Reader of what a browser would load from elsewhere, and of the page's data."""
 
     def __init__(self):
         super().__init__()

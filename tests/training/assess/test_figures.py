@@ -29,7 +29,7 @@ SETS = ("test", "test-new-pairs", "test-rendered")
 
 
 def chance_like(value, count, chance):
-    """Whether a share of answers can come from guessing: within the 99.99 % interval of the
+    """Return True if a share of answers can come from guessing: within the 99.99 % interval of the
     binomial distribution.
     """
     low, high = binom.ppf([5e-5, 1 - 5e-5], count, chance)
@@ -186,7 +186,7 @@ def vector(meanings):
 
 
 class Knowing:
-    """What a picture shows it is told, sentences it reads word by word."""
+    """An encoder that is told what a picture shows, and reads sentences word by word."""
 
     def __init__(self, sets):
         self.sets = sets
@@ -219,7 +219,7 @@ class Guessing(Knowing):
 
 
 class Blind(Knowing):
-    """The same of everything."""
+    """An encoder that gives one vector for everything."""
 
     def one(self, kind, row):
         return np.ones(32)

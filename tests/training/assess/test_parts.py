@@ -77,7 +77,7 @@ def vector(features):
 
 
 class Reading:
-    """What a picture shows it is told, sentences it reads."""
+    """An encoder that is told what a picture shows, and reads sentences."""
 
     def __init__(self, pictures):
         self.pictures = pictures

@@ -1,4 +1,4 @@
-"""What a card says besides its figures."""
+"""Text of a card besides its figures."""
 
 import hashlib
 

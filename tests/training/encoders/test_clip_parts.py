@@ -23,7 +23,7 @@ from training.worlds.part_pictures import GROUND, LOOKS, OTHER, PARTS, SKY, Part
 
 
 def noun(text):
-    """What a phrase names, without what stands before."""
+    """Noun of a phrase, without the words before it."""
     for start in ("a photo of ", "a picture of "):
         text = text.removeprefix(start)
     return text if text == "the sky" else text.removeprefix("a ").removeprefix("an ")

@@ -150,7 +150,7 @@ def shape_of(part):
 
 
 def shapes_and_palettes():
-    """Of the scenes' files, as they are written."""
+    """Shapes and palettes of the scenes' files, as they are written."""
     folder = (Path(attnwarp_eval.__file__).parent / "scenes").resolve()
     shapes, palettes = set(), set()
     for path in folder.glob("*.yaml"):

@@ -169,7 +169,7 @@ def drawn(count, seed=0):
 
 
 def says(caption, kind, ground, time, surfaces):
-    """Whether a caption is true, read one condition at a time."""
+    """Return True if a caption is true, read one condition at a time."""
 
     def is_like(said, shown):
         finish, color, second = (int(v) for v in shown)

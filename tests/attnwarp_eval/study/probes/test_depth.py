@@ -1,4 +1,4 @@
-"""What the report says where nothing was drawn."""
+"""Sentences of the report where nothing was drawn."""
 
 import written_runs
 

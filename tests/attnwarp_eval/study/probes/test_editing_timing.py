@@ -135,7 +135,7 @@ ERROR = "multiview.delta_e_above.edit_inside"
 VARIANTS = ["full", "alone", "fast", "slow"]
 RATIOS = {"full": 1.0, "alone": 0.8, "fast": 0.25, "slow": 4.0}
 DRIFT = [1.0, 1.0, 2.0, 2.0, 2.0, 16.0, 16.0]
-"""How slow the machine was in each round."""
+"""Slowness of the machine in each round."""
 
 ERRORS = {"full": 1.0, "alone": 9.0, "fast": 3.0, "slow": 0.5}
 BY_CELLS = {"full": 1.0, "alone": 1.0, "fast": 40.0, "slow": 0.1}

@@ -51,7 +51,7 @@ def load(folder, **changes):
 
 
 def chord(yaw):
-    """Of the source camera and a target, in scene units, by the law of cosines."""
+    """Distance of the source camera and a target, in scene units, by the law of cosines."""
     cameras = load_scene("spheres").spec.cameras
     target = next(t for t in cameras.targets if abs(t.yaw - cameras.source.yaw) == yaw)
     across = 2 * cameras.radius**2 * (1 - math.cos(math.radians(yaw)))
