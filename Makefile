@@ -64,6 +64,7 @@ lint: venv
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m scripts.check_docstrings
 
 # Lint on one core; on another the kernels are compiled, which each worker of the tests would do for itself, and the gate
 # uses them. Lint ends first, so that what else would be done by each worker follows it: other kernels, and modules compiled
