@@ -216,7 +216,7 @@ def _moments(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tens
 
 
 class _Ssim(torch.autograd.Function):
-    """With its own backward pass: eight blurs in place of ten, and few passes over memory.
+    """SSIM with its own backward pass: eight blurs in place of ten, and few passes over memory.
 
     With mu = blur(x), e = blur(x^2), e12 = blur(x y) the similarity is a function of the five
     blurred images, and the blur is its own adjoint: dx = blur(dmu) + 2 x blur(de) + y blur(de12).

@@ -48,7 +48,7 @@ WIDTHS = (1.0, 0.1, 0.03, 0.01, 0.003, 0.001)
 LIMIT = 1e-4
 
 ROUNDED_PIXELS = 21 * 2.0**-24
-"""By how much float32 moves a splat in the picture, px.
+"""Distance by which float32 moves a splat in the picture, px.
 
 A splat's u at a pixel is u_0 + u_x x + u_y y in float32, with (x, y) within 3.5 px of the middle of
 8 x 8 pixels. Three coefficients, two products and two sums are rounded, of numbers up to |u_x x| +

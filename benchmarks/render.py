@@ -71,7 +71,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """For the table."""
+        """Name for the table."""
         return f"{self.kind} {self.size} {self.splats // 1000}k {self.sigma:g}"
 
 
@@ -101,7 +101,7 @@ def scene(kind: str, count: int, sigma: float, seed: int = 0) -> Gaussians:
 
 
 def camera(size: int) -> Camera:
-    """At distance 3 from the ball's middle, which fills the picture."""
+    """Camera at distance 3 from the ball's middle, which fills the picture."""
     return Camera.look_at([0, -3, 0], [0, 0, 0], width=size, height=size, fov_y=42)
 
 

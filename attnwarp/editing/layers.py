@@ -201,7 +201,7 @@ def hooked(unet: torch.nn.Module, layers: Sequence[Layer], hook: Hook) -> Iterat
 
 
 def _cause(unet: torch.nn.Module, missing: Sequence[str], *, passes: bool) -> str:
-    """Why hooks of layers were not called."""
+    """Reason why hooks of layers were not called."""
     modules = [unet, *map(unet.get_submodule, missing)]
     compiled = any(
         hasattr(module, "_orig_mod") or getattr(module, "_compiled_call_impl", None) is not None

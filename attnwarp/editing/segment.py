@@ -32,8 +32,9 @@ MASK_PROTOCOL = 1
 """Raised when the same settings come to cut pictures otherwise, so that no edit mixes both."""
 
 LONGEST_SIDE = 1024
-"""In px, of what is rated and cut: a panorama would take memory without bound. Pictures up to 4:1
-stay below it."""
+"""Longest side in px of what is rated and cut: a panorama would take memory without bound. Pictures
+up to 4:1 stay below it.
+"""
 
 
 @runtime_checkable
@@ -356,7 +357,7 @@ class ClipSegmenter:
 
     @classmethod
     def bundled(cls) -> ClipSegmenter:
-        """With clip-parts."""
+        """Build the segmenter with clip-parts."""
         encoder = load_encoder("clip-parts", "clip")
         assert isinstance(encoder, PlaceEncoder)
         return cls(encoder)

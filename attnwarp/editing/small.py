@@ -29,7 +29,9 @@ ONE_THREAD_PARAMETERS = 50_000_000
 the CPU time on two threads of a busy machine, and other bits."""
 
 TEXT_GUIDANCE, IMAGE_GUIDANCE = 1.5, 1.0
-"""At higher text guidance a few colours take most answers, and colours saturate."""
+"""Guidance weights of bundled editors. At higher text guidance a few colours take most answers, and
+colours saturate.
+"""
 
 DEPTH_GUIDANCE = 2.0
 """Guidance weight of a bundled editor that takes depth; ControlNet's own 5 to 7.5 saturates its

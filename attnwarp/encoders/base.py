@@ -50,7 +50,7 @@ class EncoderInfo:
     dim: int | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Fields for JSON."""
         return asdict(self)
 
 
@@ -68,7 +68,7 @@ class ImageEncoder(Protocol):
 
     @property
     def about(self) -> EncoderInfo:
-        """Which encoder this is."""
+        """Identity of the encoder."""
         ...
 
     def images(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
@@ -163,7 +163,7 @@ class PerceptualDistance(Protocol):
 
     @property
     def about(self) -> EncoderInfo:
-        """Which network this is."""
+        """Identity of the network."""
         ...
 
     def distance(self, a: Sequence[Image], b: Sequence[Image]) -> npt.NDArray[np.float64]:

@@ -164,7 +164,7 @@ def _quarters(views: Sequence[int], count: int) -> list[list[int]]:
 
 
 def _choice(views: Sequence[int], count: int, generator: torch.Generator) -> list[int]:
-    """So many different ones at random, in their order."""
+    """Draw so many different views at random, in their order."""
     order = torch.randperm(len(views), generator=generator)[:count].tolist()
     return [int(views[k]) for k in sorted(order)]
 
@@ -172,7 +172,7 @@ def _choice(views: Sequence[int], count: int, generator: torch.Generator) -> lis
 def _spread_draw(
     views: Sequence[int], parts: int, most: int, generator: torch.Generator
 ) -> list[int]:
-    """At most so many views: an equal share of each contiguous part, at random."""
+    """Draw at most so many views: an equal share of each contiguous part, at random."""
     if len(views) <= most:
         return list(views)
     shares = [len(part) for part in np.array_split(np.arange(most), min(parts, len(views)))]

@@ -242,7 +242,7 @@ def _left_out(names: Sequence[str], most: int) -> str:
 
 
 def _spread(names: Sequence[str], most: int) -> list[str]:
-    """At most so many, evenly spread."""
+    """Choose at most so many names, evenly spread."""
     if len(names) <= most:
         return list(names)
     return [names[k * len(names) // most] for k in range(most)]

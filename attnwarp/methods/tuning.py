@@ -24,7 +24,9 @@ from attnwarp.render import Render, render
 from attnwarp.workdir import Workdir
 
 Order = Callable[[int], int]
-"""Which of a round's views an iteration takes, by the iteration's number in the round."""
+"""Order of a round's views: the view that an iteration takes, by the iteration's number in the
+round.
+"""
 
 
 class PerceptualLoss(Protocol):
@@ -32,7 +34,7 @@ class PerceptualLoss(Protocol):
 
     @property
     def about(self) -> EncoderInfo:
-        """Whose weights it has."""
+        """Identity of the weights."""
         ...
 
     @property

@@ -37,7 +37,7 @@ ACCEPT_2D = "ATTNWARP_GSPLAT_2D"
 
 
 def reason_not() -> str | None:
-    """Why this backend cannot run here, or None if it can."""
+    """Reason why this backend cannot run here, or None if it can."""
     if not torch.cuda.is_available():
         return "needs a GPU that torch can see"
     if importlib.util.find_spec("gsplat") is None:

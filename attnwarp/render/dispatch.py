@@ -1,4 +1,4 @@
-"""Which machine code a call of a kernel runs.
+"""Dispatch of a kernel's calls to machine code.
 
 numba works out the types of all arguments at every call, which takes microseconds for each array
 of a structure. A small picture takes milliseconds and dozens of calls with dozens of arrays, so
@@ -14,7 +14,8 @@ import numba
 import numpy as np
 
 SCALARS = frozenset({bool, int, float, np.float32, np.float64, np.int32, np.int64})
-"""Whose numba type follows from Python's; that of an integer of more bits follows from its value.
+"""Types whose numba type follows from Python's; that of an integer of more bits follows from its
+value.
 """
 
 PLAIN, WRITEABLE = 0x101, 0x400

@@ -18,8 +18,9 @@ from attnwarp.render.dispatch import machine_code
 
 _lock = threading.Lock()
 _pools: dict[int, ThreadPoolExecutor] = {}
-"""By the number of threads that was set: a pool for each number of jobs would keep its own
-threads."""
+"""Pools by the number of threads that was set: a pool for each number of jobs would keep its own
+threads.
+"""
 
 
 def _forget() -> None:

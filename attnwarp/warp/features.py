@@ -17,8 +17,9 @@ from attnwarp.warp.correspondence import Correspondence
 from attnwarp.warp.taps import Taps
 
 Backend: TypeAlias = Literal["auto", "reference"]
-"""Who computes a warp: "reference" is the definition in torch, on any device. "auto" takes the
-kernels (:mod:`attnwarp.warp.cpu`) for what lies in the host's memory, and torch elsewhere."""
+"""Backend that computes a warp: "reference" is the definition in torch, on any device. "auto" takes
+the kernels (:mod:`attnwarp.warp.cpu`) for what lies in the host's memory, and torch elsewhere.
+"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -278,7 +278,7 @@ def camera_frame(
 def gaussian_filter(
     gaussians: Gaussians, source: Camera, target: Camera, rule: GaussianFilter, angle: float = 60.0
 ) -> Tensor:
-    """Which Gaussians remain when the target's depth is rendered.
+    """Mask of the Gaussians that remain when the target's depth is rendered.
 
     Args:
         gaussians: of the scene.

@@ -64,7 +64,7 @@ def measure(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int64]) -> 
 
 
 def difference(ours: Facts, theirs: Facts, tolerance: float) -> str:
-    """Which facts differ, with both values; empty if none."""
+    """Facts that differ, with both values; empty if none."""
     span = max(map(abs, (*theirs.low, *theirs.high))) or 1.0
     scales = {
         "area": abs(theirs.area),

@@ -150,7 +150,7 @@ def our_views(data: Dataset) -> list[View]:
 
 
 def difference(ours: list[View], theirs: list[View]) -> str:
-    """Which values differ; empty if none."""
+    """Values that differ; empty if none."""
     if [v.image for v in ours] != [v.image for v in theirs]:
         return f"{len(ours)} images against {len(theirs)}, or other ones"
     for k, (one, two) in enumerate(zip(ours, theirs, strict=True)):

@@ -531,8 +531,8 @@ def broadcast(typing: Any, array: Any, item: Any) -> Any:
 
 @intrinsic
 def with_any_bit(typing: Any, array: Any, item: Any, wanted: Any) -> Any:
-    """Which of sixteen int32 of ``array`` from ``item`` on, counted flat, have one of these bits: a
-    bit for each.
+    """Mask of sixteen int32 of ``array`` from ``item`` on, counted flat: a bit for each that has
+    one of the wanted bits.
     """
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:

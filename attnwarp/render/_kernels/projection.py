@@ -258,8 +258,9 @@ def _gather(batch, splats, order, begin, last, discs):
 
 @inlined
 def _cull(batch, view, candidates, begin, first, wanted, table, outlines):
-    """Which of the ``candidates``, one bit each, may show in a wanted tile; the others are marked
-    as not drawn."""
+    """Mask of those ``candidates``, one bit each, that may show in a wanted tile; the others are
+    marked as not drawn.
+    """
     visible = candidates
     for lane in range(8):
         if not candidates >> lane & 1:

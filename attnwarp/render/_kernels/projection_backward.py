@@ -79,7 +79,7 @@ def _rotation(quats, i, Q):
 
 @inlined
 def _direction_backward(degree, x, y, z, d_basis):
-    """From gradients in the harmonics to those in the direction (x, y, z), as if it were free."""
+    """Backward of the harmonics to the direction (x, y, z), as if it were free."""
     dx, dy, dz = 0.0, 0.0, 0.0
     if degree > 0:
         dx -= C1 * d_basis[3]

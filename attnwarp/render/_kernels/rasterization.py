@@ -234,7 +234,7 @@ def _lay_out_block(space, table, lists, weights, view, tile, begin, e, end, ende
 
 @inlined
 def _in_block(masks, squares):
-    """Which splats of the block are composited in any of these squares: a bit for each."""
+    """Mask of the block's splats that are composited in any of these squares: a bit for each."""
     return with_any_bit(masks, 0, squares) | with_any_bit(masks, 16, squares) << 16
 
 

@@ -221,7 +221,7 @@ def effects(
         Path | None, typer.Option(help="Folder of --all; runs/effects if left out.")
     ] = None,
 ) -> None:
-    """Which light transport a scene needs, what leaving out the rest saves, and a proof."""
+    """Show which light transport a scene needs, what leaving out the rest saves, and a proof."""
     import json
 
     if every == (scene is not None):

@@ -123,7 +123,7 @@ class Comparison:
 
     @property
     def too_little(self) -> str:
-        """Why nothing can be said; empty where something can."""
+        """Reason why nothing can be said; empty where something can."""
         if not self.rows:
             return "both sides share no gated figure"
         if not self.exact and self.scenes < FEWEST_SCENES:

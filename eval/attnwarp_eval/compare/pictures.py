@@ -170,7 +170,7 @@ def _of_cell(
 
 
 def _margins(key: str, first: Figure, second: Figure | None, view: str) -> float:
-    """By how many margins a view's figure changed; 0 within the registry's tolerance."""
+    """Number of margins by which a view's figure changed; 0 within the registry's tolerance."""
     if second is None or view not in first.values or view not in second.values:
         return 0.0
     old, new = first.values[view], second.values[view]

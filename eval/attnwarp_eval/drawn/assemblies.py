@@ -440,7 +440,7 @@ RECIPES: dict[str, Callable[[Dice], Pieces]] = {
 """Every thing with parts, with its recipe."""
 
 WHOLE = "whole"
-"""In place of a part's name: all parts together."""
+"""Name in place of a part's: all parts together."""
 
 KINDS = tuple(RECIPES)
 

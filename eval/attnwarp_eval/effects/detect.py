@@ -1,4 +1,4 @@
-"""Which light transport a scene needs.
+"""Light transport that a scene needs.
 
 :func:`detect` compares the file with the graph handed to Mitsuba (plugin names) and with Mitsuba's
 scene (BSDF flags, emitter flags, media, textures by class name). An effect in one that another

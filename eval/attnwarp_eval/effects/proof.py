@@ -210,7 +210,7 @@ class Proof:
         return asdict(self)
 
     def lines(self) -> Iterator[str]:
-        """For a person."""
+        """Lines for a person."""
         yield f"proof: {self.words} ({self.seconds:.1f} s)"
         for rung in self.rungs:
             word = {None: "-", True: "ok", False: "REFUSED"}[rung.passed]

@@ -129,7 +129,7 @@ class Comparison:
 
 
 def needs_truth(variant: Variant) -> str | None:
-    """Why a variant cannot run without a scene whose truth is known; None where it can."""
+    """Reason why a variant cannot run without a scene whose truth is known; None where it can."""
     own = variant.part(editing.VariantPart)
     if own.method == "true pictures":
         return "its edits are the true pictures"

@@ -128,7 +128,7 @@ SUMMARY = [
 
 
 def _summary(rows: Sequence[Row]) -> list[list[str]]:
-    """By yaw: the least and the largest ratio over the scenes."""
+    """Rows by yaw: the least and the largest ratio over the scenes."""
 
     def value(row: Row, kind: str, name: str) -> float:
         return row.figures[kind][f"consistency.{name}"]

@@ -1,4 +1,4 @@
-"""Is the depth right? Depth along the optical axis and normals against truth."""
+"""Accuracy of depth: depth along the optical axis and normals against truth."""
 
 from __future__ import annotations
 

@@ -100,8 +100,8 @@ def nearest_answer(
     answers: Mapping[str, Mapping[str, Any]],
     masks: Mapping[str, Any] | None = None,
 ) -> tuple[str | None, dict[str, float]]:
-    """Which of an ambiguous edit's right answers a method gave: one for all views, the least mean
-    MSE over them.
+    """Answer that a method gave, of an ambiguous edit's right ones: one for all views, the least
+    mean MSE over them.
 
     One answer for all, since a method that answers differently from view to view is not free to
     (docs/edits.md).

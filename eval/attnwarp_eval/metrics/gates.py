@@ -1,4 +1,4 @@
-"""Which figures a comparison of two runs is gated on, and how much worse each may get.
+"""Figures that a comparison of two runs is gated on, and how much worse each may get.
 
 The direction of a figure and what counts as no change at all stand in the registry.
 """

@@ -1,5 +1,5 @@
-"""Is an edit one edit in all views? Disagreement above its floor, one answer everywhere, fidelity
-to the nearest truth, each by yaw.
+"""Agreement of an edit's views: disagreement above its floor, one answer everywhere, fidelity to
+the nearest truth, each by yaw.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Is the warp right? Endpoint error of its positions, and error of the features that it carries."""
+"""Accuracy of a warp: endpoint error of its positions, and error of the features that it
+carries.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a run's results to its report: every section, in order."""
+"""Build of a report from a run's results: every section, in order."""
 
 from __future__ import annotations
 

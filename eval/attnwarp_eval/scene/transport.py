@@ -1,5 +1,4 @@
-"""Which light transport the words of a scene file call for, and where they contradict each
-other."""
+"""Light transport that the words of a scene file call for, and their contradictions."""
 
 from __future__ import annotations
 

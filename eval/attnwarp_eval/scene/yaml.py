@@ -100,7 +100,9 @@ def read_yaml(text: str) -> tuple[dict[Place, int], Any]:
 
 
 class _Reading:
-    """From nodes to values; an alias is read wherever it stands, so that its values count again."""
+    """Reading of nodes as values; an alias is read wherever it stands, so that its values count
+    again.
+    """
 
     def __init__(self) -> None:
         self.lines: dict[Place, int] = {}

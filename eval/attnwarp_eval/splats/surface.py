@@ -371,7 +371,8 @@ def _eliminate(points: Array, normals: Array, spacing: Array, count: int) -> npt
 
 @numba.njit(cache=CACHE)
 def _crowds(distance, near, radius, normals):  # type: ignore[no-untyped-def]
-    """Who crowds whom, as the rows of a sparse matrix: (n + 1,) starts, others, and closeness.
+    """Pairs of crowding points, as the rows of a sparse matrix: (n + 1,) starts, others, and
+    closeness.
 
     1 minus the distance of two points over the sum of their radii, where that is positive. The two
     sides of a thin sheet do not crowd each other.

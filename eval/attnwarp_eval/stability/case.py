@@ -258,7 +258,7 @@ class Outcome:
 
     @property
     def verdict(self) -> Verdict:
-        """In one word; what must be refused and is holds."""
+        """Verdict in one word; what must be refused and is holds."""
         margin = self.margin
         return "refused" if math.isnan(margin) else "holds" if margin >= 0 else "breaks"
 

@@ -268,7 +268,7 @@ def _bounds_of_median(values: npt.NDArray[np.float64]) -> tuple[float, float]:
 
 
 def agreement(a: ByView, b: ByView, sign: int) -> tuple[int, int]:
-    """In how many of the views that both have b - a has the given sign: (those, all).
+    """Number of the views that both have in which b - a has the given sign: (those, all).
 
     It says what was seen on these scenes, without speaking of others. What is within the rounding
     of the values (:data:`ROUNDING`) has no sign.

@@ -178,7 +178,7 @@ def _variance_of_seeds(scene: Seeds) -> float | None:
 
 
 def _differences(a: ByView, b: ByView) -> list[Seeds]:
-    """For each scene the differences of its views, by seed."""
+    """Differences of each scene's views, by seed."""
     scenes = []
     for scene in sorted(set(a) & set(b)):
         seeds: Seeds = {}

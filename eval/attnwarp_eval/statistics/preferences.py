@@ -89,7 +89,7 @@ class Share:
 
 @dataclass(frozen=True)
 class Preferences:
-    """Which methods people prefer.
+    """Preferences of people among methods.
 
     Attributes:
         methods: by name.

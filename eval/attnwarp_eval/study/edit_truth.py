@@ -195,7 +195,9 @@ def _edit_truth(
 
 
 def neighbours(of: World, views: Sequence[str]) -> dict[str, str]:
-    """For each target the nearest by yaw of the source and of the targets that are nearer to it."""
+    """Neighbour of each target: the nearest by yaw of the source and of the targets that are nearer
+    to it.
+    """
     yaw = {of.source.name: 0.0, **of.signed_yaw}
     ordered = [of.source.name, *sorted(views, key=lambda view: of.yaw[view])]
 

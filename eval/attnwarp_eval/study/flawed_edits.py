@@ -77,7 +77,7 @@ class Task:
         return self.edit if self.answer is None else f"{self.edit}-{self.answer}"
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Fields for JSON."""
         return {
             **asdict(self),
             "others": [list(o) for o in self.others],
@@ -86,7 +86,7 @@ class Task:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Task:
-        """From what :meth:`to_dict` gave."""
+        """Rebuild from what :meth:`to_dict` gave."""
         others = tuple((name, content) for name, content in data["others"])
         return cls(
             **{

@@ -55,7 +55,7 @@ class View:
 
     @classmethod
     def from_json(cls, data: Json) -> View:
-        """From :meth:`to_json`."""
+        """Rebuild from :meth:`to_json`."""
         return cls(data["view"], float(data["yaw"]), with_nan(data["metrics"]))
 
 
@@ -86,7 +86,7 @@ class PictureFile:
 
     @classmethod
     def from_json(cls, data: Json) -> PictureFile:
-        """From :meth:`to_json`."""
+        """Rebuild from :meth:`to_json`."""
         return cls(data["view"], data["what"], data["path"], data["sha256"])
 
 
@@ -118,7 +118,7 @@ class Cost:
 
     @classmethod
     def from_json(cls, data: Json) -> Cost:
-        """From :meth:`to_json`; entries of a probe's own beside it are left alone."""
+        """Rebuild from :meth:`to_json`; entries of a probe's own beside it are left alone."""
         return cls(data["seconds"], data["counters"], data["peak_memory_mb"], data["threads"])
 
 
@@ -155,7 +155,7 @@ class Environment:
 
     @classmethod
     def from_json(cls, data: Json) -> Environment:
-        """From :meth:`to_json`; one object for all records of the same environment."""
+        """Rebuild from :meth:`to_json`; one object for all records of the same environment."""
         versions, machine, git = data["versions"], data["machine"], data["git"]
         code = (git["sha"], git["dirty"], data["source"])
         key = (cls, *versions.items(), *machine.items(), *code)
@@ -192,7 +192,7 @@ class Record(Generic[E]):
     extra: E
 
     def to_json(self) -> Json:
-        """For :meth:`attnwarp_eval.study.store.Store.write`."""
+        """Entries for :meth:`attnwarp_eval.study.store.Store.write`."""
         own = self.extra.to_json()
         cost = {**self.cost.to_json(), **own.pop("cost", {})}
         return {
@@ -207,7 +207,7 @@ class Record(Generic[E]):
 
     @classmethod
     def from_json(cls, data: Json, extra: E) -> Record[E]:
-        """From :meth:`to_json`, with the extra that its probe has read."""
+        """Rebuild from :meth:`to_json`, with the extra that its probe has read."""
         return cls(
             data["id"],
             data["spec"],
@@ -221,7 +221,7 @@ class Record(Generic[E]):
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a cell has no record."""
+    """Reason why a cell has no record."""
 
     scene: str
     variant: str
@@ -233,7 +233,7 @@ class Failure:
 
     @classmethod
     def from_json(cls, data: Json) -> Failure:
-        """From a failure's file."""
+        """Read from a failure's file."""
         names = ("scene", "variant", "probe", "error", "title", "traceback", "id")
         return cls(**{name: str(data.get(name, "")) for name in names})
 

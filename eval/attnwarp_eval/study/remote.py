@@ -39,7 +39,7 @@ class Code:
     worker: str = ""
 
     def difference(self, expected: Code) -> str:
-        """In what a worker's code is another than expected; empty where it is the same."""
+        """Difference of a worker's code from the expected; empty where it is the same."""
         names = sorted(self.versions.keys() | expected.versions.keys())
         parts = [
             f"{name} {self.versions.get(name, 'missing')}, expected"

@@ -326,7 +326,7 @@ class Store:
 
 
 FLUSH_SECONDS = 1.0
-"""At least between two flushes of cells to disk by one process.
+"""Least time between two flushes of cells to disk by one process.
 
 A flush takes longer than a cell that costs nothing. Without it the system writes the file half a
 minute later; a record that a power cut damages fails its checksum and is computed again.

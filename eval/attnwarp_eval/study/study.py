@@ -1,4 +1,4 @@
-"""From a study's YAML to its cells: the shared parts joined with those of every probe."""
+"""Way from a study's YAML to its cells: the shared parts joined with those of every probe."""
 
 from __future__ import annotations
 

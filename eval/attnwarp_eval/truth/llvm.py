@@ -1,5 +1,5 @@
-"""Which of Mitsuba's variants renders on this machine: compiled by LLVM where that works,
-interpreted elsewhere.
+"""Choice of Mitsuba's variant on this machine: compiled by LLVM where that works, interpreted
+elsewhere.
 
 ``llvm_ad_rgb`` compiles each scene's integrator to vector code and is several times faster
 (docs/accuracy-and-time.md), but with some LLVMs (14 and 15) it ends the whole process instead of

@@ -220,8 +220,8 @@ def buried(
     primitive_id: npt.NDArray[np.int64],
     rays: int = 64,
 ) -> npt.NDArray[np.bool_]:
-    """Which surface points no ray from outside the scene reaches: inside other objects, or where
-    two of them touch.
+    """Mask of surface points that no ray from outside the scene reaches: inside other objects, or
+    where two of them touch.
 
     Args:
         points, normals, primitive_id: as in :func:`irradiance`.

@@ -165,5 +165,5 @@ def _list(items: Iterable[str]) -> str:
 
 
 def _line(text: str) -> str:
-    """On one line, as names of files need not be."""
+    """Join text to one line, as names of files need not be."""
     return " ".join(text.split())

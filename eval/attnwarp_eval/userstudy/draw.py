@@ -1,4 +1,4 @@
-"""Which choices each person gets, in which order and on which side: drawn by a seed, balanced."""
+"""Draw of each person's choices, their order and their sides: by a seed, balanced."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Choice:
         return SCRAMBLED in (self.left, self.right)
 
     def mirrored(self) -> Choice:
-        """With its sides exchanged."""
+        """Choice with its sides exchanged."""
         return replace(self, left=self.right, right=self.left)
 
 

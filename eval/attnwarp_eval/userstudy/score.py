@@ -1,4 +1,4 @@
-"""From people's answers to preferences, and their report."""
+"""Preferences from people's answers, and their report."""
 
 from __future__ import annotations
 

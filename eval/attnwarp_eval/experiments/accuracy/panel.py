@@ -13,7 +13,7 @@ PROTOCOL = 1
 """Raised whenever a panel would come out otherwise."""
 
 QUESTIONS = ("pictures", "depth", "visibility")
-"""In the order of the report."""
+"""Questions in the order of the report."""
 
 
 @dataclass(frozen=True)

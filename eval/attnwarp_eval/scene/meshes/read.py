@@ -132,7 +132,7 @@ MOST_RECENT = 2
 """Meshes that are kept: a scene is built more than once, and a large one takes seconds to read."""
 
 _recent: dict[tuple[str, str], MeshFile] = {}
-"""By path and SHA-256 of the file."""
+"""Meshes by path and SHA-256 of the file."""
 
 
 def _read(path: Path, reader: Callable[[bytes], Surface], data: bytes) -> MeshFile:

@@ -36,7 +36,7 @@ WHOLE, HALF = backward("float64", "float32"), backward(*HALVES)
 
 
 def _camera(height: int, width: int) -> Camera:
-    """Whose grid is all that a warp takes of it."""
+    """Camera whose grid is all that a warp takes of it."""
     return orbit(0, size=height, width=width)
 
 

@@ -21,7 +21,7 @@ DECIBELS = Bound("dB", 1e-6, "reports show two digits behind the point")
 
 
 def _cosine(a: np.ndarray, b: np.ndarray) -> float:
-    """In mpmath, so that no length overflows."""
+    """Cosine in mpmath, so that no length overflows."""
     with mpmath.workdps(40):
         u, v = ([mpmath.mpf(float(x)) for x in row] for row in (a, b))
         product = sum(x * y for x, y in zip(u, v, strict=True))

@@ -266,7 +266,7 @@ def _undefined_depth(share: float, way: Way) -> float:
 
 
 def engine_of(way: Way) -> Backend:
-    """Who samples features: torch's definition, or the kernels."""
+    """Backend that samples features: torch's definition, or the kernels."""
     return "reference" if way.backend == "reference" else "auto"
 
 

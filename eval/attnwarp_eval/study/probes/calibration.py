@@ -135,7 +135,7 @@ class Calibration(Probe[Extra]):
         return Extra(Transport(**transport_of(work.world.scene), variant=variant()))
 
     def read_extra(self, data: Json) -> Extra:
-        """From the record's entry ``effects``."""
+        """Read from the record's entry ``effects``."""
         return Extra(Transport(**data["effects"]))
 
     def problems(self, results: Results) -> list[str]:

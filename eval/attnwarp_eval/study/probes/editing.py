@@ -189,7 +189,7 @@ class EditResult:
 
     @classmethod
     def from_json(cls, data: Json) -> EditResult:
-        """From :meth:`to_json`."""
+        """Rebuild from :meth:`to_json`."""
         judgements = {
             key: Judgement(
                 data[key]["answer"],
@@ -461,7 +461,7 @@ class EditingProbe(Probe[EditResult]):
         return Budget(seconds, given.get("network_rows"))
 
     def read_extra(self, data: Json) -> EditResult:
-        """From the record's entry ``edit``."""
+        """Read from the record's entry ``edit``."""
         return EditResult.from_json(data["edit"])
 
     def repeatable(self, record: Record[EditResult]) -> bool:

@@ -171,7 +171,7 @@ class EditingTimingProbe(Probe[Rounds]):
         return Work(cell, work.root, work.scene_world, Meter())
 
     def read_extra(self, data: Json) -> Rounds:
-        """From the record's cost."""
+        """Read from the record's cost."""
         rounds = data["cost"]["rounds"]
         seconds = {s: [[float(v) for v in row] for row in rounds[s]] for s in STAGES}
         return Rounds(seconds, [dict(row) for row in data["cost"]["work"]])

@@ -95,7 +95,9 @@ class Point:
 
     @classmethod
     def from_json(cls, data: Json) -> Point:
-        """From :meth:`to_json`, or from an evaluation's attributes, None where undefined."""
+        """Rebuild from :meth:`to_json`, or from an evaluation's attributes, None where
+        undefined.
+        """
         numbers = with_nan({name: data[name] for name in ("loss", "psnr", "psnr_pooled")})
         return cls(**{**data, **numbers, "measures": with_nan(data["measures"])})
 
@@ -229,7 +231,7 @@ class Fit(Probe[Curve]):
         )
 
     def read_extra(self, data: Json) -> Curve:
-        """From the record's entry ``curve``."""
+        """Read from the record's entry ``curve``."""
         return Curve(tuple(map(Point.from_json, data["curve"])))
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:

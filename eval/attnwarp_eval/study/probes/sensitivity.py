@@ -1,4 +1,4 @@
-"""Which metric can see what: every metric on right results of an edit and on flawed ones.
+"""Sensitivity of metrics: every metric on right results of an edit and on flawed ones.
 
 A metric that ranks the right result above the flawed one sees that flaw. One that ranks them at
 random is blind to it, and one that prefers the flaw moves the wrong way.
@@ -252,7 +252,7 @@ class Sensitivity(Probe[Seconds]):
         return Seconds(seconds)
 
     def read_extra(self, data: Json) -> Seconds:
-        """From the record's cost."""
+        """Read from the record's cost."""
         rounds = data["cost"].get("rounds", {})
         return Seconds({key: [float(v) for v in values] for key, values in rounds.items()})
 

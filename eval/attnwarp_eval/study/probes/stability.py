@@ -32,7 +32,7 @@ from attnwarp_eval.study.schema import Part, Study
 
 
 class Sweep(Part):
-    """Which hard cases a study sweeps."""
+    """Hard cases that a study sweeps."""
 
     cases: list[str] = Field(default_factory=list, description="by name; all of them if empty")
     levels: Literal["all", "quick"] = "all"
@@ -156,7 +156,7 @@ class Stability(Probe[Extra]):
         return Extra(refusals)
 
     def read_extra(self, data: Json) -> Extra:
-        """From the record's entry ``refusals``."""
+        """Read from the record's entry ``refusals``."""
         return Extra(data["refusals"])
 
     def read(self, data: Json) -> Record[Extra]:

@@ -114,7 +114,7 @@ class Timing(Probe[Rounds]):
         return Rounds(timed(render), timed(pair))
 
     def read_extra(self, data: Json) -> Rounds:
-        """From the record's cost."""
+        """Read from the record's cost."""
         rounds = data["cost"]["rounds"]
         return Rounds(
             **{s: [[float(v) for v in row] for row in rounds[s]] for s in ("render", "pair")}

@@ -68,7 +68,7 @@ class Varied:
 
     @classmethod
     def from_json(cls, data: Json) -> Varied:
-        """From :meth:`to_json`."""
+        """Rebuild from :meth:`to_json`."""
         return cls(**{**data, "seeds": tuple(data["seeds"]), "answers": tuple(data["answers"])})
 
 
@@ -199,7 +199,7 @@ class VariabilityProbe(Probe[Varied]):
         }
 
     def read_extra(self, data: Json) -> Varied:
-        """From the record's entry ``varied``."""
+        """Read from the record's entry ``varied``."""
         return Varied.from_json(data["varied"])
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
@@ -298,7 +298,9 @@ def described(change: Interval, between: Interval, excess: Interval) -> str:
 
 
 def _above(value: Interval, limit: float) -> bool | None:
-    """On which side of a limit an interval lies; None if on both, or without bounds."""
+    """Return True if an interval lies above a limit, False if below; None if on both, or without
+    bounds.
+    """
     if not value.bounded or value.low <= limit <= value.high:
         return None
     return value.low > limit
