@@ -9,7 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 FOLDERS = ("attnwarp", "benchmarks", "eval", "scripts", "tests")
-FRAGMENT = re.compile(r"\s*(Of|What|Where|Whether|How|The same|See|When|Not|As)\b")
+FRAGMENT = re.compile(
+    r"\s*(Of|What|Where|Whether|Which|Who|Whose|Why|How|The same|See|When|Not|As)\b"
+)
 """First words of a docstring that begins with neither a noun nor an imperative verb."""
 
 

@@ -1,4 +1,4 @@
-"""Which part of a study a stack belongs to, and that the parts name code that exists."""
+"""Part of a study that a stack belongs to, and that the parts name code that exists."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ class Case:
     thing: Mask
 
     def answer(self, image: Image, where: Mask | None = None) -> int:
-        """Which of the answers a picture is nearest to in the thing, or in a part of it."""
+        """Index of the answer that a picture is nearest to in the thing, or in a part of it."""
         return nearest(image, self.answers, self.thing if where is None else self.thing & where)
 
 
@@ -282,7 +282,8 @@ class _Rolled:
 def warped_figure(
     editor: Any, worlds: Worlds, *, size: int, count: int = 10, noises: int = 8
 ) -> Figure:
-    """In how many worlds a true warp between two views beats the same warp displaced by an eighth.
+    """Share of worlds in which a true warp between two views beats the same warp displaced by an
+    eighth.
 
     For each noise the target's colours at points that the source sees are compared with the source's
     (CIEDE2000). A world counts where the difference's 95 % interval over noises (Student's t) is above 0.

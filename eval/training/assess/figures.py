@@ -71,7 +71,7 @@ class Figure:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Fields for JSON."""
         return asdict(self)
 
 
@@ -225,8 +225,8 @@ def _retrieval(encoder: TextImageEncoder, images: Array, pictures: Pictures, wha
 
 
 def _direction(encoder: TextImageEncoder, images: Array, pictures: Pictures) -> Figure:
-    """Which of 8 edits was made, by the cosine of the change of pictures and of captions, as
-    directional similarity.
+    """Choice of the edit that was made among 8, by the cosine of the change of pictures and of
+    captions, as directional similarity.
     """
     rng = np.random.default_rng(2)
     index = {
@@ -458,8 +458,9 @@ def ssim_distance(a: Image, b: Image) -> float:
 def perceptual_figures(
     encoder: PerceptualDistance, renders: npt.NDArray[np.uint8], *, pairs: int = 600
 ) -> list[Figure]:
-    """Which of two distortions is the stronger: on photographs and worlds that training never
-    saw."""
+    """Choice of the stronger of two distortions: on photographs and worlds that training never
+    saw.
+    """
     sources = Sources(photographs(HELD_OUT_PHOTOS), renders)
     distances: dict[str, Distance] = {
         "perceptual": lambda a, b: float(encoder.distance([a], [b])[0]), "PSNR": psnr_distance, "SSIM": ssim_distance,

@@ -1,4 +1,4 @@
-"""Which of some answers an edited picture gives, and what it leaves alone."""
+"""Answer that an edited picture gives, and what it leaves alone."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ def mean_lab(image: Image, mask: npt.NDArray[np.bool_]) -> Lab:
 
 
 def nearest(image: Image, answers: Sequence[Image], mask: npt.NDArray[np.bool_]) -> int:
-    """Which of some pictures has the mean colour in the mask that is nearest to the picture's (CIEDE2000)."""
+    """Index of the picture that has the mean colour in the mask that is nearest to the picture's
+    (CIEDE2000).
+    """
     from skimage.color import deltaE_ciede2000
 
     own = mean_lab(image, mask)

@@ -60,7 +60,7 @@ def _wholes(encoder: TextImageEncoder, images: Array, pictures: PartPictures) ->
 
 
 def _surfaces(encoder: TextImageEncoder, images: Array, pictures: PartPictures) -> Figure:
-    """Which of 17 colours and materials a part has, by the picture as a whole."""
+    """Choice of a part's surface among 17 colours and materials, by the picture as a whole."""
     choices = surface_choices()
     numbers = surface_number(pictures.surfaces)
     right, worlds = [], []
@@ -80,7 +80,7 @@ def _surfaces(encoder: TextImageEncoder, images: Array, pictures: PartPictures) 
 
 
 def _directions(encoder: TextImageEncoder, images: Array, pictures: PartPictures) -> Figure:
-    """Which of 8 edits of parts of one picture was made, by directional similarity.
+    """Choice of the edit that was made among 8 of parts of one picture, by directional similarity.
 
     The seven others give a surface to a part of it too: the same part or another that is seen.
     """
@@ -131,7 +131,8 @@ def _directions(encoder: TextImageEncoder, images: Array, pictures: PartPictures
 def scene_figure(
     encoder: TextImageEncoder, *, scenes: Sequence[str] = SCENES
 ) -> tuple[Figure, dict[str, float]]:
-    """Which of a scene's own edits was made, by directional similarity; and the share of each scene.
+    """Choice of the edit that was made among a scene's own, by directional similarity; and the
+    share of each scene.
 
     Each answer of an ambiguous edit is an edit of its own. Their true pictures are the package's.
     """

@@ -13,7 +13,7 @@ from training.worlds.editing_pairs import SIZE, THING, Worlds
 
 @dataclass(frozen=True)
 class Row:
-    """Which pictures a pair is made of."""
+    """Pictures that a pair is made of."""
 
     world: int
     view: int

@@ -151,7 +151,7 @@ def _mask(segmenter: Segmenter, image: Image, words: str) -> Mask | None:
 def report(
     figures: dict[str, list[Figure]], scenes: Sequence[tuple[str, str, float | None, float]]
 ) -> str:
-    """In Markdown."""
+    """Report in Markdown."""
     lines = [
         "# Masks by words: overlap with exact masks", "",
         "`ClipSegmenter` with clip-parts. Made by `python -m training.assess.segment`, from the folder eval/.",

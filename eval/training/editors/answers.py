@@ -1,4 +1,4 @@
-"""Which answer a noise picks: directions of the noise's mean, one a look."""
+"""Answer that a noise picks: directions of the noise's mean, one a look."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ HALF_PLANES = 0.7
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Which pictures the pairs of a batch are made of; all are (B,).
+    """Pictures that the pairs of a batch are made of; all are (B,).
 
     Attributes:
         world, view, source, target: numbers of the world, its view and its looks before and after.

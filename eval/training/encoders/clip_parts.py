@@ -207,7 +207,8 @@ def part_losses(
     model: ClipParts, pooled: Tensor, dense: Tensor, ids: npt.NDArray[np.uint8], surfaces: Ints, tokenizer: Tokenizer,
     rng: np.random.Generator,
 ) -> Tensor:  # fmt: skip
-    """Which surface a part has, among all colours and materials: asked of the picture and of the part's places.
+    """Losses of a part's surface, among all colours and materials: asked of the picture and of the
+    part's places.
 
     Args:
         model: for its text tower and scales.

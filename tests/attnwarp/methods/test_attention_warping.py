@@ -42,7 +42,9 @@ QUICK = preset("attention_warping", stages=2, views_per_stage=2, steps=2, iterat
 
 
 def plan(result):
-    """Who was edited when, by the result's rounds: the sources are the first of the first."""
+    """Plan of who was edited when, by the result's rounds: the sources are the first of the
+    first.
+    """
     sources = result.counters["sources"]
     first, *others = [part.views for part in result.rounds]
     stages = [first[sources:], *others]

@@ -1,4 +1,4 @@
-"""Which effects a scene needs, what is planned for them, and materials, lamps, fog and lens against
+"""Effects that a scene needs, what is planned for them, and materials, lamps, fog and lens against
 closed forms.
 """
 

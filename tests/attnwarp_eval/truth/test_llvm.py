@@ -1,4 +1,4 @@
-"""Which of Mitsuba's variants is chosen, and whether the pictures of the two are the same."""
+"""Choice of Mitsuba's variant, and whether the pictures of the two are the same."""
 
 import subprocess
 
