@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 
 import attnwarp.cli.main
 import attnwarp_eval.cli.main
-from attnwarp_eval.study.study import shipped_studies
+from attnwarp_eval.study.study import load_study, shipped_studies
 
 ROOT = Path(__file__).parents[1]
 PAGES = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
@@ -227,7 +227,7 @@ probes: {depth: [a]}
 def test_cheap_commands_of_a_page_run_in_their_order(page, tmp_path, monkeypatch):
     small_capture.write(tmp_path)
     (tmp_path / "study.yaml").write_text(TINY)
-    (tmp_path / "my.yaml").write_text("".join(blocks("docs/studies.md", ("yaml",))))
+    (tmp_path / "my.yaml").write_text(next(blocks("docs/studies.md", ("yaml",))))
     monkeypatch.chdir(tmp_path)
     named = [shlex.join(words) for block in blocks(page, SHELLS) for words in split(block)]
     places = [named.index(line) for line in CHEAP[page]]
@@ -236,6 +236,16 @@ def test_cheap_commands_of_a_page_run_in_their_order(page, tmp_path, monkeypatch
         program, *rest = shlex.split(line)
         done = CliRunner().invoke(APPS[program], rest)
         assert done.exit_code == 0, (line, done.output)
+
+
+def test_the_study_that_extends_another_on_its_page_says_what_it_keeps(tmp_path):
+    """Oracle: the comments of the page."""
+    _, extending = blocks("docs/studies.md", ("yaml",))
+    (tmp_path / "mine.yaml").write_text(extending)
+    mine, base = load_study(str(tmp_path / "mine.yaml")), load_study("ablation-quick")
+    assert mine.editing.options == base.editing.options | {"steps": 4}
+    assert (mine.size, mine.seeds, mine.fronts) == (96, [1, 2], [])
+    assert mine.variants == base.variants
 
 
 def test_a_scheduler_as_the_documents_start_it_listens_at_one_address(tmp_path):

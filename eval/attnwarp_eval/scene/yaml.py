@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 
@@ -57,6 +57,8 @@ SCALARS: dict[str, Callable[[str], Any]] = {
 
 Place = tuple[int | str, ...]
 """Keys and indices that lead to a value; () is the whole file."""
+
+Line = TypeVar("Line")
 
 
 def read_yaml(text: str) -> tuple[dict[Place, int], Any]:
@@ -171,7 +173,7 @@ def _bare_color(text: str) -> str:
     return ""
 
 
-def line_of(lines: dict[Place, int], loc: Sequence[int | str]) -> int:
+def line_of(lines: dict[Place, Line], loc: Sequence[int | str]) -> Line:
     """Line (from 1) of the deepest place that ``loc`` leads to; the tags that unions put into a loc
     lead nowhere.
     """

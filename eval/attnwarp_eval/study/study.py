@@ -14,7 +14,7 @@ from attnwarp.io.text import read_text
 from attnwarp_eval.scene import explain
 from attnwarp_eval.scene.file import is_scene_file, scene_name
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.scene.yaml import YamlError, line_of, read_yaml
+from attnwarp_eval.scene.yaml import Place, YamlError, line_of, read_yaml
 from attnwarp_eval.study.cell import Cell, merged
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.probes.base import Probe
@@ -31,6 +31,10 @@ from attnwarp_eval.study.schema import (
 
 KEYS = "study/shipped/quick.yaml"
 """File of this package that shows the keys of a study, for messages."""
+
+
+_Lines = dict[Place, tuple[Path, int]]
+"""File and line (from 1) of every place of a study."""
 
 
 class _PlacedError(ValueError):
@@ -203,10 +207,15 @@ def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:
     return merged(sorted(cells, key=lambda cell: place.get(cell.scene, len(place))))
 
 
-def shipped_studies() -> dict[str, Path]:
-    """Studies that come with the package, by name."""
+def shipped_studies(parts: bool = False) -> dict[str, Path]:
+    """Studies that come with the package, by name.
+
+    Args:
+        parts: add what several of them extend and what is no study by itself.
+    """
     folder = Path(str(resources.files("attnwarp_eval.study") / "shipped"))
-    return {p.stem: p for p in sorted(folder.glob("*.yaml"))}
+    files = folder.rglob("*.yaml") if parts else folder.glob("*.yaml")
+    return {p.stem: p for p in sorted(files)}
 
 
 def load_study(name_or_path: str, **overrides: Any) -> Study:
@@ -220,8 +229,8 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         overrides: fields to replace, such as ``size`` or ``scenes``; None leaves a field as it is.
 
     Raises:
-        StudyError: no such study, not YAML, an unknown key, a value out of range, or a setting that
-            decides nothing of the study.
+        StudyError: no such study, not YAML, an unknown key, a value out of range, a setting that
+            decides nothing of the study, or studies that extend each other in a circle.
 
     Example:
         >>> study = load_study("quick", scenes=["spheres"])
@@ -235,22 +244,8 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
             f"{name_or_path}: no such study{did_you_mean(name_or_path, shipped)}, or give a YAML"
             " file's path"
         )
-    try:
-        lines, data = read_yaml(read_text(path))
-    except (YamlError, UnicodeDecodeError) as error:
-        line = f":{error.line}" if isinstance(error, YamlError) and error.line else ""
-        raise StudyError(f"{path}{line}: {error}") from None
-    if not isinstance(data, dict):
-        raise StudyError(
-            f"{path}: expected keys such as scenes, variants, probes; got a {type(data).__name__}"
-        )
-    if {"objects", "cameras"} <= data.keys():
-        raise StudyError(
-            f"{path}: is a scene; name it under 'scenes' in a study, or as run STUDY --scenes"
-            f" {path}"
-        )
+    data, lines = _read(path)
     keys = set(data)
-    data = _beside(data, path.parent)
     every = data.get("scenes")
     named = every if isinstance(every, list) else ()
     files = {scene_name(where): where for where in named if is_scene_file(where)}
@@ -268,18 +263,99 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         study = parse_study(data)
     except ValidationError as error:
         place = _place(error.errors()[0])
-        line = f":{line_of(lines, place)}" if place else ""
-        raise StudyError(f"{path}{line}: {explain_errors(error)}") from None
-    if problems := [
-        (line_of(lines, place), f"{'.'.join(place)}: {why}")
-        for place, why in unused(study, keys, probes())
-    ]:
-        told = "; line ".join(f"{line}: {problem}" for line, problem in sorted(problems))
-        raise StudyError(f"{path}:{told}")
+        file, line = line_of(lines, place) if place else (path, None)
+        at = f"{file}:{line}" if line else str(file)
+        raise StudyError(f"{at}: {explain_errors(error)}") from None
+    problems: dict[Path, list[tuple[int, str]]] = {}
+    for place, why in unused(study, keys, probes()):
+        file, line = line_of(lines, place)
+        inherited = "" if file == path else f", or take it away with null in {path.name}"
+        problems.setdefault(file, []).append((line, f"{'.'.join(place)}: {why}{inherited}"))
+    if problems:
+        raise StudyError(
+            "; ".join(
+                f"{file}:" + "; line ".join(f"{line}: {problem}" for line, problem in sorted(found))
+                for file, found in problems.items()
+            )
+        )
     if isinstance(every, list):
         called = {scene_name(name) for name in study.scenes}
         study._left_out = tuple(name for name in every if scene_name(name) not in called)
     return study
+
+
+def _read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], _Lines]:
+    """A study's data joined with what it extends, and where each of its places is written.
+
+    Args:
+        path: of the file.
+        above: files that extend this one, the first of them first.
+    """
+    try:
+        read, data = read_yaml(read_text(path))
+    except (YamlError, UnicodeDecodeError) as error:
+        line = f":{error.line}" if isinstance(error, YamlError) and error.line else ""
+        raise StudyError(f"{path}{line}: {error}") from None
+    if not isinstance(data, dict):
+        raise StudyError(
+            f"{path}: expected keys such as scenes, variants, probes; got a {type(data).__name__}"
+        )
+    if {"objects", "cameras"} <= data.keys():
+        raise StudyError(
+            f"{path}: is a scene; name it under 'scenes' in a study, or as run STUDY --scenes"
+            f" {path}"
+        )
+    lines = {place: (path, line) for place, line in read.items()}
+    data = _beside(data, path.parent)
+    if "extends" not in data:
+        return data, lines
+    name, at = data.pop("extends"), f"{path}:{read['extends',]}: extends"
+    if not isinstance(name, str):
+        raise StudyError(f"{at}: got {name!r}, expected the name of a study or a YAML file's path")
+    shipped = shipped_studies(parts=True)
+    base = shipped.get(name, path.parent / Path(name).expanduser())
+    if not base.is_file():
+        raise StudyError(
+            f"{at}: no such study {name!r}{did_you_mean(name, shipped)}, or give a YAML file's path"
+            " from the folder of this file"
+        )
+    chain = (*above, path)
+    if base.resolve() in {file.resolve() for file in chain}:
+        way = " extends ".join(file.name for file in (*chain, base))
+        raise StudyError(f"{at}: leads back to {base.name} ({way}); leave one out")
+    return _extended(*_read(base, chain), data, lines)
+
+
+def _extended(
+    base: dict[str, Any], base_lines: _Lines, own: dict[str, Any], own_lines: _Lines
+) -> tuple[dict[str, Any], _Lines]:
+    """A study's own data over that of the one it extends.
+
+    Mappings are merged, all else is replaced; null takes away a key that the other has.
+    """
+    replaced: list[Place] = []
+
+    def over(old: Any, new: Any, place: Place) -> Any:
+        if not (isinstance(old, dict) and isinstance(new, dict)):
+            replaced.append(place)
+            return new
+        joined = old | {
+            key: over(old[key], value, (*place, key)) if key in old else value
+            for key, value in new.items()
+        }
+        return {
+            key: value
+            for key, value in joined.items()
+            if not (value is None and key in new and key in old)
+        }
+
+    data = over(base, own, ())
+    kept = {
+        place: at
+        for place, at in base_lines.items()
+        if not any(place[: len(root)] == root for root in replaced)
+    }
+    return data, kept | own_lines
 
 
 def _place(problem: Any) -> tuple[int | str, ...]:

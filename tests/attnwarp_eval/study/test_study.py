@@ -316,3 +316,134 @@ def test_a_scene_of_a_file_has_its_name_in_cells_and_its_file_beside_it(tmp_path
     store.write_study(expected(planned))
     assert {cell["scene"] for cell in stored_study(store).cells} == {"room"}
     assert not verify(store).damaged
+
+
+BASE = """\
+name: base
+size: 64
+scenes: [spheres]
+views: [yaw030, yaw090]
+spp: 1
+splats: {count: 500, position_noise: 0.1}
+variants:
+  corrected: {}
+  slipped: {set: {pixel_centers: integer, opaque: 0.9}}
+  bare: {preset: released}
+probes:
+  depth: [corrected]
+  warp: [corrected, slipped, bare]
+yaw: {variants: [slipped]}
+"""
+
+CHILD = """\
+extends: base.yaml
+name: child
+views: [yaw060]
+splats: {count: 700}
+variants:
+  slipped: {set: {opaque: null, depth: center}}
+  bare: null
+  bounds only: {set: {opaque: null}}
+probes:
+  depth: null
+  warp: [slipped, bounds only]
+yaw: null
+"""
+
+BY_HAND = """\
+name: child
+size: 64
+scenes: [spheres]
+views: [yaw060]
+spp: 1
+splats: {count: 700, position_noise: 0.1}
+variants:
+  corrected: {}
+  slipped: {set: {pixel_centers: integer, depth: center}}
+  bounds only: {set: {opaque: null}}
+probes:
+  warp: [corrected, slipped, bounds only]
+"""
+
+
+def extending(folder, child=CHILD, base=BASE):
+    (folder / "base.yaml").write_text(base)
+    path = folder / "child.yaml"
+    path.write_text(child)
+    return str(path)
+
+
+def test_a_study_that_extends_another_is_the_one_merged_by_hand(tmp_path):
+    listed = CHILD.replace("[slipped, bounds only]", "[corrected, slipped, bounds only]")
+    merged = load_study(extending(tmp_path, listed))
+    (tmp_path / "by_hand.yaml").write_text(BY_HAND)
+    by_hand = load_study(str(tmp_path / "by_hand.yaml"))
+    assert merged.model_dump() == by_hand.model_dump()
+    assert [cell.id for cell in cells(merged)] == [cell.id for cell in cells(by_hand)]
+
+
+def test_a_shipped_study_is_extended_by_its_name(tmp_path):
+    path = tmp_path / "larger.yaml"
+    path.write_text("extends: gate\nname: larger\nsize: 160\nfeature_sizes: [160]\n")
+    by_hand = load_study("gate", size=160).model_dump() | {
+        "name": "larger",
+        "feature_sizes": [160],
+    }
+    assert load_study(str(path)).model_dump() == by_hand
+
+
+def test_paths_of_an_extended_study_count_from_its_own_folder(tmp_path):
+    (tmp_path / "far").mkdir()
+    shipped = pathlib.Path(__file__).parents[3] / "scenes" / "spheres.yaml"
+    (tmp_path / "far" / "room.yaml").write_text(shipped.read_text())
+    (tmp_path / "far" / "base.yaml").write_text(BASE.replace("spheres", "room.yaml"))
+    path = tmp_path / "child.yaml"
+    path.write_text("extends: far/base.yaml\nname: child\n")
+    assert load_study(str(path)).scenes == [str(tmp_path / "far" / "room.yaml")]
+
+
+@pytest.mark.parametrize(
+    ("child", "told"),
+    [
+        ("extends: bas.yaml\n", r"child.yaml:1: extends: no such study 'bas.yaml'"),
+        ("name: a\nextends: gatee\n", r"child.yaml:2: .*'gatee'; did you mean 'gate'"),
+        ("name: a\nextends: [base.yaml]\n", r"child.yaml:2: extends: got \['base.yaml'\]"),
+        ("name: a\nextends: child.yaml\n", r"child.yaml:2: extends: leads back to child.yaml"),
+        ("extends: spheres.yaml\n", r"spheres.yaml: is a scene"),
+        # A key that the child wrote, one that it left to the base, and one that it took away.
+        ("extends: base.yaml\nviews: [yaw030]\nspp: none\n", r"child.yaml:3: spp"),
+        ("extends: base.yaml\nname: null\n", r"child.yaml:2: name"),
+        ("extends: base.yaml\nsplats:\n  kind: 4d\n", r"child.yaml:3: splats.kind"),
+    ],
+)
+def test_a_mistake_in_a_study_that_extends_another_has_its_file_and_line(tmp_path, child, told):
+    shipped = pathlib.Path(__file__).parents[3] / "scenes" / "spheres.yaml"
+    (tmp_path / "spheres.yaml").write_text(shipped.read_text())
+    with pytest.raises(StudyError, match=told):
+        load_study(extending(tmp_path, child))
+
+
+@pytest.mark.parametrize(
+    ("was", "is_now", "told"),
+    [
+        ("spp: 1", "spp: none", r"base.yaml:5: spp"),
+        ("count: 500", "count: -1", r"base.yaml:6: splats.count"),
+        ("name: base", "name: [", r"base.yaml:\d+: not valid YAML"),
+        ("name: base", "name: base\nextends: child.yaml", r"base.yaml:2: .*leads back to child"),
+        ("spp: 1", "spp: 1\ncolour: red", r"base.yaml:6: .*colour"),
+    ],
+)
+def test_a_mistake_in_an_extended_study_has_its_own_file_and_line(tmp_path, was, is_now, told):
+    path = extending(tmp_path, "extends: base.yaml\nname: a\n", BASE.replace(was, is_now))
+    with pytest.raises(StudyError, match=told):
+        load_study(path)
+
+
+def test_an_inherited_key_that_nothing_reads_is_told_how_to_take_away(tmp_path):
+    child = "extends: base.yaml\nname: a\nprobes: {warp: null}\nyaw: null\ntiming_rounds: 3\n"
+    with pytest.raises(StudyError) as told:
+        load_study(extending(tmp_path, child))
+    text = str(told.value)
+    assert "base.yaml:9: variants.slipped: " in text and "line 10: variants.bare: " in text
+    assert text.count("or take it away with null in child.yaml") >= 2
+    assert "child.yaml:5: timing_rounds: " in text
