@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import typer.testing
+from all_reported import pytest_runtest_logreport, pytest_sessionfinish  # noqa: F401  (hooks)
 
 ROOT = Path(__file__).parent
 
