@@ -21,7 +21,7 @@ def test_case(case):
 
 
 def test_a_run_whose_worker_dies_ends_and_does_not_pass(tmp_path):
-    """Where the other worker asks the dying one for tests, xdist may lose them, not fail one."""
+    """A dying worker that the other asks for tests may lose them, in place of failing one."""
     for number in range(4):
         (tmp_path / f"test_{number}.py").write_text(FILE.format(dies=number == 1))
     (distribution,) = re.findall(r"--dist \w+", MAKEFILE)
