@@ -236,6 +236,9 @@ def interrupted(moment):
         signal.signal(signal.SIGINT, handler)
 
 
+# Ctrl-C may come between the opening of a file and the block that closes it.
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(folder):
     # On a busy machine the run may be over before the signal is sent: then once more.
     for attempt in range(5):
