@@ -56,13 +56,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Navigation: home, the documents in the order of their titles, the reference."""
-    pages = sorted(path.name for path in (ROOT / "docs").glob("*.md"))
-    config.nav = [
-        {"Home": "index.md"},
-        {"Documents": pages},
-        {"Reference": ["api/index.md", *(f"api/{name}.md" for name in public_modules())]},
-    ]
+    """Append the reference to the navigation of mkdocs.yml."""
+    pages = ["api/index.md", *(f"api/{name}.md" for name in public_modules())]
+    config.nav = [*(config.nav or []), {"Reference": pages}]
     return config
 
 
@@ -73,10 +69,10 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         text, target = match[1], match[2]
         if "://" in target or files.get_file_from_path(target) is not None:
             return match[0]
-        base = ROOT if page.file.src_uri == "index.md" else ROOT / "docs"
-        path = (base / target).resolve()
-        if path.is_relative_to(ROOT / "docs") and path.suffix == ".md":
-            return match[0]  # a page: mkdocs itself checks it
+        home = page.file.src_uri == "index.md"
+        path = ((ROOT if home else (ROOT / "docs" / page.file.src_uri).parent) / target).resolve()
+        if path.is_relative_to(ROOT / "docs"):
+            return match[0]  # of the site: mkdocs itself checks it
         if not path.exists():
             raise PluginError(f"{page.file.src_uri}: links to {target}, which does not exist")
         name = path.relative_to(ROOT).as_posix()

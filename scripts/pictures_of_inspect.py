@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/inspecting.md with the commands that the page names.
+"""Draw the pictures of docs/measuring/inspecting.md with the commands that the page names.
 
 python scripts/pictures_of_inspect.py docs/pictures
 """

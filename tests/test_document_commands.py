@@ -26,7 +26,10 @@ import attnwarp_eval.cli.main
 from attnwarp_eval.study.study import load_study, shipped_studies
 
 ROOT = Path(__file__).parents[1]
-PAGES = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
+PAGES = [
+    "README.md",
+    *sorted(f"{path.relative_to(ROOT)}" for path in (ROOT / "docs").rglob("*.md")),
+]
 APPS = {"attnwarp": attnwarp.cli.main.app, "attnwarp-eval": attnwarp_eval.cli.main.app}
 SHELLS = ("sh", "bash", "shell", "console")
 
@@ -192,7 +195,7 @@ def test_a_command_that_cannot_be_called_is_found(line, tmp_path, monkeypatch):
 
 
 CHEAP = {
-    "docs/commands.md": [
+    "docs/start/commands.md": [
         "attnwarp render fits/mine/splats.ply my_capture --out fits/views",
         "attnwarp convert fits/mine/splats.ply mine.splat",
         "attnwarp undistort my_capture undistorted",
@@ -200,9 +203,9 @@ CHEAP = {
         "attnwarp-eval scenes edits bear",
         "attnwarp-eval encoders",
     ],
-    "docs/hard-cases.md": ["attnwarp-eval stability --list"],
-    "docs/studies.md": ["attnwarp-eval studies", "attnwarp-eval run my.yaml --dry-run"],
-    "docs/gate.md": [
+    "docs/measuring/hard-cases.md": ["attnwarp-eval stability --list"],
+    "docs/measuring/studies.md": ["attnwarp-eval studies", "attnwarp-eval run my.yaml --dry-run"],
+    "docs/measuring/gate.md": [
         "attnwarp-eval run study.yaml --out runs/before",
         "attnwarp-eval compare baseline.jsonl runs/before --update",
         "attnwarp-eval run study.yaml --out runs/after",
@@ -227,7 +230,7 @@ probes: {depth: [a]}
 def test_cheap_commands_of_a_page_run_in_their_order(page, tmp_path, monkeypatch):
     small_capture.write(tmp_path)
     (tmp_path / "study.yaml").write_text(TINY)
-    (tmp_path / "my.yaml").write_text(next(blocks("docs/studies.md", ("yaml",))))
+    (tmp_path / "my.yaml").write_text(next(blocks("docs/measuring/studies.md", ("yaml",))))
     monkeypatch.chdir(tmp_path)
     named = [shlex.join(words) for block in blocks(page, SHELLS) for words in split(block)]
     places = [named.index(line) for line in CHEAP[page]]
@@ -240,7 +243,7 @@ def test_cheap_commands_of_a_page_run_in_their_order(page, tmp_path, monkeypatch
 
 def test_the_study_that_extends_another_on_its_page_says_what_it_keeps(tmp_path):
     """Oracle: the comments of the page."""
-    _, extending = blocks("docs/studies.md", ("yaml",))
+    _, extending = blocks("docs/measuring/studies.md", ("yaml",))
     (tmp_path / "mine.yaml").write_text(extending)
     mine, base = load_study(str(tmp_path / "mine.yaml")), load_study("ablation-quick")
     assert mine.editing.options == base.editing.options | {"steps": 4}
@@ -250,7 +253,7 @@ def test_the_study_that_extends_another_on_its_page_says_what_it_keeps(tmp_path)
 
 def test_a_scheduler_as_the_documents_start_it_listens_at_one_address(tmp_path):
     """Oracle: the kernel's table of the ports that the process listens at."""
-    page = "docs/scale.md"
+    page = "docs/measuring/scale.md"
     named = [
         words for block in blocks(page, SHELLS) for words in split(block) if words[0] == "dask"
     ]

@@ -114,18 +114,18 @@ def test_examples_of_the_docstrings_give_what_they_print(name, folder):
 
 
 NAMES = {
-    "docs/edits.md": """
+    "docs/truth/edits.md": """
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.truth import Geometry
 from attnwarp_eval.truth.edits import edit_mask
 """,
-    "docs/metrics-pictures.md": """
+    "docs/measuring/metrics-pictures.md": """
 image_srgb, target_srgb = np.random.default_rng(0).uniform(size=(2, 32, 32, 3))
 mask = np.ones((32, 32), bool)
 distance = lambda a, b: float(np.abs(a - b).mean())
 edited, rendered = {"0": image_srgb}, {"0": target_srgb}
 """,
-    "docs/consistency.md": """
+    "docs/measuring/consistency.md": """
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.truth import Geometry
 scene = load_scene("spheres")
@@ -133,16 +133,16 @@ geometry = Geometry(scene)
 source, target = (camera.resize(32, 32) for camera in scene.cameras[:2])
 source_srgb, target_srgb = np.random.default_rng(0).uniform(size=(2, 32, 32, 3))
 """,
-    "docs/fidelity.md": """
+    "docs/measuring/fidelity.md": """
 image_srgb, truth_srgb, original = np.random.default_rng(0).uniform(size=(3, 32, 32, 3))
 mask = np.zeros((32, 32), bool)
 mask[8:24, 8:24] = True
 """,
-    "docs/editing.md": """
+    "docs/method/editing.md": """
 source_picture = target_picture = np.random.default_rng(0).random((64, 64, 3), np.float32)
 view = None
 """,
-    "docs/warping.md": """
+    "docs/method/warping.md": """
 from attnwarp.io import read_dataset, read_ply
 gaussians = read_ply("scene.ply")
 source, target = read_dataset("my_capture").cameras[:2]
@@ -153,10 +153,10 @@ source_tokens, own_tokens = torch.rand(2, 1, 64 * 64, 8)
 """Code that a page's blocks take for granted. Blocks of pages that are not here run as they are."""
 
 NOT_RUN = {
-    "docs/encoders.md": "weights of the user's own",
-    "docs/extending.md": "registers a method for the rest of the process",
-    "docs/fitting.md": "3000 iterations",
-    "docs/masks-by-words.md": "weights of the user's own",
+    "docs/measuring/encoders.md": "weights of the user's own",
+    "docs/project/extending.md": "registers a method for the rest of the process",
+    "docs/method/fitting.md": "3000 iterations",
+    "docs/method/masks-by-words.md": "weights of the user's own",
 }
 
 
@@ -164,7 +164,10 @@ def blocks(page):
     return re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.M | re.S)
 
 
-PAGES = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
+PAGES = [
+    "README.md",
+    *sorted(f"{path.relative_to(ROOT)}" for path in (ROOT / "docs").rglob("*.md")),
+]
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page) and page not in NOT_RUN])

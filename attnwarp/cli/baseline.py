@@ -41,7 +41,7 @@ class BaselineMethod(StrEnum):
 
 @reading_options()
 def baseline(
-    method: Annotated[BaselineMethod, typer.Argument(help="Of docs/baselines.md.")],
+    method: Annotated[BaselineMethod, typer.Argument(help="Of docs/method/baselines.md.")],
     data: DataArgument,
     ply: Annotated[Path, typer.Option(help="Splats of the scene, such as attnwarp fit makes.")],
     instruction: InstructionOption,
@@ -51,7 +51,7 @@ def baseline(
         str,
         typer.Option(
             help="The method's choices: default, or as published: released, improved (igs2gs),"
-            " paper, random (gaussctrl); see docs/baselines.md."
+            " paper, random (gaussctrl); see docs/method/baselines.md."
         ),
     ] = "default",
     seconds: Annotated[

@@ -70,7 +70,7 @@ def edit(
         typer.Option(
             metavar="NAME",
             help="The method's choices: corrected, extended, paper, released, released-controlnet"
-            " (see docs/presets.md).",
+            " (see docs/method/presets.md).",
         ),
     ] = "corrected",
     source: Annotated[

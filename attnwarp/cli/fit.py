@@ -80,7 +80,9 @@ def fit(
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     change: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Any other setting; see docs/fitting.md."),
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="Any other setting; see docs/method/fitting.md."
+        ),
     ] = None,
     checkpoint_seconds: Annotated[
         float, typer.Option(min=0, help="Seconds between two checkpoints.")

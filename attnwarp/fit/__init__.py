@@ -1,5 +1,5 @@
 """Splats from pictures: the optimisation of 2D and 3D Gaussians on posed images. See
-docs/fitting.md.
+docs/method/fitting.md.
 """
 
 from attnwarp.fit.loop import Fit, Record, fit

@@ -3,8 +3,8 @@
 Properties of a splat file, in the order of the original trainers: ``x y z``, ``nx ny nz`` (zeros),
 ``f_dc_0..2``, ``f_rest_*`` (all coefficients of red, then green, then blue), ``opacity`` (logit),
 ``scale_0..1`` for 2DGS or ``scale_0..2`` for 3DGS (natural logarithm), ``rot_0..3`` (wxyz, any
-length). Header comments carry what the properties cannot; docs/files.md lists them and says who
-else writes them.
+length). Header comments carry what the properties cannot; docs/method/files.md lists them and says
+who else writes them.
 """
 
 from __future__ import annotations

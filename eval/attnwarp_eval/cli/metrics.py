@@ -153,6 +153,8 @@ def encoders(
         else:
             lines = ["ships with the package:"]
             lines += [f"  {n:22} {kind:11} {line}" for n, (kind, line) in BUNDLED.items()]
-            lines += ["read from a place of yours (docs/encoders.md says which files go there):"]
+            lines += [
+                "read from a place of yours (docs/measuring/encoders.md says which files go there):"
+            ]
             lines += [f"  {n:22} {kind:11} {line}" for n, (kind, line) in REAL.items()]
     typer.echo("\n".join(lines))

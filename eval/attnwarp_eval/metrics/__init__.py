@@ -2,8 +2,8 @@
 I/O.
 
 :data:`attnwarp_eval.metrics.registry.METRICS` has each figure's unit, direction and tolerance.
-docs/metrics.md tells which one to use. A figure with nothing to measure is NaN, never 0, with a
-count beside it.
+docs/measuring/metrics.md tells which one to use. A figure with nothing to measure is NaN, never 0,
+with a count beside it.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ _SPECS = (
     Metric("embedding.dino_image", "cosine", "higher", 1e-3, 0, "DINO: render against the edited source view"),
     Metric("embedding.undefined", "views", "lower", 0, 0, "views whose embedding or change has no direction"),
     Metric("perceptual.distance", "ratio", "lower", 1e-4, 1e-2, "perceptual distance of edited picture and render"),
-    # Image metrics, consistency and fidelity: attnwarp_eval.metrics, docs/metrics.md.
+    # Image metrics, consistency and fidelity: attnwarp_eval.metrics, docs/measuring/metrics.md.
     Metric("image.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of sRGB values"),
     Metric("image.psnr", "dB", "higher", 1e-2, 1e-3, "PSNR of sRGB values; infinite for equal pictures"),
     Metric("image.mse_linear", "ratio", "lower", 1e-6, 1e-2, "mean squared error in linear light"),
@@ -214,7 +214,7 @@ _SPECS = (
         "distance to the unedited picture, outside the object",
     ),
     Metric("fidelity.pixels", "pixels", "none", 0, 0, "pixels compared"),
-    # Hard cases: attnwarp_eval.stability, docs/hard-cases.md.
+    # Hard cases: attnwarp_eval.stability, docs/measuring/hard-cases.md.
     Metric("stability.margin", "decades", "higher", 1e-2, 0, "log10 of tolerance over error, cut at 3 and -3"),
     Metric("stability.error", "own", "lower", 0, 1e-2, "error of a hard case, in the unit of its tolerance"),
     Metric("stability.refused", "share", "none", 0, 0, "1 where a hard input was refused with an error, else 0"),

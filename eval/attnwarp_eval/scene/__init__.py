@@ -1,3 +1,3 @@
 """Scenes: the format of a scene file, and its geometry, materials, lights, cameras and edits. See
-docs/scenes.md.
+docs/truth/scenes.md.
 """

@@ -125,7 +125,7 @@ def _read(path: Path) -> Scene:
     try:
         lines, data = read_yaml(text)
     except YamlError as error:
-        hint = "" if error.line else "; docs/scenes.md has an example to start from"
+        hint = "" if error.line else "; docs/truth/scenes.md has an example to start from"
         raise SceneError(f"{error}{hint}", path, error.line) from error
     try:
         spec = SceneSpec.model_validate(data)
@@ -138,7 +138,7 @@ def _read(path: Path) -> Scene:
         more = f" (and {len(problems) - 1} more below it)" if len(problems) > 1 else ""
         loc = (*first["loc"], "type") if first["type"] == "union_tag_invalid" else first["loc"]
         raise SceneError(
-            explain(first, SceneSpec, "docs/scenes.md") + more, path, line_of(lines, loc)
+            explain(first, SceneSpec, "docs/truth/scenes.md") + more, path, line_of(lines, loc)
         ) from error
     scene = Scene(spec, path)
     _check(scene, lines)

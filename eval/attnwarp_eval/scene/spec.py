@@ -1,7 +1,7 @@
 """Models of pydantic for a scene file: objects, lights, cameras, edits.
 
-docs/scenes.md describes the format. Positions are in scene units (metres in the scenes that come
-with the package), angles in degrees, colours sRGB '#rrggbb', z up.
+docs/truth/scenes.md describes the format. Positions are in scene units (metres in the
+scenes that come with the package), angles in degrees, colours sRGB '#rrggbb', z up.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Studies: scenes x variants x seeds x probes, run as content-addressed cells that survive any
-interruption. See docs/studies.md.
+interruption. See docs/measuring/studies.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Methods that edit a scene, by the name that a study's variant gives as ``method``.
 
 A method gets a :class:`Job` and gives an :class:`EditedScene`. A new one is one line in
-:data:`EDITING_METHODS`, or an entry that a plugin adds to it (docs/extending.md).
+:data:`EDITING_METHODS`, or an entry that a plugin adds to it (docs/project/extending.md).
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ the ground, the time of day; whether an edit went in the direction of the words;
 outside its words. It knows {objects} things, {colors} colours, {finishes} surfaces, {grounds} grounds and {times} times of day (`attnwarp_eval/drawn/worlds.py`). A word
 that it does not know is read in pieces and mostly passed over: "a robot dinosaur" is a dinosaur to it. Its figures do not
 compare with those of OpenAI's CLIP, whose name stands beside a figure when it was used (`--clip clip:FOLDER`).
-On edits whose truth is known similarity to the prompt prefers blurred results and is blind to small shifts; docs/metrics.md
+On edits whose truth is known similarity to the prompt prefers blurred results and is blind to small shifts; docs/measuring/metrics.md
 and reports/metrics have the figures.
 
 **Recipe**: `training/encoders/naming.py`, then `training/encoders/clip.py`. First {warm_epochs} epochs in which linear heads name each attribute from the image
@@ -34,7 +34,7 @@ Rare words and invented ones are scattered into captions so that unknown words d
     "clip-parts": """clip-small, trained further on things with parts: pictures and English sentences in one space of {dim} dimensions, and
 a vector for each place of 8 x 8 px. From the two follows with which probability words are true of a place.
 
-**Good for**: masks by words (docs/masks-by-words.md); scores of scenes that show things with parts: people in garments, plants in pots, busts,
+**Good for**: masks by words (docs/method/masks-by-words.md); scores of scenes that show things with parts: people in garments, plants in pots, busts,
 tables laid. There it names the thing and tells edits of parts apart more often than clip-small.
 
 **Not good for**: what clip-small is not good for; and things of one piece, which it names less often than clip-small (the card of that one has

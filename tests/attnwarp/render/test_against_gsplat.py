@@ -72,7 +72,7 @@ def test_3dgs_gradients_agree(backend, antialiased, make_splats) -> None:
         )
 
     # Shares of each tensor's largest entry; float32 sums over thousands of pixels for the CPU
-    # backend, as against the reference (docs/rendering.md).
+    # backend, as against the reference (docs/method/rendering.md).
     tolerance = 1e-8 if backend == "reference" else 1e-4
     for name, ours, theirs in zip(names, gradients(False), gradients(True), strict=True):
         scale = float(theirs.abs().max())

@@ -192,7 +192,7 @@ def test_a_plane_of_splats_gives_the_planes_depth_by_intersection(
     rng = np.random.default_rng(0)
     # Splats wider than a pixel even when tilted by 85 degrees: narrower ones are drawn by the
     # screen filter, beyond 3.33 of their sigmas, where depth is bounded to their extent
-    # (docs/rendering.md says what that costs).
+    # (docs/method/rendering.md says what that costs).
     grid = np.stack(np.meshgrid(np.arange(-12, 13), np.arange(-12, 13)), -1).reshape(-1, 2) * 0.02
     grid = grid + rng.uniform(-0.005, 0.005, grid.shape)
     points = np.array([0, 0, 4.0]) + grid[:, :1] * side + grid[:, 1:] * along

@@ -24,7 +24,7 @@ def test_presets_go_through_json_and_back():
 
 
 def test_the_presets_are_the_table_of_the_docs():
-    text = (Path(__file__).parents[3] / "docs/warping.md").read_text("utf-8")
+    text = (Path(__file__).parents[3] / "docs/method/warping.md").read_text("utf-8")
     rows = re.findall(r"^\| `(\w+)` \| (\S+) \| (\S+) \| (\S+) \|$", text, re.MULTILINE)
     documented = {name: cells for name, *cells in rows}
     written = {None: "none", True: "true", False: "false"}

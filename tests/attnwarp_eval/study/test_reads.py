@@ -50,7 +50,7 @@ def refusal(tmp_path, text):
     ],
 )
 def test_a_variant_has_the_preset_of_its_method_that_it_names(method, name, expected):
-    """The published numbers of docs/baselines.md."""
+    """The published numbers of docs/method/baselines.md."""
     variant = {"method": method} | ({} if name is None else {"preset": name})
     study = parse_study(
         {"name": "s", "scenes": ["bear"], "variants": {"v": variant}, "probes": {"editing": ["v"]}}

@@ -112,7 +112,7 @@ def test_true_pictures_have_the_highest_fidelity_the_least_disagreement_and_one_
     assert figure(record, "depth.abs_rel.before") == pytest.approx(
         figure(record, "depth.abs_rel.after"), rel=0.2
     )
-    # Without encoders; docs/gate.md.
+    # Without encoders; docs/measuring/gate.md.
     assert {METRICS[key].name for key in record.views[0].metrics if gated(key)} == {
         "multiview.delta_e_above", "multiview.same_answer", "fidelity.mse", "fidelity.ssim",
         "fidelity.preserved_mse", "fidelity.preserved_psnr", "image.mse", "image.psnr",
@@ -139,7 +139,7 @@ def test_an_answer_for_each_view_is_seen_as_it_was_planned(folder, tmp_path, mon
 
 def test_the_documents_method_edits_each_view_as_the_control_does(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(EDITING_METHODS, "mine", planned([]))  # taken back afterwards
-    text = (Path(attnwarp_eval.__file__).parents[2] / "docs" / "extending.md").read_text()
+    text = (Path(attnwarp_eval.__file__).parents[2] / "docs/project/extending.md").read_text()
     exec(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1], {})
 
     def pictures(**variant):
