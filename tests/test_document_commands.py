@@ -253,7 +253,7 @@ def test_the_study_that_extends_another_on_its_page_says_what_it_keeps(tmp_path)
 
 def test_a_scheduler_as_the_documents_start_it_listens_at_one_address(tmp_path):
     """Oracle: the kernel's table of the ports that the process listens at."""
-    page = "docs/measuring/scale.md"
+    page = "docs/measuring/studies.md"
     named = [
         words for block in blocks(page, SHELLS) for words in split(block) if words[0] == "dask"
     ]

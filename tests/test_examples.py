@@ -114,31 +114,25 @@ def test_examples_of_the_docstrings_give_what_they_print(name, folder):
 
 
 NAMES = {
-    "docs/truth/edits.md": """
+    "docs/truth/scenes.md": """
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.truth import Geometry
 from attnwarp_eval.truth.edits import edit_mask
 """,
-    "docs/measuring/metrics-pictures.md": """
-image_srgb, target_srgb = np.random.default_rng(0).uniform(size=(2, 32, 32, 3))
-mask = np.ones((32, 32), bool)
-distance = lambda a, b: float(np.abs(a - b).mean())
-edited, rendered = {"0": image_srgb}, {"0": target_srgb}
-""",
-    "docs/measuring/consistency.md": """
+    "docs/measuring/metrics.md": """
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.truth import Geometry
+random = np.random.default_rng(0)
+image_srgb, target_srgb, truth_srgb, original = random.uniform(size=(4, 32, 32, 3))
+source_srgb = target_srgb
+mask = np.zeros((32, 32), bool)
+mask[8:24, 8:24] = True
+edited, rendered = {"0": image_srgb}, {"0": target_srgb}
 scene = load_scene("spheres")
 geometry = Geometry(scene)
 source, target = (camera.resize(32, 32) for camera in scene.cameras[:2])
-source_srgb, target_srgb = np.random.default_rng(0).uniform(size=(2, 32, 32, 3))
 """,
-    "docs/measuring/fidelity.md": """
-image_srgb, truth_srgb, original = np.random.default_rng(0).uniform(size=(3, 32, 32, 3))
-mask = np.zeros((32, 32), bool)
-mask[8:24, 8:24] = True
-""",
-    "docs/method/editing.md": """
+    "docs/method/algorithm.md": """
 source_picture = target_picture = np.random.default_rng(0).random((64, 64, 3), np.float32)
 view = None
 """,
@@ -153,10 +147,10 @@ source_tokens, own_tokens = torch.rand(2, 1, 64 * 64, 8)
 """Code that a page's blocks take for granted. Blocks of pages that are not here run as they are."""
 
 NOT_RUN = {
-    "docs/measuring/encoders.md": "weights of the user's own",
+    "docs/measuring/your-images.md": "weights of the user's own",
     "docs/project/extending.md": "registers a method for the rest of the process",
     "docs/method/fitting.md": "3000 iterations",
-    "docs/method/masks-by-words.md": "weights of the user's own",
+    "docs/method/editing-a-scene.md": "weights of the user's own",
 }
 
 

@@ -70,7 +70,7 @@ def edit(
         typer.Option(
             metavar="NAME",
             help="The method's choices: corrected, extended, paper, released, released-controlnet"
-            " (see docs/method/presets.md).",
+            " (see docs/method/algorithm.md).",
         ),
     ] = "corrected",
     source: Annotated[

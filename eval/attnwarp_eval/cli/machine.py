@@ -225,7 +225,7 @@ def pictures() -> Check:
         "lack",
         f"Mitsuba {version}, {variant}: no LLVM from {llvm.OLDEST} on works here",
         "true pictures take several times as long; their noise is another",
-        "apt install libllvm19 (docs/truth/llvm.md)",
+        "apt install libllvm19 (docs/truth/truth.md)",
     )
 
 

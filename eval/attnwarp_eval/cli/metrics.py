@@ -154,7 +154,7 @@ def encoders(
             lines = ["ships with the package:"]
             lines += [f"  {n:22} {kind:11} {line}" for n, (kind, line) in BUNDLED.items()]
             lines += [
-                "read from a place of yours (docs/measuring/encoders.md says which files go there):"
+                "read from a place of yours (docs/measuring/your-images.md says which files):"
             ]
             lines += [f"  {n:22} {kind:11} {line}" for n, (kind, line) in REAL.items()]
     typer.echo("\n".join(lines))

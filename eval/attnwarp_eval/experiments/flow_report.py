@@ -76,7 +76,7 @@ def write(rows: Sequence[Row], out: Path, *, size: int, spp: int) -> list[Path]:
             " The four pairs' consistency is known beforehand: **truth**, the scene unedited, and"
             " **one answer**, a recolouring that is the same in both views, are as consistent as"
             f" can be; **slip** is the second with the target moved by {SLIP} px; **two answers**"
-            " has another colour in each view. docs/measuring/optical-flow.md explains the rest."
+            " has another colour in each view. docs/measuring/metrics.md explains the rest."
         ),
     ]
     far = Section(

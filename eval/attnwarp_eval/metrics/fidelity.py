@@ -104,7 +104,7 @@ def nearest_answer(
     mean MSE over them.
 
     One answer for all, since a method that answers differently from view to view is not free to
-    (docs/truth/edits.md).
+    (docs/truth/scenes.md).
 
     Args:
         images: (H, W, 3) sRGB by the view's name, the edited views.

@@ -29,7 +29,7 @@ def explain(problem: Any, model: type[BaseModel], file: str) -> str:
         >>> try:
         ...     Ball(radius=0)
         ... except ValidationError as error:
-        ...     print(explain(error.errors()[0], Ball, "docs/truth/shapes.md"))
+        ...     print(explain(error.errors()[0], Ball, "docs/truth/scenes.md"))
         radius: got 0, but input should be greater than 0
     """
     place, _ = _follow(problem["loc"], model)
@@ -54,7 +54,7 @@ def explain(problem: Any, model: type[BaseModel], file: str) -> str:
             f" {', '.join(allowed)}"
         )
     if kind == "union_tag_not_found":
-        return f"{place}: says no type; add 'type: ...' (docs/truth/shapes.md lists the types)"
+        return f"{place}: says no type; add 'type: ...' (docs/truth/scenes.md lists the types)"
     if kind == "value_error":  # of our own validators, whose messages are whole
         message = problem["msg"].removeprefix("Value error, ")
         return f"{place}: {message}" if place else message

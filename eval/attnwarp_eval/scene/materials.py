@@ -51,7 +51,7 @@ class PlasticMaterial(Spec):
     """A diffuse base in the object's texture under a rough (GGX) dielectric coat.
 
     A smooth coat would be diffuse and specular at once, and light through it could not be counted
-    once: see docs/truth/materials.md.
+    once: see docs/truth/scenes.md.
     """
 
     type: Literal["plastic"]

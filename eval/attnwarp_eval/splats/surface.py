@@ -79,7 +79,7 @@ def surface_splats(
 
     They are spread as blue noise and lie in the tangent plane. Their colour is albedo times direct
     light, traced to each splat (:mod:`attnwarp_eval.truth.shading`). It has no light of further
-    bounces: where a scene's pictures do, its splats are darker (docs/truth/surface-splats.md).
+    bounces: where a scene's pictures do, its splats are darker (docs/truth/scenes.md).
     Colours are not taken from rendered views. Those have noise, mix colours across outlines, and
     lack the surfaces that no view shows. A diffuse surface under direct light looks the same from
     everywhere.

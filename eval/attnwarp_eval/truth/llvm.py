@@ -2,7 +2,7 @@
 elsewhere.
 
 ``llvm_ad_rgb`` compiles each scene's integrator to vector code and is several times faster
-(docs/measuring/accuracy-and-time.md), but with some LLVMs (14 and 15) it ends the whole process
+(docs/truth/truth.md), but with some LLVMs (14 and 15) it ends the whole process
 instead of raising. So a child process tries it first.
 """
 

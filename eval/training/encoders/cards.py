@@ -34,7 +34,7 @@ Rare words and invented ones are scattered into captions so that unknown words d
     "clip-parts": """clip-small, trained further on things with parts: pictures and English sentences in one space of {dim} dimensions, and
 a vector for each place of 8 x 8 px. From the two follows with which probability words are true of a place.
 
-**Good for**: masks by words (docs/method/masks-by-words.md); scores of scenes that show things with parts: people in garments, plants in pots, busts,
+**Good for**: masks by words (docs/method/editing-a-scene.md); scores of scenes that show things with parts: people in garments, plants in pots, busts,
 tables laid. There it names the thing and tells edits of parts apart more often than clip-small.
 
 **Not good for**: what clip-small is not good for; and things of one piece, which it names less often than clip-small (the card of that one has

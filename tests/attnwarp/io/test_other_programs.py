@@ -1,4 +1,4 @@
-"""The table of docs/method/other-programs.md, row by row: others with our files, we with theirs.
+"""The table of docs/method/files.md, row by row: others with our files, we with theirs.
 
 Each row has a check here, which runs where its program is installed; in CI, a missing one is a failure.
 scripts/venv.sh installs splat-transform into the environment; elsewhere the one on the PATH is taken
@@ -29,7 +29,7 @@ from attnwarp.io import (
     write_splat,
 )
 
-PAGE = Path(__file__).parents[3] / "docs/method/other-programs.md"
+PAGE = Path(__file__).parents[3] / "docs/method/files.md"
 
 
 def splats(kind="3d", **more):

@@ -79,7 +79,7 @@ def test_gradients_of_hard_splats_are_those_of_50_digits(name):
 
 def test_the_document_names_every_case_by_its_number_and_tests_that_there_are():
     root = Path(__file__).parents[3]
-    text = (root / "docs/measuring/hard-case-list.md").read_text("utf-8")
+    text = (root / "docs/measuring/hard-cases.md").read_text("utf-8")
     rows = re.findall(r"^\| (\d+) \| [^|]+ \| ([^|]+) \| (.+) \|$", text, re.MULTILINE)
     assert [int(number) for number, _, _ in rows] == list(range(1, 55))
     for number, sweeps, held in rows:

@@ -314,7 +314,7 @@ def _tasks_of(scene: Scene, edits: Sequence[str]) -> list[Task]:
     if not available:
         raise StudyError(
             f"probes.sensitivity: scene {scene.name!r} names no edits, so there is no right"
-            " result; leave it out, or give it some (docs/truth/edits.md)"
+            " result; leave it out, or give it some (docs/truth/scenes.md)"
         )
     selected = tasks(scene, edits)
     if not selected:
