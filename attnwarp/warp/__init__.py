@@ -10,6 +10,7 @@ from attnwarp.warp.correspondence import (
 )
 from attnwarp.warp.depth import TAP_SPREAD, depth_slope, resize_depth
 from attnwarp.warp.features import FeatureWarp
+from attnwarp.warp.lifting import LiftedMask, lift_masks
 from attnwarp.warp.masks import resize_mask
 from attnwarp.warp.rules import (
     EXACT_DEPTH_TOLERANCE,
@@ -41,6 +42,7 @@ __all__ = [
     "TAP_SPREAD",
     "Correspondence",
     "FeatureWarp",
+    "LiftedMask",
     "Surface",
     "WarpSettings",
     "WarpedView",
@@ -55,6 +57,7 @@ __all__ = [
     "in_bounds",
     "in_front",
     "layer_size",
+    "lift_masks",
     "opaque",
     "photometric",
     "preset",

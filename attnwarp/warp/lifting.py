@@ -1,0 +1,303 @@
+"""Masks lifted through splats: what masks of a few views mark, in any other view.
+
+A splat takes part in a mask by the share of its weight that lies on marked pixels. Splats that no
+mask's view sees follow from their neighbours: they get the chance that a random walk over splats
+near in position, normal and colour meets what is marked first (Grady, "Random Walks for Image
+Segmentation", PAMI 2006).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp import check
+from attnwarp.camera import Camera
+from attnwarp.gaussians import SH_C0, Gaussians
+from attnwarp.render import constants, render
+
+NEIGHBORS = 16
+"""Splats that each is tied to."""
+
+COLOR_SPREAD, NORMAL_SPREAD = 0.1, 0.3
+"""Difference of two splats' sRGB colours, and the sine of the angle between their normals, at which
+their tie is exp(-1/2) as strong as that of equal ones."""
+
+SEEN = 0.1
+"""Least share of its own footprint that a splat shows where its votes count. Less shines through
+what stands in front, or is the rim of a splat that peeks out behind a thing's outline."""
+
+TRUST = 30.0
+"""Strength of the votes of a splat that shows all of itself, in strongest ties."""
+
+OPPOSED = 0.25
+"""Least distance from 1/2 of two views' votes on one splat that contradict each other."""
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedMask:
+    """Part of a scene of N splats that masks of a few views mark; :func:`lift_masks` makes it.
+
+    Attributes:
+        membership: (N,) float64 in [0, 1]: how far each splat belongs to what is marked.
+        seen: (N,) bool: shown by a mask's view, so that its votes decide.
+        reached: (N,) bool: seen, or tied to seen splats; the others are left out (membership 0).
+        disputed: (N,) bool: seen by several masks' views, of which one says it belongs and one
+            says it does not.
+        agreement: for each mask, the intersection over union of it and of this, rendered there; NaN
+            where both are empty.
+    """
+
+    gaussians: Gaussians
+    near: float
+    backend: str
+    membership: npt.NDArray[np.float64]
+    seen: npt.NDArray[np.bool_]
+    reached: npt.NDArray[np.bool_]
+    disputed: npt.NDArray[np.bool_]
+    agreement: tuple[float, ...]
+
+    def render(self, camera: Camera) -> npt.NDArray[np.float32]:
+        """(H, W) in [0, 1]: how much of what a pixel shows is marked; above 1/2 is inside.
+
+        0 where nothing is drawn.
+        """
+        return _shown(self.gaussians, self.membership, camera, self.near, self.backend)
+
+
+def lift_masks(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    masks: Sequence[npt.NDArray[Any]],
+    *,
+    near: float = constants.NEAR,
+    backend: str = "auto",
+) -> LiftedMask:
+    """Lift masks of one or a few views of one thing through splats.
+
+    A splat's vote is the mean of the mask over its pixels, weighed by how much of each it makes up.
+    That mean is one derivative: of sum(mask * picture) in a value that the splat is drawn with. The
+    memberships x minimise sum_i c_i (x_i - vote_i)^2 + sum_ij t_ij (x_i - x_j)^2: c grows with how
+    much of its own footprint a splat shows, and t ties neighbours that are alike in normal and
+    colour. So seen splats keep their votes, and unseen ones get the chance that a random walk from
+    them ends at what is marked.
+
+    Args:
+        gaussians: N splats of kind "2d" or "3d".
+        cameras: of the masked views.
+        masks: (h, w) of each view, bool or floating in [0, 1], of the camera's aspect ratio at any
+            size. What none of them marks is outside, so a mask marks all of the thing that its view
+            shows.
+        near, backend: see :func:`attnwarp.render.render`.
+
+    Raises:
+        ValueError: no masks, another number of cameras, or a mask of another shape, type or range;
+            the message names it.
+
+    Example:
+        A wall of two colours: the mask of its left half, seen from the front, from the side.
+
+        >>> import numpy as np, torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.warp import lift_masks
+        >>> x, y = torch.meshgrid(*[torch.linspace(-1, 1, 40)] * 2, indexing="ij")
+        >>> place = torch.stack([x, y, 0 * x], dim=-1).reshape(-1, 3)
+        >>> color = torch.where(place[:, :1] < 0, torch.tensor([[1.0, 0, 0]]), torch.ones(1, 3))
+        >>> wall = Gaussians("2d", place, torch.tensor([[1.0, 0, 0, 0]]).repeat(1600, 1),
+        ...                  torch.full((1600, 2), 0.04), torch.full((1600,), 0.99),
+        ...                  Gaussians.sh_from_rgb(color))
+        >>> view = dict(width=32, height=32, fov_y=40, up=(0, 1, 0))
+        >>> front, side = (Camera.look_at(p, (0, 0, 0), **view) for p in ((0, 0, 3), (2, 0, 2.5)))
+        >>> left = np.arange(32) < 16
+        >>> lifted = lift_masks(wall, [front], [np.broadcast_to(left, (32, 32))])
+        >>> seen_from_side = lifted.render(side) > 0.5
+        >>> bool(seen_from_side[16, 8]), bool(seen_from_side[16, 24])
+        (True, False)
+    """
+    check.instance(gaussians, Gaussians, "gaussians", "attnwarp.Gaussians")
+    if not len(masks):
+        raise ValueError("masks: got none, expected at least one")
+    if len(cameras) != len(masks):
+        raise ValueError(f"cameras: got {len(cameras)}, expected {len(masks)}, one for each mask")
+    splats = gaussians.detach()
+    checked = [
+        _checked_mask(mask, camera, f"masks[{k}]")
+        for k, (mask, camera) in enumerate(zip(masks, cameras, strict=True))
+    ]
+    views = [
+        camera.resize(mask.shape[1], mask.shape[0])
+        for mask, camera in zip(checked, cameras, strict=True)
+    ]
+    count = len(splats)
+    marked, weight, trust = (np.zeros(count) for _ in range(3))
+    inside, outside = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    for mask, view in zip(checked, views, strict=True):
+        votes, total = _votes(splats, mask, _counted(mask), view, near, backend)
+        share = np.minimum(1, total / footprints(splats, view))
+        counts = share >= SEEN
+        marked += np.where(counts, votes, 0)
+        weight += np.where(counts, total, 0)
+        trust = np.maximum(trust, np.where(counts, share, 0))
+        own = votes / np.maximum(total, np.finfo(float).tiny)
+        inside |= counts & (own > 0.5 + OPPOSED)
+        outside |= counts & (own < 0.5 - OPPOSED)
+    seen = trust > 0
+    vote = np.where(seen, marked / np.maximum(weight, np.finfo(float).tiny), 0)
+    membership, reached = _settled(splats, vote, TRUST * trust**2)
+    agreement = []
+    for mask, view in zip(checked, views, strict=True):
+        mine = _shown(splats, membership, view, near, backend) > 0.5
+        given = mask > 0.5
+        union = int((mine | given).sum())
+        agreement.append(int((mine & given).sum()) / union if union else float("nan"))
+    return LiftedMask(
+        splats, near, backend, membership, seen, reached, inside & outside, tuple(agreement)
+    )
+
+
+def _checked_mask(mask: Any, camera: Camera, name: str) -> npt.NDArray[np.float32]:
+    array = np.asarray(mask)
+    check.shape(array, ("h", "w"), name)
+    if array.dtype != np.bool_ and array.dtype.kind != "f":
+        raise ValueError(f"{name}: got {array.dtype}, expected bool, or floating in [0, 1]")
+    check.finite(array, name)
+    if array.size and (array.min() < 0 or array.max() > 1):
+        raise ValueError(f"{name}: got values to {array.max():g}, expected [0, 1]")
+    full = (camera.height, camera.width)
+    remedy = f"crop or pad it to the view {camera.name!r}"
+    check.same_aspect((array.shape[0], array.shape[1]), full, name, remedy)
+    return array.astype(np.float32)
+
+
+def _votes(
+    splats: Gaussians,
+    mask: npt.NDArray[np.float32],
+    counted: npt.NDArray[np.bool_],
+    camera: Camera,
+    near: float,
+    backend: str,
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """(N,) sum over counted pixels of w_i mask, and of w_i."""
+    values = torch.zeros(len(splats), 2, device=splats.means.device, requires_grad=True)
+    with torch.enable_grad():
+        picture = render(splats, camera, features=values, near=near, backend=backend)
+        marks = torch.from_numpy(np.stack([mask * counted, counted], axis=-1))
+        (sums,) = torch.autograd.grad((picture.color * marks.to(picture.color)).sum(), values)
+    first, second = sums.double().cpu().numpy().T
+    return first, second
+
+
+def _counted(mask: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+    """(h, w) bool: pixels whose votes count: all but those along a mask's outline.
+
+    There splats of both sides show, whose rims peek out. The inside of what is too thin to have
+    anything but an outline counts.
+    """
+    import cv2
+
+    square = np.ones((3, 3), np.uint8)
+    inside = (mask > 0.5).astype(np.uint8)
+    core = cv2.erode(inside, square, borderType=cv2.BORDER_REPLICATE)
+    thin = (inside > 0) & (cv2.dilate(core, square) == 0)
+    return (core > 0) | thin | (cv2.dilate(inside, square) == 0)
+
+
+def _shown(
+    splats: Gaussians,
+    membership: npt.NDArray[np.float64],
+    camera: Camera,
+    near: float,
+    backend: str,
+) -> npt.NDArray[np.float32]:
+    values = torch.from_numpy(membership).to(splats.means)[:, None]
+    with torch.no_grad():
+        picture = render(splats, camera, features=values, near=near, backend=backend)
+        share = picture.color[..., 0] / picture.alpha.clamp_min(1e-6)
+    return np.asarray(share.clamp(0, 1).float().cpu().numpy())
+
+
+def footprints(splats: Gaussians, camera: Camera) -> npt.NDArray[np.float64]:
+    """(N,) px of each splat's opacity summed over a picture in which nothing hides it.
+
+    2 pi opacity sqrt(det S), S the covariance that the splat's has where it is projected (EWA
+    splatting, Zwicker et al. 2001) with the screen filter added. 1 where a splat lies behind the
+    camera.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.1), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = dict(width=64, height=64, fov_y=40, up=(0, 1, 0))
+        >>> camera = Camera.look_at((0, 0, 3), (0, 0, 0), **view)
+        >>> from attnwarp.render import render
+        >>> drawn = float(render(disc, camera).weight[0])
+        >>> bool(abs(footprints(disc, camera)[0] / drawn - 1) < 0.1)
+        True
+    """
+    place = (splats.world_means() - camera.position) @ camera.rotation.T
+    ahead = place[:, 2] > 0
+    z = np.where(ahead, place[:, 2], 1.0)
+    axes = (splats.rotations()[:, :, : splats.scales.shape[1]] * splats.scales[:, None]).double()
+    turned = camera.rotation @ axes.cpu().numpy()
+    fx, fy = camera.K[0, 0], camera.K[1, 1]
+    across = fx * (turned[:, 0] - turned[:, 2] * (place[:, 0] / z)[:, None]) / z[:, None]
+    down = fy * (turned[:, 1] - turned[:, 2] * (place[:, 1] / z)[:, None]) / z[:, None]
+    xx, yy = ((v * v).sum(-1) + splats.screen_filter for v in (across, down))
+    xy = (across * down).sum(-1)
+    area = 2 * np.pi * np.sqrt(np.maximum(xx * yy - xy * xy, 0))
+    return np.where(ahead, area * splats.opacities.double().cpu().numpy() + 1e-9, 1.0)
+
+
+def _settled(
+    splats: Gaussians, vote: npt.NDArray[np.float64], trust: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    """Memberships that votes and ties settle on; whether a splat is tied to any that is seen."""
+    from scipy.sparse import diags
+    from scipy.sparse.csgraph import connected_components
+    from scipy.sparse.linalg import cg
+
+    ties = _ties(splats)
+    _, part = connected_components(ties, directed=False)
+    reached = np.isin(part, np.unique(part[trust > 0]))
+    if not (vote * trust).any():
+        return np.zeros(len(vote)), reached
+    # What no vote reaches is held at 0, so that the system has one solution.
+    held = np.where(reached, trust, 1.0)
+    degree = np.asarray(ties.sum(axis=1)).ravel()
+    system = diags(degree + held) - ties
+    jacobi = diags(1 / (degree + held))
+    solved, failed = cg(system, held * vote, x0=vote, rtol=1e-4, maxiter=2000, M=jacobi)
+    if failed:
+        warnings.warn("lift_masks: unseen splats did not settle", RuntimeWarning, stacklevel=3)
+    return np.clip(np.where(reached, solved, 0), 0, 1), reached
+
+
+def _ties(splats: Gaussians) -> Any:
+    """(N, N) sparse symmetric ties of neighbours, in [0, 1]."""
+    from scipy.sparse import coo_array
+    from scipy.spatial import cKDTree
+
+    place = splats.world_means()
+    count = len(place)
+    k = min(NEIGHBORS, count - 1)
+    if k < 1:
+        return coo_array((count, count)).tocsr()
+    distance, other = cKDTree(place).query(place, k=k + 1)
+    distance, other = distance[:, 1:], other[:, 1:]
+    own = np.broadcast_to(np.arange(count)[:, None], other.shape)
+    reach = np.maximum(np.median(distance, axis=1), np.finfo(float).tiny)
+    near = distance**2 / (reach[:, None] * reach[other])
+    normal = splats.normals().double().cpu().numpy()
+    bend = 1 - (normal[own] * normal[other]).sum(-1) ** 2
+    color = splats.sh[:, 0].double().cpu().numpy() * SH_C0
+    paint = ((color[own] - color[other]) ** 2).sum(-1)
+    tie = np.exp(-near / 2 - bend / (2 * NORMAL_SPREAD**2) - paint / (2 * COLOR_SPREAD**2))
+    one = coo_array((tie.ravel(), (own.ravel(), other.ravel())), shape=(count, count)).tocsr()
+    return one.maximum(one.T)
