@@ -32,6 +32,7 @@ test: checks
 
 ## everything, the thorough checks too
 test-all: checks
+	@scripts/browser.sh
 	$(PYTEST)
 
 ## did a change make the figures of warp, masks and depth worse? (docs/measuring/gate.md)

@@ -8,7 +8,14 @@ from typing import Annotated
 
 import typer
 
-from attnwarp.cli.edit_image import DeviceOption, EditorOption, InstructionOption, ThreadsOption
+from attnwarp.cli.edit_image import (
+    ControlOption,
+    DeviceOption,
+    EditorOption,
+    InstructionOption,
+    ThreadsOption,
+    TurntableOption,
+)
 from attnwarp.cli.files import (
     check_inputs_stay,
     check_seen,
@@ -70,6 +77,8 @@ def baseline(
     max_size: MaxSizeOption = None,
     device: DeviceOption = "cpu",
     threads: ThreadsOption = None,
+    control: ControlOption = None,
+    turntable: TurntableOption = None,
     *,
     reading: Reading,
 ) -> None:
@@ -92,14 +101,14 @@ def baseline(
         splats = read_splats(ply, kind, antialiased, screen_filter)
         check_seen(ply, splats, dataset.cameras, report)
         warn_of_misfit(ply, splats, dataset)
-        result = run_baseline(
+        result, page = run_baseline(
             method.value, dataset, splats, editor, instruction, settings, out,
             budget=budget, max_size=max_size, device=device, threads=threads,
-            report=report,
+            control=control, turntable=turntable, report=report,
         )  # fmt: skip
         ended = f", cut short by its {result.cut.replace('_', ' ')}" if result.cut else ""
         typer.echo(
             f"{out / 'edited.ply'}: {result.counters['edits']} edits of"
             f" {result.counters['views']} views in {sum(result.seconds.values()):.0f} s{ended}"
         )
-        typer.echo(out / "sheet.png")
+        typer.echo(page)

@@ -13,11 +13,13 @@ from attnwarp.cli.bundled_scene import SIZE, capture, exact_masks, is_scene
 from attnwarp.cli.edit_image import (
     MOST_PIXELS,
     SEGMENTER,
+    ControlOption,
     DeviceOption,
     EditorOption,
     InstructionOption,
     SegmenterOption,
     ThreadsOption,
+    TurntableOption,
     WhereOption,
     check_segmenter,
 )
@@ -124,6 +126,8 @@ def edit(
     store: Annotated[Store, typer.Option(help="Where recorded features are kept.")] = Store.cpu,
     device: DeviceOption = "cpu",
     threads: ThreadsOption = None,
+    control: ControlOption = None,
+    turntable: TurntableOption = None,
     *,
     reading: Reading,
 ) -> None:
@@ -186,7 +190,7 @@ def edit(
             source=source,
             source_picture=source_picture, masks=masks, words=words,
             segmenter=segmenter or SEGMENTER, max_size=max_size, store=store.value, device=device,
-            threads=threads,
+            threads=threads, control=control, turntable=turntable,
             report=report,
         )  # fmt: skip
         seconds = sum(result.seconds.values())

@@ -56,6 +56,17 @@ SegmenterOption = Annotated[
         help="What --where asks: clip-parts if left out, or DINO_FOLDER,SAM_FOLDER (transformers)."
     ),
 ]
+ControlOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--control/--no-control",
+        help="Edit the page's views each alone too, for comparison; on with a bundled editor.",
+    ),
+]
+TurntableOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Film of the scene turning, before and after: .gif or .mp4."),
+]
 ThreadsOption = Annotated[
     int | None,
     typer.Option(min=1, help="CPU threads; if left out, one for a small editor, else all cores."),

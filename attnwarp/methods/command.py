@@ -15,7 +15,7 @@ import torch
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import own_size
 from attnwarp.editing.segment import load_segmenter
-from attnwarp.editing.small import check_instruction, load_editor, thread_count
+from attnwarp.editing.small import bundled, check_instruction, load_editor, thread_count
 from attnwarp.errors import InputError, suggest
 from attnwarp.fit import (
     FitSettings,
@@ -33,7 +33,8 @@ from attnwarp.methods import METHODS, Budget, MethodSettings, Result
 from attnwarp.methods.attention_warping import attention_warping
 from attnwarp.methods.base import VIEWER_PLY, workdir_of
 from attnwarp.methods.features import Features
-from attnwarp.methods.page import write_page
+from attnwarp.methods.page import show_edit
+from attnwarp.methods.page.orbit import check_film
 from attnwarp.methods.pictures import check_view_aspect
 from attnwarp.methods.scene import images_of
 from attnwarp.methods.settings import AttentionWarpingSettings
@@ -87,6 +88,8 @@ def edit_dataset(
     store: Any,
     device: str,
     threads: int | None,
+    control: bool | None = None,
+    turntable: Path | None = None,
     report: Reporter,
 ) -> tuple[Result, Path]:
     """Fit where no splats are given, edit, and write the page and a PLY for other viewers.
@@ -107,6 +110,8 @@ def edit_dataset(
         max_size: larger pictures are averaged down to it.
         store, device: see :func:`attnwarp.methods.attention_warping` and ``load_editor``.
         threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
+        control: also edit the page's views each alone; None does so with a bundled editor.
+        turntable: file of the scene's turn, GIF or MP4.
         report: receives how the work stands.
 
     Returns:
@@ -120,6 +125,7 @@ def edit_dataset(
         raise InputError("--where: got --masks too, expected one of the two")
     if words is not None and not words.strip():
         raise InputError(f"--where: got {words!r}, expected words such as 'bear'")
+    check_film(turntable)
     workdir_of(out).check_unclaimed()  # again in the edit, but here before a fit
     views = load_views(dataset, max_size=max_size)
     index = _view_of(views.cameras, source, dataset)
@@ -165,7 +171,16 @@ def edit_dataset(
     if result.gaussians.kind == "2d":
         # Other programs take no splats of two scales.
         write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
-    return result, write_page(workdir_of(out), views.cameras, images)
+    page = show_edit(
+        workdir_of(out), splats, views.cameras, images, turntable=turntable, report=report,
+        editor=editor if _has_control(control, editor_name) else None,
+    )  # fmt: skip
+    return result, page
+
+
+def _has_control(control: bool | None, editor: str) -> bool:
+    """True if the page's views are edited alone too: a bundled editor takes seconds."""
+    return editor in bundled() if control is None else control
 
 
 def run_baseline(
@@ -181,9 +196,11 @@ def run_baseline(
     max_size: int | None,
     device: str,
     threads: int | None,
+    control: bool | None = None,
+    turntable: Path | None = None,
     report: Reporter,
-) -> Result:
-    """Run a method on the views of a data set.
+) -> tuple[Result, Path]:
+    """Run a method on the views of a data set, and write the page.
 
     Args:
         method: see :data:`attnwarp.methods.METHODS`.
@@ -197,11 +214,19 @@ def run_baseline(
         max_size: larger pictures are averaged down to it.
         device: of the editor.
         threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
+        control: also edit the page's views each alone; None does so with a bundled editor.
+        turntable: file of the scene's turn, GIF or MP4.
+        control: also edit the page's views each alone; None does so with a bundled editor.
+        turntable: file of the scene's turn, GIF or MP4.
         report: receives how the work stands.
 
+    Returns:
+        The edit and the path of its page.
+
     Raises:
-        InputError: no such editor; a folder of another run.
+        InputError: no such editor; a folder of another run; a film of another format.
     """
+    check_film(turntable)
     views = load_views(dataset, max_size=max_size)
     images = images_of(views)
     editor = load_editor(editor_name, device=device)
@@ -210,7 +235,7 @@ def run_baseline(
     if settings.size is None:
         settings = settings.changed(size=own_size(editor))
     compile_kernels(splats.kind, report)
-    return METHODS[method](
+    result = METHODS[method](
         splats,
         views.cameras,
         images,
@@ -221,6 +246,11 @@ def run_baseline(
         budget=budget,
         report=report,
     )
+    page = show_edit(
+        workdir_of(out), splats, views.cameras, images, turntable=turntable, report=report,
+        editor=editor if _has_control(control, editor_name) else None,
+    )  # fmt: skip
+    return result, page
 
 
 def _by_words(

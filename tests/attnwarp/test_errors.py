@@ -15,7 +15,6 @@ PACKAGES = {
     "scikit-image": "skimage",
     "trame-vtk": "trame_vtk",
     "trame-vuetify": "trame_vuetify",
-    "warp-lang": "warp",
 }
 """Names on the package index that differ from the module's."""
 BROUGHT_ALONG = {"dask": "distributed", "drjit": "mitsuba", "markupsafe": "jinja2"}
@@ -41,9 +40,9 @@ def test_the_extras_of_the_errors_are_those_of_the_package(extra):
 def test_a_missing_package_is_an_input_error_that_names_its_extra():
     named = pytest.raises(MissingExtraError, match=r"pip install -c constraints.txt '\.\[gpu\]'")
     with named as caught, optional_imports():
-        raise ModuleNotFoundError("No module named 'warp'", name="warp")
+        raise ModuleNotFoundError("No module named 'gsplat'", name="gsplat")
     assert isinstance(caught.value, InputError)
-    assert (caught.value.module, caught.value.extra) == ("warp", "gpu")
+    assert (caught.value.module, caught.value.extra) == ("gsplat", "gpu")
 
 
 @pytest.mark.door

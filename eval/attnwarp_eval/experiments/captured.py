@@ -205,10 +205,12 @@ def compare(
         edited = _edit(study, name, editor, views, splats, words, folder / "run", seconds)
         seconds[name] = sum(edited.seconds.get(part, 0.0) for part in editing.OWN_WORK)
         _write_pictures(views.cameras, splats, edited, originals, folder)
+        page = _page(folder / "run", splats, views.cameras, originals, editor, parts[name].name)
         result.rows[name] = _measured(study, edited, words, folder, out / "originals", result)
         result.rows[name] |= {
             "editor": parts[name].name,
             "folder": folder.name,
+            "page": page,
             "seconds": seconds[name],
             "network_rows": edited.counters.get("network_rows", math.nan),
             "edited_views": len(edited.edited),
@@ -305,6 +307,31 @@ def _write_pictures(
         write_picture(folder / "edited" / f"{_name(k)}.png", _bytes(picture))
 
 
+def _page(
+    run: Path,
+    before: Gaussians,
+    cameras: Sequence[Camera],
+    originals: Sequence[npt.NDArray[np.float32]],
+    editor: Any,
+    name: str,
+) -> str | None:
+    """The page of a method's run, by its path in the comparison's folder; None for a method from
+    outside that leaves no such run.
+    """
+    from attnwarp.editing.small import bundled
+    from attnwarp.methods.base import workdir_of
+    from attnwarp.methods.page import PAGE, show_edit
+    from attnwarp.workdir import MANIFEST
+
+    folder = workdir_of(run)
+    if not folder.has(MANIFEST):
+        return None
+    if not folder.has(PAGE):
+        control = editor if name in bundled() else None
+        show_edit(folder, before, cameras, originals, editor=control)
+    return f"{run.parent.name}/{run.name}/{PAGE}"
+
+
 def _measured(
     study: Study,
     edited: EditedScene,
@@ -383,6 +410,8 @@ def report(study: Study, words: Words, cameras: Sequence[Camera], result: Compar
         "One scene and one seed: figures without intervals, from which nothing follows for other"
         " scenes.",
     ]
+    listed = [f"{name} `{row['page']}`" for name, row in result.rows.items() if row["page"]]
+    pages = [f"The splats, and all else of a method: {', '.join(listed)}."] if listed else []
     cut = [name for name, row in result.rows.items() if row["cut"]]
     if cut:
         lead.append(f"**Did not finish within their budget: {', '.join(cut)}.**")
@@ -392,6 +421,6 @@ def report(study: Study, words: Words, cameras: Sequence[Camera], result: Compar
         [
             Section("Figures that need no truth", tables=[table]),
             Section("Left out", ["What cannot be computed here, by name."], [lacking]),
-            Section("Edited scenes", gallery=Gallery(pictures)),
+            Section("Edited scenes", pages, gallery=Gallery(pictures)),
         ],
     )

@@ -45,7 +45,7 @@ def test_the_command_gives_what_the_library_gives_and_says_where(place):
     out = place / "out"
     assert str(out / "edited.ply") in result.stdout
     assert "2 edits of 2 views" in result.stdout
-    assert result.stdout.splitlines()[-1] == str(out / "sheet.png")
+    assert result.stdout.splitlines()[-1] == str(out / "index.html")
     views = load_views(read_dataset(place / "data"))
     images = [read_image(place / "data" / camera.name) for camera in views.cameras]
     expected = by_view(

@@ -14,7 +14,6 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from backends import GPU
 
 from attnwarp import Camera
 from attnwarp.render import api, constants, reference, render
@@ -33,7 +32,7 @@ def scene(kind: str, make_splats, opacity: float = 0.5):
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("backend", ["reference", "cpu", GPU])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_3dgs_agrees_whole(backend, antialiased, make_splats) -> None:
     splats, camera = scene("3d", make_splats)
     judged = gsplat_torch.render(splats, camera, antialiased=antialiased, depth=True)
@@ -51,7 +50,7 @@ def test_3dgs_agrees_whole(backend, antialiased, make_splats) -> None:
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("backend", ["reference", "cpu", GPU])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_3dgs_gradients_agree(backend, antialiased, make_splats) -> None:
     splats, camera = scene("3d", make_splats)
     names = ("means", "quats", "scales", "opacities", "sh")
@@ -81,7 +80,7 @@ def test_3dgs_gradients_agree(backend, antialiased, make_splats) -> None:
         assert float((ours - theirs).abs().max()) < tolerance * scale, name
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu", GPU])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_2dgs_agrees_in_colour_alpha_and_normals(backend, make_splats) -> None:
     splats, camera = scene("2d", make_splats)
     judged = gsplat_torch.render(splats, camera, depth=True)

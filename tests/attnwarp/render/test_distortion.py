@@ -8,13 +8,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from backends import GPU
 
 from attnwarp import Camera, Gaussians
 from attnwarp.losses import depth_distortion
 from attnwarp.render import render
 
-BACKENDS = ("cpu", "reference", GPU)
+BACKENDS = ("cpu", "reference")
 
 
 def crossing_discs(count: int, seed: int) -> Gaussians:

@@ -116,7 +116,7 @@ PLACES = """[...document.querySelectorAll('.scroll')].map((table) => {
 
 def test_a_table_that_is_cut_has_a_shadow_at_its_right_edge(tmp_path):
     if browser.executable() is None:
-        pytest.skip("needs a Chromium (Debian: chromium-headless-shell)")
+        pytest.skip("needs a Chromium (scripts/browser.sh)")
     wide = Table(["a", *(f"column {k}" for k in range(40))], [["x", *["1"] * 40]], caption="wide")
     narrow = Table(["a", "b"], [["x", "1"]], caption="narrow")
     path = tmp_path / "report.html"

@@ -161,7 +161,7 @@ def children(pid):
 def served(tmp_path):
     """A served window: its process and its address."""
     if browser.executable() is None:
-        pytest.skip("needs a Chromium (Debian: chromium-headless-shell)")
+        pytest.skip("needs a Chromium (scripts/browser.sh)")
     process = subprocess.Popen(
         [*COMMAND, "spheres", "--size", "32", "--view", "yaw060", "--web"],
         env=environment(), stdout=subprocess.PIPE, text=True, cwd=tmp_path,
@@ -225,7 +225,7 @@ def test_ctrl_c_ends_the_server(served):
 
 def test_a_page_to_share_draws_itself_without_a_network(tmp_path):
     if browser.executable() is None:
-        pytest.skip("needs a Chromium (Debian: chromium-headless-shell)")
+        pytest.skip("needs a Chromium (scripts/browser.sh)")
     page = tmp_path / "a.html"
     subprocess.run([*COMMAND, "spheres", "--size", "32", "--view", "yaw060", "--pixel", "16,20",
                     "--export", page], env=environment(), check=True)  # fmt: skip

@@ -73,7 +73,7 @@ def test_a_page_has_a_command_beside_each_picture_of_a_variant(tmp_path):
 
 def test_a_browser_shows_the_commands_of_the_pages_own_folder_and_of_the_picture_picked(tmp_path):
     if browser.executable() is None:
-        pytest.skip("needs a Chromium (Debian: chromium-headless-shell)")
+        pytest.skip("needs a Chromium (scripts/browser.sh)")
     root = tmp_path / "it's here"
     root.mkdir()
     (root / "report.html").write_text(page(report(root), root))

@@ -12,7 +12,7 @@ from attnwarp_eval.cli.main import app
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(browser.executable() is None, reason="needs a Chromium (Debian: chromium-headless-shell)"),
+    pytest.mark.skipif(browser.executable() is None, reason="needs a Chromium (scripts/browser.sh)"),
 ]  # fmt: skip
 
 LEFT, RIGHT, BACK, PAUSE = ("ArrowLeft", 37), ("ArrowRight", 39), ("Backspace", 8), ("p", 80)

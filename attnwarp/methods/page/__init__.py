@@ -1,0 +1,419 @@
+"""The page that shows an edit by any method: one HTML file that needs no other."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Callable, Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.camera import Camera
+from attnwarp.editing.editor import Editor
+from attnwarp.gaussians import Gaussians
+from attnwarp.io import read_ply, write_splat
+from attnwarp.io.file import write_atomically
+from attnwarp.io.images import encode_png
+from attnwarp.io.names import file_stems
+from attnwarp.io.splat import RECORD
+from attnwarp.methods.base import VIEWER_PLY, edit_file
+from attnwarp.methods.page.measured import CONTROL, disagreement, edited_alone, spill
+from attnwarp.methods.page.orbit import focus_of, orbit, renders, up_of, write_film
+from attnwarp.methods.pictures import SOURCE_COLORS, Bytes, resized, to_bytes
+from attnwarp.methods.scene import Scene, near_of, to_float
+from attnwarp.reporting import SILENT, Reporter
+from attnwarp.workdir import MANIFEST, Workdir
+
+PAGE = "index.html"
+
+MOST_VIEWS = 5
+"""Edited views on the page; the folder has the rest."""
+
+MOST_SPLATS = 100_000
+"""Splats on the page, those that cover most; ``edited.ply`` has the rest."""
+
+LONGEST = 768
+"""Longest side of a picture on the page, in px."""
+
+EXACT, QUALITY = 256, 90
+"""Longest side in px of pictures that are kept exactly, and JPEG quality of larger ones, of 100."""
+
+CANVAS = 512
+"""Longest side of the picture that the viewer draws, in px."""
+
+RENDERS = ("renders/before", "renders/after")
+
+
+def show_edit(
+    folder: Workdir,
+    before: Gaussians,
+    cameras: Sequence[Camera],
+    images: Sequence[npt.NDArray[Any]],
+    *,
+    editor: Editor | None = None,
+    turntable: Path | None = None,
+    report: Reporter = SILENT,
+) -> Path:
+    """Write the page of a finished edit, ``index.html``, from its folder's files.
+
+    Args:
+        folder: of the edit, by any method.
+        before: the splats before the edit.
+        cameras: of the views.
+        images: (H, W, 3) photograph of each view, sRGB, uint8, uint16 or floating in [0, 1].
+        editor: edits the page's views each alone, as the control; None for no control.
+        turntable: file of the orbit as a film, GIF or MP4; None for none.
+        report: receives each view of the control.
+
+    Returns:
+        The path of the page.
+    """
+    page = _Page(folder, cameras, images, before)
+    if editor is not None:
+        views = [page.names.index(name) for name in page.shown]
+        scene = Scene.checked(cameras, images, page.segments)
+        edited_alone(folder, before, scene, editor, views, report)
+    turns = [renders(model, page.turn) for model in (before, page.after)]
+    if turntable is not None:
+        write_film(turntable, *turns)
+    parts = [page.head(), page.scene(), page.views(), page.agreement(), page.outside()]
+    parts += [page.orbit(turns), page.costs()]
+    text = Template(_file("page.html")).substitute(
+        title=escape(f"{page.manifest['instruction']} - attnwarp"),
+        style=_file("page.css"),
+        body="\n".join(parts),
+        script=_file("viewer.js") + _file("page.js"),
+    )
+    path = folder.path / PAGE
+    # The name of a view may be no UTF-8.
+    write_atomically(path, lambda stream: stream.write(text.encode("utf-8", "replace")))
+    return path
+
+
+class _Page:
+    """The parts of a page, each as HTML."""
+
+    def __init__(
+        self,
+        folder: Workdir,
+        cameras: Sequence[Camera],
+        images: Sequence[npt.NDArray[Any]],
+        before: Gaussians,
+    ) -> None:
+        self.folder, self.cameras, self.before = folder, cameras, before
+        self.manifest, self.result = folder.read_json(MANIFEST), folder.read_json("result.json")
+        self.names = file_stems(cameras)
+        self.photographs = dict(zip(self.names, images, strict=True))
+        # A run that was cut short lacks the views that it planned last.
+        self.edited = [name for name in self.names if folder.has(f"views/{name}.png")]
+        self.sources = [name for name in self.manifest.get("sources", []) if name in self.edited]
+        others = [name for name in self.edited if name not in self.sources]
+        room = min(max(0, MOST_VIEWS - len(self.sources)), len(others))
+        spread = [others[k * len(others) // room] for k in range(room)]
+        self.shown = [*self.sources, *spread][:MOST_VIEWS]
+        files = [f"segments/{name}.png" for name in self.names]
+        self.segments = (
+            [folder.read_picture(file)[..., 0] > 127 for file in files]
+            if all(map(folder.has, files))
+            else None
+        )
+        self.after = read_ply(folder.path / "edited.ply")
+        self.first = self.names.index(self.shown[0]) if self.shown else 0
+        self.points = before.world_means()
+        self.turn = orbit(cameras, self.points, first=self.first)
+
+    def head(self) -> str:
+        """The instruction and what was done."""
+        method = self.manifest["method"].replace("_", " ")
+        cut = self.result["cut"]
+        ended = f", cut short by its {cut.replace('_', ' ')}" if cut else ""
+        lines = [
+            f"<h1>{escape(self.manifest['instruction'])}</h1>",
+            f"<p>Edited by {escape(method)}: {len(self.edited)} of {len(self.names)} views were"
+            f" edited, and the splats were tuned on them{ended}. The edited scene is"
+            " <code>edited.ply</code> in this folder"
+            + (
+                f"; viewers of 3DGS open <code>{VIEWER_PLY}</code>"
+                if self.folder.has(VIEWER_PLY)
+                else ""
+            )
+            + ".</p>",
+        ]
+        return "\n".join(lines)
+
+    def scene(self) -> str:
+        """The slider and the splats, side by side."""
+        buttons = "".join(
+            f'<button aria-pressed="{str(k == 0).lower()}"'
+            f' data-pictures=\'["before-{k}", "after-{k}"]\'>{escape(name)}</button>'
+            for k, name in enumerate(self.shown)
+        )
+        first = self.names[self.first]
+        pair = "".join(
+            f'<img alt="{escape(first)}, the scene {when}"'
+            f' src="{_data(self.folder.read_picture(f"{part}/{first}.png"))}">'
+            for part, when in zip(RENDERS, ("before", "after"), strict=True)
+        )
+        return (
+            '<h2>The scene</h2><div class="pair"><figure>'
+            f'<div class="slider">{pair}<input type="range" value="50" aria-label="before, after">'
+            "</div><figcaption>Rendered splats: before on the left, edited on the right. Drag the"
+            f' line.</figcaption><div class="views">{buttons}</div></figure>'
+            f"{self._viewer()}</div>"
+        )
+
+    def _viewer(self) -> str:
+        with TemporaryDirectory() as place:
+            path = Path(place) / "edited.splat"
+            # Viewers hold float32, which far from the origin would move splats.
+            write_splat(path, self.after, coordinates="relative")
+            data = path.read_bytes()
+        count = len(data) // RECORD.itemsize
+        data = data[: MOST_SPLATS * RECORD.itemsize]
+        left_out = (
+            f" {MOST_SPLATS:,} of {count:,} splats, those that cover most."
+            if count > MOST_SPLATS
+            else ""
+        )
+        camera = self.cameras[self.first]
+        scale = CANVAS / max(camera.width, camera.height)
+        origin = self.after.origin
+        about = {
+            "width": round(scale * camera.width), "height": round(scale * camera.height),
+            "fx": scale * camera.K[0, 0], "fy": scale * camera.K[1, 1],
+            "cx": scale * camera.K[0, 2], "cy": scale * camera.K[1, 2],
+            "position": (camera.position - origin).tolist(),
+            "rotation": camera.rotation.T.tolist(),
+            "focus": (focus_of(self.cameras, self.points) - origin).tolist(),
+            "up": up_of(self.cameras).tolist(),
+            "near": near_of(self.cameras, self.after),
+        }  # fmt: skip
+        return (
+            '<figure><canvas id="splats" tabindex="0" aria-label="the edited splats"></canvas>'
+            "<figcaption>The edited splats themselves: drag to turn, wheel or pinch to zoom, double"
+            f" click to go back. Colours do not depend on the view here.{left_out}</figcaption>"
+            f'<script type="application/json" id="splat-scene">{json.dumps(about)}</script>'
+            '<script type="text/plain" id="splat-bytes">'
+            f"{base64.b64encode(data).decode()}</script></figure>"
+        )
+
+    def views(self) -> str:
+        """Rows of pictures, a column for each view."""
+        carried = any(self.folder.has(f"features/{name}.png") for name in self.shown)
+        rows: list[tuple[str, str, Callable[[str], Bytes | None]]] = [
+            ("Photograph", "photograph", self._photograph),
+            ("Edited view", "edited", lambda name: self._read(f"views/{name}.png")),
+            (
+                "The same view edited alone, with noise of its own", "edited alone",
+                lambda name: self._read(f"{CONTROL}/{name}.png"),
+            ),
+            ("Scene before", "scene before", lambda name: self._read(f"{RENDERS[0]}/{name}.png")),
+            ("Edited scene", "edited scene", lambda name: self._read(f"{RENDERS[1]}/{name}.png")),
+            (self._where(), "where features came from",
+             lambda name: self._read(f"masks/{name}.png")),
+            ("Features of the source, warped to the view; their three main components as colours",
+             "features", lambda name: self._read(f"features/{name}.png")),
+        ]  # fmt: skip
+        cells = [f'<span class="small">{escape(self._title(name))}</span>' for name in self.shown]
+        for title, what, picture in rows:
+            pictures = [picture(name) for name in self.shown]
+            if all(picture is None for picture in pictures):
+                continue
+            cells.append(f"<b>{title}</b>")
+            for k, (name, data) in enumerate(zip(self.shown, pictures, strict=True)):
+                id_ = {"scene before": f"before-{k}", "edited scene": f"after-{k}"}.get(what, "")
+                cells.append(_figure(f"{name}, {what}", data, id_))
+        count = (
+            f"<p>{len(self.shown)} of {len(self.edited)} edited views; the folder has all.</p>"
+            if len(self.shown) < len(self.edited)
+            else ""
+        )
+        style = f"grid-template-columns: repeat({max(1, len(self.shown))}, minmax(0, 1fr))"
+        shares = self._shares() if carried else ""
+        return (
+            f'<h2>Views</h2>{count}{shares}<div class="grid" style="{style}">{"".join(cells)}</div>'
+        )
+
+    def _title(self, name: str) -> str:
+        return f"{name} (source)" if name in self.sources else name
+
+    def _where(self) -> str:
+        if len(self.sources) < 2:
+            return "Where features came from: white from the source, black from none"
+        colors = " ".join(
+            f'<span style="background:rgb{SOURCE_COLORS[k % len(SOURCE_COLORS)]};color:#000;'
+            f'padding:0 .4em;border-radius:3px">{escape(name)}</span>'
+            for k, name in enumerate(self.sources)
+        )
+        return f"Where features came from: {colors}; black from none"
+
+    def _shares(self) -> str:
+        """Sentence on the part of the views that gets features."""
+        lines = []
+        for name in self.shown:
+            about = self._record(name)
+            if about is None or name == self.sources[0]:
+                continue
+            if "sources" in about:
+                each = [f"{v:.0%} from {escape(k)}" for k, v in about["sources"].items() if v > 0]
+                lines.append(f"{escape(name)} {', '.join(each) or 'none'}")
+            else:
+                lines.append(f"{escape(name)} {about['injected']:.0%}")
+        if not lines:
+            return ""
+        return f"<p>Pixels that take features of a source: {'; '.join(lines)}.</p>"
+
+    def _record(self, name: str) -> dict[str, Any] | None:
+        numbers = [k for k, part in enumerate(self.manifest["rounds"]) if name in part["views"]]
+        made = [edit_file(number, name) for number in numbers]
+        about = [self.folder.record(file) for file in made if self.folder.has(file)]
+        return about[-1] if about and "injected" in about[-1] else None
+
+    def agreement(self) -> str:
+        """Differences between pictures of one surface point."""
+        sizes = {n: self.folder.read_picture(f"views/{n}.png").shape[:2] for n in self.shown}
+        index = {name: self.names.index(name) for name in self.shown}
+
+        def at_size(name: str, pixels: npt.NDArray[Any]) -> Bytes:
+            return to_bytes(resized(to_float(pixels), sizes[name]))
+
+        pictures: dict[str, dict[int, Bytes]] = {
+            "photographs": {index[n]: at_size(n, self.photographs[n]) for n in self.shown}
+        }
+        parts = {"edited views": "views", "each edited alone": CONTROL, "edited scene": RENDERS[1]}
+        for title, part in parts.items():
+            read = {n: f"{part}/{n}.png" for n in self.shown if self.folder.has(f"{part}/{n}.png")}
+            pictures[title] = {
+                index[n]: at_size(n, self.folder.read_picture(file)) for n, file in read.items()
+            }
+        cameras = {index[n]: self.cameras[index[n]].resize(w, h) for n, (h, w) in sizes.items()}
+        masks = self.segments
+        segments = None if masks is None else {
+            index[n]: resized(masks[index[n]][..., None].repeat(3, 2).astype(np.float32), sizes[n])[
+                ..., 0] > 0.5
+            for n in self.shown
+        }  # fmt: skip
+        values = disagreement(self.before, cameras, pictures, segments)
+        if "edited views" not in values:
+            return ""
+        where = "" if segments is None else " inside the mask"
+        rows = [(title, f"{value:.1%}") for title, value in values.items()]
+        return (
+            "<h2>Do the views agree?</h2><p>Difference between the pictures of two views where"
+            f" they show one point of the surface{where}, in percent of the full range: a mean over"
+            f" all pairs of the {len(self.shown)} views above, at correspondences of the rendered"
+            " splats. Less is more consistent. Photographs differ too: light, texture and depth"
+            f" are not exact.</p>{_table(('pictures', 'difference'), rows)}"
+        )
+
+    def outside(self) -> str:
+        """The share of the change outside the mask."""
+        title, masks = "<h2>Does it stay inside?</h2>", self.segments
+        if masks is None:
+            return f"{title}<p>No mask was given, so everything may change.</p>"
+        read = [
+            [self.folder.read_picture(f"{part}/{name}.png") for name in self.names]
+            for part in RENDERS
+        ]
+        share, covered = spill(read[0], read[1], masks)
+        said = "The scene did not change" if math.isnan(share) else (
+            f"{share:.0%} of the edited scene's change lies outside the mask"
+        )  # fmt: skip
+        return f"{title}<p>{said}; the mask covers {covered:.0%} of the pictures.</p>"
+
+    def orbit(self, turns: Sequence[Sequence[Bytes]]) -> str:
+        """Both scenes from cameras around them."""
+        frames = [[_data(picture, quality=80, exact=0) for picture in turn] for turn in turns]
+        sides = "".join(
+            f'<figure><img class="turned" alt="the scene {when}" src="{turn[0]}">'
+            f"<figcaption>{when}</figcaption></figure>"
+            for when, turn in zip(("before", "after"), frames, strict=True)
+        )
+        return (
+            f'<h2>All around</h2><div class="orbit"><div class="pair">{sides}</div>'
+            '<div class="controls"><button>Play</button>'
+            f'<input type="range" min="0" max="{len(self.turn) - 1}" value="0" aria-label="turn">'
+            f'</div><script type="application/json">{json.dumps(frames)}</script></div>'
+        )
+
+    def costs(self) -> str:
+        """Counts, seconds and settings, folded."""
+        psnr, seconds = self.result["edit_psnr"], self.folder.read_json("times.json")
+        counts = [
+            (name.replace("_", " "), _short(v)) for name, v in self.result["counters"].items()
+        ]
+        counts += [(f"Edit PSNR, {k}", "-" if psnr[k] is None else f"{psnr[k]:.2f} dB")
+                   for k in ("pooled", "mean")]  # fmt: skip
+        times = [*((part, f"{value:.1f}") for part, value in seconds.items())]
+        times.append(("all", f"{sum(seconds.values()):.1f}"))
+        settings = self.manifest["settings"]
+        flat = {k: v for k, v in settings.items() if not isinstance(v, dict)}
+        flat |= {f"{k}.{n}": w for k, v in settings.items() if isinstance(v, dict)
+                 for n, w in v.items()}  # fmt: skip
+        listed = [(name, "none" if value is None else value) for name, value in flat.items()]
+        folded = "".join(
+            f"<details><summary>{title}</summary>{_table(('', ''), rows)}</details>"
+            for title, rows in (("Counts", counts), ("Settings", listed))
+        )
+        return f"<h2>What it took</h2>{_table(('part', 'seconds'), times)}{folded}"
+
+    def _photograph(self, name: str) -> Bytes:
+        """A view before its edit at the size of its edit."""
+        h, w = self.folder.read_picture(f"views/{name}.png").shape[:2]
+        return to_bytes(resized(to_float(self.photographs[name]), (h, w)))
+
+    def _read(self, file: str) -> Bytes | None:
+        return self.folder.read_picture(file) if self.folder.has(file) else None
+
+
+def _file(name: str) -> str:
+    return files(__name__).joinpath(name).read_text(encoding="utf-8")
+
+
+def _shrunk(pixels: Bytes) -> Bytes:
+    """The picture, no larger than :data:`LONGEST`."""
+    longest = max(pixels.shape[:2])
+    if longest <= LONGEST:
+        return pixels
+    h, w = (max(1, round(side * LONGEST / longest)) for side in pixels.shape[:2])
+    return to_bytes(resized(to_float(pixels), (h, w)))
+
+
+def _data(pixels: Bytes, quality: int = QUALITY, exact: int = EXACT) -> str:
+    """Address of a picture that is in the page: a PNG up to a longest side, a JPEG beyond."""
+    if max(pixels.shape[:2]) <= exact:
+        return f"data:image/png;base64,{base64.b64encode(encode_png(pixels)).decode()}"
+    import cv2
+
+    bgr = np.ascontiguousarray(_shrunk(pixels)[..., ::-1])
+    data = bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
+    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+
+
+def _figure(text: str, picture: Bytes | None, id_: str = "") -> str:
+    """A picture that says what it shows, or its empty place."""
+    if picture is None:
+        return "<span></span>"
+    name = f' id="{id_}"' if id_ else ""
+    return f'<figure><img{name} alt="{escape(text)}" src="{_data(picture)}"></figure>'
+
+
+def _short(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) and value != int(value) else str(value)
+
+
+def _table(head: tuple[str, str], rows: Sequence[tuple[str, Any]]) -> str:
+    top = "".join(f"<th>{escape(name)}</th>" for name in head) if any(head) else ""
+    body = "".join(
+        f"<tr><td>{escape(str(name))}</td><td>{escape(str(value))}</td></tr>"
+        for name, value in rows
+    )
+    return f"<table>{f'<tr>{top}</tr>' if top else ''}{body}</table>"

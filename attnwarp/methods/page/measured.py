@@ -1,0 +1,147 @@
+"""Figures and pictures that a page shows beside an edit: its control, agreement, and spill."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp.camera import Camera
+from attnwarp.editing.editor import Editor
+from attnwarp.gaussians import Gaussians
+from attnwarp.io.names import file_stems
+from attnwarp.methods.by_view import ByView
+from attnwarp.methods.pictures import Bytes, to_bytes
+from attnwarp.methods.scene import Scene, near_of
+from attnwarp.methods.settings import ByViewSettings
+from attnwarp.methods.work import Work
+from attnwarp.reporting import Reporter
+from attnwarp.warp import preset, render_surface, sample_at, warp_surfaces
+from attnwarp.workdir import MANIFEST, Workdir
+
+CONTROL = "control"
+"""Folder of the views that were edited alone."""
+
+
+def edited_alone(
+    folder: Workdir,
+    gaussians: Gaussians,
+    scene: Scene,
+    editor: Editor,
+    views: Sequence[int],
+    report: Reporter,
+) -> None:
+    """Edit views each alone, with noise of its own and all else equal, into a run's folder.
+
+    Args:
+        folder: of the run that this is the control of.
+        gaussians, scene, editor: before the edit, and what edits.
+        views: their numbers; those that the folder has are kept.
+        report: receives each view.
+    """
+    manifest, names = folder.read_json(MANIFEST), file_stems(scene.cameras)
+    shared = {field.name for field in fields(ByViewSettings)} & manifest["settings"].keys()
+    own = {name: manifest["settings"][name] for name in shared}
+    settings = ByViewSettings.from_dict({**own, "noise": "fresh"})
+    instruction = manifest["instruction"]
+    work = Work(gaussians, scene, editor, instruction, settings, "auto", folder, report)
+    method = ByView(work, settings)
+    (folder.path / CONTROL).mkdir(parents=True, exist_ok=True)
+    for place, view in enumerate(views):
+        file = f"{CONTROL}/{names[view]}.png"
+        report.step(place, len(views), "control: each view of the page edited alone")
+        if not folder.has_picture(file):
+            (edit,) = method.edit((view,), work.frozen, lambda: None)
+            folder.write_picture(file, to_bytes(work.composite(view, edit.picture)))
+
+
+def disagreement(
+    gaussians: Gaussians,
+    cameras: Mapping[int, Camera],
+    pictures: Mapping[str, Mapping[int, Bytes]],
+    segments: Mapping[int, npt.NDArray[np.bool_]] | None = None,
+) -> dict[str, float]:
+    """Difference between pictures of one surface point: the mean over all ordered pairs of views,
+    at the correspondences of rendered splats that the preset ``corrected`` accepts.
+
+    Args:
+        gaussians: the scene before the edit.
+        cameras: of the views, at the size of their pictures.
+        pictures: (H, W, 3) uint8 of each view, by what they show.
+        segments: (H, W) bool of each view: pixels of others do not count.
+
+    Returns:
+        Mean absolute difference as a share of the full range, by what the pictures show; without
+        an entry where no two views see one point.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> wall = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 9.0), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = dict(width=8, height=8, fov_y=40, up=(0, 1, 0))
+        >>> cameras = {k: Camera.look_at((0, 0, 3 + k), (0, 0, 0), **view) for k in (0, 1)}
+        >>> grey = {k: np.full((8, 8, 3), 51 * k, np.uint8) for k in cameras}
+        >>> round(disagreement(wall, cameras, {"grey": grey})["grey"], 3)  # 51 of 255
+        0.2
+    """
+    near = near_of(list(cameras.values()), gaussians)
+    settings = preset("corrected")
+    surfaces = {
+        view: render_surface(gaussians, camera, settings, near=near)
+        for view, camera in cameras.items()
+    }
+    totals, counts = dict.fromkeys(pictures, 0.0), dict.fromkeys(pictures, 0)
+    for source, target in permutations(cameras, 2):
+        warp = warp_surfaces(
+            cameras[source], cameras[target], surfaces[target], surfaces[source], settings,
+            warn_empty=False,
+        )  # fmt: skip
+        counted = warp.mask.numpy()
+        if segments is not None:
+            counted = counted & segments[target]
+        for name, of_view in pictures.items():
+            if not {source, target} <= of_view.keys():
+                continue
+            channels = torch.from_numpy(of_view[source]).double().permute(2, 0, 1)
+            there = sample_at(channels, warp.correspondence.xy).permute(1, 2, 0).numpy()[counted]
+            here = of_view[target][counted].astype(np.float64)
+            totals[name] += float(np.abs(there - here).sum()) / (3 * 255)
+            counts[name] += len(here)
+    return {name: totals[name] / counts[name] for name in pictures if counts[name]}
+
+
+def spill(
+    before: Sequence[npt.NDArray[Any]],
+    after: Sequence[npt.NDArray[Any]],
+    segments: Sequence[npt.NDArray[np.bool_]],
+) -> tuple[float, float]:
+    """Share of a change that lies outside what may change.
+
+    Args:
+        before, after: (H, W, 3) pictures of each view.
+        segments: (H, W) bool of each: what may change.
+
+    Returns:
+        The share of the summed absolute change outside (NaN for no change), and the segments' share
+        of the pixels.
+
+    Example:
+        >>> import numpy as np
+        >>> left = np.array([[True, False, False, False]])
+        >>> change = np.array([[3, 1, 0, 0]], np.uint8)[..., None].repeat(3, axis=2)
+        >>> spill([0 * change], [change], [left])
+        (0.25, 0.25)
+    """
+    outside = whole = 0.0
+    for one, two, segment in zip(before, after, segments, strict=True):
+        change = np.abs(two.astype(np.float64) - one).sum(axis=2)
+        outside += float(change[~segment].sum())
+        whole += float(change.sum())
+    covered = sum(int(segment.sum()) for segment in segments)
+    return outside / whole if whole else np.nan, covered / sum(s.size for s in segments)

@@ -1,0 +1,215 @@
+"""Cameras around a scene, along the capture's own, and a film of what they show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.camera import Camera
+from attnwarp.errors import InputError
+from attnwarp.gaussians import Gaussians
+from attnwarp.io.file import write_atomically
+from attnwarp.methods.pictures import Bytes, to_bytes
+from attnwarp.methods.scene import near_of, render_picture
+
+Array = npt.NDArray[np.float64]
+
+FRAMES = 36
+"""Pictures of a turn: one every 10 degrees."""
+
+SPEED = 12
+"""Pictures a second of a film."""
+
+ALL_AROUND = np.radians(120)
+"""Cameras that leave no wider gap surround what they look at."""
+
+SMOOTH = np.radians(15)
+"""Width of the mean over neighbouring cameras' heights and distances."""
+
+FILMS = (".gif", ".mp4")
+
+
+def focus_of(cameras: Sequence[Camera], points: Array) -> Array:
+    """The point that cameras look at: nearest to all optical axes.
+
+    Where the axes are parallel or part, it lies as far before the cameras as what they see.
+
+    Args:
+        cameras: at least one.
+        points: (N, 3) of the scene.
+
+    Returns:
+        (3,) in world units.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> view = dict(width=8, height=8, fov_y=40)
+        >>> ring = [Camera.look_at((x, y, 2), (0, 0, 1), **view) for x, y in ((3, 0), (0, 3))]
+        >>> (focus_of(ring, np.zeros((1, 3))).round(6) + 0.0).tolist()
+        [0.0, 0.0, 1.0]
+    """
+    positions = np.stack([camera.position for camera in cameras])
+    axes = np.stack([camera.forward for camera in cameras])
+    depths = []
+    for camera in cameras:
+        xy, z = camera.project(points)
+        seen = (z > 0) & (xy >= 0).all(axis=1) & (xy <= (camera.width, camera.height)).all(axis=1)
+        depths += [float(np.median(z[seen]))] if seen.any() else []
+    ahead = positions + axes * (np.median(depths) if depths else 1.0)
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    system, right = across.sum(axis=0), (across @ positions[:, :, None]).sum(axis=0)[:, 0]
+    # A grain of what lies ahead decides where axes do not.
+    grain = 1e-9 * len(cameras)
+    point = np.linalg.solve(system + grain * np.eye(3), right + grain * ahead.mean(axis=0))
+    parallel = np.linalg.eigvalsh(system)[0] < 1e-3 * len(cameras)
+    behind = ((point - positions) * axes).sum(axis=1).mean() <= 0
+    return np.asarray(ahead.mean(axis=0) if parallel or behind else point)
+
+
+def orbit(
+    cameras: Sequence[Camera], points: Array, *, first: int = 0, longest: int = 320
+) -> list[Camera]:
+    """Cameras that turn about what a capture looks at: all around, or to and fro where it was taken
+    from one side.
+
+    Args:
+        cameras: of the capture; height and distance follow those nearby.
+        points: (N, 3) of the scene.
+        first: number of the camera that a full turn begins beside.
+        longest: side of the pictures in px.
+
+    Returns:
+        :data:`FRAMES` cameras, of which the last leads to the first.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> ring = [Camera.look_at((3 * np.cos(a), 3 * np.sin(a), 1), (0, 0, 0), width=8, height=8,
+        ...                        fov_y=40) for a in np.radians(np.arange(0, 360, 45))]
+        >>> turn = orbit(ring, np.zeros((1, 3)))
+        >>> len(turn), turn[9].position.round(2).tolist()  # a quarter of the way around
+        (36, [0.0, 3.0, 1.0])
+    """
+    focus, up = focus_of(cameras, points), up_of(cameras)
+    ahead = focus - cameras[first].position
+    east = ahead - (ahead @ up) * up
+    east = _unit(
+        east if np.linalg.norm(east) > 1e-6 else np.cross(up, np.eye(3)[np.argmin(abs(up))])
+    )
+    north = np.cross(up, east)
+    away = np.stack([camera.position for camera in cameras]) - focus
+    heights, angles = away @ up, np.arctan2(away @ north, away @ east)
+    distances = np.hypot(away @ north, away @ east)
+    ordered = np.sort(angles)
+    gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
+    widest = int(np.argmax(gaps))
+    turn = 2 * np.pi * np.arange(FRAMES) / FRAMES
+    if gaps[widest] > ALL_AROUND:
+        begin = ordered[(widest + 1) % len(ordered)]
+        half = (2 * np.pi - gaps[widest]) / 2
+        turn = begin + half + max(half, SMOOTH / 2) * np.sin(turn)
+    else:
+        turn = turn + angles[first]
+    sides = np.array([[camera.width, camera.height] for camera in cameras])
+    w, h = (sides[first] * min(1.0, longest / sides[first].max())).round().astype(int).clip(1)
+    fov = np.degrees(2 * np.arctan(cameras[first].height / (2 * cameras[first].K[1, 1])))
+    result = []
+    for number, angle in enumerate(turn):
+        apart = (angles - angle + np.pi) % (2 * np.pi) - np.pi
+        weights = np.exp(-0.5 * ((apart / SMOOTH) ** 2 - ((apart / SMOOTH) ** 2).min()))
+        height, distance = (weights @ values / weights.sum() for values in (heights, distances))
+        place = focus + height * up + distance * (np.cos(angle) * east + np.sin(angle) * north)
+        result.append(
+            Camera.look_at(
+                tuple(place), tuple(focus), up=tuple(up), width=int(w), height=int(h),
+                fov_y=float(fov), name=f"orbit-{number:02d}",
+            )
+        )  # fmt: skip
+    return result
+
+
+def up_of(cameras: Sequence[Camera]) -> Array:
+    """(3,) direction upwards, of length 1: across the lower edges of the pictures, which a level
+    camera keeps level, and where these do not tell, along the mean of the upright ones.
+
+    Example:
+        >>> from attnwarp import Camera
+        >>> view = dict(width=8, height=8, fov_y=40)
+        >>> side = [Camera.look_at((x, 3, 2), (0, 0, 0), **view) for x in (-2, 0, 2)]
+        >>> bool(up_of(side)[2] > 0.999)  # though all of them look down
+        True
+    """
+    level = np.stack([camera.rotation[0] for camera in cameras])
+    upright = -np.stack([camera.rotation[1] for camera in cameras]).mean(axis=0)
+    tilt = level.T @ level / len(level) - 0.005 * np.outer(upright, upright)
+    up = np.linalg.eigh(tilt)[1][:, 0]
+    return np.asarray(up if up @ upright >= 0 else -up)
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def renders(gaussians: Gaussians, cameras: Sequence[Camera], backend: str = "auto") -> list[Bytes]:
+    """(H, W, 3) uint8 of splats from each camera."""
+    near = near_of(cameras, gaussians)
+    return [to_bytes(render_picture(gaussians, camera, near, backend)) for camera in cameras]
+
+
+def check_film(path: Path | None) -> None:
+    """Refuse a film of another format.
+
+    Raises:
+        InputError: the name ends in neither of :data:`FILMS`.
+    """
+    if path is not None and path.suffix.lower() not in FILMS:
+        raise InputError(f"--turntable: got {path}, expected a name ending in {' or '.join(FILMS)}")
+
+
+def write_film(path: Path, before: Sequence[Bytes], after: Sequence[Bytes]) -> None:
+    """Write a turn as GIF or MP4, before on the left and after on the right.
+
+    Args:
+        path: ends in one of :data:`FILMS`; an older file is replaced.
+        before, after: (H, W, 3) uint8 frames.
+
+    Raises:
+        InputError: another ending.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> frames = [np.full((8, 8, 3), value, np.uint8) for value in (0, 200)]
+        >>> write_film(Path("turn.gif"), frames, frames)
+    """
+    check_film(path)
+    frames = []
+    for pair in zip(before, after, strict=True):
+        both = np.concatenate(pair, axis=1)
+        h, w = (side - side % 2 for side in both.shape[:2])  # as MP4's colours ask
+        frames.append(both if path.suffix.lower() == ".gif" else both[:h, :w])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix.lower() == ".gif":
+        from PIL import Image
+
+        first, *others = [Image.fromarray(frame) for frame in frames]
+        write_atomically(
+            path,
+            lambda stream: first.save(
+                stream, "GIF", save_all=True, append_images=others, loop=0,
+                duration=round(1000 / SPEED),
+            ),
+        )  # fmt: skip
+        return
+    import cv2
+
+    h, w = frames[0].shape[:2]
+    code = cv2.VideoWriter.fourcc(*"mp4v")
+    film = cv2.VideoWriter(str(path), code, SPEED, (w, h))
+    for frame in frames:
+        film.write(np.ascontiguousarray(frame[..., ::-1]))
+    film.release()
