@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from attnwarp import check
-from attnwarp.editing.schedule import Schedule, following, steps_as_published
+from attnwarp.editing.schedule import Grid, Schedule, following, steps_as_published
 from attnwarp.errors import InputWarning
 
 Image = npt.NDArray[np.float32]
@@ -131,6 +131,7 @@ def edit(
     steps: int = STEPS,
     seed: int = 0,
     start: int | None = None,
+    grid: Grid = "even",
     pictures: Sequence[Image] | None = None,
     noise: Tensor | None = None,
     latents: Tensor | None = None,
@@ -150,6 +151,7 @@ def edit(
             latents are noised to T's share of signal, then ``steps`` steps follow
             (:func:`attnwarp.editing.schedule.steps_as_published`). Left out, the edit starts from
             pure noise.
+        grid: of the steps below ``start``; noise is added at ``start`` in either.
         pictures: (H, W, 3) that ``start`` begins from; ``guides`` if left out.
         noise: (B, C, h, w) in place of the seed's.
         latents: (B, C, h, w) to begin from as they are, such as those of an inversion; neither
@@ -184,7 +186,7 @@ def edit(
     timesteps = (
         editor.timesteps(steps)
         if start is None
-        else steps_as_published(editor.schedule, start, steps)
+        else steps_as_published(editor.schedule, start, steps, grid)
     )
     if noise is None:
         noise = shared_noise(task.shape, seed)
@@ -198,7 +200,8 @@ def edit(
     else:
         before = editor.encode(guides if pictures is None else pictures)
         check.shape(before, task.shape, "pictures")
-        x = editor.schedule.add_noise(before, noise, timesteps[0])
+        (noised,) = steps_as_published(editor.schedule, start, 1)
+        x = editor.schedule.add_noise(before, noise, noised)
     with torch.no_grad():
         for number, (now, then) in enumerate(following(timesteps)):
             change = None if estimate is None else partial(estimate, number)

@@ -14,6 +14,12 @@ from attnwarp.warp.sampling import work_type
 
 Prediction = Literal["epsilon", "sample", "v_prediction"]
 
+Grid = Literal["even", "scheduler"]
+"""Timesteps below a start T: "even" ones from T itself, or those of a "scheduler" that is made anew
+for T training steps, as published code has it: from T - T / steps + 1 down to 1, though noise is
+added at T.
+"""
+
 PUBLISHED_STEPS = 1000
 """Steps of Stable Diffusion, whose numbers publications give."""
 
@@ -136,13 +142,39 @@ def stable_diffusion_alphas() -> Tensor:
     return torch.cumprod(1 - roots.square(), 0)
 
 
-def steps_as_published(schedule: Schedule, start: int, steps: int) -> list[int]:
+def published_steps(start: int, steps: int, grid: Grid = "even") -> list[int]:
+    """Timesteps of Stable Diffusion that an edit from ``start`` denoises at.
+
+    Args:
+        start: timestep that noise is added at.
+        steps: how many.
+        grid: see :data:`Grid`.
+
+    Raises:
+        ValueError: fewer timesteps than steps.
+
+    Example:
+        >>> published_steps(980, 20)[:2], published_steps(980, 20, "scheduler")[:2]
+        ([980, 931], [932, 883])
+    """
+    if grid == "even":
+        return steps_from(start, steps)
+    if steps < 1 or start < steps:
+        raise ValueError(
+            f"start, steps: got {start}, {steps}, expected at least one step and start >= steps"
+        )
+    return [start // steps * k + 1 for k in reversed(range(steps))]
+
+
+def steps_as_published(
+    schedule: Schedule, start: int, steps: int, grid: Grid = "even"
+) -> list[int]:
     """The steps of a schedule that stand for steps of Stable Diffusion, as publications give them.
 
     A method noises a picture to a published timestep T. It relies on the share of the picture that
-    is left there, sqrt(alpha-bar), and not on the number T. So Stable Diffusion's steps fall evenly
-    from ``start`` (:func:`steps_from`), and each becomes the step of the nearest alpha-bar. With
-    Stable Diffusion's own schedule that is the same step.
+    is left there, sqrt(alpha-bar), and not on the number T. So each of Stable Diffusion's steps
+    (:func:`published_steps`) becomes the step of the nearest alpha-bar. With Stable Diffusion's own
+    schedule that is the same step.
 
     Stable Diffusion's last step still shows some of the picture, and methods rely on it. So it does
     not become the pure noise that another schedule may end in. Where neighbours have the same
@@ -154,6 +186,7 @@ def steps_as_published(schedule: Schedule, start: int, steps: int) -> list[int]:
         schedule: of the editor.
         start: Stable Diffusion's first timestep, in [0, 999].
         steps: how many.
+        grid: see :data:`Grid`.
 
     Raises:
         ValueError: no such timestep, or more steps than the schedule has from there.
@@ -167,7 +200,7 @@ def steps_as_published(schedule: Schedule, start: int, steps: int) -> list[int]:
         [856, 713, 558, 360]
     """
     check.number(start, 0, PUBLISHED_STEPS - 1, "start", whole=True)
-    published = stable_diffusion_alphas()[steps_from(start, steps)]
+    published = stable_diffusion_alphas()[published_steps(start, steps, grid)]
     own = schedule.alphas.double().cpu()
     result: list[int] = []
     for alpha in published:

@@ -9,10 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
-from itertools import chain, groupby, islice
+from itertools import chain, groupby
 from typing import Any, Literal, Unpack
 
-import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
@@ -25,13 +24,11 @@ from attnwarp.editing.recording import record
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
 from attnwarp.methods.geometry import Warps
-from attnwarp.methods.settings import MOST_VIEWS, AttentionWarpingSettings
+from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.methods.sight import Sight
+from attnwarp.methods.stages import draw_stages, released_order
 from attnwarp.methods.view_edits import RecordedSource, ViewEdits
 from attnwarp.methods.work import Work, chunks
-
-SOURCE_EVERY = 10
-"""The released code tunes on the source at every tenth step."""
 
 
 def attention_warping(
@@ -129,10 +126,10 @@ class AttentionWarping(Method):
             for _, same in groupby(views, key=lambda view: self.work.sizes[view]):
                 for batch in chunks(list(same), s.batch):
                     # (4) warp the source's features to them, (5) edit them with these injected;
-                    rows = self.views.rows(len(batch), s.guidance(stage))
+                    rows = self.views.rows(len(batch), s.guidance(stage), stage)
                     loop.edit(stage, batch, partial(self.edit_targets, stage, batch), rows=rows)
             # (6) tune the splats on edited views.
-            edited += views
+            edited += [view for view in views if view not in edited]
             own = [*(self.sources[1:] if stage == 0 else ()), *views]
             if s.training == "all" or not views:
                 loop.tune(stage, edited, s.iterations)
@@ -173,7 +170,7 @@ class AttentionWarping(Method):
         with work.folder.seconds.part("warp"):
             sights = [views.sight(count, view, model) for view in batch]
         with work.guided(self.settings.guidance(stage)), ExitStack() as stack:
-            start = views.start(batch, model)
+            start = views.start(batch, model, stage=stage)
             self._inject(stack, recorded, sights)
             pictures, _ = views.denoise(start, sights, step)
         return [
@@ -219,31 +216,3 @@ class AttentionWarping(Method):
             "feature_bytes": sum(about.get("feature_bytes", 0) for about in records.values()),
             "injected": sum(shares) / len(shares) if shares else 0.0,
         }
-
-
-def draw_stages(unedited: Sequence[int], settings: AttentionWarpingSettings) -> list[list[int]]:
-    """Draw each stage's views at random from those not edited so far (line 3).
-
-    Where all are sources, one stage without views is left, which tunes on these.
-
-    Example:
-        >>> stages = draw_stages(range(1, 7), AttentionWarpingSettings(stages=2))
-        >>> [len(views) for views in stages], sorted(sum(stages, []))
-        ([3, 3], [1, 2, 3, 4, 5, 6])
-    """
-    s = settings
-    if s.views_per_stage is None:
-        shares = np.array_split(np.arange(len(unedited)), s.stages)
-        sizes = [min(MOST_VIEWS, len(share)) for share in shares]
-    else:
-        sizes = [s.views_per_stage] * s.stages
-    # Parts of one permutation are draws without replacement.
-    generator = torch.Generator().manual_seed(s.seed)
-    order = iter([unedited[k] for k in torch.randperm(len(unedited), generator=generator).tolist()])
-    stages = [list(islice(order, size)) for size in sizes]
-    return [views for views in stages if views] or [[]]
-
-
-def released_order(views: int) -> Callable[[int], int]:
-    """The released code's order: the source, then view ``step % views``, which misses some."""
-    return lambda step: 0 if step % SOURCE_EVERY == 0 else 1 + step % views

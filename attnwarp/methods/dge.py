@@ -15,7 +15,7 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor
-from attnwarp.editing.schedule import following, steps_as_published, steps_from
+from attnwarp.editing.schedule import following, published_steps, steps_as_published
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
 from attnwarp.methods.matching import key_views
@@ -99,7 +99,8 @@ class DGE(Method):
         """Edit the views of a round, from their noised renders."""
         work, s = self.work, self.settings
         editor: Any = work.editor
-        timesteps = steps_as_published(editor.schedule, self._start(number), s.steps)
+        timesteps = steps_as_published(editor.schedule, self._start(number), s.steps, s.grid)
+        (noised,) = steps_as_published(editor.schedule, self._start(number), 1)
         cameras = [work.scene.cameras[view] for view in group]
         batches = chunks(range(len(group)), s.batch)
         generator = work.generator(KEYS, number)
@@ -109,7 +110,7 @@ class DGE(Method):
             task = editor.task(guides, work.instruction)
             before = editor.encode([work.render(view, model) for view in group])
             noise = work.noise(number, group).to(before)
-            x = editor.schedule.add_noise(before, noise, timesteps[0])
+            x = editor.schedule.add_noise(before, noise, noised)
             with key_views(
                 editor.unet, task.branches, (x.shape[2], x.shape[3]), s.epipolar
             ) as attention:
@@ -145,8 +146,9 @@ class DGE(Method):
 
     def _with_keys(self, number: int) -> list[bool]:
         """Flags of a round's steps, True where views take the outputs of key views there."""
-        published = steps_from(self._start(number), self.settings.steps)
-        return [timestep >= self.settings.plain_below for timestep in published]
+        s = self.settings
+        published = published_steps(self._start(number), s.steps, s.grid)
+        return [timestep >= s.plain_below for timestep in published]
 
 
 def by_angle(cameras: Sequence[Camera], views: Sequence[int]) -> list[int]:

@@ -4,8 +4,8 @@ inverted noise of their renders.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import partial
 from typing import Any, Unpack
 
@@ -113,8 +113,6 @@ class GaussCtrl(Method):
         latents = torch.cat([self.latents(view, guides[view]) for view in views])
         with ExitStack() as stack:
             stack.enter_context(work.guided(s.text_guidance))
-            if s.negative_prompt is not None:
-                stack.enter_context(_negative(editor, s.negative_prompt))
             count, branches = len(self.references), len(editor.branches)
             rule = aligned(count, s.self_share, branches)
             stack.enter_context(self_attention(editor.unet, rule))
@@ -124,7 +122,7 @@ class GaussCtrl(Method):
             result = edit(
                 editor,
                 [guides[view] for view in views],
-                work.instruction + s.suffix,
+                work.prompt,
                 steps=s.steps,
                 latents=latents,
                 on_step=lambda *_: step(),
@@ -138,23 +136,12 @@ class GaussCtrl(Method):
         if s.latents == "random":
             return work.noise(0, [view]).to(work.editor.unet.device, work.editor.unet.dtype)
         if view not in self._latents:
-            prompt = work.instruction + s.suffix if s.source_prompt is None else s.source_prompt
+            prompt = work.prompt if s.source_prompt is None else s.source_prompt
             self._latents[view] = invert_view(
                 work.editor, depth, work.render(view, work.frozen), prompt,
                 steps=s.steps, seed=s.seed,
             )  # fmt: skip
         return self._latents[view]
-
-
-@contextmanager
-def _negative(editor: Any, prompt: str) -> Iterator[None]:
-    """Use another negative prompt while the block runs."""
-    before = editor.negative_prompt
-    editor.negative_prompt = prompt
-    try:
-        yield
-    finally:
-        editor.negative_prompt = before
 
 
 def _quarters(views: Sequence[int], count: int) -> list[list[int]]:

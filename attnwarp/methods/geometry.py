@@ -41,7 +41,8 @@ class Geometry:
         warps = [self.warp(source, view, model) for source in sources]
         scales = [self._edit_share(source) / self._edit_share(view) for source in sources]
         margins = [self._margin(source) for source in sources] if s.estimate_margin > 0 else None
-        return Sight(warps, s.confidence, scales, margins)
+        zeros = not s.mask and s.outside == "zeros"
+        return Sight(warps, s.confidence, scales, margins, zeros)
 
     def warp(self, source: int, target: int, model: Gaussians) -> WarpedView:
         """The warp from one view to another along the model before the edit, or the current one."""

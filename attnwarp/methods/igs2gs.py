@@ -93,6 +93,7 @@ class IGS2GS(Method):
                 work.instruction,
                 steps=s.steps,
                 start=start,
+                grid=s.grid,
                 pictures=[work.render(view, model)],
                 noise=work.noise(number, (view,)),
                 on_step=lambda *_: step(),

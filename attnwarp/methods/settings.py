@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from attnwarp import check
 from attnwarp.editing.layers import Block, Kind
-from attnwarp.editing.schedule import PUBLISHED_STEPS
+from attnwarp.editing.schedule import PUBLISHED_STEPS, Grid
 from attnwarp.errors import Named
 from attnwarp.settings import Count, Number, Range, Seed, Settings, Share, Weight
 from attnwarp.warp.settings import PRESETS as WARPS
@@ -129,18 +129,25 @@ class AttentionWarpingSettings(MethodSettings):
         stages: of editing and tuning.
         views_per_stage: new views that a stage edits. None: an equal share of the views, at most
             40. A stage for which no view is left is dropped.
+        fill_last_stage: whether a last stage that is short of views takes some that were edited
+            before, at random.
         noise: "shared" by source and targets, pixel by pixel; "fresh" for each view; or "surface":
             a point of the surface has the same noise in every view
             (:mod:`attnwarp.methods.noise`).
         latents: what a view's edit starts from: "random" ones, or the DDIM "inversion" of its
-            picture before the edit, without guidance, of an editor that is guided by depth. Each
-            view then has a start of its own, so ``noise`` stays "shared" and ``start`` None.
+            ``start_picture``, without guidance, of an editor that is guided by depth. Each view
+            then has a start of its own, so ``noise`` stays "shared" and ``start`` None. "by_stage":
+            random in the first stage, inversion in those after it.
         source_prompt: of the inversion: what the scene shows; None for the instruction.
         start: (lowest, highest) timestep of Stable Diffusion, of which one is drawn for all views,
             to start from in place of pure noise. On the editor's own schedule it becomes the step
             that leaves as much of the picture
             (:func:`attnwarp.editing.schedule.steps_as_published`).
-        start_picture: what is noised to ``start``: the current "render" (IGS2GS) or the "original".
+        grid: of the steps below ``start``, :data:`attnwarp.editing.schedule.Grid`.
+        start_picture: what is noised to ``start`` or inverted: the "original", the current "render"
+            (IGS2GS), or "by_stage": the original in the first stage, the render after it.
+        suffix: of the instruction.
+        negative_prompt: of a ControlNet's unconditional branch; None for the editor's own.
         text_guidance: s_T of the first stage; None for the editor's own.
         guidance_drop: what each further stage takes off ``text_guidance``, which may fall to 0 and
             not below.
@@ -148,6 +155,8 @@ class AttentionWarpingSettings(MethodSettings):
         batch: target views that go through the network together. Another batch gives other bits.
         warp: correspondences and masks, :class:`attnwarp.warp.WarpSettings`.
         mask: False injects wherever the target has a depth (the ablation "no M").
+        outside: features of what projects outside the source: the "border"'s, or "zeros", as
+            padding gives them. With a mask nothing is taken there.
         sources: views whose features are recorded and warped. Those after the first are edited in
             a chain outward from it, each covered by those before; a target's pixel takes the source
             that sees it best (:mod:`attnwarp.methods.sight`).
@@ -205,15 +214,20 @@ class AttentionWarpingSettings(MethodSettings):
     method: Literal["warp", "each view alone"] = "warp"
     stages: Count = 3
     views_per_stage: Count | None = None
-    latents: Latents = "random"
+    fill_last_stage: bool = False
+    latents: Literal["random", "inversion", "by_stage"] = "random"
     source_prompt: str | None = ""
     start: tuple[int, int] | None = None
-    start_picture: Literal["render", "original"] = "render"
+    grid: Grid = "even"
+    start_picture: Literal["original", "render", "by_stage"] = "original"
+    suffix: str = ""
+    negative_prompt: str | None = None
     guidance_drop: Weight = 0.0
     source_text_guidance: Weight | None = None
     batch: Count = 4
     warp: WarpSettings = WARPS["corrected"]
     mask: bool = True
+    outside: Literal["border", "zeros"] = "border"
     sources: Count = 1
     chain_coverage: Share = 0.5
     confidence: bool = False
@@ -263,11 +277,14 @@ class AttentionWarpingSettings(MethodSettings):
                     " 'inversion', which reads it, or leave it out"
                 )
             return
+        plain: Any
         for name, value, plain in (("noise", self.noise, "shared"), ("start", self.start, None)):
+            if name == "noise" and self.latents == "by_stage":  # the first stage starts from it
+                continue
             if value != plain:
                 raise ValueError(
-                    f"{name}: got {value!r} with latents 'inversion', from which each view has its"
-                    f" own start; set {name} to {plain!r}, or latents to 'random'"
+                    f"{name}: got {value!r} with latents {self.latents!r}, from which each view has"
+                    f" its own start; set {name} to {plain!r}, or latents to 'random'"
                 )
 
     def guidance(self, stage: int) -> float | None:
@@ -281,6 +298,17 @@ class AttentionWarpingSettings(MethodSettings):
         if self.text_guidance is None:
             return None
         return self.text_guidance - self.guidance_drop * stage
+
+    def inverts(self, stage: int) -> bool:
+        """Return True if the views of a stage, counted from 0, start from inverted latents.
+
+        Example:
+            >>> from attnwarp.methods import PRESETS
+            >>> released = PRESETS["attention_warping"]["released-controlnet"]
+            >>> [released.inverts(stage) for stage in range(3)]
+            [False, True, True]
+        """
+        return self.latents == "inversion" or (self.latents == "by_stage" and stage > 0)
 
     def feature_range(self) -> range:
         """Numbers of the steps whose features are recorded and injected, from 0.
@@ -336,6 +364,7 @@ class IGS2GSSettings(MethodSettings):
     Args:
         every: iterations of tuning after which all views are edited again.
         start: (lowest, highest) timestep, of which each edit draws one to start from.
+        grid: of the steps below it, :data:`attnwarp.editing.schedule.Grid`.
 
     Example:
         >>> from attnwarp.methods import IGS2GSSettings
@@ -347,6 +376,7 @@ class IGS2GSSettings(MethodSettings):
     iterations: Number = 7500
     every: Count = 2500
     start: tuple[int, int] = (700, 980)
+    grid: Grid = "even"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -362,6 +392,7 @@ class DGESettings(MethodSettings):
         views: that a round edits; all where there are fewer.
         batch: neighbouring views that share a key view.
         starts: timestep that a round starts from; the last also serves all further rounds.
+        grid: of the steps below it, :data:`attnwarp.editing.schedule.Grid`.
         plain_below: timestep below which every view has its own attention.
         nearest: key views that a token is matched in; one for the first batch.
         epipolar: distance in px of the layer from the epipolar line beyond which matches are
@@ -381,6 +412,7 @@ class DGESettings(MethodSettings):
     views: Count = 20
     batch: Count = 5
     starts: tuple[int, ...] = (998, 299)
+    grid: Grid = "even"
     plain_below: Annotated[int, Range(0, 1000)] = 100
     nearest: Annotated[int, Range(1, 2)] = 2
     epipolar: Weight | None = 1.0
@@ -438,11 +470,15 @@ _STABLE_DIFFUSION: dict[str, Any] = {
     "text_guidance": 5.0,
 }
 
-_IGS2GS = IGS2GSSettings(text_guidance=12.5, image_guidance=1.5)
+_IGS2GS = IGS2GSSettings(text_guidance=12.5, image_guidance=1.5, grid="scheduler")
 
 _RELEASED = AttentionWarpingSettings(
     views_per_stage=MOST_VIEWS,
+    fill_last_stage=True,
+    iterations=960,
     start=(700, 980),
+    grid="scheduler",
+    start_picture="by_stage",
     text_guidance=12.5,
     guidance_drop=1.5,
     warp=WARPS["released"],
@@ -470,9 +506,12 @@ PRESETS: Named[Named[MethodSettings]] = Named({
             _RELEASED,
             noise="fresh",
             start=None,
-            text_guidance=12.5,
+            grid="even",
+            latents="by_stage",
             guidance_drop=0.0,
             source_text_guidance=7.5,
+            suffix=_STABLE_DIFFUSION["suffix"],
+            negative_prompt=_STABLE_DIFFUSION["negative_prompt"],
         ),
         "extended": AttentionWarpingSettings(
             sources=4,
@@ -491,7 +530,7 @@ PRESETS: Named[Named[MethodSettings]] = Named({
     }),
     "dge": Named({
         "default": DGESettings(),
-        "released": DGESettings(text_guidance=7.5, image_guidance=1.5),
+        "released": DGESettings(text_guidance=7.5, image_guidance=1.5, grid="scheduler"),
     }),
     "gaussctrl": Named({
         "default": GaussCtrlSettings(),
@@ -508,10 +547,14 @@ Those of ``attention_warping`` have the warp of their name (:data:`attnwarp.warp
 as it stands, and pictures are black outside the segments. What the text leaves open is as in
 ``corrected``.
 
-``released``: the authors' code with InstructPix2Pix. One timestep in [700, 980] and one noise for
-all views, s_T = 12.5 - 1.5 stage, depth of the current model, tuning by the step's number modulo
-the stage's views, segments blurred with sigma 1.5. ``released-controlnet``: the same with a
-ControlNet, where each view draws fresh noise, and the source has s_T 7.5 and the targets 12.5.
+``released``: the authors' code with InstructPix2Pix. One timestep T in [700, 980] and one noise for
+all views, added at T, while the steps are those of a scheduler of T training steps; the original is
+noised in the first stage and the render after it. s_T = 12.5 - 1.5 stage, depth of the current
+model, 40 edits and 960 iterations a stage, tuning by the step's number modulo the stage's views, a
+short last stage filled up, segments blurred with sigma 1.5. ``released-controlnet``: the same with
+a ControlNet, where each view draws fresh noise in the first stage and starts from the inversion of
+the current render after it; the source has s_T 7.5 and the targets 12.5, prompts end in a suffix
+and there is a negative prompt.
 
 ``corrected``: the default. Noise is shared, depth is that of the model before the edit, and a stage
 tunes on everything edited so far, with larger steps of the colours.
@@ -521,7 +564,7 @@ surface, and the sources' clean pictures, with a weight that falls from 1 to a h
 depth edges. The study ``beyond`` has each alone and all together.
 
 ``default`` of the others: the method, with the guidance and prompts of the editor at hand. Further
-ones have the guidance and prompts published for Stable Diffusion.
+ones have the guidance, the prompts and the grid of steps published for Stable Diffusion.
 
 ``improved`` of ``igs2gs``: 3000 iterations in place of 7500. ``released`` of ``gaussctrl``: the
 authors' code, which also aligns the ControlNet's attention, without a share of the view's own, and

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -126,6 +127,7 @@ class Sight:
             differ in. None where all are 1.
         margins: of each source: px of its depth map on either side of a depth edge whose picture is
             not taken. None where all are 0.
+        zeros: features of what projects outside a source are zeros, not its border's.
 
     Example:
         >>> import numpy as np
@@ -146,6 +148,7 @@ class Sight:
     soft: bool = False
     scales: Sequence[float] | None = None
     margins: Sequence[int] | None = None
+    zeros: bool = False
     _choices: dict[tuple[Size, bool], Tensor] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -244,21 +247,65 @@ class SourceWarp:
     sight: Sight
     number: int
     picture: bool = False
-    _at: dict[tuple[int, ...], FeatureWarp | SoftWarp] = field(default_factory=dict, repr=False)
+    _at: dict[tuple[int, ...], LayerOfSource] = field(default_factory=dict, repr=False)
 
-    def at(self, size: Size, *, source_size: Size | None = None) -> FeatureWarp | SoftWarp:
+    def at(self, size: Size, *, source_size: Size | None = None) -> LayerOfSource:
         """The warp of an (h, w) grid of the target from a grid of the source."""
         key = (*size, *(source_size or ()))
         if key not in self._at:
             layer = self.sight.views[self.number].at(size, source_size=source_size)
             choice = self.sight.choice(size, picture=self.picture)
             mask = layer.mask & (choice == self.number)
-            own: FeatureWarp | SoftWarp = FeatureWarp(layer.correspondence, mask, layer.backend)
+            plain = FeatureWarp(layer.correspondence, mask, layer.backend)
+            zeros = self.sight.zeros and not self.picture
+            hard = ZerosOutside(plain) if zeros else plain
+            own: LayerOfSource = hard
             if self.sight.soft:
-                weight = averaged(self.sight.confidence[self.number], size) * mask
-                own = SoftWarp(FeatureWarp(layer.correspondence, mask, layer.backend), weight)
+                own = SoftWarp(hard, averaged(self.sight.confidence[self.number], size) * mask)
             self._at[key] = own
         return self._at[key]
+
+
+@dataclass(frozen=True, eq=False)
+class ZerosOutside:
+    """A warp in which zeros stand around the source's features, as zero padding has it.
+
+    A tap beyond the border counts 0, so the border's value, which the warp gives there, is
+    multiplied by the weight of the taps inside.
+
+    Args:
+        warp: of the layer.
+    """
+
+    warp: FeatureWarp
+
+    @property
+    def weight(self) -> Tensor:
+        """(h w, 1) float32: 1 in the mask, 0 elsewhere."""
+        return self.warp.weight
+
+    @property
+    def mask(self) -> Tensor:
+        """(h, w) bool: where the warped features count."""
+        return self.warp.mask
+
+    @cached_property
+    def inside(self) -> Tensor:
+        """(h w, 1) float64 weight of the taps within the source's grid; 0 without a position."""
+        both = self.warp.correspondence
+        size = both.xy.new_tensor([both.source.width, both.source.height])
+        place = both.xy - 0.5
+        share = torch.minimum(place + 1, size - place).clamp(0, 1).prod(dim=-1)
+        return torch.nan_to_num(share, nan=0.0).reshape(-1, 1)
+
+    def warp_tokens(self, source: Tensor) -> Tensor:
+        """Warp tokens as :meth:`attnwarp.warp.FeatureWarp.warp_tokens` tells."""
+        warped = self.warp.warp_tokens(source)
+        return warped * self.inside.to(warped)
+
+    def blend_tokens(self, source: Tensor, new: Tensor, alpha: float) -> Tensor:
+        """a (M warp(source) + (1 - M) new) + (1 - a) new; see :meth:`SoftWarp.blend_tokens`."""
+        return SoftWarp(self, self.mask.double()).blend_tokens(source, new, alpha)
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +317,7 @@ class SoftWarp:
         share: (h, w) in [0, 1].
     """
 
-    hard: FeatureWarp
+    hard: FeatureWarp | ZerosOutside
     share: Tensor
 
     @cached_property
@@ -301,6 +348,10 @@ class SoftWarp:
         share = (alpha * self.share).reshape(-1, 1).to(new.device, work)
         mixed = share * warped + (1 - share) * new.to(work)
         return torch.where(share > 0, mixed.to(new.dtype), new)
+
+
+LayerOfSource: TypeAlias = FeatureWarp | ZerosOutside | SoftWarp
+"""The warp of a layer from one source."""
 
 
 def averaged(values: Tensor, size: Size) -> Tensor:

@@ -87,12 +87,12 @@ def check_editor(editor: Any, settings: AttentionWarpingSettings) -> int | None:
             prompt that is too long, or for a start too low for the steps.
     """
     s = settings
-    if s.latents == "inversion":
+    if s.latents != "random":
         if s.source_prompt and hasattr(editor, "check_text"):
             editor.check_text(s.source_prompt)
         if editor.guide != "depth":
             raise ValueError(
-                "latents: 'inversion' is made for a depth ControlNet, got InstructPix2Pix, which"
+                f"latents: {s.latents!r} is made for a depth ControlNet, got InstructPix2Pix, which"
                 " takes pictures; choose another editor, or 'random'"
             )
     if s.start is None:
@@ -101,7 +101,7 @@ def check_editor(editor: Any, settings: AttentionWarpingSettings) -> int | None:
     generator = torch.Generator().manual_seed(s.seed)
     timestep = int(torch.randint(low, high + 1, (1,), generator=generator))
     # Refuses more steps than there are timesteps.
-    steps_as_published(editor.schedule, timestep, s.steps)
+    steps_as_published(editor.schedule, timestep, s.steps, s.grid)
     return timestep
 
 
@@ -246,12 +246,15 @@ class ViewEdits:
 
     # --- an edit
 
-    def start(self, views: Sequence[int], model: Gaussians, *, by_hand: bool = False) -> Start:
+    def start(
+        self, views: Sequence[int], model: Gaussians, *, stage: int = 0, by_hand: bool = False
+    ) -> Start:
         """Start of views' edits, before features are recorded or injected.
 
         Args:
             views: their numbers.
             model: the splats as they stand.
+            stage: from 0; sources are edited in the first.
             by_hand: replay the edit made elsewhere, if there is one.
         """
         work, s = self.work, self.settings
@@ -259,15 +262,16 @@ class ViewEdits:
         guides = [work.guide(view, before, s.warp) for view in views]
         if by_hand and self.by_hand is not None:
             editor: Any = work.editor
-            task = editor.task(guides, work.instruction)
+            task = editor.task(guides, work.prompt)
             maps = noise_maps(editor, task, self.by_hand, self._timesteps(), s.seed)
             return Start(views, guides, replayed=(self.by_hand, task, maps))
-        if s.latents == "random" and self.timestep is None:
+        if not s.inverts(stage) and self.timestep is None:
             return Start(views, guides)
-        pictures = [self._start_picture(view, model) for view in views]
-        if s.latents == "random":
+        original = s.start_picture == "original" or (s.start_picture == "by_stage" and stage == 0)
+        pictures = [work.picture(view) if original else work.render(view, model) for view in views]
+        if not s.inverts(stage):
             return Start(views, guides, pictures)
-        prompt = work.instruction if s.source_prompt is None else s.source_prompt
+        prompt = work.prompt if s.source_prompt is None else s.source_prompt
         latents = torch.cat(
             [
                 invert_view(work.editor, guide, picture, prompt, steps=s.steps, seed=s.seed)
@@ -300,9 +304,10 @@ class ViewEdits:
         result = edit(
             work.editor,
             start.guides,
-            work.instruction,
+            work.prompt,
             steps=s.steps,
             start=self.timestep,
+            grid=s.grid,
             pictures=start.pictures or None,
             noise=self.noise.of(start.views, shape, sights) if start.latents is None else None,
             latents=start.latents,
@@ -311,16 +316,12 @@ class ViewEdits:
         )
         return result.images, kept
 
-    def _start_picture(self, view: int, model: Gaussians) -> Image:
-        """(h, w, 3) of a view that is noised or inverted."""
-        original = self.settings.latents == "inversion" or self.settings.start_picture == "original"
-        return self.work.picture(view) if original else self.work.render(view, model)
-
     def _timesteps(self) -> list[int]:
         editor: Any = self.work.editor
         if self.timestep is None:
             return list(editor.timesteps(self.settings.steps))
-        return steps_as_published(editor.schedule, self.timestep, self.settings.steps)
+        s = self.settings
+        return steps_as_published(editor.schedule, self.timestep, s.steps, s.grid)
 
     def latent_size(self, view: int) -> Size:
         """(h, w) of a view's latents."""
@@ -331,13 +332,13 @@ class ViewEdits:
         """Rows through the UNet for the edit of a source; one made by hand is inverted first."""
         guidance = self.features.source_guidance(further=number > 0)
         by_hand = number == 0 and self.by_hand is not None
-        return self.rows(1, guidance) * (2 if by_hand else 1)
+        return self.rows(1, guidance, 0) * (2 if by_hand else 1)
 
-    def rows(self, views: int, guidance: float | None) -> int:
-        """Rows through the UNet for the edits of views with a text guidance."""
+    def rows(self, views: int, guidance: float | None, stage: int) -> int:
+        """Rows through the UNet for the edits of a stage's views with a text guidance."""
         s = self.settings
         rows = views * s.steps * len(self.features.branches(guidance))
-        if s.latents == "inversion":
+        if s.inverts(stage):
             rows += views * len(inversion_steps(self.work.editor, s.steps)[0])
         return rows
 

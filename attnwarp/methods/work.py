@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from attnwarp.editing.editor import Editor, guided, shared_noise, side_multiple
-from attnwarp.editing.schedule import steps_as_published
+from attnwarp.editing.schedule import Grid, steps_as_published
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.noise import own_seed
 from attnwarp.methods.pictures import Image, Size, composite, edit_size, resized
@@ -127,7 +127,7 @@ class Work:
         """
         steps = self.settings.steps
         try:
-            steps_as_published(self.editor.schedule, lowest, steps)
+            steps_as_published(self.editor.schedule, lowest, steps, self.grid)
         except ValueError:
             raise ValueError(
                 f"{field}: {lowest} leaves too few timesteps for {steps} steps on this editor's"
@@ -160,25 +160,40 @@ class Work:
         generator = self.generator(TIMESTEP, number, *views)
         return int(torch.randint(low, high + 1, (1,), generator=generator))
 
+    @property
+    def prompt(self) -> str:
+        """The instruction with the settings' suffix, if they have one."""
+        return self.instruction + getattr(self.settings, "suffix", "")
+
+    @property
+    def grid(self) -> Grid:
+        """Grid of the steps below a start, if the settings have one."""
+        grid: Grid = getattr(self.settings, "grid", "even")
+        return grid
+
     @contextmanager
     def guided(self, text: float | None) -> Iterator[None]:
-        """Use a text guidance, and the settings' image guidance, while the block runs; None leaves
-        the editor's own.
+        """Use a text guidance, and the settings' image guidance and negative prompt, while the
+        block runs; None leaves the editor's own.
         """
         editor: Any = self.editor
-        image = self.settings.image_guidance
-        if image is not None and not hasattr(editor, "image_guidance"):
-            raise ValueError("image_guidance: this editor has none; leave it out")
-        before = getattr(editor, "image_guidance", None)
+        own = {
+            "image_guidance": self.settings.image_guidance,
+            "negative_prompt": getattr(self.settings, "negative_prompt", None),
+        }
+        own = {name: value for name, value in own.items() if value is not None}
+        for name in own:
+            if not hasattr(editor, name):
+                raise ValueError(f"{name}: this editor has none; leave it out")
+        before = {name: getattr(editor, name) for name in own}
         with guided(editor, text):
-            if image is None:
-                yield
-                return
-            editor.image_guidance = float(image)
             try:
+                for name, value in own.items():
+                    setattr(editor, name, value)
                 yield
             finally:
-                editor.image_guidance = before
+                for name, value in before.items():
+                    setattr(editor, name, value)
 
     def branches(self) -> int:
         """Rows of the UNet's batch for one view."""

@@ -103,7 +103,7 @@ PRESETS: Named[WarpSettings] = Named(
         opaque=None,
         depth_agreement=False,
         normal_test="none",
-        gaussian_filter="printed",
+        gaussian_filter="camera_frame",
         depth_statistic="expected",
     ),
     released=WarpSettings(
@@ -127,11 +127,13 @@ PRESETS: Named[WarpSettings] = Named(
 """Three sets of choices.
 
 ``paper``: the text. The mask is "inside the image", with the target's size; nothing asks whether a
-point lies in front of the source camera or is hidden from it. Gaussians are left out before the
-target's depth is rendered by the rule as printed, "excluded if n_s . n_t >= cos 60", which drops
-the similar ones: with source and target the same view nothing is left. What the text leaves open
-(pixel centres, resizing) is as it has to be right, and "as seen from" a view is read as in that
-camera's axes, so that this preset fails only where the text does.
+point lies in front of the source camera or is hidden from it. Gaussians whose normals, each "as
+seen from" its view, so in that camera's axes and flipped to it, are more than 60 degrees apart are
+left out before the target's depth is rendered. That is what two sentences of the text and the
+authors' code mean; the inequality is printed the other way round, "excluded if n_s . n_t >= cos
+60", which keeps nothing where source and target are one view (``gaussian_filter="printed"``).
+``"facing"`` is the same in world axes. What the text leaves open (pixel centres, resizing) is as it
+has to be right, so that this preset fails only where the text does.
 
 ``released``: the authors' code. Integer pixel centres with align_corners=True on the LAYER's grid,
 where the rasteriser samples at +0.5; no test of the sign of z; the source's size in the bounds

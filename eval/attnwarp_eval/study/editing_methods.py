@@ -183,7 +183,13 @@ def _attention_warping_reads(settings: Mapping[str, Any]) -> Set[str]:
     if s.sources == 1:
         idle.add("chain_coverage")
     if s.start is None:
-        idle.add("start_picture")
+        idle.add("grid")
+        if s.latents == "random":
+            idle.add("start_picture")
+    if s.views_per_stage is None:
+        idle.add("fill_last_stage")
+    if s.mask:
+        idle.add("outside")
     warp = warp_reads(s.warp)
     if s.confidence:  # weighs by the margin of depth agreement, whether that is a rule or not
         warp |= {"set.depth_relative", "set.depth_slope"}

@@ -28,6 +28,7 @@ from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.schedule import (
     Schedule,
     following,
+    published_steps,
     stable_diffusion_alphas,
     steps_as_published,
     steps_from,
@@ -167,6 +168,37 @@ def test_published_steps_are_those_of_diffusers_stable_diffusion():
     for start in (-1, 1000):
         with pytest.raises(ValueError, match=rf"start: got {start}, expected a whole number in"):
             steps_as_published(schedule, start, 1)
+
+
+@pytest.mark.parametrize("start", [700, 853, 980])
+def test_the_grid_of_a_scheduler_is_that_of_diffusers_with_so_many_training_steps(start):
+    """IN2N, IGS2GS and others change the configuration before set_timesteps."""
+    scheduler = DDIMScheduler(**STABLE_DIFFUSION, steps_offset=1)
+    scheduler.register_to_config(num_train_timesteps=start)
+    scheduler.set_timesteps(20)
+    assert published_steps(start, 20, "scheduler") == scheduler.timesteps.tolist()
+    schedule = Schedule.of(DDIMScheduler(**STABLE_DIFFUSION))
+    assert steps_as_published(schedule, start, 20, "scheduler") == scheduler.timesteps.tolist()
+    with pytest.raises(ValueError, match="start, steps: got 19, 20"):
+        published_steps(19, 20, "scheduler")
+
+
+def test_noise_is_added_at_the_start_whatever_the_grid():
+    editor = editor_of(pix2pix())
+    seen = []
+    handle = editor.unet.register_forward_pre_hook(
+        lambda _, args: seen.append((int(args[1]), args[0][:1, :4].clone()))
+    )
+    try:
+        for grid in ("even", "scheduler"):
+            edit(editor, [picture()], "a bear", steps=1, start=700, grid=grid)
+    finally:
+        handle.remove()
+    noise = shared_noise((1, 4, H // 2, W // 2), 0)
+    expected = editor.schedule.add_noise(editor.encode([picture()]), noise, 700)
+    assert [step for step, _ in seen] == [700, 1]
+    for _, x in seen:
+        assert torch.equal(x, expected)
 
 
 def schedulers():

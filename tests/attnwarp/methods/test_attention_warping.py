@@ -867,7 +867,7 @@ def test_the_released_start_is_one_timestep_in_the_range(scene, editor):
     assert min(drawn) >= 700
     assert max(drawn) <= 980
     assert len(drawn) > 30
-    result = run(scene, editor, settings=replace(QUICK, start=(700, 700), start_picture="original"))
+    result = run(scene, editor, settings=replace(QUICK, start=(700, 700)))
     noised = edit(editor, [scene[2][0]], "a bear", steps=2, seed=0, start=700).images[0]
     assert np.array_equal(result.edited[0], to_bytes(noised))
 
@@ -1018,19 +1018,82 @@ def depth_editor():
     return DepthControlNet(*(getattr(pipe, name) for name in names), guidance=1.0)
 
 
+SHORT = {"suffix": ", good", "negative_prompt": "blur"}
+"""Words that the tiny text encoder has room for, in place of Stable Diffusion's."""
+
+
 def test_a_controlnet_is_guided_by_depth_with_both_branches_and_its_released_guidance(
     scene, depth_editor, tmp_path
 ):
-    settings = quick("released-controlnet")
+    settings = quick("released-controlnet", **SHORT)
     values, result = guidance_of_passes(
         depth_editor, "guidance", lambda: run(scene, depth_editor, tmp_path, settings)
     )
-    assert values == [7.5, 12.5]
+    assert values == [7.5, 12.5, 1.0, 12.5]  # the second stage inverts its views unguided
     source = record(tmp_path, "v0")
-    assert result.counters["network_rows"] == 5 * 2 * 2
+    assert result.counters["network_rows"] == 5 * 2 * 2 + 2 * 2
     # 4 layers of 16 channels at 16 x 16 and 4 of 32 at 8 x 8, two branches, two steps, float32.
     assert source["feature_bytes"] == (4 * 256 * 16 + 4 * 64 * 32) * 2 * 2 * 4
     assert len(result.edited) == 5
+
+
+def test_latents_by_stage_are_random_first_and_the_renders_own_later(
+    scene, depth_editor, monkeypatch
+):
+    from attnwarp.methods import view_edits
+
+    model, views, _ = scene
+    inverted, prompts = [], []
+    invert, task = view_edits.invert_view, depth_editor.task
+
+    def noted(editor, guide, picture, prompt, **more):
+        inverted.append(picture)
+        return invert(editor, guide, picture, prompt, **more)
+
+    monkeypatch.setattr(view_edits, "invert_view", noted)
+    monkeypatch.setattr(
+        depth_editor,
+        "task",
+        lambda g, words: prompts.append((words, depth_editor.negative_prompt)) or task(g, words),
+    )
+    settings = quick("released-controlnet", color_rate=40.0, **SHORT)
+    result = run(scene, depth_editor, None, settings)
+    # Two views a stage: the source and stage 1 from noise, stage 2 from renders of the tuned scene.
+    assert len(inverted) == 2
+    first, second = (result.rounds[k].views for k in (0, 1))
+    assert len(first) == 3 and len(second) == 2
+    for picture, view in zip(inverted, second, strict=True):
+        before = pictures(model, [views[view]])[0]
+        assert np.abs(picture - before).max() > 0.02  # tuning moved it
+        assert np.abs(picture - before).mean() < 0.2
+    edits = [(words, negative) for words, negative in prompts if words]
+    assert set(edits) == {("a bear, good", "blur")}
+    assert depth_editor.negative_prompt == ""
+
+
+def test_an_editor_without_a_negative_prompt_is_refused_one(scene, editor):
+    with pytest.raises(ValueError, match="negative_prompt: this editor has none; leave it out"):
+        run(scene, editor, settings=replace(QUICK, negative_prompt="blur"))
+
+
+def test_the_released_start_noises_the_original_first_and_the_render_later(
+    scene, editor, monkeypatch
+):
+    from attnwarp.methods import view_edits
+
+    model, views, images = scene
+    noised = []
+    one = view_edits.edit
+    monkeypatch.setattr(
+        view_edits, "edit", lambda *a, **k: noised.extend(k["pictures"]) or one(*a, **k)
+    )
+    settings = quick("released", color_rate=40.0)
+    result = run(scene, editor, settings=settings)
+    first, second = (result.rounds[k].views for k in (0, 1))
+    assert all(np.array_equal(p, images[v]) for p, v in zip(noised, first, strict=False))
+    for picture, view in zip(noised[len(first) :], second, strict=True):
+        assert not np.array_equal(picture, images[view])
+        assert np.abs(picture - pictures(model, [views[view]])[0]).max() > 0.02
 
 
 def inverted_by_diffusers(net, depth, picture, prompt, steps):

@@ -10,7 +10,7 @@ import attnwarp.warp
 from attnwarp.methods import PRESETS as ALL_PRESETS
 from attnwarp.methods import AttentionWarpingSettings
 from attnwarp.methods import preset as any_preset
-from attnwarp.methods.attention_warping import draw_stages
+from attnwarp.methods.stages import draw_stages
 
 PRESETS = ALL_PRESETS["attention_warping"]
 
@@ -22,6 +22,10 @@ def preset(name, **changes):
 TABLE = {
     # field: (paper, released, corrected)
     "views_per_stage": (40, 40, None),
+    "fill_last_stage": (False, True, False),
+    "iterations": (300, 960, 300),
+    "grid": ("even", "scheduler", "even"),
+    "start_picture": ("original", "by_stage", "original"),
     "warp": tuple(attnwarp.warp.PRESETS[name] for name in ("paper", "released", "corrected")),
     "noise": ("shared", "shared", "shared"),
     "start": (None, (700, 980), None),
@@ -46,11 +50,29 @@ def test_presets_are_the_columns_of_the_table_and_agree_in_all_else(name, column
 def test_a_controlnet_of_the_released_code_draws_fresh_noise_and_has_other_guidance():
     one, other = PRESETS["released"], PRESETS["released-controlnet"]
     differing = {f.name for f in fields(one) if getattr(one, f.name) != getattr(other, f.name)}
-    assert differing == {"noise", "start", "guidance_drop", "source_text_guidance"}
+    assert differing == {
+        "noise", "start", "grid", "latents", "guidance_drop", "source_text_guidance", "suffix", "negative_prompt",
+    }  # fmt: skip
+    assert [other.inverts(stage) for stage in range(3)] == [False, True, True]
+    assert (
+        other.suffix == ", best quality, extremely detailed"
+        and other.negative_prompt.startswith("longbody, lowres")
+    )
     assert other.noise == "fresh"
     assert other.source_text_guidance == 7.5
     assert [other.guidance(stage) for stage in range(3)] == [12.5, 12.5, 12.5]
     assert [one.guidance(stage) for stage in range(3)] == [12.5, 11.0, 9.5]
+
+
+def test_a_short_last_stage_is_filled_with_views_edited_before():
+    settings = AttentionWarpingSettings(stages=3, views_per_stage=4, fill_last_stage=True, seed=3)
+    plain = draw_stages(range(1, 11), replace(settings, fill_last_stage=False))
+    stages = draw_stages(range(1, 11), settings)
+    assert [len(stage) for stage in plain] == [4, 4, 2] and stages[:2] == plain[:2]
+    assert stages[2][:2] == plain[2] and len(stages[2]) == 4
+    assert set(stages[2][2:]) <= {*stages[0], *stages[1]} and len({*stages[2]}) == 4
+    # With nothing edited before there is nothing to fill it with.
+    assert [len(s) for s in draw_stages(range(1, 4), settings)] == [3]
 
 
 def test_extended_is_corrected_with_ideas_beyond_the_paper():

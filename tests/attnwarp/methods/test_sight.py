@@ -1,5 +1,7 @@
 """Oracles: the Jacobian of a plane's homography by differences, loops over pixels, formulas written out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -49,6 +51,35 @@ def test_the_ratio_of_pixels_is_the_determinant_of_the_homographys_jacobian(sour
         ]
         jacobian = np.stack([moved[0] - moved[1], moved[2] - moved[3]]) / (2 * step)
         assert ratio[row, column] == pytest.approx(abs(np.linalg.det(jacobian)), rel=1e-6)
+
+
+@pytest.mark.parametrize("size", [(SIZE, SIZE), (6, 6)])
+def test_zeros_stand_around_the_source_as_padding_has_them(size):
+    """Oracle: torch's grid_sample with zero padding."""
+    view = warp(SIDE, in_front=False, opaque=None, depth_agreement=False, normal_test="none")
+    view = replace(view, mask=view.rules["defined"].clone(), _at={})
+    h, w = size
+    features = torch.rand(
+        1, h * w, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    layer = Sight([view], zeros=True).warp(0).at(size)
+    xy = layer.warp.correspondence.xy
+    grid = 2 * xy / torch.tensor([w, h]) - 1
+    maps = features[0].T.reshape(1, 3, h, w)
+    padded = torch.nn.functional.grid_sample(
+        maps, grid[None], padding_mode="zeros", align_corners=False
+    )
+    assert torch.allclose(
+        layer.warp_tokens(features), padded[0].flatten(1).T[None], rtol=0, atol=1e-9
+    )
+    border = Sight([view]).warp(0).at(size).warp_tokens(features)
+    assert (border - layer.warp_tokens(features)).abs().max() > 0.1
+    new = torch.rand(
+        features.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
+    share = 0.3 * layer.weight.double()
+    expected = share * layer.warp_tokens(features) + (1 - share) * new
+    assert torch.allclose(layer.blend_tokens(features, new, 0.3), expected, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("size", [(SIZE, SIZE), (8, 8), (6, 6)])

@@ -10,8 +10,8 @@ from tiny_scenes import cameras, pictures, splats
 from attnwarp import Camera
 from attnwarp.encoders import load_encoder
 from attnwarp.methods import preset
-from attnwarp.methods.attention_warping import released_order
 from attnwarp.methods.scene import near_of, render_picture
+from attnwarp.methods.stages import released_order
 from attnwarp.methods.tuning import DistanceToViews, TrainingView, Tuning
 from attnwarp.render import render
 from attnwarp.workdir import Workdir

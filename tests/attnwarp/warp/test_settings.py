@@ -63,7 +63,7 @@ def test_every_field_changes_what_it_says():
         "photometric": (0.02, {}),
         "segment": (True, {}),
         "normal_test": ("facing", {}),
-        "gaussian_filter": ("printed", {}),
+        "gaussian_filter": ("camera_frame", {}),
         "normal_angle": (20.0, incidence),
         "depth": ("intersection", {}),
         "depth_statistic": ("median", {}),

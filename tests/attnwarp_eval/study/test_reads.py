@@ -289,7 +289,7 @@ def test_a_rule_that_is_not_read_changes_no_warp(fields, folder):
 
 
 CHANGED = {
-    "stages": 1, "views_per_stage": 1, "steps": 3, "noise": "fresh", "start_picture": "original",
+    "stages": 1, "views_per_stage": 1, "steps": 3, "noise": "fresh", "start_picture": "render",
     "text_guidance": 1.1, "source_text_guidance": 1.2, "batch": 1, "mask": False, "sources": 2,
     "chain_coverage": 0.9, "confidence": True, "estimate": 0.4, "estimate_until": 0.7,
     "estimate_in": "picture", "estimate_margin": 0.1, "a0": 0.5, "decay": "constant",

@@ -1,0 +1,47 @@
+"""Views of each stage, and the order in which a stage tunes on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import chain, islice
+
+import numpy as np
+import torch
+
+from attnwarp.methods.settings import MOST_VIEWS, AttentionWarpingSettings
+
+SOURCE_EVERY = 10
+"""The released code tunes on the source at every tenth step."""
+
+
+def draw_stages(unedited: Sequence[int], settings: AttentionWarpingSettings) -> list[list[int]]:
+    """Draw each stage's views at random from those not edited so far (line 3).
+
+    Where all are sources, one stage without views is left, which tunes on these. A last stage that
+    is short of views takes some of the earlier ones again, where the settings say so.
+
+    Example:
+        >>> stages = draw_stages(range(1, 7), AttentionWarpingSettings(stages=2))
+        >>> [len(views) for views in stages], sorted(sum(stages, []))
+        ([3, 3], [1, 2, 3, 4, 5, 6])
+    """
+    s = settings
+    if s.views_per_stage is None:
+        shares = np.array_split(np.arange(len(unedited)), s.stages)
+        sizes = [min(MOST_VIEWS, len(share)) for share in shares]
+    else:
+        sizes = [s.views_per_stage] * s.stages
+    # Parts of one permutation are draws without replacement.
+    generator = torch.Generator().manual_seed(s.seed)
+    order = iter([unedited[k] for k in torch.randperm(len(unedited), generator=generator).tolist()])
+    stages = [views for size in sizes if (views := list(islice(order, size)))]
+    if s.fill_last_stage and len(stages) > 1:
+        earlier, short = [*chain(*stages[:-1])], sizes[len(stages) - 1] - len(stages[-1])
+        again = torch.randperm(len(earlier), generator=generator)[:short].tolist()
+        stages[-1] += [earlier[k] for k in again]
+    return stages or [[]]
+
+
+def released_order(views: int) -> Callable[[int], int]:
+    """The released code's order: the source, then view ``step % views``, which misses some."""
+    return lambda step: 0 if step % SOURCE_EVERY == 0 else 1 + step % views
