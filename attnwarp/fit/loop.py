@@ -128,7 +128,8 @@ def fit(
     With ``folder``, a checkpoint is written there every ``checkpoint_seconds`` and at the end,
     which also writes the splats (``splats.ply``), each atomically. A fit with a checkpoint is
     resumed. On the same machine, with the same number of torch threads, it gives the bits of an
-    uninterrupted fit.
+    uninterrupted fit. One that was planned with other iterations goes on to the new end, and the
+    report says that the schedule of those done was another.
 
     Args:
         start: what to begin with: :func:`attnwarp.fit.from_points`, or splats that were fitted
@@ -152,8 +153,9 @@ def fit(
 
     Raises:
         ValueError: ``start`` is of another kind or degree than the settings say or lies on a GPU,
-            the folder holds a fit of other views, settings or first splats, or ``splats.ply``
-            without a checkpoint, or a number is out of range.
+            the folder holds a fit of other views, settings or first splats, one that is beyond
+            ``settings.iterations``, or ``splats.ply`` without a checkpoint, or a number is out of
+            range.
         FileFormatError: the folder's checkpoint is damaged.
         InputError: another run writes to the folder.
         RuntimeError: the loss or a held-out view is no longer finite, or no splat is left; the
@@ -210,7 +212,7 @@ def fit(
     run = _Run(start, views, settings, held_out, backend, measure, third_scale)
     with nullcontext() if folder is None else results_in(Path(folder)) as place:
         if place is not None:
-            run.resume(Workdir(place, "a fit"), restart=restart)
+            run.resume(Workdir(place, "a fit"), report, restart=restart)
         return run.go(max_seconds, CheckpointClock(checkpoint_seconds), report, stop)
 
 
@@ -254,7 +256,7 @@ class _Run:
             "origin": [float(v) for v in self.model.origin],
         }
 
-    def resume(self, folder: Workdir, *, restart: bool) -> None:
+    def resume(self, folder: Workdir, report: Reporter, *, restart: bool) -> None:
         self.folder = folder
         path = folder.path / CHECKPOINT
         if restart:
@@ -269,6 +271,7 @@ class _Run:
             return
         remedy = f"remove it and {SPLATS} to begin again"
         state = folder.load(CHECKPOINT, remedy)
+        self._lengthen(state, report)
         for name, expected in self.identity().items():
             stored = state.get(name)
             if stored == expected:
@@ -298,6 +301,20 @@ class _Run:
             raise FileFormatError(
                 path, f"lacks something or is damaged: {error}; {remedy}"
             ) from error
+
+    def _lengthen(self, state: dict[str, Any], report: Reporter) -> None:
+        """Take up a fit that was planned with other iterations, if it is not beyond these."""
+        settings, now = state.get("settings"), self.settings.iterations
+        if not isinstance(settings, dict) or state.get("iteration", now) > now:
+            return
+        planned = settings.get("iterations", now)
+        if planned != now:
+            settings["iterations"] = now
+            report.log(
+                f"a fit planned with {planned} iterations goes on to {now}; learning rates,"
+                " densification and losses were those of the former plan so far, so a fit of"
+                f" {now} in one go has other splats"
+            )
 
     def save(self) -> None:
         if self.folder is None:

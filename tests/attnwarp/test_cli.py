@@ -196,9 +196,11 @@ def test_fit_and_render_do_what_they_say(data, tmp_path):
 def test_a_fit_of_other_settings_names_the_options_that_begin_again(data, tmp_path):
     arguments = ("fit", data, "--out", tmp_path, "--max-size", 16, "--hold-out", 0)
     assert in_process(*arguments, "--iterations", 1).exit_code == 0
-    result = in_process(*arguments, "--iterations", 2)
+    longer = in_process(*arguments, "--iterations", 2)
+    assert longer.exit_code == 0 and "planned with 1 iterations goes on to 2" in longer.stderr
+    result = in_process(*arguments, "--iterations", 2, "--seed", 1)
     assert result.exit_code == 2
-    assert "iterations: 1, now 2" in result.stderr
+    assert "seed: 0, now 1" in result.stderr
     assert f"remove {tmp_path / 'checkpoint.pt'}" in result.stderr
     # What it advises is what it has.
     assert "--restart" in result.stderr and "--start SPLATS.ply" in result.stderr

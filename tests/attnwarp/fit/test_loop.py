@@ -455,6 +455,31 @@ def test_a_checkpoint_of_other_settings_or_views_is_refused_by_name(scene, tmp_p
         fit(moved, scene[0], settings, folder=tmp_path)
 
 
+def test_a_fit_that_is_lengthened_is_one_of_that_length_where_no_schedule_depends_on_it(
+    scene, tmp_path
+):
+    """Oracle: a fit in one go, whose learning rate and losses are the same from its beginning."""
+    level = {
+        "densify": False,
+        "lr_means_final": FitSettings().lr_means,
+        "normal": 0.0,
+        "distortion": 0.0,
+    }
+    start, settings = begin(scene, iterations=9, background="random", **level)
+    fit(start, scene[0], settings, folder=tmp_path / "once")
+    lines = []
+    report = Watched(log=lines.append)
+    for iterations in (4, 9):
+        again = settings.changed(iterations=iterations)
+        result = fit(start, scene[0], again, folder=tmp_path / "longer", report=report)
+    assert result.iteration == 9
+    assert (tmp_path / "longer" / SPLATS).read_bytes() == (tmp_path / "once" / SPLATS).read_bytes()
+    (line,) = [line for line in lines if "planned with" in line]
+    assert "planned with 4 iterations goes on to 9" in line
+    with pytest.raises(ValueError, match=r"other settings \(iterations: 9, now 8\)"):
+        fit(start, scene[0], settings.changed(iterations=8), folder=tmp_path / "longer")
+
+
 def test_splats_without_a_checkpoint_stay(scene, tmp_path):
     """A fit whose checkpoint was removed, or splats of another program."""
     start, settings = begin(scene, iterations=2, sh_degree=0)
