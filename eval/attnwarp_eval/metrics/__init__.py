@@ -37,6 +37,7 @@ from attnwarp_eval.metrics.image import (
     ssim,
     ssim_map,
 )
+from attnwarp_eval.metrics.labels import carried_labels, label_transport
 from attnwarp_eval.metrics.multiview import (
     YawMean,
     above_floor,
@@ -63,6 +64,7 @@ __all__ = [
     "approximation_error",
     "at_size",
     "by_yaw",
+    "carried_labels",
     "clip_similarity",
     "confusion",
     "cross_view",
@@ -77,6 +79,7 @@ __all__ = [
     "flow_error",
     "image_error",
     "image_similarity",
+    "label_transport",
     "mask_error",
     "mean_by_yaw",
     "metric",

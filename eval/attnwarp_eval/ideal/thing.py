@@ -1,0 +1,131 @@
+"""A thing in parts: its labels and true answers in every view, and the editor that knows them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from attnwarp.camera import Camera
+from attnwarp_eval.colors import to_srgb
+from attnwarp_eval.ideal.editor import FACTOR, Answers, Cross, IdealEditor
+from attnwarp_eval.ideal.paint import answer_colors, painted
+from attnwarp_eval.ideal.parts import Labels, part_labels, token_parts
+from attnwarp_eval.ideal.share import Grams
+from attnwarp_eval.metrics.parts import PartTruth
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.truth import Geometry, appearance
+
+
+def labels_of(
+    scene: Scene, geometry: Geometry, cameras: Sequence[Camera], objects: Sequence[str], parts: int
+) -> dict[str, Labels]:
+    """(H, W) part of each pixel by the view's name, -1 outside the thing.
+
+    Args:
+        scene: with the objects.
+        geometry: of the scene.
+        cameras: of the views, whose surface points are pooled.
+        objects: names of what the thing is made of.
+        parts: number of parts.
+
+    Raises:
+        ValueError: no such object, or no view shows one.
+    """
+    there = scene.object_names
+    for name in objects:
+        if name not in there:
+            raise ValueError(f"objects: got {name!r}, expected some of {', '.join(there)}")
+    ids = [there.index(name) for name in objects]
+    points = {}
+    for camera in cameras:
+        hits = geometry.trace(camera)
+        inside = np.isin(hits.object_id, ids)
+        points[camera.name] = np.where(inside[..., None], hits.point, np.nan)
+    return part_labels(points, parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """A thing in parts, each with the same answers.
+
+    Attributes:
+        labels: (H, W) part of each pixel, by view.
+        before: (H, W, 3) sRGB in [0, 1] before the edit, by view.
+        after: (K, H, W, 3) after it, the whole thing in one answer, by view.
+        parts: number of parts.
+    """
+
+    labels: Mapping[str, Labels]
+    before: Mapping[str, np.ndarray]
+    after: Mapping[str, np.ndarray]
+    parts: int
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        geometry: Geometry,
+        cameras: Sequence[Camera],
+        objects: Sequence[str],
+        *,
+        parts: int,
+        colors: int,
+        spp: int,
+    ) -> Thing:
+        """A scene's objects, painted in colours.
+
+        Args:
+            scene, geometry, cameras, objects, parts: see :func:`labels_of`. The source comes first.
+            colors: answers of each part.
+            spp: samples a pixel of the true pictures.
+
+        Example:
+            >>> from attnwarp_eval.scene.file import load_scene
+            >>> from attnwarp_eval.truth import Geometry
+            >>> scene = load_scene("spheres").with_size(16, 16)
+            >>> thing = Thing.of(scene, Geometry(scene), scene.cameras[:2], ["melon"],
+            ...                  parts=2, colors=3, spp=1)
+            >>> thing.after["source"].shape
+            (3, 16, 16, 3)
+        """
+        labels = labels_of(scene, geometry, cameras, objects, parts)
+
+        def pictures(of: Scene) -> dict[str, np.ndarray]:
+            return {c.name: to_srgb(appearance(of, c, spp=spp, seed=0)) for c in cameras}
+
+        before = pictures(scene)
+        after = [pictures(painted(scene, objects, color)) for color in answer_colors(colors)]
+        return cls(
+            labels, before, {name: np.stack([one[name] for one in after]) for name in before}, parts
+        )
+
+    def tokens(self, view: str) -> Labels:
+        """(h, w) part of each token of a view."""
+        H, W = self.labels[view].shape
+        return token_parts(self.labels[view], (H // FACTOR, W // FACTOR))
+
+    @cached_property
+    def views(self) -> list[Answers]:
+        """Views as the editor takes them."""
+        return [
+            Answers(before, self.after[name], self.tokens(name))
+            for name, before in self.before.items()
+        ]
+
+    @cached_property
+    def grams(self) -> Grams:
+        """Gram matrices of the parts, which decide the share of signal."""
+        return Grams.of(self.views)
+
+    def editor(self, share: float, cross: Cross = "paint") -> IdealEditor:
+        """The editor of these views."""
+        return IdealEditor(self.views, share, cross)
+
+    def truth(self, view: str) -> PartTruth:
+        """True pictures of a view, for figures."""
+        return PartTruth.of(
+            self.before[view], self.after[view], self.labels[view], self.tokens(view)
+        )

@@ -1,0 +1,142 @@
+"""Label transport: part labels carried along the tokens of a warp, against exact truth.
+
+No diffusion is needed: what a token takes is decided by the warp and its mask alone.
+docs/measuring/ideal-editor.md tells what the figures decide, and what they cannot.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp import check
+from attnwarp_eval.metrics.arrays import share
+
+Labels = npt.NDArray[np.int16]
+Mask = npt.NDArray[np.bool_]
+
+NONE = -2
+"""Label of a token that takes nothing."""
+
+OUTSIDE = -1
+"""Label of a token that does not show the thing."""
+
+
+class Layer(Protocol):
+    """The warp of one grid, such as :class:`attnwarp.warp.FeatureWarp`."""
+
+    @property
+    def mask(self) -> Any:
+        """(h, w) bool, where features are taken."""
+        ...
+
+    def warp(self, features: npt.NDArray[Any]) -> Any:
+        """(C, h, w) of the source's (C, h', w')."""
+        ...
+
+
+def carried_labels(layer: Layer, source: Labels) -> Labels:
+    """(h, w) label that each token of a target takes: the one of the largest weight among its taps.
+
+    Args:
+        layer: the warp.
+        source: (h', w') part of each token of the source, -1 outside the thing.
+
+    Returns:
+        A part, :data:`OUTSIDE`, or :data:`NONE` where the mask is False. Of equal weights the
+        smallest label.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import FeatureWarp, correspond
+        >>> from attnwarp_eval.metrics.labels import carried_labels
+        >>> camera = Camera(np.array([[2.0, 0, 1], [0, 2, 1], [0, 0, 1]]), np.eye(4), 2, 2)
+        >>> same = correspond(camera, camera, np.ones((2, 2)))
+        >>> layer = FeatureWarp(same, torch.tensor([[True, True], [True, False]]))
+        >>> carried_labels(layer, np.array([[0, 1], [-1, 1]], np.int16)).tolist()
+        [[0, 1], [-1, -2]]
+    """
+    check.shape(source, ("h", "w"), "source")
+    codes = np.arange(OUTSIDE, int(source.max()) + 1)
+    one_hot = (source == codes[:, None, None]).astype(np.float32)
+    weights = np.nan_to_num(np.asarray(layer.warp(one_hot)))
+    labels = codes[weights.argmax(axis=0)]
+    return np.where(np.asarray(layer.mask), labels, NONE).astype(np.int16)
+
+
+def most(pixels: Mask, size: tuple[int, int]) -> Mask:
+    """(h, w) bool: tokens of which more than half of the pixels are True.
+
+    Args:
+        pixels: (H, W), sides that are multiples of the grid's.
+        size: (h, w) of the grid.
+    """
+    (H, W), (h, w) = pixels.shape, size
+    cells = pixels.reshape(h, H // h, w, W // w).sum(axis=(1, 3))
+    return np.asarray(2 * cells > (H // h) * (W // w))
+
+
+def label_transport(
+    carried: Labels, tokens: Labels, pixels: Labels, visible: Mask, unseen: Mask
+) -> dict[str, float]:
+    """Right, wrong and missing labels among visible tokens, and labels where none belongs.
+
+    A token is visible where more than half of its pixels show its part and the source shows them;
+    hidden where more than half show its part and the source does not.
+
+    Args:
+        carried: (h, w) from :func:`carried_labels`.
+        tokens: (h, w) true part of each token of the target, -1 outside the thing.
+        pixels: (H, W) true part of each pixel.
+        visible: (H, W) bool, the source certainly shows the pixel's surface.
+        unseen: (H, W) bool, the source certainly does not.
+
+    Returns:
+        ``labels.right``, ``labels.wrong`` and ``labels.none`` of visible tokens, which sum to 1;
+        ``labels.painted_hidden`` of hidden tokens and ``labels.painted_outside`` of tokens outside
+        the thing: those that take a part; and the counts ``labels.visible``, ``labels.hidden`` and
+        ``labels.outside``. NaN where there are no such tokens.
+
+    Raises:
+        ValueError: shapes that do not fit.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> true = np.array([[0, 1, -1]], np.int16)
+        >>> seen = np.array([[True, False, False]])
+        >>> carried = np.array([[0, 0, -2]], np.int16)
+        >>> figures = metrics.label_transport(carried, true, true, seen, ~seen)
+        >>> figures["labels.right"], figures["labels.painted_hidden"]
+        (1.0, 1.0)
+    """
+    h, w = tokens.shape
+    H, W = pixels.shape
+    check.shape(carried, (h, w), "carried")
+    for name, array in (("visible", visible), ("unseen", unseen)):
+        check.shape(array, (H, W), name)
+    if H % h or W % w:
+        raise ValueError(f"tokens: got {h} x {w} for {H} x {W} px, expected divisors of them")
+    own = pixels == np.repeat(np.repeat(tokens, H // h, axis=0), W // w, axis=1)
+    thing = tokens >= 0
+    seen = thing & most(own & visible, (h, w))
+    hidden = thing & most(own & unseen, (h, w))
+    painted = carried >= 0
+    right, none = carried == tokens, carried == NONE
+    counts = {
+        "visible": int(seen.sum()),
+        "hidden": int(hidden.sum()),
+        "outside": int((~thing).sum()),
+    }
+    figures = {
+        "right": share(int((seen & right).sum()), counts["visible"]),
+        "wrong": share(int((seen & ~right & ~none).sum()), counts["visible"]),
+        "none": share(int((seen & none).sum()), counts["visible"]),
+        "painted_hidden": share(int((hidden & painted).sum()), counts["hidden"]),
+        "painted_outside": share(int((~thing & painted).sum()), counts["outside"]),
+        **counts,
+    }
+    return {f"labels.{name}": value for name, value in figures.items()}

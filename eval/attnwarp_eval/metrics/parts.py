@@ -1,0 +1,162 @@
+"""Figures of an edit whose answers vary over a thing in parts: seen, through, bleed and dE.
+
+They are read together: ``seen`` alone rewards painting everything.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp_eval.metrics.arrays import share
+
+Image = npt.NDArray[np.float32]
+Labels = npt.NDArray[np.int16]
+Mask = npt.NDArray[np.bool_]
+
+LEAST_PIXELS = 16
+"""Pixels of a part that a view must show for its answer to count, the area of one token."""
+
+UNKNOWN = -1
+"""Answer of a part that a view does not show."""
+
+
+@dataclass(frozen=True, eq=False)
+class PartTruth:
+    """True pictures of one view.
+
+    Attributes:
+        before: (H, W, 3) sRGB in [0, 1] before the edit.
+        after: (K, H, W, 3) after it, the whole thing in one answer.
+        pixels: (H, W) part of each pixel, where it is its token's part too; else -1.
+        outside: (H, W) bool: neither the pixel nor its token shows the thing.
+    """
+
+    before: Image
+    after: npt.NDArray[np.float32]
+    pixels: Labels
+    outside: Mask
+
+    @classmethod
+    def of(
+        cls, before: Image, after: npt.NDArray[np.float32], pixels: Labels, tokens: Labels
+    ) -> PartTruth:
+        """The truth of a view whose tokens have parts.
+
+        Args:
+            before, after: see there.
+            pixels: (H, W) part of each pixel, -1 outside the thing.
+            tokens: (h, w) part of each token.
+        """
+        factor = pixels.shape[0] // tokens.shape[0]
+        large = np.repeat(np.repeat(tokens, factor, axis=0), factor, axis=1)
+        own = np.where(pixels == large, pixels, -1)
+        return cls(before, after, own.astype(np.int16), (pixels < 0) & (large < 0))
+
+    def errors(self, picture: Image) -> npt.NDArray[np.float32]:
+        """(K, H, W) squared error of a picture to each answer."""
+        return np.square(picture - self.after).sum(axis=-1)
+
+
+def part_answers(
+    picture: Image, truth: PartTruth, parts: int, among: Mask | None = None
+) -> npt.NDArray[np.int64]:
+    """(P,) the answer that each part of a picture is nearest to; :data:`UNKNOWN` where fewer than
+    :data:`LEAST_PIXELS` pixels show it.
+
+    Args:
+        picture: (H, W, 3) sRGB in [0, 1].
+        truth: of the view.
+        parts: P.
+        among: (H, W) bool, pixels that count; all if left out.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval.metrics.parts import PartTruth, part_answers
+        >>> after = np.stack([np.full((4, 4, 3), v, np.float32) for v in (0.2, 0.8)])
+        >>> truth = PartTruth(after[0], after, np.zeros((4, 4), np.int16), np.zeros((4, 4), bool))
+        >>> part_answers(np.full((4, 4, 3), 0.7, np.float32), truth, parts=2).tolist()
+        [1, -1]
+    """
+    counted = truth.pixels >= 0 if among is None else (truth.pixels >= 0) & among
+    labels = truth.pixels[counted]
+    sums = np.stack(
+        [np.bincount(labels, error[counted], minlength=parts) for error in truth.errors(picture)]
+    )
+    enough = np.bincount(labels, minlength=parts) >= LEAST_PIXELS
+    return np.where(enough, sums.argmin(axis=0), UNKNOWN)
+
+
+def answered(truth: PartTruth, answers: npt.NDArray[np.int64]) -> Image:
+    """(H, W, 3) the true picture in which each part has its own answer; NaN at the thing's pixels
+    whose part has none, or none of its own.
+
+    Args:
+        truth: of the view.
+        answers: (P,) from :func:`part_answers` of the source.
+    """
+    picture = np.where(truth.outside[..., None], truth.before, np.nan).astype(np.float32)
+    own = truth.pixels >= 0
+    answer = np.where(own, answers[truth.pixels], UNKNOWN)
+    rows, columns = np.nonzero(answer >= 0)
+    picture[rows, columns] = truth.after[answer[rows, columns], rows, columns]
+    return picture
+
+
+def part_figures(
+    picture: Image,
+    truth: PartTruth,
+    answers: npt.NDArray[np.int64],
+    visible: Mask,
+    hidden: Mask,
+    before_it: Labels,
+) -> dict[str, float]:
+    """Figures of one target view, given the source's answers.
+
+    Args:
+        picture: (H, W, 3) sRGB in [0, 1], edited.
+        truth: of the view.
+        answers: (P,) of the source, from :func:`part_answers`.
+        visible: (H, W) bool, the source certainly shows the pixel's surface.
+        hidden: (H, W) bool, it falls inside the source image and is certainly not shown there.
+        before_it: (H, W) part of the surface that the source shows there instead; -1 for none.
+
+    Returns:
+        ``parts.seen``: of the parts truly seen by the source, those that show its answer;
+        ``parts.through``: of hidden pixels with another part before them, those that show that
+        part's answer, by chance 1/K;
+        ``parts.bleed``: mean CIEDE2000 to the picture before, outside the thing;
+        ``parts.delta_e``: mean CIEDE2000 to the truth of the source's answers, at pixels truly
+        seen; and the counts ``parts.seen_parts`` and ``parts.hidden_pixels``. NaN where there is
+        nothing to measure.
+    """
+    parts = len(answers)
+    there = part_answers(picture, truth, parts, visible)
+    known = (there != UNKNOWN) & (answers != UNKNOWN)
+    front = np.where(before_it >= 0, answers[before_it], UNKNOWN)
+    asked = hidden & (truth.pixels >= 0) & (front != UNKNOWN) & (before_it != truth.pixels)
+    shown = truth.errors(picture).argmin(axis=0)
+    source = answered(truth, answers)
+    seen = visible & (truth.pixels >= 0) & np.isfinite(source).all(axis=-1)
+    return {
+        "parts.seen": share(int((there == answers)[known].sum()), int(known.sum())),
+        "parts.through": share(int((shown == front)[asked].sum()), int(asked.sum())),
+        "parts.bleed": _delta_e(picture, truth.before, truth.outside),
+        "parts.delta_e": _delta_e(picture, source, seen),
+        "parts.seen_parts": int(known.sum()),
+        "parts.hidden_pixels": int(asked.sum()),
+    }
+
+
+def _delta_e(first: Any, second: Any, among: Mask) -> float:
+    """Mean CIEDE2000 of pixels; NaN for none."""
+    from skimage.color import deltaE_ciede2000, rgb2lab
+
+    if not among.any():
+        return math.nan
+    pair = (rgb2lab(np.asarray(image, dtype=np.float64)[among]) for image in (first, second))
+    return float(np.mean(deltaE_ciede2000(*pair)))

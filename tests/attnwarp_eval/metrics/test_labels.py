@@ -1,0 +1,122 @@
+"""Oracle: loops over pixels, written out from the definitions."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from attnwarp.warp import preset
+from attnwarp_eval import metrics
+from attnwarp_eval.ideal.parts import token_parts
+from attnwarp_eval.ideal.thing import labels_of
+from attnwarp_eval.metrics.labels import NONE, carried_labels
+from attnwarp_eval.study.warping import warp_truth
+from attnwarp_eval.world import world
+
+PARTS = 9
+
+
+@pytest.fixture(scope="module")
+def labels():
+    of = world("spheres", 64)
+    cameras = [of.camera(name) for name in ("source", "yaw045")]
+    return labels_of(
+        of.scene, of.geometry, cameras, ["melon", "marble", "planet", "beach_ball"], PARTS
+    )
+
+
+def bounds_only(**changes):
+    rules = {"in_front": False, "opaque": None, "depth_agreement": False, "normal_test": "none"}
+    return preset("corrected", depth_relative=1e-4, depth_spread=0.02, **{**rules, **changes})
+
+
+@pytest.mark.parametrize("grid", [8, 16, 32])
+@pytest.mark.parametrize(
+    "rules", [preset("corrected", depth_relative=1e-4, depth_spread=0.02), bounds_only()]
+)
+def test_labels_are_those_of_a_loop_over_pixels(labels, grid, rules):
+    of = world("spheres", 64)
+    pair = of.pair("yaw045", 64)
+    layer = warp_truth(of, pair, rules).at((grid, grid))
+    source, target = (token_parts(labels[name], (grid, grid)) for name in ("source", "yaw045"))
+    carried = carried_labels(layer, source)
+    figures = metrics.label_transport(carried, target, labels["yaw045"], pair.visible, pair.unseen)
+
+    xy, mask, cell = layer.correspondence.xy.numpy(), layer.mask.numpy(), 64 // grid
+    counts = dict.fromkeys(
+        ("right", "wrong", "none", "hidden", "painted_hidden", "outside", "painted_outside"), 0
+    )
+    for row in range(grid):
+        for column in range(grid):
+            taken = NONE
+            if mask[row, column]:
+                u, v = np.clip(xy[row, column] - 0.5, 0, grid - 1)
+                left, top = int(u), int(v)
+                weights = {}
+                for y, b in ((top, 1 - (v - top)), (min(top + 1, grid - 1), v - top)):
+                    for x, a in ((left, 1 - (u - left)), (min(left + 1, grid - 1), u - left)):
+                        weights[int(source[y, x])] = weights.get(
+                            int(source[y, x]), 0.0
+                        ) + np.float32(a * b)
+                taken = max(sorted(weights), key=weights.__getitem__)
+            assert taken == carried[row, column]
+            seen = unseen = 0
+            for y in range(row * cell, row * cell + cell):
+                for x in range(column * cell, column * cell + cell):
+                    own = labels["yaw045"][y, x] == target[row, column]
+                    seen += own and pair.label[y, x] == 1
+                    unseen += own and bool(pair.unseen[y, x])
+            if target[row, column] < 0:
+                counts["outside"] += 1
+                counts["painted_outside"] += taken >= 0
+            elif 2 * seen > cell * cell:
+                counts[
+                    "none"
+                    if taken == NONE
+                    else "right"
+                    if taken == target[row, column]
+                    else "wrong"
+                ] += 1
+            elif 2 * unseen > cell * cell:
+                counts["hidden"] += 1
+                counts["painted_hidden"] += taken >= 0
+    visible = counts["right"] + counts["wrong"] + counts["none"]
+    assert visible > 3
+    assert figures["labels.visible"] == visible
+    for name in ("right", "wrong", "none"):
+        assert figures[f"labels.{name}"] == pytest.approx(counts[name] / visible)
+    for name in ("hidden", "outside"):
+        assert figures[f"labels.{name}"] == counts[name]
+        if counts[name]:
+            assert figures[f"labels.painted_{name}"] == pytest.approx(
+                counts[f"painted_{name}"] / counts[name]
+            )
+
+
+def test_without_tokens_of_a_kind_a_share_is_undefined():
+    outside = np.full((2, 2), -1, np.int16)
+    nothing = np.zeros((4, 4), bool)
+    figures = metrics.label_transport(
+        outside, outside, np.full((4, 4), -1, np.int16), nothing, nothing
+    )
+    assert math.isnan(figures["labels.right"]) and math.isnan(figures["labels.painted_hidden"])
+    assert figures["labels.painted_outside"] == 0.0 and figures["labels.outside"] == 4
+
+
+def test_a_grid_that_does_not_divide_the_picture_is_refused():
+    with pytest.raises(ValueError, match="tokens: got 3 x 3 for 4 x 4 px"):
+        metrics.label_transport(
+            np.zeros((3, 3), np.int16), np.zeros((3, 3), np.int16), np.zeros((4, 4), np.int16),
+            np.zeros((4, 4), bool), np.zeros((4, 4), bool),
+        )  # fmt: skip
+
+
+def test_a_position_without_a_tap_takes_what_stands_outside():
+    class Layer:
+        mask = torch.ones(1, 1, dtype=torch.bool)
+
+        def warp(self, features):
+            return torch.zeros(len(features), 1, 1)
+
+    assert carried_labels(Layer(), np.array([[0]], np.int16)).tolist() == [[-1]]
