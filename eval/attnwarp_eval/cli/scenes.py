@@ -1,4 +1,4 @@
-"""Commands about scenes whose truth is exact: list, show, render, export, calibrate,
+"""Commands about scenes whose truth is exact: list, draw, show, render, export, calibrate,
 effects, cost.
 """
 
@@ -110,6 +110,49 @@ def export(
                 report=report,
             )  # fmt: skip
     typer.echo(out / "transforms.json")
+
+
+@app.command()
+def draw(
+    count: Annotated[int, typer.Argument(min=1, help="How many scenes.")],
+    seed: Annotated[int, typer.Option(min=0, help="Of the population.")],
+    out: Annotated[Path, typer.Option(help="Folder for the YAML files.")],
+    axis: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="Fix an axis of difficulty from 0 to 1: occlusion, thin, grazing, texture,"
+            " highlights; or the number of things, 2 to 6. May be repeated.",
+        ),
+    ] = None,
+    stratify: Annotated[
+        str | None, typer.Option(help="Axes spread evenly over the scenes (comma-separated).")
+    ] = None,
+) -> None:
+    """Draw scenes that no one made by hand, with cameras, edits and bounces.
+
+    The same seed draws the same files everywhere.
+    """
+    with clear_errors():
+        from attnwarp.errors import InputError
+        from attnwarp_eval.drawn.files import write
+        from attnwarp_eval.drawn.population import population
+
+        fixed = {}
+        for text in axis or ():
+            name, _, value = text.partition("=")
+            try:
+                fixed[name] = float(value)
+            except ValueError:
+                raise InputError(f"--axis: got {text!r}, expected such as occlusion=0.9") from None
+        wanted = population(
+            {"drawn": count, "seed": seed, "axes": fixed, "stratify": names(stratify) or []}
+        )
+        with reporter(title="drawing") as report:
+            for k, scene in enumerate(wanted.scenes()):
+                write(scene.data, out)
+                report.step(k + 1, count, scene.spec.name)
+    typer.echo(f"{wanted.words} -> {out}")
 
 
 def _say_open_bounces(scene: Scene) -> None:

@@ -74,13 +74,13 @@ class Look:
         finish = FINISHES[self.finish]
         grain = {"variation": round(float(rng.uniform(0.05, 0.3)), 3), "grain": round(float(rng.uniform(0.03, 0.1)), 3)}
         if finish in ("plain", "shiny"):
-            texture = {"type": "plain", "color": _shade(COLORS[self.color], rng), **grain}
+            texture = {"type": "plain", "color": shade(COLORS[self.color], rng), **grain}
             if finish == "plain":
                 return {"texture": texture}
             rough = round(float(rng.uniform(0.03, 0.12)), 3)
             return {"texture": {**texture, "variation": 0.05}, "material": {"type": "plastic", "roughness": rough}}
         if finish in TWO_COLORED:
-            pair = [_shade(COLORS[self.color], rng), _shade(COLORS[self.second], rng)]
+            pair = [shade(COLORS[self.color], rng), shade(COLORS[self.second], rng)]
             size = round(float(rng.uniform(0.07, 0.16)), 3)
             if finish == "checked":
                 return {"texture": {"type": "checker", "colors": pair, "size": size, **grain}}
@@ -240,7 +240,8 @@ class Look:
                 ]
 
 
-def _shade(color: str, rng: np.random.Generator) -> str:
+def shade(color: str, rng: np.random.Generator) -> str:
+    """A shade of a colour of :data:`COLORS`, as '#rrggbb'."""
     hue, saturation, value = HSV[color]
     spread = 4 if color in ("orange", "brown", "yellow") else 7
     hue = (hue + rng.uniform(-spread, spread)) / 360 % 1
@@ -515,7 +516,7 @@ def sentence(values: tuple[int, ...], rng: np.random.Generator, *, fillers: bool
     if fillers and rng.uniform() < 0.35:
         words = f"{_one(FILLERS, rng)} {words}"
     if statue:
-        described = f"{words} {_one(('statue', 'sculpture'), rng)} of {_a(noun)}"
+        described = f"{words} {_one(('statue', 'sculpture'), rng)} of {with_article(noun)}"
     elif noun in ("bust of a man", "head of a man"):
         described = f"{words} {noun}"
     else:
@@ -523,7 +524,7 @@ def sentence(values: tuple[int, ...], rng: np.random.Generator, *, fillers: bool
     if noun == "bear" and not statue and rng.uniform() < 0.5 and color >= 0 and finish in (-1, 0):
         named = {"white": "polar bear", "brown": "grizzly bear"}.get(COLORS[color])
         described = named or described
-    parts = [_one(OPENINGS, rng), _a(" ".join(described.split()))]
+    parts = [_one(OPENINGS, rng), with_article(" ".join(described.split()))]
     tail = [_one(PLACES[GROUNDS[ground]], rng)] if ground >= 0 else []
     if time >= 0:
         tail.insert(int(rng.uniform() < 0.8) * len(tail), _one(HOURS[TIMES[time]], rng))
@@ -552,5 +553,6 @@ def _one(choices: tuple[str, ...], rng: np.random.Generator) -> str:
     return choices[int(rng.integers(len(choices)))]
 
 
-def _a(words: str) -> str:
+def with_article(words: str) -> str:
+    """Words with their indefinite article."""
     return f"{'an' if words[:1] in 'aeiou' else 'a'} {words}"

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numba
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from attnwarp.numba_cache import CACHE
 from attnwarp_eval.scene.base import Color, Coordinate, Direction, Positive, Spec, linear_rgb
@@ -84,12 +84,42 @@ class Rings(_Texture):
     wobble: float = Field(0.0, ge=0)  # how far noise bends the rings, in rings
 
 
-Texture = Annotated[Plain | Checker | Stripes | Noise | Bricks | Rings, Field(discriminator="type")]
+class Cells(_Texture):
+    """One colour around each of some points: what is nearest to a point has its colour."""
+
+    type: Literal["cells"]
+    centers: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = Field(min_length=1)
+    colors: tuple[Color, ...]
+
+    @model_validator(mode="after")
+    def _a_color_a_center(self) -> Cells:
+        if len(self.colors) != len(self.centers):
+            raise ValueError(
+                f"got {len(self.colors)} colors for {len(self.centers)} centers, expected one for"
+                " each"
+            )
+        return self
 
 
-def albedo(
-    texture: Plain | Checker | Stripes | Noise | Bricks | Rings, points: npt.ArrayLike
-) -> Array:
+AnyTexture = Plain | Checker | Stripes | Noise | Bricks | Rings | Cells
+
+Texture = Annotated[AnyTexture, Field(discriminator="type")]
+
+
+def nearest(points: Array, centers: Array) -> npt.NDArray[np.int64]:
+    """(N,) index of the nearest of (P, 3) ``centers`` to each of (N, 3) ``points``.
+
+    Example:
+        >>> nearest(np.array([[0.1, 0, 0], [0.9, 0, 0]]), np.array([[0.0, 0, 0], [1, 0, 0]]))
+        array([0, 1])
+    """
+    # |p - c|^2 without |p|^2, about the centres' mean, so that far from the origin no digits go.
+    middle = centers.mean(axis=0)
+    away = centers - middle
+    return ((away**2).sum(axis=1) - 2 * (points - middle) @ away.T).argmin(axis=1)
+
+
+def albedo(texture: AnyTexture, points: npt.ArrayLike) -> Array:
     """(N, 3) linear RGB albedo in [0, 0.9] at (N, 3) world ``points``."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     match texture:
@@ -129,6 +159,8 @@ def albedo(
                     2 * fractal_noise(points / (6 * texture.size), 3, 13) - 1
                 )
             color = _palette(texture.colors)[np.floor(ring).astype(np.int64) % len(texture.colors)]
+        case Cells():
+            color = _palette(texture.colors)[nearest(points, np.array(texture.centers))]
         case Bricks():
             length, height = texture.size
             row = np.floor(points[:, 2] / height)

@@ -217,3 +217,20 @@ def _bounces_needed(material: Material) -> tuple[int, str]:
         case MirrorMaterial() | MetalMaterial(roughness=0.0):
             return 2, "what it shows is a bounce further on"
     return 1, ""
+
+
+def likely_bounces(spec: SceneSpec) -> int:
+    """A number of bounces that a scene of these materials and lights does not exceed, as a rule.
+
+    It is read off the words; :mod:`attnwarp_eval.truth.bounces` measures the number. Light that
+    meets diffuse things alone is spent after three bounces, as their albedo is at most 0.9 and most
+    of it leaves for the sky. What reflects or refracts adds the bounces that it needs itself.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> likely_bounces(load_scene("bear").spec)
+        3
+    """
+    more = {"glossy": 1, "specular": 1, "refraction": 1, "medium": 2, "subsurface": 6}
+    present = called_for(spec)
+    return 3 + sum(extra for effect, extra in more.items() if effect in present)

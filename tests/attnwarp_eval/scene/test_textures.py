@@ -5,6 +5,7 @@ import skimage.color
 from attnwarp_eval.colors import to_linear, to_srgb
 from attnwarp_eval.scene.textures import (
     Bricks,
+    Cells,
     Checker,
     Noise,
     Plain,
@@ -45,6 +46,7 @@ def test_a_checker_changes_colour_from_cube_to_cube_but_not_within_a_floor():
         Stripes(type="stripes", colors=("#102030", "#fff0e0", "#ff0000"), size=0.2, wobble=0.5),
         Noise(type="noise", colors=("#102030", "#fff0e0"), size=0.4),
         Bricks(type="bricks", colors=("#a05040",), mortar="#cccccc", size=(0.6, 0.2)),
+        Cells(type="cells", centers=((0, 0, 0), (1, 1, 0)), colors=("#a05040", "#20c030")),
     ],
 )
 def test_an_albedo_is_a_function_of_the_point_alone_and_physical(texture):
@@ -54,6 +56,18 @@ def test_an_albedo_is_a_function_of_the_point_alone_and_physical(texture):
     order = np.random.default_rng(2).permutation(3000)
     assert np.array_equal(albedo(texture, points[order]), color[order])
     assert color.std() > 0.02  # something to see
+
+
+def test_cells_have_the_colour_of_their_nearest_centre_far_from_the_origin_too():
+    rng = np.random.default_rng(8)
+    centers, points = rng.normal(size=(12, 3)) + 1e5, rng.normal(size=(500, 3)) + 1e5
+    colors = tuple(f"#{k:02x}8040" for k in range(12))
+    texture = Cells(type="cells", centers=tuple(map(tuple, centers)), colors=colors)
+    nearest = np.linalg.norm(points[:, None] - centers[None], axis=-1).argmin(axis=1)
+    expected = [linear_rgb(colors[k]) for k in nearest]
+    assert np.allclose(albedo(texture, points), np.minimum(expected, 0.9))
+    with pytest.raises(ValueError, match="got 11 colors for 12 centers"):
+        Cells(type="cells", centers=texture.centers, colors=colors[:-1])
 
 
 def test_noise_is_smooth_spread_about_a_half_and_the_same_everywhere():

@@ -1,0 +1,181 @@
+"""Axes of difficulty of drawn scenes: what each one sets, and the quantity that measures it.
+
+A scene's place on an axis is drawn, fixed by a study, or spread evenly over its scenes. The
+quantities are measured on the exact geometry and never used to draw: they show that an axis does
+what it says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.errors import InputError, suggest
+from attnwarp_eval.scene.materials import DiffuseMaterial
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.truth import Geometry, two_view
+from attnwarp_eval.truth.shading import object_albedo
+from attnwarp_eval.two_view import HIDDEN, Hits
+
+Array = npt.NDArray[np.float64]
+
+FEWEST, MOST = 2, 6
+"""Things that stand in a drawn scene."""
+
+
+@dataclass(frozen=True)
+class Axes:
+    """A scene's place on each axis of difficulty, from 0 to 1; ``things`` is their number.
+
+    Attributes:
+        occlusion: how near and how large the things about the first one are.
+        thin: how many fences stand there, and how thin their pickets are.
+        grazing: how low the cameras are, so that the ground is seen at a glance.
+        texture: how many surfaces have a pattern, and how fine the patterns are.
+        highlights: share of the things that are metal or plastic.
+        things: how many stand there, from 2 to 6.
+    """
+
+    occlusion: float
+    thin: float
+    grazing: float
+    texture: float
+    highlights: float
+    things: int
+
+
+NAMES = tuple(Axes.__dataclass_fields__)
+
+MEASURES = {
+    "occlusion": "share of the pixels at 60 degrees, inside the source's picture, that it hides",
+    "thin": "share of the pixels of things and fences within 1.5 % of the height of another object",
+    "grazing": "share of the source's pixels whose surface is turned away by more than 75 degrees",
+    "texture": "mean step of the albedo between pixels of one object, in the source",
+    "highlights": "share of the things' pixels in the source that are not diffuse",
+    "things": "number of things",
+}
+"""Quantity of each axis, in words."""
+
+
+def drawn_axes(rng: np.random.Generator, fixed: Mapping[str, float]) -> Axes:
+    """Axes drawn evenly, but for those that are fixed.
+
+    Example:
+        >>> drawn_axes(np.random.default_rng(0), {"thin": 0.0, "things": 4}).things
+        4
+    """
+    drawn = {name: float(rng.random()) for name in NAMES}
+    values: dict[str, Any] = {
+        name: fixed.get(name, round(value, 3)) for name, value in drawn.items() if name != "things"
+    }
+    number = FEWEST + int(drawn["things"] * (MOST - FEWEST + 1))
+    return Axes(**values, things=int(fixed.get("things", number)))
+
+
+def check_axes(fixed: Mapping[str, Any], stratified: Iterable[str] = ()) -> None:
+    """Refuse what is no axis, or no place on one.
+
+    Raises:
+        InputError: names the axis, what came, and what was expected.
+
+    Example:
+        >>> check_axes({"thin": 2})
+        Traceback (most recent call last):
+        attnwarp.errors.InputError: axes.thin: got 2, expected a number from 0 to 1
+    """
+    for name in (*fixed, *stratified):
+        if name not in NAMES:
+            raise InputError(
+                f"axes: no axis {name!r}{suggest(str(name), NAMES)}; they are {', '.join(NAMES)}"
+            )
+    for name, value in fixed.items():
+        low, high = (FEWEST, MOST) if name == "things" else (0, 1)
+        whole = name != "things" or value == int(value)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not whole:
+            raise InputError(f"axes.{name}: got {value!r}, expected a number from {low} to {high}")
+        if not low <= value <= high:
+            raise InputError(f"axes.{name}: got {value}, expected a number from {low} to {high}")
+    for name in stratified:
+        if name in fixed:
+            raise InputError(f"stratify: {name!r} is fixed under axes; leave out one of the two")
+
+
+def spread(name: str, count: int, seed: int) -> list[float]:
+    """Places on an axis for ``count`` scenes, one in each of as many equal parts, in an order of
+    chance.
+
+    Example:
+        >>> sorted(spread("occlusion", 4, seed=1))
+        [0.125, 0.375, 0.625, 0.875]
+        >>> sorted(spread("things", 5, seed=1))
+        [2, 3, 4, 5, 6]
+    """
+    rng = np.random.default_rng([seed, *b"strata", *name.encode()])
+    middles = (rng.permutation(count) + 0.5) / count
+    if name == "things":
+        return [FEWEST + int(value * (MOST - FEWEST + 1)) for value in middles]
+    return [round(float(value), 4) for value in middles]
+
+
+def measured(scene: Scene, groups: Mapping[str, str], *, size: int = 96) -> dict[str, float]:
+    """The quantity of each axis (:data:`MEASURES`), from exact geometry and albedo.
+
+    Args:
+        scene: with a target ``yaw060``.
+        groups: by an object's name, what it belongs to: "thing 0" and so on, "fence", "around".
+        size: of the views that are cast, px.
+    """
+    small = scene.with_size(size, size)
+    geometry = Geometry(small)
+    source, aside = small.source, small.camera("yaw060")
+    hits, pair = geometry.trace(source), two_view(geometry, source, aside)
+    names = np.array([groups[name] for name in small.object_names])
+    group = np.where(hits.valid, names[np.maximum(hits.object_id, 0)], "around")
+    standing, thing = group != "around", np.char.startswith(group.astype(str), "thing")
+    hidden = float((pair.label == HIDDEN).sum())
+    return {
+        "occlusion": hidden / max(hidden + float(pair.visible.sum()), 1.0),
+        "thin": _near_edges(hits.object_id, standing, round(0.015 * size)),
+        "grazing": _share(hits.cosine[hits.valid] < np.cos(np.radians(75))),
+        "texture": _steps(small, geometry, hits),
+        "highlights": _share(_shiny(small)[hits.object_id[thing]]),
+        "things": float(len({name for name in names if name.startswith("thing")})),
+    }
+
+
+def _share(chosen: npt.NDArray[np.bool_]) -> float:
+    return float(chosen.mean()) if chosen.size else 0.0
+
+
+def _near_edges(
+    object_id: npt.NDArray[np.int32], standing: npt.NDArray[np.bool_], reach: int
+) -> float:
+    """The share of the pixels of what stands there that another object is ``reach`` px from."""
+    from scipy import ndimage
+
+    side = 2 * reach + 1
+    low, high = (f(object_id, size=side) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+    return _share((low != high)[standing])
+
+
+def _steps(scene: Scene, geometry: Geometry, hits: Hits) -> float:
+    """The mean step of the albedo between neighbours that show one object."""
+    color = np.zeros((*hits.valid.shape, 3))
+    ids = hits.primitive_id[hits.valid]
+    color[hits.valid] = object_albedo(scene, geometry, hits.point[hits.valid], ids)
+    step = np.abs(color[:, 1:] - color[:, :-1]).mean(-1)
+    same = hits.valid[:, 1:] & (hits.object_id[:, 1:] == hits.object_id[:, :-1])
+    return float(step[same].mean())
+
+
+def _shiny(scene: Scene) -> npt.NDArray[np.bool_]:
+    return np.array([not isinstance(item.material, DiffuseMaterial) for item in scene.spec.objects])
+
+
+def to_words(axes: Axes) -> str:
+    """A scene's place on each axis, as its description has it."""
+    return ", ".join(f"{name} {value:g}" for name, value in asdict(axes).items())

@@ -1,0 +1,592 @@
+"""Scenes without end: generator 1, which draws a crowded scene with its edits from three numbers.
+
+A scene is decided by the generator's number, a seed and the scene's own number, and by nothing
+else: not by the machine, its locale or its threads, nor by the scenes drawn before it. It is held
+out from the training of the bundled weights: no thing has a shape that training shows, and a thing
+with a colour has one that training never shows such a thing in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from attnwarp_eval.drawn import asked
+from attnwarp_eval.drawn.assemblies import KINDS, USUAL, Assembly
+from attnwarp_eval.drawn.axes import Axes, drawn_axes, to_words
+from attnwarp_eval.drawn.objects import body, plain_numbers
+from attnwarp_eval.drawn.worlds import (
+    COLORS,
+    FINISHES,
+    GROUNDS,
+    OBJECTS,
+    TIMES,
+    Look,
+    held_out,
+    shade,
+)
+from attnwarp_eval.scene.bodies import BodySpec
+from attnwarp_eval.scene.spec import SceneSpec
+from attnwarp_eval.scene.transport import likely_bounces
+
+GENERATOR = 1
+"""Raise it when the same seed and number would give another scene."""
+
+FIRST_SHAPE = 2**40
+"""Shapes of drawn scenes count from here; those that training draws lie far below."""
+
+YAWS = (10, 30, 45, 60, 90, 120, 150, 180)
+"""Degrees from the source to the targets, counter-clockwise."""
+
+SATURATED = ("red", "orange", "yellow", "green", "blue", "purple", "pink")
+
+SUBJECTS = tuple(kind for kind in KINDS if kind in OBJECTS)
+"""Things with named parts that have a colour which training never shows them in."""
+
+
+def unseen_colors(kind: str) -> list[int]:
+    """Colours that training never shows a thing of this kind in.
+
+    Example:
+        >>> [COLORS[c] for c in unseen_colors("rabbit")]
+        ['yellow']
+    """
+    return [c for c in range(len(COLORS)) if held_out(OBJECTS.index(kind), c)]
+
+
+@dataclass(frozen=True)
+class Thing:
+    """One thing of a drawn scene.
+
+    Attributes:
+        kind: a word of :data:`~attnwarp_eval.drawn.worlds.OBJECTS`.
+        instance: number of its shape.
+        look: finish and colours; of the first thing, of its first part.
+        objects: as the scene's file has them.
+        reach: radius of the circle on the ground that holds it, and its height.
+    """
+
+    kind: str
+    instance: int
+    look: Look
+    objects: list[dict[str, Any]]
+    reach: tuple[float, float]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of its objects."""
+        return [item["name"] for item in self.objects]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A drawn scene, and what it was drawn as.
+
+    Attributes:
+        spec: the scene, checked.
+        data: the same as its file has it.
+        axes: its place on each axis of difficulty.
+        things: those that stand there, the one with parts first.
+        groups: by an object's name, what it belongs to: "thing 0" and so on, "fence", "around".
+    """
+
+    spec: SceneSpec
+    data: dict[str, Any]
+    axes: Axes
+    things: tuple[Thing, ...]
+    groups: Mapping[str, str]
+
+
+def draw(number: int, seed: int, axes: Mapping[str, float] | None = None) -> Drawn:
+    """Draw the scene of a number and a seed.
+
+    Args:
+        number: of the scene, from 0.
+        seed: of the population.
+        axes: places on axes that are fixed; the others are drawn.
+
+    Example:
+        >>> scene = draw(3, seed=7, axes={"things": 4})
+        >>> scene.spec.name, len(scene.things), len(scene.spec.cameras.targets)
+        ('drawn-3', 4, 8)
+        >>> draw(3, seed=7, axes={"things": 4}).spec == scene.spec
+        True
+    """
+    return Draft(number, seed, axes or {}).finished()
+
+
+@dataclass
+class Draft:
+    """A scene while it is drawn."""
+
+    number: int
+    seed: int
+    fixed: Mapping[str, float]
+    things: list[Thing] = field(default_factory=list)
+    places: list[tuple[float, float, float]] = field(default_factory=list)
+    fences: list[dict[str, Any]] = field(default_factory=list)
+    extras: list[dict[str, Any]] = field(default_factory=list)
+
+    def finished(self) -> Drawn:
+        """The scene, after everything has been drawn in turn."""
+        self.axes = drawn_axes(self.stream("axes"), self.fixed)
+        self._choose_surroundings()
+        self._choose_things()
+        self._place_things()
+        self._place_extras()
+        self._place_fences()
+        self._place_cameras()
+        around = [self._ground(), *self._walls()]
+        groups = {name: f"thing {k}" for k, one in enumerate(self.things) for name in one.names}
+        groups |= {item["name"]: "fence" for item in self.fences}
+        groups |= {item["name"]: "around" for item in (*self.extras, *around)}
+        objects = [o for one in self.things for o in one.objects]
+        data: dict[str, Any] = {
+            "name": f"drawn-{self.number}",
+            "title": self._title(),
+            "description": f"Generator {GENERATOR}, seed {self.seed}, number {self.number};"
+            f" {to_words(self.axes)}.",
+            "objects": [*objects, *self.fences, *self.extras, *around],
+            "lights": self.lights,
+            "appearance": {"spp": 16},
+            "cameras": self.cameras,
+        }
+        if self.fog is not None:
+            data["medium"] = self.fog
+        data["edits"] = asked.edits(self)
+        data = plain_numbers(data)
+        with_bounces(data)
+        return Drawn(SceneSpec.model_validate(data), data, self.axes, tuple(self.things), groups)
+
+    def stream(self, what: str) -> np.random.Generator:
+        """Random numbers for one aspect, which no other aspect's draws move."""
+        return np.random.default_rng([GENERATOR, self.seed, self.number, *what.encode()])
+
+    def index(self, rng: np.random.Generator, count: int) -> int:
+        """An index below ``count``."""
+        return _index(rng, count)
+
+    def unseen(self, kind: str) -> int:
+        """A colour that training never shows this kind in."""
+        return unseen_colors(kind)[0]
+
+    def other_color(self, rng: np.random.Generator, color: int) -> int:
+        """The accent of the scene, or a bright colour where that is ``color``."""
+        second = COLORS.index(self.accent)
+        while second == color:
+            second = COLORS.index(SATURATED[_index(rng, len(SATURATED))])
+        return second
+
+    # What is there ----------------------------------------------------------------------------
+
+    def _choose_surroundings(self) -> None:
+        rng = self.stream("around")
+        self.accent = SATURATED[_index(rng, len(SATURATED))]
+        self.ground = _index(rng, len(GROUNDS))
+        smooth, fog = rng.random() < 0.25, rng.random() < 0.08
+        time = _choice(rng, TIMES, (0.4, 0.2, 0.15, 0.25))
+        # Light of a sun that glass or a mirror bends is a caustic, which would double the cost of
+        # every picture. Smooth things stand under an even sky.
+        self.smooth, self.time = smooth, TIMES.index("cloudy" if smooth else time)
+        self.look = Look(0, 0, -1, self.ground, self.time, int(rng.integers(2**31)))
+        self.lights = [dict(light) for light in self.look.lights]
+        self.fog = None
+        if fog and not smooth:
+            self.fog = {"sigma_t": _between(rng, 0.02, 0.06), "albedo": 0.95, "g": 0.4}
+
+    def _choose_things(self) -> None:
+        rng = self.stream("things")
+        count = self.axes.things
+        shiny = _marks(rng, count, 0.7 * self.axes.highlights)
+        patterned = _marks(rng, count, self.axes.texture)
+        kinds = [SUBJECTS[_index(rng, len(SUBJECTS))]]
+        while len(kinds) < count:
+            kind = OBJECTS[_index(rng, len(OBJECTS))]
+            # A second thing of one colour half of the time: kinds share the colours kept for them.
+            twin = len(kinds) == 1 and rng.random() < 0.5
+            if kind in kinds or (
+                twin and not set(unseen_colors(kind)) & set(unseen_colors(kinds[0]))
+            ):
+                continue
+            kinds.append(kind)
+        for k, kind in enumerate(kinds):
+            own = self.stream(f"thing {k}")
+            look = self._look(own, kind, shiny[k], patterned[k])
+            instance = FIRST_SHAPE + int(own.integers(2**32))
+            size = 1.0 if k == 0 else 0.4 + 0.7 * self.axes.occlusion
+            scale = round(size * _between(own, 0.95, 1.2), 3)
+            yaw = round(_between(own, 0, 360), 1)
+            make = self._assembly if k == 0 else self._single
+            self.things.append(make(own, kind, instance, look, scale, yaw))
+
+    def _look(self, rng: np.random.Generator, kind: str, shiny: bool, patterned: bool) -> Look:
+        """A look that training never shows this kind in, or one without a colour."""
+        color = unseen_colors(kind)[_index(rng, len(unseen_colors(kind)))]
+        second = self.other_color(rng, color)
+        if shiny:
+            finish = ("golden", "silver", "bronze")[_index(rng, 3)]
+            if kind in ("ball", "cube") and rng.random() < 0.7:
+                finish = "shiny"
+        elif patterned:
+            finish = ("striped", "checked", "wooden", "marble")[_pick(rng, (3, 3, 1, 1))]
+        else:
+            finish = "stone" if rng.random() < 0.15 else "plain"
+        colored = finish in ("plain", "shiny", "striped", "checked")
+        return Look(
+            FINISHES.index(finish), color if colored else -1,
+            second if finish in ("striped", "checked") else -1,
+            self.ground, self.time, int(rng.integers(2**31)),
+        )  # fmt: skip
+
+    def surface(self, look: Look) -> dict[str, Any]:
+        """A surface as a file has it, its pattern finer where the texture's axis is higher."""
+        surface = {key: dict(value) for key, value in look.surface.items()}
+        texture, material = surface.get("texture"), surface.get("material")
+        if material and material["type"] == "metal":
+            # Smoother metal throws specks of the sun that few samples a pixel make noise of.
+            material["roughness"] = round(0.2 + material["roughness"], 3)
+        if texture and look.second >= 0:
+            texture["size"] = round(texture["size"] * (1.5 - 0.8 * self.axes.texture), 3)
+        if texture:
+            texture["variation"] = round(texture["variation"] * (0.3 + self.axes.texture), 3)
+        return surface
+
+    def _single(
+        self,
+        rng: np.random.Generator,
+        kind: str,
+        instance: int,
+        look: Look,
+        scale: float,
+        yaw: float,
+    ) -> Thing:
+        shape = body(kind, instance, plain=look.statue, resolution=48)
+        reach, height = _reach([shape])
+        name = kind.replace(" ", "_")
+        if FINISHES[look.finish] == "shiny":
+            return self._exact(kind, instance, look, scale, yaw)
+        shape |= {"yaw": yaw, "scale": scale}
+        thing = {"name": name, "shape": shape, **self.surface(look)}
+        return Thing(kind, instance, look, [thing], (scale * reach, scale * height))
+
+    def _exact(self, kind: str, instance: int, look: Look, scale: float, yaw: float) -> Thing:
+        """A ball or a cube as an exact shape, which alone can be plastic."""
+        rng = np.random.default_rng([instance, *b"exact"])
+        r = round(scale * _between(rng, 0.36, 0.46), 3)
+        if kind == "ball":
+            shape: dict[str, Any] = {"type": "sphere", "center": [0, 0, r], "radius": r}
+            reach = r
+        else:
+            h = round(2 * r * _between(rng, 0.8, 1.1), 3)
+            shape = {"type": "box", "center": [0, 0, h / 2], "size": [2 * r, 2 * r, h], "yaw": yaw}
+            reach = 1.42 * r
+        thing = {"name": kind, "shape": shape, **self.surface(look)}
+        return Thing(kind, instance, look, [thing], (reach, 2 * r))
+
+    def _assembly(
+        self,
+        rng: np.random.Generator,
+        kind: str,
+        instance: int,
+        look: Look,
+        scale: float,
+        yaw: float,
+    ) -> Thing:
+        pieces = Assembly(KINDS.index(kind), instance, 0).pieces()
+        objects = []
+        for k, (name, parts) in enumerate(pieces.items()):
+            shape = {
+                "type": "body", "parts": plain_numbers(parts), "blend": 0.03, "resolution": 48,
+                "yaw": yaw, "scale": scale,
+            }  # fmt: skip
+            own = look
+            if k and not look.statue:
+                words = USUAL.get(name, ()) if rng.random() < 0.5 else SATURATED
+                color = COLORS.index((words or SATURATED)[_index(rng, len(words or SATURATED))])
+                finish = FINISHES.index("plain")
+                own = Look(finish, color, -1, look.ground, look.time, int(rng.integers(2**31)))
+            label = f"{kind}_{name}".replace(" ", "_")
+            objects.append({"name": label, "shape": shape, **self.surface(own)})
+        reach, height = _reach([item["shape"] for item in objects])
+        return Thing(kind, instance, look, objects, (reach * scale, height * scale))
+
+    # Where it stands --------------------------------------------------------------------------
+
+    def _place_things(self) -> None:
+        rng = self.stream("places")
+        for k, thing in enumerate(self.things):
+            if k == 0:
+                place = (_between(rng, -0.1, 0.1), _between(rng, -0.1, 0.1))
+            else:
+                gap = 0.02 + (1 - self.axes.occlusion) * _between(rng, 0.3, 0.9)
+                # What is tall stays out of the way between the source and the first thing.
+                tall = thing.reach[1] > 0.4 * self.things[0].reach[1]
+                place = self._free(rng, thing.reach[0], gap, clear=40.0 if tall else 0.0)
+            _move([item["shape"] for item in thing.objects], *place)
+            self.places.append((*place, thing.reach[0]))
+
+    def _free(
+        self, rng: np.random.Generator, radius: float, gap: float, clear: float
+    ) -> tuple[float, float]:
+        """A free place about the first thing, ``gap`` from it or as near as there is room."""
+        x, y, first = self.places[0]
+        for attempt in range(200):
+            far = first + radius + gap + 0.02 * attempt
+            # What stands nearer to the source than the first thing hides more of what lies behind.
+            aside = clear + (180 - clear) * float(rng.random()) ** (0.6 + 1.4 * self.axes.occlusion)
+            angle = math.radians(aside if rng.random() < 0.5 else -aside)
+            place = (x + far * math.cos(angle), y + far * math.sin(angle))
+            if all(math.dist(place, p[:2]) > radius + p[2] + 0.02 for p in self.places):
+                return place
+        raise RuntimeError(f"seed {self.seed}, number {self.number}: no room for a thing")
+
+    def _place_extras(self) -> None:
+        """A mirror, glass, or a lamp at night."""
+        rng = self.stream("extras")
+        if self.smooth:
+            kind = ("mirror ball", "mirror", "glass ball", "pane")[_index(rng, 4)]
+            r = round(_between(rng, 0.2, 0.34), 3)
+            wide = 0.6 if kind in ("mirror", "pane") else r
+            x, y = self._free(rng, wide, _between(rng, 0.05, 0.4), clear=50.0)
+            self.places.append((x, y, wide))
+            ball = {"type": "sphere", "center": [x, y, r], "radius": r}
+            away = math.hypot(x, y)
+            upright = {
+                "type": "rectangle", "center": [x, y, 0.6], "size": [1.1, 1.2],
+                "facing": [-x / away, -y / away, 0.0],
+            }  # fmt: skip
+            glass = {"type": "glass", "tint": "#f4fbf6"}
+            name, shape, material = {
+                "mirror ball": ("mirror_ball", ball, {"type": "mirror", "tint": "#f2f4f6"}),
+                "mirror": ("mirror", upright, {"type": "mirror", "tint": "#e8eeee"}),
+                "glass ball": ("glass_ball", ball, glass),
+                "pane": ("pane", upright, glass | {"thin": True}),
+            }[kind]
+            self.extras.append({"name": name, "shape": shape, "material": material})
+        if TIMES[self.time] == "night" and rng.random() < 0.7:
+            r = round(_between(rng, 0.1, 0.16), 3)
+            x, y = self._free(rng, r, _between(rng, 0.1, 0.5), clear=50.0)
+            self.places.append((x, y, r))
+            z = _between(rng, 0.9, 1.5)
+            light = {"radiance": _between(rng, 12, 22), "color": "#ffd9a0"}
+            lamp = {"type": "sphere", "center": [x, y, z], "radius": r}
+            post = {"type": "box", "center": [x, y, (z - r) / 2], "size": [0.05, 0.05, z - r]}
+            dark = {"type": "plain", "color": "#4a4440", "variation": 0.1}
+            self.extras.append({"name": "lamp_light", "shape": lamp, "emission": light})
+            self.extras.append({"name": "lamp_post", "shape": post, "texture": dark})
+
+    def _place_fences(self) -> None:
+        rng, thin = self.stream("fences"), self.axes.thin
+        for k in range(round(3 * thin)):
+            count = 5 + int(9 * thin)
+            width, step = 0.055 - 0.035 * thin, 0.16 - 0.05 * thin
+            half = 0.5 * step * (count - 1) + width
+            high = _between(rng, 0.45, 0.9)
+            for attempt in range(60):
+                angle = math.radians(_between(rng, 0, 360))
+                far = self.places[0][2] + _between(rng, 0.15, 0.5) + 0.04 * attempt
+                middle = (far * math.cos(angle), far * math.sin(angle))
+                along = (-math.sin(angle), math.cos(angle))
+                if all(_clear(middle, along, half, p) for p in self.places):
+                    break
+            else:
+                continue
+            yaw = round(math.degrees(angle) + 90, 1)
+            ux, uy = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
+            start = [
+                middle[0] - ux * step * (count - 1) / 2,
+                middle[1] - uy * step * (count - 1) / 2,
+            ]
+            texture = {
+                "type": "plain", "color": _hue(rng, SATURATED[_index(rng, len(SATURATED))]),
+                "variation": 0.2, "grain": 0.05,
+            }  # fmt: skip
+            pickets = {
+                "type": "box", "center": [*start, high / 2], "size": [width, 0.02, high], "yaw": yaw,
+                "repeat": {"count": count, "step": [ux * step, uy * step, 0.0]},
+            }  # fmt: skip
+            rail = {
+                "type": "box", "center": [*middle, 0.8 * high], "size": [2 * half, 0.025, 0.6 * width],
+                "yaw": yaw,
+            }  # fmt: skip
+            self.fences.append({"name": f"fence{k}", "shape": pickets, "texture": texture})
+            self.fences.append({"name": f"rail{k}", "shape": rail, "texture": texture})
+            # Along its length, so that no wall or camera comes near.
+            self.places.append((*middle, half))
+
+    def _place_cameras(self) -> None:
+        rng = self.stream("cameras")
+        self.extent = max(math.hypot(x, y) + r for x, y, r in self.places)
+        height = self.things[0].reach[1]
+        self.radius = max(2.6, 1.15 * self.extent + 0.7) * _between(rng, 1.0, 1.15)
+        look = [_between(rng, -0.05, 0.05), _between(rng, -0.05, 0.05), round(0.42 * height, 2)]
+        fov = math.degrees(2 * math.atan(1.1 * max(height, 1.0) / self.radius))
+        tilt = 30 - 23 * self.axes.grazing
+        views = []
+        for yaw in (0, *YAWS):
+            angle = math.radians(max(4.0, tilt + _between(rng, -3, 3)))
+            high = look[2] + self.radius * math.tan(angle)
+            view = {"yaw": yaw, "height": round(high, 2)}
+            views.append(view if yaw else {"name": "source", **view})
+        self.cameras = {
+            "look_at": look, "radius": round(self.radius, 2), "fov": round(min(max(fov, 28), 48), 1),
+            "size": [512, 512], "source": views[0], "targets": views[1:],
+        }  # fmt: skip
+
+    def _ground(self) -> dict[str, Any]:
+        rng = self.stream("ground")
+        texture = dict(self.look.floor)
+        if rng.random() < self.axes.texture * 0.6:
+            colors = [_hue(rng, self.accent), _hue(rng, "white")]
+            size = round(_between(rng, 0.3, 0.6) * (1.4 - 0.7 * self.axes.texture), 2)
+            texture = {
+                "type": "checker", "colors": colors, "size": size, "variation": 0.1, "grain": 0.05,
+            }  # fmt: skip
+            if rng.random() < 0.5:
+                angle = _between(rng, 0, math.pi)
+                way = [round(math.cos(angle), 2), round(math.sin(angle), 2), 0.0]
+                texture |= {"type": "stripes", "direction": way}
+        texture["variation"] = round(texture["variation"] * (0.4 + 0.6 * self.axes.texture), 3)
+        shape = {"type": "rectangle", "center": [0, 0, 0], "size": [30, 30]}
+        return {"name": "ground", "shape": shape, "texture": texture}
+
+    def _walls(self) -> Iterator[dict[str, Any]]:
+        """Walls behind the cameras, where they leave the things in the sun."""
+        rng = self.stream("walls")
+        far = self.radius + _between(rng, 0.8, 2.2)
+        for k in range(4):
+            wanted, high = rng.random() < 0.6, _between(rng, 1.0, 2.8)
+            texture = self._wall(rng)
+            angle = math.pi / 2 * k
+            for light in self.lights:
+                if light["type"] == "sun":
+                    toward = math.cos(math.radians(light["azimuth"]) - angle)
+                    room = (far - self.extent) * math.tan(math.radians(light["elevation"]))
+                    if toward > 0:
+                        high = min(high, room / toward)
+            if not wanted or high < 0.5:
+                continue
+            x, y = round(math.cos(angle)), round(math.sin(angle))
+            shape = {
+                "type": "rectangle", "center": [far * x, far * y, high / 2],
+                "size": [2 * far, high], "facing": [-x, -y, 0],
+            }  # fmt: skip
+            yield {"name": f"wall{k}", "shape": shape, "texture": texture}
+
+    def _wall(self, rng: np.random.Generator) -> dict[str, Any]:
+        kind = ("bricks", "checker", "stripes", "noise")[_index(rng, 4)]
+        color = SATURATED[_index(rng, len(SATURATED))]
+        if rng.random() > 0.3 + self.axes.texture:
+            kind = "plain"
+        first, second = _hue(rng, color), _hue(rng, "white" if rng.random() < 0.5 else "grey")
+        size = round(_between(rng, 0.3, 0.6), 2)
+        match kind:
+            case "bricks":
+                return {"type": "bricks", "colors": [first, _hue(rng, color)], "mortar": second,
+                        "size": [size, round(0.4 * size, 2)], "variation": 0.2}  # fmt: skip
+            case "checker":
+                return {
+                    "type": "checker",
+                    "colors": [first, second],
+                    "size": size,
+                    "variation": 0.1,
+                }
+            case "stripes":
+                return {"type": "stripes", "colors": [first, second], "size": size,
+                        "direction": [1, 1, round(_between(rng, -0.5, 0.5), 2)]}  # fmt: skip
+            case "noise":
+                return {"type": "noise", "colors": ["#24391a", "#46652c", "#7fa04e"], "size": size,
+                        "octaves": 5, "variation": 0.4}  # fmt: skip
+        return {"type": "plain", "color": first, "variation": 0.1}
+
+    def _title(self) -> str:
+        first, *others = (asked.described(one) for one in self.things)
+        return f"{first} {asked.place(self.ground)}, with {', '.join(others)}".capitalize()
+
+
+def with_bounces(data: dict[str, Any]) -> None:
+    """Write the bounces of a scene and its edits into its data, by what each is made of."""
+    spec = SceneSpec.model_validate(data)
+    own = likely_bounces(spec)
+    data["appearance"] = {"bounces": own, **data["appearance"]}
+    spec = SceneSpec.model_validate(data)
+    for edit, entry in zip(spec.edits, data["edits"], strict=True):
+        for answer, part in zip(edit.answers, entry.get("answers", ()), strict=True):
+            _own_bounces(spec, edit, answer, own, part)
+        if not edit.answers:
+            _own_bounces(spec, edit, None, own, entry)
+
+
+def _own_bounces(spec: SceneSpec, edit: Any, answer: Any, own: Any, entry: dict[str, Any]) -> None:
+    from attnwarp_eval.scene.edits import apply
+
+    number = likely_bounces(apply(spec, edit, answer))
+    if number != own:
+        entry["bounces"] = number
+
+
+# Draws that do not depend on NumPy's own algorithms for them ---------------------------------------
+
+
+def _index(rng: np.random.Generator, count: int) -> int:
+    return min(int(rng.random() * count), count - 1)
+
+
+def _between(rng: np.random.Generator, low: float, high: float) -> float:
+    return round(low + (high - low) * float(rng.random()), 4)
+
+
+def _pick(rng: np.random.Generator, weights: Sequence[float]) -> int:
+    at = rng.random() * sum(weights)
+    for k, weight in enumerate(weights):
+        at -= weight
+        if at < 0:
+            return k
+    return len(weights) - 1
+
+
+def _choice(rng: np.random.Generator, words: Sequence[str], weights: Sequence[float]) -> str:
+    return words[_pick(rng, weights)]
+
+
+def _marks(rng: np.random.Generator, count: int, share: float) -> list[bool]:
+    """That share of ``count`` things, marked in an order of chance."""
+    order = sorted(range(count), key=lambda k: (rng.random(), k))
+    return [order.index(k) < round(share * count) for k in range(count)]
+
+
+def _hue(rng: np.random.Generator, color: str) -> str:
+    return shade(color, rng)
+
+
+def _reach(shapes: Sequence[dict[str, Any]]) -> tuple[float, float]:
+    """Radius of the circle about the upright that holds bodies, and their height."""
+    boxes = [
+        part.reach()
+        for shape in shapes
+        for part in BodySpec.model_validate(shape).solid()
+        if not part.carve
+    ]
+    corners = max(float(np.hypot(*np.abs(box[:, :2]).max(0))) for box in boxes)
+    return corners, max(float(box[1, 2]) for box in boxes)
+
+
+def _move(shapes: Sequence[dict[str, Any]], x: float, y: float) -> None:
+    for shape in shapes:
+        if shape["type"] == "body":
+            shape["position"] = [round(x, 3), round(y, 3), 0.0]
+        else:
+            shape["center"] = [round(x, 3), round(y, 3), shape["center"][2]]
+
+
+def _clear(
+    middle: tuple[float, float], along: tuple[float, float], half: float, place: Sequence[float]
+) -> bool:
+    """True if a straight fence stays out of a circle."""
+    x, y = place[0] - middle[0], place[1] - middle[1]
+    t = min(max(x * along[0] + y * along[1], -half), half)
+    return math.hypot(x - t * along[0], y - t * along[1]) > place[2] + 0.05
