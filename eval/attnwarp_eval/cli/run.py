@@ -203,7 +203,7 @@ def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
         [[*key, str(len(done)), str(sum(done))] for key, done in rows.items()],
     )
     Console().print(terminal(table))
-    scenes = f"scenes {', '.join(loaded.scene_names)}; " if loaded.scenes else ""
+    scenes = f"{loaded.scenes_in_words}; " if loaded.scenes else ""
     _name_untabulated(loaded)
     _name_notices(planned)
     typer.echo(

@@ -50,6 +50,11 @@ class DrawnScenes(Spec):
         return self
 
     @property
+    def count(self) -> int:
+        """Number of scenes."""
+        return self.drawn
+
+    @property
     def word(self) -> str:
         """First word of the scenes' names."""
         return "drawn"
@@ -65,11 +70,11 @@ class DrawnScenes(Spec):
     @property
     def names(self) -> list[str]:
         """Names of the scenes."""
-        return [f"{self.word}-{k}" for k in range(self.drawn)]
+        return [f"{self.word}-{k}" for k in range(self.count)]
 
     def scenes(self) -> Iterator[Drawn]:
         """Draw them, one at a time."""
-        for k in range(self.drawn):
+        for k in range(self.count):
             yield self.scene(k)
 
     def scene(self, number: int) -> Drawn:
@@ -99,7 +104,7 @@ def population(data: Any) -> DrawnScenes:
     Example:
         >>> population({"drawn": 0, "seed": 7})
         Traceback (most recent call last):
-        attnwarp.errors.InputError: drawn: got 0, expected 1 or more...
+        attnwarp.errors.InputError: drawn: got 0, but input should be greater than or equal to 1
     """
     try:
         return DrawnScenes.model_validate(data)

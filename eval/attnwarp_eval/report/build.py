@@ -34,8 +34,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
             f"Study `{study.name}`: {results.measured} of {total} cells measured,"
             f" {len(results.failures)} failed"
             + (
-                f"; scenes {', '.join(study.scene_names)}; {study.size} x {study.size} px; seeds"
-                f" {study.seeds}."
+                f"; {study.scenes_in_words}; {study.size} x {study.size} px; seeds {study.seeds}."
                 if study.scenes
                 else "."
             )

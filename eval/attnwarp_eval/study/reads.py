@@ -39,6 +39,7 @@ _ALWAYS = frozenset(
         "title",
         "description",
         "scenes",
+        "population",
         "variants",
         "probes",
         "ablations",

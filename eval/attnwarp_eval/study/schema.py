@@ -21,6 +21,7 @@ from pydantic import (
 from attnwarp import check
 from attnwarp.errors import InputError, suggest
 from attnwarp.warp import PRESETS, WarpSettings
+from attnwarp_eval.drawn.population import DrawnScenes
 from attnwarp_eval.scene.file import scene_name
 
 if TYPE_CHECKING:
@@ -149,7 +150,11 @@ class Study(Part):
     title: str = ""
     description: str = ""
     size: Annotated[Whole, Field(ge=16, le=4096)] = 512
-    scenes: list[str] = Field(default_factory=list)
+    scenes: list[str] = Field(
+        default_factory=list,
+        description="names, paths, or a population such as {drawn: 8, seed: 7}",
+    )
+    population: DrawnScenes | None = Field(None, description="of which the scenes are a sample")
     views: list[str] = Field(
         default_factory=list, description="target views by name; all of them if empty"
     )
@@ -178,6 +183,19 @@ class Study(Part):
             where if names.count(name) > 1 else name
             for where, name in zip(self.scenes, names, strict=True)
         ]
+
+    @property
+    def sampled(self) -> str:
+        """The population that the scenes are a sample of, in words; empty if of none."""
+        if self.population is None:
+            return ""
+        count, words = len(self.scenes), self.population.words
+        return words if count == self.population.count else f"{count} of {words}"
+
+    @property
+    def scenes_in_words(self) -> str:
+        """The population, or the scenes' names."""
+        return self.sampled or f"scenes {', '.join(self.scene_names)}"
 
     @property
     def left_out(self) -> tuple[str, ...]:

@@ -10,12 +10,14 @@ from typing import Any
 
 from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
 
+from attnwarp.errors import InputError
 from attnwarp.io.text import read_text
 from attnwarp_eval.scene import explain
 from attnwarp_eval.scene.file import is_scene_file, scene_name
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.yaml import Place, YamlError, line_of, read_yaml
 from attnwarp_eval.study.cell import Cell, merged
+from attnwarp_eval.study.populations import expanded
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.probes.base import Probe
 from attnwarp_eval.study.reads import unused
@@ -47,6 +49,11 @@ class _PlacedError(ValueError):
 
 class _Joined(Study):
     """A study whose names are checked against the probes."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _scenes_of_a_population(cls, data: Any) -> Any:
+        return expanded(data) if isinstance(data, dict) else data
 
     @model_validator(mode="before")
     @classmethod
@@ -246,6 +253,11 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         )
     data, lines = _read(path)
     keys = set(data)
+    try:
+        data = expanded(data)
+    except InputError as error:
+        line = line_of(lines, ("scenes",))
+        raise StudyError(f"{line[0]}:{line[1]}: {error}" if line else f"{path}: {error}") from None
     every = data.get("scenes")
     named = every if isinstance(every, list) else ()
     files = {scene_name(where): where for where in named if is_scene_file(where)}

@@ -1,0 +1,65 @@
+"""Scenes that a study names by a population: each as the file that it is drawn into."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from attnwarp.errors import InputError
+from attnwarp_eval.drawn.population import population
+
+
+def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A study's data with the files of its population under ``scenes``.
+
+    Data that has been through here before names files, perhaps of another machine's cache: they are
+    found, or drawn, again. An entry of ``editing.edits`` for the population's word, such as
+    ``drawn``, is one for each of its scenes.
+
+    Args:
+        data: of a study; ``scenes`` is a mapping, or ``population`` says what the files are.
+
+    Raises:
+        InputError: there is no such population.
+
+    Example:
+        >>> study = expanded({"name": "mine", "scenes": {"drawn": 2, "seed": 7}})
+        >>> [Path(name).name for name in study["scenes"]]
+        ['drawn-0.yaml', 'drawn-1.yaml']
+        >>> study["population"]["seed"]
+        7
+    """
+    result = dict(data)
+    scenes = result.get("scenes")
+    if isinstance(scenes, Mapping):
+        try:
+            wanted = population(scenes)
+        except InputError as error:
+            raise InputError(f"scenes: {error}") from None
+        result["population"] = wanted.model_dump(mode="json")
+        result["scenes"] = [str(path) for path in wanted.files()]
+    elif result.get("population") and isinstance(scenes, list):
+        wanted = population(result["population"])
+        files = {path.stem: path for path in wanted.files()}
+        named = [Path(str(name)) for name in scenes]
+        if not all(_is_one_of(path, files) for path in named):
+            # Other scenes beside them are no sample of anything.
+            result["population"] = None
+            return result
+        result["scenes"] = [str(files[path.stem]) for path in named]
+    else:
+        return result
+    editing = result.get("editing")
+    edits = editing.get("edits") if isinstance(editing, Mapping) else None
+    if isinstance(edits, Mapping) and wanted.word in edits:
+        own = {name: value for name, value in edits.items() if name != wanted.word}
+        each = {Path(name).stem: edits[wanted.word] for name in result["scenes"]}
+        result["editing"] = {**editing, "edits": {**each, **own}}
+    return result
+
+
+def _is_one_of(path: Path, files: Mapping[str, Path]) -> bool:
+    """Return True if a file, where there is one, is what the population has under its name."""
+    own = files.get(path.stem)
+    return own is not None and (not path.is_file() or path.read_bytes() == own.read_bytes())
