@@ -43,6 +43,20 @@ class Metric:
         return self.unit in ("pixels", "views") and self.direction == "none"
 
 
+    @property
+    def scale(self) -> Literal["ratio", "share", "plain"]:
+        """Scale on which two variants are compared: errors above 0 as ratios, shares as shares.
+
+        Example:
+            >>> [METRICS[name].scale for name in ("warp.epe_median", "occlusion.recall", "fit.psnr")]
+            ['ratio', 'share', 'plain']
+        """
+        if self.unit == "share":
+            return "share"
+        errors = ("px", "layer px", "scene", "deg", "ratio")
+        return "ratio" if self.direction == "lower" and self.unit in errors else "plain"
+
+
 class Registry(dict[str, Metric]):
     """Metrics by name, which also answers to a result's key, whatever region or size stands behind the name."""
 
