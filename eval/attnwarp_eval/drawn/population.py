@@ -17,6 +17,9 @@ from attnwarp_eval.drawn.scenes import Drawn, draw
 from attnwarp_eval.scene.base import Spec
 from attnwarp_eval.scene.explain import explain
 
+OTHER_SEED = 1_000_003
+"""Added to a population's seed for its pilot, which must have other scenes."""
+
 Count = Annotated[int, Field(ge=1, le=10_000)]
 
 
@@ -58,6 +61,11 @@ class DrawnScenes(Spec):
     def word(self) -> str:
         """First word of the scenes' names."""
         return "drawn"
+
+    def pilot(self, count: int) -> DrawnScenes:
+        """A few scenes of another seed, drawn in the same way."""
+        other = (self.seed + OTHER_SEED) % 2**32
+        return self.model_copy(update={"drawn": count, "seed": other})
 
     @property
     def words(self) -> str:

@@ -115,10 +115,10 @@ def _hours_a_scene(results: Results) -> float:
     ]
     if not done or any(is_fitted(record.spec) for records in done for record in records):
         return math.nan
-    return fmean(sum(map(_seconds, records)) for records in done) / 3600
+    return fmean(sum(map(seconds_of, records)) for records in done) / 3600
 
 
-def _seconds(record: Record[Any]) -> float:
+def seconds_of(record: Record[Any]) -> float:
     """Seconds of a cell, each counted once: the first view and the others are within the rest, and
     parts of an edit within its whole.
     """

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from attnwarp.errors import InputError
 from attnwarp_eval.drawn.population import population
+
+if TYPE_CHECKING:
+    from attnwarp_eval.study.schema import Study
 
 
 def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -51,12 +54,40 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
     else:
         return result
     editing = result.get("editing")
-    edits = editing.get("edits") if isinstance(editing, Mapping) else None
+    if not isinstance(editing, Mapping):
+        return result
+    edits = editing.get("edits")
     if isinstance(edits, Mapping) and wanted.word in edits:
         own = {name: value for name, value in edits.items() if name != wanted.word}
         each = {Path(name).stem: edits[wanted.word] for name in result["scenes"]}
         result["editing"] = {**editing, "edits": {**each, **own}}
     return result
+
+
+def pilot_of(study: Study, count: int) -> Study:
+    """A study on a few scenes of another seed of its population.
+
+    Raises:
+        InputError: its scenes are of no population.
+    """
+    from attnwarp_eval.study.study import parse_study
+
+    if study.population is None:
+        raise InputError(
+            f"--plan: study {study.name!r} names its scenes one by one; a pilot needs a population"
+            " such as scenes: {drawn: 48, seed: 7}"
+        )
+    data = study.model_dump(mode="json", exclude_unset=True)
+    other = study.population.pilot(count)
+    editing = data.get("editing")
+    if editing and editing.get("edits"):
+        names = set(other.names)
+        kept = {name: edits for name, edits in editing["edits"].items() if name in names}
+        data["editing"] = {**editing, "edits": kept}
+    scenes = other.model_dump(mode="json")
+    return parse_study(
+        {**data, "name": f"{study.name}-pilot", "population": None, "scenes": scenes}
+    )
 
 
 def _is_one_of(path: Path, files: Mapping[str, Path]) -> bool:

@@ -256,8 +256,8 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
     try:
         data = expanded(data)
     except InputError as error:
-        line = line_of(lines, ("scenes",))
-        raise StudyError(f"{line[0]}:{line[1]}: {error}" if line else f"{path}: {error}") from None
+        where, at_line = line_of(lines, ("scenes",))
+        raise StudyError(f"{where}:{at_line}: {error}") from None
     every = data.get("scenes")
     named = every if isinstance(every, list) else ()
     files = {scene_name(where): where for where in named if is_scene_file(where)}

@@ -1,0 +1,144 @@
+"""Scenes that each claim of a study needs, by a pilot on other scenes, and the study's cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+
+from attnwarp_eval.document.model import Table
+from attnwarp_eval.document.numbers import number
+from attnwarp_eval.metrics.registry import Metric
+from attnwarp_eval.report.claims import load_claims
+from attnwarp_eval.report.settling import seconds_of
+from attnwarp_eval.statistics.contrasts import Contrast, contrast
+from attnwarp_eval.statistics.planning import MOST_SCENES, scenes_needed
+from attnwarp_eval.statistics.signflips import FEWEST
+from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.results import Results
+
+PILOT_SCENES = 8
+
+INTEREST = {"ratio": math.log(1.1), "share": 0.05, "dB": 0.5, "dE00": 1.0, "cosine": 0.02}
+"""Smallest difference of interest: by the scale, or by the unit of what is compared plainly."""
+
+COLUMNS = (
+    "claim or row", "metric", "difference of interest", "spread between scenes", "scenes needed",
+    "for the pilot's own difference",
+)  # fmt: skip
+
+
+def interest(metric: Metric) -> float | None:
+    """Smallest difference of a metric that matters, on its scale; None where nobody has said.
+
+    Example:
+        >>> from attnwarp_eval.metrics.registry import METRICS
+        >>> round(interest(METRICS["warp.epe_median"]), 4)  # a tenth more or less
+        0.0953
+    """
+    return INTEREST.get(metric.scale, INTEREST.get(metric.unit))
+
+
+def needed(value: Contrast, difference: float) -> int:
+    """Scenes with which a test at 5 % tells a true difference in 80 % of studies, at least six.
+
+    Args:
+        value: of the pilot, whose spread between scenes counts.
+        difference: on the contrast's scale.
+    """
+    spread = float(np.std(list(value.by_scene.values()), ddof=1))
+    return max(FEWEST, scenes_needed(difference, spread))
+
+
+def plan_table(results: Results) -> Table:
+    """For each claim, and each row of the study's tables of differences, how many scenes it needs.
+
+    Args:
+        results: of the pilot.
+    """
+    rows = []
+    for title, name, metric, value in _contrasts(results):
+        if len(value.by_scene) < 3:
+            continue
+        aim, spread = interest(metric), float(np.std(list(value.by_scene.values()), ddof=1))
+        shown = "–" if aim is None else _difference(aim, value.scale)
+        count = "–" if aim is None else _count(needed(value, aim))
+        own = _count(needed(value, value.flips.mean)) if value.flips.mean else "–"
+        rows.append([title, name, shown, number(spread), count, own])
+    return Table(list(COLUMNS), rows)
+
+
+def _contrasts(results: Results) -> Iterator[tuple[str, str, Metric, Contrast]]:
+    for claim in (one for entry in load_claims() for one in entry.of_each_editor()):
+        found = claim.measure(results)
+        if found is not None:
+            metric = probe(claim.probe).metric(found.metric)
+            scale = metric.scale if len(found.sides) > 1 else "plain"
+            value = contrast(found.a, found.b, scale, floor=metric.atol)
+            yield claim.text, found.metric, metric, value
+    for table in results.study.ablations:
+        own = probe(table.probe)
+        for name in table.variants:
+            for key in (one.format(layer=results.layer) for one in own.contrasts):
+                metric = own.metric(key)
+                a, b = (results.views(own.name, who, key) for who in (table.baseline, name))
+                value = contrast(a, b, metric.scale, floor=metric.atol)
+                if name != table.baseline and metric.direction in ("higher", "lower"):
+                    yield f"{name} against {table.baseline}", key, metric, value
+
+
+def _difference(value: float, scale: str) -> str:
+    return f"{100 * math.expm1(value):.0f} %" if scale == "ratio" else number(value)
+
+
+def _count(scenes: int) -> str:
+    return f"over {MOST_SCENES}" if scenes > MOST_SCENES else str(scenes)
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of cells that are still to do.
+
+    Attributes:
+        hours: of one worker.
+        gigabytes: that they add to the run's folder.
+        unknown: cells of kinds of which none was measured; they are in neither.
+    """
+
+    hours: float
+    gigabytes: float
+    unknown: int
+
+
+def cost_of(
+    kinds: Iterable[tuple[str, tuple[str, ...]]], measured: Iterable[tuple[Results, Path]]
+) -> Cost:
+    """Cost of cells, from the means of finished cells of their kind.
+
+    Args:
+        kinds: probe and variants of each cell to do.
+        measured: finished runs with the same variants, such as the part that is done and the pilot,
+            each with its folder.
+    """
+    seconds: dict[tuple[str, tuple[str, ...]], list[float]] = {}
+    sizes = []
+    for results, folder in measured:
+        for cell in results.cells:
+            if cell.record is not None:
+                kind = (cell.probe, cell.variants)
+                seconds.setdefault(kind, []).append(seconds_of(cell.record))
+        if results.measured:
+            sizes.append(_bytes(folder) / results.measured)
+    todo = list(kinds)
+    known = [fmean(seconds[kind]) for kind in todo if kind in seconds]
+    size = fmean(sizes) if sizes else 0.0
+    return Cost(sum(known) / 3600, size * len(known) / 1e9, len(todo) - len(known))
+
+
+def _bytes(folder: Path) -> int:
+    parts = (folder / name for name in ("cells", "pictures"))
+    return sum(path.stat().st_size for part in parts for path in part.rglob("*") if path.is_file())
