@@ -10,7 +10,6 @@ import typer
 
 from attnwarp.cli.edit_image import (
     ControlOption,
-    DeviceOption,
     EditorOption,
     InstructionOption,
     ThreadsOption,
@@ -26,6 +25,7 @@ from attnwarp.cli.files import (
 from attnwarp.cli.options import (
     AntialiasedOption,
     DataArgument,
+    DeviceOption,
     MaxSizeOption,
     Reading,
     ScreenFilterOption,
@@ -75,7 +75,7 @@ def baseline(
     antialiased: AntialiasedOption = None,
     screen_filter: ScreenFilterOption = None,
     max_size: MaxSizeOption = None,
-    device: DeviceOption = "cpu",
+    device: DeviceOption = "auto",
     threads: ThreadsOption = None,
     control: ControlOption = None,
     turntable: TurntableOption = None,

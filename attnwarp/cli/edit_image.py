@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from attnwarp.cli.options import DeviceOption
 from attnwarp.editing.small import check_words, guide_of
 from attnwarp.errors import InputWarning
 from attnwarp.reporting import reporter
@@ -43,7 +44,6 @@ PictureEditorOption = Annotated[
         help="A bundled editor that takes pictures, or a folder in diffusers' format.",
     ),
 ]
-DeviceOption = Annotated[str, typer.Option(help="Of the editor: cpu or cuda.")]
 WhereOption = Annotated[
     str | None,
     typer.Option(
@@ -102,7 +102,7 @@ def edit_image(
     mask_out: Annotated[
         Path | None, typer.Option("--mask", help="PNG file for the mask that --where gives.")
     ] = None,
-    device: DeviceOption = "cpu",
+    device: DeviceOption = "auto",
     threads: ThreadsOption = None,
 ) -> None:
     """Edit a picture by an instruction."""
@@ -130,6 +130,7 @@ def edit_image(
     import numpy as np
     import torch
 
+    from attnwarp.devices import choose
     from attnwarp.editing.editor import edit, own_size, side_multiple
     from attnwarp.editing.segment import load_segmenter
     from attnwarp.editing.small import check_instruction, load_editor, thread_count
@@ -137,6 +138,7 @@ def edit_image(
 
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
     given = {name: value for name, value in guidance.items() if value is not None}
+    device = choose(device, splats=False)
     model = load_editor(editor, device=device, **given)
     check_instruction(editor, model, instruction)
     torch.set_num_threads(thread_count(model, threads))

@@ -19,6 +19,7 @@ from attnwarp.cli.files import (
 )
 from attnwarp.cli.options import (
     DataArgument,
+    DeviceOption,
     Kind,
     MaxSizeOption,
     Reading,
@@ -87,6 +88,7 @@ def fit(
     checkpoint_seconds: Annotated[
         float, typer.Option(min=0, help="Seconds between two checkpoints.")
     ] = 30.0,
+    device: DeviceOption = "auto",
     threads: RenderThreadsOption = None,
     restart: Annotated[
         bool, typer.Option("--restart", help="Begin again, over the fit in --out.")
@@ -130,6 +132,7 @@ def fit(
             checkpoint_seconds,
             restart,
             third_scale,
+            device,
             report,
         )
         last = result.history[-1]
@@ -178,6 +181,7 @@ def _fit(
     checkpoint_seconds: float,
     restart: bool,
     third_scale: float | None,
+    device: str,
     report: Reporter,
 ) -> Fit:
     changes = {**changes, "kind": kind.value[:2], "seed": seed}
@@ -193,11 +197,13 @@ def _fit(
         )
 
     import attnwarp.fit
+    from attnwarp.devices import choose
     from attnwarp.fit.loop import CHECKPOINT, SPLATS
     from attnwarp.fit.start import FIRST_POINTS
     from attnwarp.io.names import file_stems
 
     settings = attnwarp.fit.FitSettings.from_dict(changes)
+    device = choose(device, report)
     dataset = read_views(data, reading)
     # A view without a picture can be neither fitted on nor held out.
     there = [k for k, path in enumerate(dataset.image_paths) if path is not None]
@@ -217,6 +223,7 @@ def _fit(
         first = attnwarp.fit.first_splats(
             dataset, views.cameras, settings, report, random=points or FIRST_POINTS
         )
+    first = first.to(device=device)
     out.mkdir(parents=True, exist_ok=True)
     try:
         with asked_to_stop(report) as stop:
@@ -264,13 +271,13 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
     folder.mkdir(exist_ok=True)
     near = _near(result.settings, result.extent)
     white = result.settings.background == "white"
-    background = torch.full((3,), 1.0 if white else 0.0)
+    background = torch.full((3,), 1.0 if white else 0.0, device=result.gaussians.means.device)
     for index, (camera, name) in enumerate(
         zip(held_out.cameras, file_stems(held_out.cameras), strict=True)
     ):
         color = render(result.gaussians, camera, background=background, near=near).color.clamp(0, 1)
         both = torch.cat([held_out.target(index, background), color], dim=1)
-        write_image(folder / f"{name}.png", both.numpy())
+        write_image(folder / f"{name}.png", both.cpu().numpy())
 
 
 def _near(settings: FitSettings, extent: float) -> float:

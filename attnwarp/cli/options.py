@@ -53,6 +53,10 @@ class Coordinates(StrEnum):
     relative = "relative"
 
 
+DeviceOption = Annotated[
+    str, typer.Option(help="cpu, cuda, or auto: a GPU where there is one.", metavar="DEVICE")
+]
+
 DataArgument = Annotated[
     Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
 ]

@@ -11,7 +11,8 @@ from typing import Any
 
 import torch
 
-from attnwarp.encoders._weights import check_archive, device_of, reason_of
+from attnwarp.devices import device_of
+from attnwarp.encoders._weights import check_archive, reason_of
 from attnwarp.encoders.pretrained import check_config
 from attnwarp.errors import InputError, install_command
 from attnwarp.io.text import read_text

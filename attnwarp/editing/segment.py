@@ -206,7 +206,7 @@ class GroundedSam:
             InputError: files that are missing, by name, or that cannot be read.
             MissingExtraError: transformers is not installed.
         """
-        from attnwarp.encoders._weights import device_of
+        from attnwarp.devices import device_of
 
         torch_device = str(device_of(device))
         _check_folder(Path(dino), "grounding-dino", ("tokenizer.json", "vocab.txt"))

@@ -144,7 +144,8 @@ def load_encoder(name: str, kind: Kind | None = None, *, device: str = "cpu") ->
         name: a bundled one (``clip-small``, ``clip-parts``, ``dino-small``,
             ``perceptual-small``), or ``clip:FOLDER``, ``dinov2:FOLDER``, ``lpips:FILE_OR_FOLDER``.
         kind: the expected kind; an encoder of another kind is refused before it is loaded.
-        device: "cpu" or "cuda", for real ones; the bundled ones are small and stay on the CPU.
+        device: "cpu" or "cuda", for real ones. The bundled ones are small and stay on the CPU; the
+            loss of ``perceptual-small`` is computed where its pictures lie.
 
     Returns:
         A :class:`TextImageEncoder` ("clip"), a :class:`TokenEncoder` ("dino") or a

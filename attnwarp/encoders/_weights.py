@@ -75,19 +75,6 @@ def reason_of(error: Exception) -> str:
     return (text.splitlines() or [type(error).__name__])[0]
 
 
-def device_of(name: str) -> torch.device:
-    """A device by name. Raises InputError where there is none of that name."""
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise InputError(f"device {name!r}: unknown, expected cpu or cuda") from None
-    if device.type not in ("cpu", "cuda"):
-        raise InputError(f"device {name!r}: not supported, expected cpu or cuda")
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise InputError(f"device {name!r}: this machine or this torch has no CUDA; name cpu")
-    return device
-
-
 @contextmanager
 def full_float32() -> Iterator[None]:
     """No gradients, and true float32 in convolutions: cuDNN would take TF32, of 10 bits, by

@@ -239,6 +239,7 @@ class BundledPerceptual:
         see the model card.
         """
         distances = []
+        self.net.to("cpu")
         with full_float32():
             for first, second in checked_pairs(a, b):
                 x, y = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in (first, second))
@@ -250,8 +251,9 @@ class BundledPerceptual:
         return self.between(self.features(image), self.features(target))
 
     def features(self, picture: torch.Tensor) -> list[torch.Tensor]:
-        """Features for :meth:`between` of a picture (H, W, 3) in [0, 1], differentiable."""
-        return self.net.stack(picture.permute(2, 0, 1)[None])
+        """Features for :meth:`between` of a picture (H, W, 3) in [0, 1], differentiable. The
+        network goes to the picture's device."""
+        return self.net.to(picture.device).stack(picture.permute(2, 0, 1)[None])
 
     def between(self, image: list[torch.Tensor], target: list[torch.Tensor]) -> torch.Tensor:
         """() the distance of two pictures by their :meth:`features`."""

@@ -20,7 +20,8 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from attnwarp.encoders._weights import device_of, full_float32, sha256_of, state_of
+from attnwarp.devices import device_of
+from attnwarp.encoders._weights import full_float32, sha256_of, state_of
 from attnwarp.encoders.base import EncoderInfo, Image, checked_pairs
 from attnwarp.errors import InputError
 

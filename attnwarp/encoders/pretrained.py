@@ -22,7 +22,8 @@ import numpy.typing as npt
 import torch
 
 from attnwarp import check
-from attnwarp.encoders._weights import check_archive, device_of, full_float32, reason_of, sha256_of
+from attnwarp.devices import device_of
+from attnwarp.encoders._weights import check_archive, full_float32, reason_of, sha256_of
 from attnwarp.encoders.base import EncoderInfo, Image, Kind, checked_image, checked_texts
 from attnwarp.encoders.preprocess import Preprocessing, read_json, read_preprocessing
 from attnwarp.errors import InputError, optional_imports

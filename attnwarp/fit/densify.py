@@ -45,13 +45,14 @@ def screen_gradient(
         near: depth in scene units below which a centre has no position on screen; 0 comes out
             there.
     """
-    R = torch.from_numpy(camera.rotation.copy())
-    moved = torch.from_numpy(camera.rotation @ origin + camera.translation)
+    device = means.device
+    R = torch.tensor(camera.rotation, device=device)
+    moved = torch.tensor(camera.rotation @ origin + camera.translation, device=device)
     z = means.double() @ R[2] + moved[2]
     across = gradient.double() @ R[:2].T
     across[:, 1] -= float(camera.K[0, 1] / camera.K[0, 0]) * across[:, 0]
-    focal = torch.tensor([camera.K[0, 0], camera.K[1, 1]])
-    half = torch.tensor([camera.width / 2, camera.height / 2], dtype=torch.float64)
+    focal = torch.tensor([camera.K[0, 0], camera.K[1, 1]], device=device)
+    half = torch.tensor([camera.width / 2, camera.height / 2], dtype=torch.float64, device=device)
     on_screen = across * z[:, None] / focal * half
     return torch.where(z > near, on_screen.norm(dim=1), 0.0).float()
 
@@ -65,12 +66,21 @@ class Density:
     """
 
     def __init__(
-        self, settings: FitSettings, extent: float, center: np.ndarray, count: int
+        self,
+        settings: FitSettings,
+        extent: float,
+        center: np.ndarray,
+        count: int,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.settings, self.extent = settings, extent
-        self.center = torch.from_numpy(np.asarray(center, dtype=np.float32))
-        self.total, self.seen = torch.zeros(count), torch.zeros(count)
+        self.center = torch.tensor(np.asarray(center, dtype=np.float32), device=device)
+        self._clear(count)
         self.last = int(settings.densify_until * settings.iterations)
+
+    def _clear(self, count: int) -> None:
+        self.total = torch.zeros(count, device=self.center.device)
+        self.seen = torch.zeros_like(self.total)
 
     def watch(self, model: Model, gaussians: Gaussians, camera: Camera, weight: Tensor) -> None:
         """Note one view's gradients, before the optimiser drops them."""
@@ -143,7 +153,7 @@ class Density:
                 " splats describe; check that cameras and points are in one coordinate system"
             )
         model.replace(keep, added)
-        self.total, self.seen = torch.zeros(len(model)), torch.zeros(len(model))
+        self._clear(len(model))
 
     def _half(
         self, t: dict[str, Tensor], index: Tensor, random: torch.Generator
@@ -153,7 +163,8 @@ class Density:
         """
         half = {name: tensor[index].clone() for name, tensor in t.items()}
         scales = half["scales"].exp()
-        offset = torch.randn(scales.shape, generator=random) * scales
+        # Drawn in main memory: every device grows the same splats.
+        offset = torch.randn(scales.shape, generator=random).to(scales.device) * scales
         if scales.shape[1] == 2:
             offset = torch.nn.functional.pad(offset, (0, 1))
         kind = self.settings.kind
@@ -166,8 +177,10 @@ class Density:
 
     def state(self) -> dict[str, Any]:
         """Everything that the next refinement depends on."""
-        return {"total": self.total.clone(), "seen": self.seen.clone()}
+        return {"total": self.total.cpu().clone(), "seen": self.seen.cpu().clone()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what :meth:`state` gave."""
-        self.total, self.seen = state["total"].clone(), state["seen"].clone()
+        device = self.center.device
+        self.total = state["total"].to(device, copy=True)
+        self.seen = state["seen"].to(device, copy=True)

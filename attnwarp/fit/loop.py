@@ -16,7 +16,7 @@ import torch
 
 from attnwarp import check, losses
 from attnwarp.fit.densify import Density
-from attnwarp.fit.model import Model, check_on_cpu
+from attnwarp.fit.model import Model
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.start import extent_of
 from attnwarp.fit.views import Views, warn_of_twins
@@ -134,6 +134,7 @@ def fit(
     Args:
         start: what to begin with: :func:`attnwarp.fit.from_points`, or splats that were fitted
             before; of the settings' kind. Harmonics that it uses are used from the first iteration.
+            The fit runs where they lie: ``start.to(device="cuda")`` takes it to a GPU.
         views: the pictures to fit on.
         settings: the default ones for ``start.kind`` if left out.
         held_out: pictures to evaluate on, never fitted on.
@@ -152,8 +153,8 @@ def fit(
         stop: asked before every iteration; True ends the fit in good order.
 
     Raises:
-        ValueError: ``start`` is of another kind or degree than the settings say or lies on a GPU,
-            the folder holds a fit of other views, settings or first splats, one that is beyond
+        ValueError: ``start`` is of another kind or degree than the settings say, the folder holds a
+            fit of other views, settings or first splats, one that is beyond
             ``settings.iterations``, or ``splats.ply`` without a checkpoint, or a number is out of
             range.
         FileFormatError: the folder's checkpoint is damaged.
@@ -196,7 +197,6 @@ def fit(
         )
     if len(start) == 0:
         raise ValueError("start: holds no splats")
-    check_on_cpu(start)
     if settings.ssim:
         losses.check_sizes(views.cameras, losses.SSIM_WINDOW, "SSIM", "ssim")
     if max_seconds is not None:
@@ -237,7 +237,7 @@ class _Run:
         self.start, self.first_degree = start.digest(), start.used_sh_degree()
         self.model = Model(start, settings, self.extent)
         middle = centers.mean(0) - self.model.origin
-        self.density = Density(settings, self.extent, middle, len(start))
+        self.density = Density(settings, self.extent, middle, len(start), self.model.device)
         self.random = torch.Generator().manual_seed(settings.seed)
         self.queue: list[int] = []
         self.iteration = 0
@@ -345,7 +345,7 @@ class _Run:
     ) -> Fit:
         s = self.settings
         if self.backend in ("auto", "cpu") and self.iteration < s.iterations:
-            compile_kernels(s.kind, report)
+            compile_kernels(s.kind, report, self.model.device)
         if not self.history:
             self.evaluate()
         while True:
@@ -414,8 +414,8 @@ class _Run:
         if choice == "auto":
             choice = "random" if self.views.transparent else "black"
         if choice == "random" and fitting:
-            return torch.rand(3, generator=self.random)
-        return torch.full((3,), 1.0 if choice == "white" else 0.0)
+            return torch.rand(3, generator=self.random).to(self.model.device)
+        return torch.full((3,), 1.0 if choice == "white" else 0.0, device=self.model.device)
 
     def iterate(self) -> None:
         s = self.settings

@@ -33,19 +33,6 @@ in float32.
 """
 
 
-def check_on_cpu(start: Gaussians) -> None:
-    """Refuse splats on a GPU, whose pictures, statistics and random numbers would lie elsewhere.
-
-    Raises:
-        ValueError: they are not in main memory.
-    """
-    if start.means.device.type != "cpu":
-        raise ValueError(
-            f"splats: lie on {start.means.device}, but are fitted and tuned on the CPU; use"
-            " gaussians.to(device='cpu')"
-        )
-
-
 class Model:
     """Splats as Adam sees them: centres, harmonics, logit of opacity, logarithm of scales,
     quaternions.
@@ -104,6 +91,11 @@ class Model:
     def __len__(self) -> int:
         return int(self.tensors["means"].shape[0])
 
+    @property
+    def device(self) -> torch.device:
+        """Device of the splats and of Adam's memory."""
+        return self.tensors["means"].device
+
     def gaussians(self) -> Gaussians:
         """The splats, differentiable in the leaves."""
         t = self.tensors
@@ -143,7 +135,7 @@ class Model:
                 [self.first[name]],
                 [self.second[name]],
                 [],
-                [torch.tensor(float(self.steps))],
+                [torch.tensor(float(self.steps), device=tensor.device)],
                 fused=True,
                 amsgrad=False,
                 beta1=0.9,
@@ -178,13 +170,15 @@ class Model:
         self.second["opacity"].zero_()
 
     def state(self) -> dict[str, Any]:
-        """Everything that the next step depends on."""
+        """Everything that the next step depends on, in main memory."""
+        parts = {"tensors": self.tensors, "first": self.first, "second": self.second}
         return {
             "steps": self.steps,
             "origin": [float(v) for v in self.origin],
-            "tensors": {name: tensor.detach().clone() for name, tensor in self.tensors.items()},
-            "first": {name: moment.clone() for name, moment in self.first.items()},
-            "second": {name: moment.clone() for name, moment in self.second.items()},
+            **{
+                part: {name: tensor.detach().cpu().clone() for name, tensor in tensors.items()}
+                for part, tensors in parts.items()
+            },
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -192,9 +186,9 @@ class Model:
         origin = np.array(state["origin"], dtype=np.float64)
         check.shape(origin, (3,), "origin")
         self.steps, self.origin = int(state["steps"]), origin
+        device = self.device
         for name in NAMES:
-            self.tensors[name] = state["tensors"][name].clone().requires_grad_(True)
-            self.first[name], self.second[name] = (
-                state["first"][name].clone(),
-                state["second"][name].clone(),
-            )
+            tensor = state["tensors"][name].to(device, copy=True)
+            self.tensors[name] = tensor.requires_grad_(True)
+            self.first[name] = state["first"][name].to(device, copy=True)
+            self.second[name] = state["second"][name].to(device, copy=True)

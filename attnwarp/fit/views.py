@@ -27,6 +27,9 @@ from attnwarp.io.images import weighted_by_alpha
 HELD_OUT_EVERY = 8
 """One image of so many is held out where a data set names no split (LLFF's habit)."""
 
+HELD_BYTES = 2**31
+"""Bytes of pictures that a GPU keeps: 650 of 1297 x 840 px in 8 bits."""
+
 SAME_POSE = 1e-6
 """Largest difference of rotations, of places in extents of the cameras, and of focal lengths and
 principal points in sides of the picture, by which two views are one: rounding of printed poses."""
@@ -99,13 +102,31 @@ class Views:
         )
 
     def target(self, index: int, background: torch.Tensor) -> torch.Tensor:
-        """(H, W, 3) float32 picture in [0, 1], over ``background`` (3,) where it is transparent."""
+        """(H, W, 3) float32 picture in [0, 1], over ``background`` (3,) where it is transparent;
+        on the background's device."""
         image = self.images[index]
-        picture = torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32)) / _top(image)
+        if background.device.type == "cpu":
+            pixels = torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32))
+        else:
+            pixels = self._on(background.device, index).float()
+        picture = pixels / _top(image)
         if picture.shape[2] == 3:
             return picture
         alpha = picture[..., 3:]
         return picture[..., :3] * alpha + (1 - alpha) * background.to(picture.dtype)
+
+    def _on(self, device: torch.device, index: int) -> torch.Tensor:
+        """The pixels of a picture on a GPU, which keeps those of as many pictures as fit."""
+        if (device, index) in self._held:
+            return self._held[device, index]
+        pixels = torch.from_numpy(np.ascontiguousarray(self.images[index])).to(device)
+        if sum(held.nbytes for held in self._held.values()) + pixels.nbytes <= HELD_BYTES:
+            self._held[device, index] = pixels
+        return pixels
+
+    @cached_property
+    def _held(self) -> dict[tuple[torch.device, int], torch.Tensor]:
+        return {}
 
     @cached_property
     def digest(self) -> str:

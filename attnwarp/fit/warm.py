@@ -15,11 +15,13 @@ from attnwarp.reporting import SILENT, Reporter
 QUIET_SECONDS = 5.0
 """A person is told of what takes longer. Loading what is compiled takes about one."""
 
-_ready: set[Kind] = set()
+_ready: set[tuple[Kind, str]] = set()
 
 
-def compile_kernels(kind: Kind, report: Reporter = SILENT) -> None:
-    """Have numba compile the CPU renderer and its gradients, or load what it compiled before.
+def compile_kernels(
+    kind: Kind, report: Reporter = SILENT, device: torch.device | str = "cpu"
+) -> None:
+    """Have the renderer and its gradients compiled, or loaded if they were compiled before.
 
     Otherwise the first iteration does so, and the seconds of a fit hold a minute that no later fit
     takes. Further calls in a process do nothing.
@@ -27,12 +29,14 @@ def compile_kernels(kind: Kind, report: Reporter = SILENT) -> None:
     Args:
         kind: of the splats, "2d" or "3d".
         report: receives one line if it takes seconds.
+        device: where the splats lie: numba compiles for a CPU, Warp for a GPU.
 
     Example:
         >>> from attnwarp.fit import compile_kernels
         >>> compile_kernels("2d")
     """
-    if kind in _ready:
+    place = torch.device(device)
+    if (kind, place.type) in _ready:
         return
     text = "waiting for the renderer, which is compiled once after an installation: about a minute"
     timer = threading.Timer(QUIET_SECONDS, report.log, [text])
@@ -41,13 +45,13 @@ def compile_kernels(kind: Kind, report: Reporter = SILENT) -> None:
     try:
         # A caller may have switched gradients off.
         with torch.inference_mode(False), torch.enable_grad():
-            _call_all(kind)
+            _call_all(kind, place)
     finally:
         timer.cancel()
-    _ready.add(kind)
+    _ready.add((kind, place.type))
 
 
-def _call_all(kind: Kind) -> None:
+def _call_all(kind: Kind, device: torch.device) -> None:
     """Render one splat, and its loss's gradients. Fits are in float32, whatever torch's default."""
     single = torch.float32
     means = torch.zeros(1, 3, requires_grad=True, dtype=single)
@@ -60,5 +64,5 @@ def _call_all(kind: Kind) -> None:
         torch.zeros(1, 1, 3, dtype=single),
     )
     camera = Camera.look_at((0, 0, 3), (0, 0, 0), width=16, height=16, fov_y=40, up=(0, 1, 0))
-    view = render(disc, camera, backend="cpu")
+    view = render(disc.to(device=device), camera)
     (view.color.sum() + normal_consistency(view) + view.distortion_l1.sum()).backward()

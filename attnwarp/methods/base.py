@@ -493,7 +493,8 @@ class _Run:
         order: Order | None,
     ) -> None:
         if self.work.backend in ("auto", "cpu"):
-            compile_kernels(self.work.frozen.kind)  # not within the budget's seconds
+            # Not within the budget's seconds.
+            compile_kernels(self.work.frozen.kind, device=self.tuning.model.device)
         views = DrawnViews([partial(self._training, view) for view in training])
         text = f"round {number + 1} of {len(self.rounds)}: tuning"
 

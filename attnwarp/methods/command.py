@@ -13,6 +13,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp.camera import Camera
+from attnwarp.devices import choose
 from attnwarp.editing.editor import own_size
 from attnwarp.editing.segment import load_segmenter
 from attnwarp.editing.small import bundled, check_instruction, load_editor, thread_count
@@ -108,7 +109,8 @@ def edit_dataset(
         words: of what is edited, instead of masks.
         segmenter: makes them; see :func:`attnwarp.editing.segment.load_segmenter`.
         max_size: larger pictures are averaged down to it.
-        store, device: see :func:`attnwarp.methods.attention_warping` and ``load_editor``.
+        store: see :func:`attnwarp.methods.attention_warping`.
+        device: of the editor and the splats, "auto", "cpu" or "cuda".
         threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
         control: also edit the page's views each alone; None does so with a bundled editor.
         turntable: file of the scene's turn, GIF or MP4.
@@ -127,6 +129,7 @@ def edit_dataset(
         raise InputError(f"--where: got {words!r}, expected words such as 'bear'")
     check_film(turntable)
     workdir_of(out).check_unclaimed()  # again in the edit, but here before a fit
+    device = choose(device, report)
     views = load_views(dataset, max_size=max_size)
     index = _view_of(views.cameras, source, dataset)
     images = images_of(views)
@@ -151,9 +154,10 @@ def edit_dataset(
         check_editor(editor, settings)
         Features(editor, settings, "cpu")
         perceptual_net(settings)
-        splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, report)
+        splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, device, report)
     torch.set_num_threads(thread_count(editor, threads))
-    compile_kernels(splats.kind, report)
+    splats = splats.to(device=device)
+    compile_kernels(splats.kind, report, device)
     result = attention_warping(
         splats,
         views.cameras,
@@ -212,7 +216,7 @@ def run_baseline(
         out: folder of all results.
         budget: limits of the run.
         max_size: larger pictures are averaged down to it.
-        device: of the editor.
+        device: of the editor and the splats, "auto", "cpu" or "cuda".
         threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
         control: also edit the page's views each alone; None does so with a bundled editor.
         turntable: file of the scene's turn, GIF or MP4.
@@ -227,6 +231,7 @@ def run_baseline(
         InputError: no such editor; a folder of another run; a film of another format.
     """
     check_film(turntable)
+    device = choose(device, report)
     views = load_views(dataset, max_size=max_size)
     images = images_of(views)
     editor = load_editor(editor_name, device=device)
@@ -234,7 +239,8 @@ def run_baseline(
     torch.set_num_threads(thread_count(editor, threads))
     if settings.size is None:
         settings = settings.changed(size=own_size(editor))
-    compile_kernels(splats.kind, report)
+    splats = splats.to(device=device)
+    compile_kernels(splats.kind, report, device)
     result = METHODS[method](
         splats,
         views.cameras,
@@ -281,6 +287,7 @@ def _fitted(
     plan: FitPlan,
     seed: int,
     folder: Path,
+    device: str,
     report: Reporter,
 ) -> Gaussians:
     """Splats fitted to all views; a fit in the folder is resumed."""
@@ -292,7 +299,7 @@ def _fitted(
             "seed": seed,
         }
     )
-    start = first_splats(dataset, views.cameras, settings, report)
+    start = first_splats(dataset, views.cameras, settings, report).to(device=device)
     report.log(f"no --ply: fitting splats to {len(views)} views first: {folder}")
     folder.mkdir(parents=True, exist_ok=True)
     with asked_to_stop(report) as stop:

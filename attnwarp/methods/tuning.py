@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol, cast
 from weakref import WeakKeyDictionary
 
@@ -15,7 +16,7 @@ from attnwarp import losses
 from attnwarp.camera import Camera
 from attnwarp.encoders import EncoderInfo, load_encoder
 from attnwarp.fit import FitSettings, extent_of
-from attnwarp.fit.model import Model, check_on_cpu
+from attnwarp.fit.model import Model
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError
 from attnwarp.methods.pictures import Image
@@ -51,15 +52,17 @@ class PerceptualLoss(Protocol):
         ...
 
 
-def perceptual_net(settings: MethodSettings) -> PerceptualLoss | None:
-    """The perceptual distance of the settings; None where no iteration takes it.
+def perceptual_net(settings: MethodSettings, device: str = "cpu") -> PerceptualLoss | None:
+    """The perceptual distance of the settings on a device; None where no iteration takes it.
 
     Raises:
         InputError: no such encoder, or one of another kind.
     """
     if not (settings.perceptual and settings.iterations):
         return None
-    return cast(PerceptualLoss, load_encoder(settings.perceptual_encoder, "perceptual"))
+    return cast(
+        PerceptualLoss, load_encoder(settings.perceptual_encoder, "perceptual", device=device)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +78,14 @@ class TrainingView:
     number: int
     camera: Camera
     picture: Image
+
+    def on(self, device: torch.device) -> Tensor:
+        """(H, W, 3) the picture on a device, where it stays as long as the view."""
+        return self._tensors.setdefault(device, torch.from_numpy(self.picture).to(device))
+
+    @cached_property
+    def _tensors(self) -> dict[torch.device, Tensor]:
+        return {}
 
 
 HELD_BYTES = 2**31
@@ -139,7 +150,7 @@ class DistanceToViews:
         if view in self._kept:
             return self._kept[view]
         with torch.no_grad():
-            features = self._perceptual.features(torch.from_numpy(view.picture).to(device))
+            features = self._perceptual.features(view.on(device))
         held = sum(x.nbytes for kept in self._kept.values() for x in kept)
         if held + sum(x.nbytes for x in features) <= self._bytes:
             self._kept[view] = features
@@ -164,7 +175,6 @@ class Tuning:
 
     Raises:
         InputError: no such perceptual distance.
-        ValueError: the splats lie on a GPU.
     """
 
     def __init__(
@@ -175,7 +185,6 @@ class Tuning:
         iterations: int,
         backend: str = "auto",
     ) -> None:
-        check_on_cpu(start)
         self.settings, self.iterations, self.backend = settings, iterations, backend
         rates = FitSettings(kind=start.kind)
         c, g = settings.color_rate, settings.geometry_rate
@@ -198,7 +207,7 @@ class Tuning:
         self.loss = math.nan
         self.visits: dict[int, int] = {}
         # Here and not at its first use: before it, views are edited for hours.
-        net = perceptual_net(settings)
+        net = perceptual_net(settings, str(self.model.device))
         self._smallest: list[tuple[str, int, str]] = []
         if net is not None:
             name = f"the perceptual distance {net.about.name}"
@@ -322,11 +331,11 @@ class Tuning:
         """
         s = self.settings
         image = picture.color.float()
-        loss = s.l1 * losses.l1(image, torch.from_numpy(view.picture).to(image.device))
+        target = view.on(image.device)
+        loss = s.l1 * losses.l1(image, target)
         if self.perceptual is not None:
             loss = loss + s.perceptual * self.perceptual(image.clamp(0, 1), view).to(loss)
         if s.ssim:
-            target = torch.from_numpy(view.picture).to(image.device)
             loss = loss + s.ssim * (1 - losses.ssim(image, target))
         if s.normal:
             loss = loss + s.normal * losses.normal_consistency(picture)
@@ -339,5 +348,5 @@ class Tuning:
     def _background(self) -> Tensor:
         choice = self.settings.background
         if choice == "random":
-            return torch.rand(3, generator=self.random)
-        return torch.full((3,), 1.0 if choice == "white" else 0.0)
+            return torch.rand(3, generator=self.random).to(self.model.device)
+        return torch.full((3,), 1.0 if choice == "white" else 0.0, device=self.model.device)

@@ -37,6 +37,13 @@ def test_ssim_is_that_of_scikit_image(channels):
     assert float(losses.ssim(image, target)) == pytest.approx(expected, abs=1e-12)
 
 
+def test_the_window_by_convolutions_is_that_by_opencv():
+    values = torch.randn(19, 14, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    torch.testing.assert_close(
+        losses._convolved(values), losses._filter(values), rtol=0, atol=1e-12
+    )
+
+
 def test_ssim_map_is_that_of_kornia():
     import kornia
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.devices import device_of
 from attnwarp.editing.small import guide_of
-from attnwarp.encoders._weights import device_of
 from attnwarp.errors import InputError
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.document import write

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.devices import device_of
 from attnwarp.encoders import EncoderInfo, Kind, check_kind, load_encoder
-from attnwarp.encoders._weights import device_of
 from attnwarp.errors import InputError
 from attnwarp.io.find import name_key
 from attnwarp.reporting import SILENT, Reporter

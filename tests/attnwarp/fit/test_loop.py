@@ -81,6 +81,45 @@ def test_a_fit_brings_held_out_views_closer_to_their_pictures(scene, kind):
     assert last.psnr > first.psnr + 5
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["2d", "3d"])
+def test_the_gpu_backend_fits_as_well_as_the_cpus(kind):
+    """Pictures of 64 px on Warp's CPU device. With splats that grow too; but which ones grow, a
+    last bit may decide, so that fits by one backend differ by 0.5 dB."""
+    truth = blobs(40)
+    cameras = ring(9, size=64)
+    views, held_out = pictures(truth, cameras[1:]), pictures(truth, cameras[:1])
+    start = from_points(truth.world_means(), kind=kind, sh_degree=0)
+
+    def reached(backend, **changes):
+        settings = FitSettings(**{**FAST, **changes, "kind": kind, "iterations": 250})
+        result = fit(start, views, settings, held_out=held_out, backend=backend)
+        return result.history[-1].psnr, result.history[0].psnr, len(result.gaussians)
+
+    psnr, before, _ = reached("gpu")
+    assert psnr == pytest.approx(reached("cpu")[0], abs=0.3) and psnr > before + 3
+    growing = {"densify": True, "densify_from": 50, "densify_every": 50, "grow_gradient": 1e-5}
+    psnr, before, count = reached("gpu", **growing, max_splats=60)
+    assert psnr > before + 3 and count == 60
+
+
+@pytest.mark.slow
+def test_a_fit_begun_by_one_backend_goes_on_by_another(scene, tmp_path):
+    start, settings = begin(scene, iterations=40, **FAST)
+    whole = fit(start, scene[0], settings, held_out=scene[1])
+    steps = itertools.count()
+    fit(
+        start,
+        scene[0],
+        settings,
+        held_out=scene[1],
+        folder=tmp_path,
+        stop=lambda: next(steps) == 20,
+    )
+    result = fit(start, scene[0], settings, held_out=scene[1], folder=tmp_path, backend="gpu")
+    assert result.history[-1].psnr == pytest.approx(whole.history[-1].psnr, abs=0.05)
+
+
 def test_a_fit_that_weighs_the_exact_distortion_has_less_of_it(scene):
     """Oracle: the reference's sum over the fitted splats."""
     left = {}
@@ -522,15 +561,6 @@ def test_splats_of_another_kind_or_degree_are_refused(scene):
         fit(start, scene[0], FitSettings(kind="3d", sh_degree=0))
     with pytest.raises(ValueError, match=r"harmonics of degree 0, but settings.sh_degree is 3"):
         fit(start, scene[0], FitSettings())
-
-
-@pytest.mark.door
-def test_splats_that_lie_elsewhere_than_in_main_memory_are_refused(scene):
-    start, settings = begin(scene, iterations=5, sh_degree=0)
-    # A device without a GPU, which holds no numbers: the door of Gaussians would look at them.
-    object.__setattr__(start, "means", start.means.to("meta"))
-    with pytest.raises(ValueError, match=r"lie on meta, .*use gaussians.to\(device='cpu'\)"):
-        fit(start, scene[0], settings)
 
 
 @pytest.mark.door

@@ -20,7 +20,7 @@ def cold(monkeypatch):
 def test_seconds_of_a_fit_hold_no_compilation(scene, monkeypatch):
     now = [0.0]
 
-    def compiled(kind, report):
+    def compiled(kind, report, device):
         now[0] += 60
 
     clock = SimpleNamespace(perf_counter=lambda: now[0], process_time=lambda: now[0])

@@ -74,6 +74,18 @@ def finished(scene, editor, tmp_path_factory):
     return run(scene, editor, folder), folder
 
 
+@pytest.mark.slow
+def test_the_gpu_backend_ends_with_the_same_pictures(finished, scene, editor):
+    result, _ = finished
+    other = run(scene, editor, backend="gpu")
+    for view, picture in result.edited.items():
+        assert np.abs(other.edited[view].astype(int) - picture).max() <= 1
+    for mine, theirs in zip(
+        pictures(other.gaussians, scene[1]), pictures(result.gaussians, scene[1]), strict=True
+    ):
+        assert np.abs(to_bytes(mine).astype(int) - to_bytes(theirs)).max() <= 1
+
+
 def test_the_source_is_edited_as_the_editor_alone_does(finished, scene, editor):
     result, folder = finished
     alone = edit(editor, [scene[2][0]], "a bear", steps=2, seed=0).images[0]

@@ -49,13 +49,6 @@ def test_otherwise_every_view_is_visited_once_in_each_round():
     assert order[:40] != order[40:80]
 
 
-def test_splats_that_lie_elsewhere_than_in_main_memory_are_refused():
-    start = splats()
-    object.__setattr__(start, "means", start.means.to("meta"))  # a device without a GPU
-    with pytest.raises(ValueError, match="lie on meta, but are fitted and tuned on the CPU"):
-        Tuning(start, cameras(), SETTINGS, 1)
-
-
 def test_tuning_recolours_the_scene_to_its_pictures():
     start, views = splats(), cameras()
     goal = replace(start, sh=start.sh.flip(-1))  # red and blue exchanged

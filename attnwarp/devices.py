@@ -1,0 +1,68 @@
+"""The device that a command computes on, by its name."""
+
+from __future__ import annotations
+
+import importlib.util
+from typing import TYPE_CHECKING
+
+from attnwarp.errors import InputError, MissingExtraError, install_command
+from attnwarp.reporting import SILENT, Reporter
+
+if TYPE_CHECKING:
+    import torch
+
+
+def device_of(name: str) -> torch.device:
+    """A device by its name, "cpu", "cuda" or "cuda:1".
+
+    Raises:
+        InputError: there is none of that name.
+
+    Example:
+        >>> device_of("cpu")
+        device(type='cpu')
+    """
+    import torch
+
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise InputError(f"device {name!r}: unknown, expected cpu or cuda") from None
+    if device.type not in ("cpu", "cuda"):
+        raise InputError(f"device {name!r}: not supported, expected cpu or cuda")
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"device {name!r}: this machine or this torch has no CUDA; name cpu")
+    return device
+
+
+def choose(name: str, report: Reporter = SILENT, *, splats: bool = True) -> str:
+    """The device of a command's ``--device``: "auto" is the GPU where there is one.
+
+    Args:
+        name: "auto", or as of :func:`device_of`.
+        report: receives a line where "auto" finds a GPU.
+        splats: they are rendered there too, which takes the extra ``gpu``.
+
+    Raises:
+        InputError: no such device.
+        MissingExtraError: a GPU is named, and the extra is missing.
+
+    Example:
+        >>> choose("cpu")
+        'cpu'
+    """
+    import torch
+
+    has_kernels = not splats or importlib.util.find_spec("warp") is not None
+    if name != "auto":
+        if device_of(name).type == "cuda" and not has_kernels:
+            raise MissingExtraError("warp", "gpu")
+        return name
+    if not torch.cuda.is_available():
+        return "cpu"
+    found = torch.cuda.get_device_name()
+    if not has_kernels:
+        report.log(f"{found} is left alone: splats on it need Warp; {install_command('gpu')}")
+        return "cpu"
+    report.log(f"on {found}; --device cpu computes on the processor")
+    return "cuda"
