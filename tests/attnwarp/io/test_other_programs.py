@@ -6,6 +6,7 @@ scripts/venv.sh installs splat-transform into the environment; elsewhere the one
 """
 
 import ctypes
+import dataclasses
 import importlib
 import importlib.metadata
 import os
@@ -18,8 +19,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from attnwarp import Gaussians
+from attnwarp.cli.main import app
 from attnwarp.io import (
     THIRD_SCALE,
     FileFormatError,
@@ -28,6 +31,7 @@ from attnwarp.io import (
     write_ply,
     write_splat,
 )
+from attnwarp.io.splat_transform import read_back, transform
 
 PAGE = Path(__file__).parents[3] / "docs/method/files.md"
 
@@ -157,6 +161,36 @@ def transform_drops_the_antialias_comment(tmp_path):
     assert read_ply(tmp_path / "b.ply", antialiased=True).antialiased
 
 
+def transform_writes_spz_for_us(tmp_path):
+    splat_transform("--version")  # skips without it
+    # Its bytes clip harmonics beyond 1.
+    write_ply(tmp_path / "a.ply", dataclasses.replace(splats(), sh=0.2 * splats().sh))
+    transform(tmp_path / "a.ply", tmp_path / "a.spz")
+    back, turn = read_back(tmp_path / "a.spz")
+    assert np.array_equal(turn, np.eye(4))
+    # SPZ keeps positions to 2^-12, and does not keep the order.
+    ours, theirs = (np.sort(v, axis=0) for v in (our_centres(splats()), back.world_means()))
+    np.testing.assert_allclose(theirs, ours, atol=2**-12)
+    done = CliRunner().invoke(app, ["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.spz")])
+    assert done.exit_code == 0, done.output
+    (psnr,) = re.findall(r"render with ([\d.]+) dB", done.output)
+    assert 30 < float(psnr) < 70
+
+
+def transform_writes_gltf_for_us(tmp_path):
+    splat_transform("--version")
+    write_ply(tmp_path / "a.ply", splats("2d"), third_scale=THIRD_SCALE)
+    transform(tmp_path / "a.ply", tmp_path / "a.glb")
+    back, turn = read_back(tmp_path / "a.glb")
+    # Half a turn about z, and nothing else: floats stay.
+    np.testing.assert_array_equal(back.world_means() * [-1, -1, 1], our_centres(splats("2d")))
+    np.testing.assert_array_equal(turn, np.diag([-1, -1, 1, 1]))
+    done = CliRunner().invoke(app, ["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.glb")])
+    assert done.exit_code == 0, done.output
+    (psnr,) = re.findall(r"render with ([\d.]+|equal)", done.output)
+    assert psnr == "equal" or float(psnr) > 90
+
+
 def we_refuse_compressed_ply(tmp_path):
     write_ply(tmp_path / "a.ply", splats())
     done = splat_transform(tmp_path / "a.ply", tmp_path / "b.compressed.ply")
@@ -198,6 +232,8 @@ CHECKS = {
     ("splat-transform", "2DGS PLY with a third scale", "read"): transform_reads_thin_3dgs,
     ("splat-transform", ".splat from us", "read"): transform_reads_splat,
     ("splat-transform", "the antialias comment", "dropped"): transform_drops_the_antialias_comment,
+    ("splat-transform", "SPZ, by attnwarp convert", "written, read"): transform_writes_spz_for_us,
+    ("splat-transform", "glTF, by attnwarp convert", "written"): transform_writes_gltf_for_us,
     ("splat-transform", "its compressed PLY to us", "refused"): we_refuse_compressed_ply,
     ("pycolmap", "its models, binary and text, to us", "read"): we_read_what_pycolmap_writes,
 }
@@ -238,3 +274,12 @@ def test_the_versions_in_the_docs_are_no_newer_than_what_was_tried(program):
     assert len(stated) == 1
     number = lambda text: [int(part) for part in text.split(".")[:3]]  # noqa: E731
     assert number(stated.pop()) <= number(version), "tried here with an older one: correct the page"
+
+
+def test_a_missing_splat_transform_is_named_with_its_installation(tmp_path, monkeypatch):
+    write_ply(tmp_path / "a.ply", splats())
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    done = CliRunner().invoke(app, ["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.spz")])
+    assert done.exit_code == 2 and "npm install -g @playcanvas/splat-transform" in done.output
+    assert not (tmp_path / "a.spz").exists()
