@@ -42,7 +42,7 @@ EXTRAS = {
         ("pyvista",), "no window of a warp in 3D; reports have their pictures"
     ),
     "web": Extra(("trame", "trame_vtk", "trame_vuetify"), "no warp in 3D in a browser"),
-    "gpu": Extra(("gsplat",), "splats are rendered on the processor"),
+    "gpu": Extra(("warp",), "splats are rendered on the processor"),
 }  # fmt: skip
 """Every extra that a user may lack, by its name in pyproject.toml."""
 

@@ -126,13 +126,19 @@ def bracket(inputs: Inputs, displacements: int = 0) -> dict[str, tuple[Tensor, T
     return result
 
 
-def excess(inputs: Inputs, displacements: int = 0) -> dict[str, float]:
-    """Distance by which each output of the CPU backend lies outside of its bounds.
+def excess(inputs: Inputs, displacements: int = 0, backend: str = "cpu") -> dict[str, float]:
+    """Distance by which each output of backend "cpu" or "gpu" lies outside of its bounds.
 
     Raises:
         AssertionError: an output is NaN where it is defined, or the other way round.
     """
-    expected, actual = bracket(inputs, displacements), cpu.render(inputs)
+    if backend == "cpu":
+        actual = cpu.render(inputs)
+    else:
+        from attnwarp.render import gpu
+
+        actual = gpu.render(inputs)
+    expected = bracket(inputs, displacements)
     worst = {}
     for name in OUTPUTS:
         value, (low, high) = getattr(actual, name).double(), expected[name]

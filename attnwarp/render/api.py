@@ -17,7 +17,7 @@ from attnwarp.render.interface import Inputs, Outputs
 
 Tensor = torch.Tensor
 
-BACKENDS = ("auto", "cpu", "reference", "cuda")
+BACKENDS = ("auto", "cpu", "reference", "gpu")
 DEPTHS = {"2d": ("intersection", "center"), "3d": ("center", "peak")}
 
 
@@ -27,9 +27,6 @@ class Render:
     mode.
 
     Per pixel, w_i = alpha_i prod_{j<i} (1 - alpha_j) is the share of splat i, z_i its depth there.
-    Backend "cuda" leaves out what gsplat cannot give: there ``median_depth``,
-    ``distortion_ordered`` and ``distortion_l1`` are NaN everywhere, ``weight`` carries no gradient,
-    and ``counters`` holds only "splats".
 
     Attributes:
         color: (H, W, C) sum w_i c_i + (1 - alpha) background: sRGB colour, or the features passed
@@ -39,21 +36,22 @@ class Render:
             NaN where nothing was drawn. The background takes no part in it.
         median_depth: (H, W) depth of the last splat drawn while the transmittance before it is
             above 1/2; NaN where nothing was drawn. Where alpha stays below 1/2 it is the last
-            splat's. NaN everywhere from backend "cuda".
+            splat's.
         normal: (H, W, 3) sum w_i n_i in world axes, each n_i turned to face the camera; its length
             is at most alpha.
         distortion_ordered: (H, W) 2 sum_{j<i} w_i w_j (z_i - z_j) in compositing order (gsplat):
             ``distortion_l1`` where depth grows along that order. A pair out of order counts
-            negative. Scene units. NaN everywhere from backend "cuda".
+            negative. Scene units.
         distortion_l2_ndc: (H, W) sum_{j<i} w_i w_j (m_i - m_j)^2 with m = far / (far - near) (1 -
             near / z) and the planes ``ndc`` (the original 2DGS code). No unit.
         weight: (N,) sum over pixels of w_i: how much of the picture a splat makes up; 0 means it is
-            not seen. From backend "cuda" it carries no gradient.
+            not seen.
         counters: amounts of work. "splats": of the model. "visible": can show in the picture.
-            "tiles", "tile_pairs": splats over 16 x 16 tiles. "pairs": splats over pixels whose
-            intersection was computed. "composited": those pairs in a 4 x 4 square that the splat
-            draws to. "contributing": those drawn. Backend "reference" has "splats", "pairs" and
-            "contributing", "cuda" only "splats".
+            "tiles", "tile_pairs": splats over tiles, of 16 x 16 pixels on the CPU and 8 x 8 on a
+            GPU. "pairs": splats over pixels whose intersection was computed. "composited": those
+            pairs in a 4 x 4 square that the splat draws to. "contributing": those drawn. Backend
+            "reference" has "splats", "pairs" and "contributing"; "gpu" has the first four, which
+            it need not wait for.
         camera: the camera, with the pose that was used.
         depth_mode, backend: what was asked for, and what rendered it.
 
@@ -103,7 +101,7 @@ class Render:
         """(H, W) sum over ordered pairs of w_i w_j |z_i - z_j| (2DGS paper), in scene units.
 
         Every pair of splats counts twice, as in the paper's sum over i and j. Made on first use, by
-        a second pass over the splats; differentiable. NaN everywhere from backend "cuda".
+        a second pass over the splats; differentiable.
 
         Raises:
             RuntimeError: the splats were modified in place since they were rendered.
@@ -191,16 +189,15 @@ def render(
 
     Gradients reach every tensor that requires them: means, quats, scales, opacities, sh (or
     ``features``), ``pose`` and ``background``. They come from every output except
-    ``Render.counters`` and the mask ``valid``. Backend "cuda" gives none from ``weight``. Its
-    ``median_depth``, ``distortion_ordered`` and ``distortion_l1`` are NaN, so a loss must not use
-    them.
+    ``Render.counters`` and the mask ``valid``.
 
     Args:
         gaussians: N splats of kind "2d" (2DGS) or "3d" (3DGS), float32 or float64.
         camera: the view; H x W pixels.
         backend: "cpu" is numba, float32 with a float64 projection. "reference" is brute force in
-            float64, for small scenes. "cuda" is gsplat on a GPU; :mod:`attnwarp.render.cuda` has
-            its limits. "auto" is "cuda" where the splats lie on a GPU and "cpu" elsewhere.
+            float64, for small scenes. "gpu" is NVIDIA Warp, float32 with a float64 projection, on
+            the GPU that the splats lie on; see :mod:`attnwarp.render.gpu`. "auto" is "gpu" where
+            the splats lie on a GPU and "cpu" elsewhere.
         depth: which z a splat has at a pixel. "2d": "intersection" of ray and disc (default) or
             "center". "3d": "center" (default) or "peak", where the Gaussian is largest along the
             ray.
@@ -215,13 +212,12 @@ def render(
         ndc: near and far of ``distortion_l2_ndc``, in scene units.
 
     Returns:
-        A :class:`Render`, float32 from "cpu" and "cuda", float64 from "reference".
+        A :class:`Render`, float32 from "cpu" and "gpu", float64 from "reference".
 
     Raises:
-        ValueError: an argument out of range or of the wrong shape, or something that backend "cuda"
-            computes differently; the message says which and what was expected.
+        ValueError: an argument out of range or of the wrong shape; the message says which and what
+            was expected. Also backend "gpu" without Warp (:class:`attnwarp.errors.InputError`).
         TypeError: an argument of another type; the message says which.
-        RuntimeError: backend "cuda" without a GPU or without gsplat.
 
     Example:
         >>> import torch
@@ -249,7 +245,7 @@ def render(
     check.instance(gaussians, Gaussians, "gaussians", "attnwarp.Gaussians")
     check.instance(camera, Camera, "camera", "attnwarp.Camera")
     check.one_of(backend, BACKENDS, "backend")
-    chosen = ("cuda" if gaussians.means.is_cuda else "cpu") if backend == "auto" else backend
+    chosen = ("gpu" if gaussians.means.is_cuda else "cpu") if backend == "auto" else backend
     inputs = _prepare(
         gaussians,
         camera,
@@ -261,9 +257,9 @@ def render(
         antialiased,
         pose,
         ndc,
-        on_cpu=chosen != "cuda",
+        on_cpu=chosen != "gpu",
     )
-    # A backend is imported when it is first asked for: numba and gsplat each take their time.
+    # A backend is imported when it is first asked for: numba and Warp each take their time.
     if chosen == "cpu":
         from attnwarp.render import cpu
 
@@ -273,9 +269,9 @@ def render(
 
         outputs = reference.render(inputs)
     else:
-        from attnwarp.render import cuda
+        from attnwarp.render import gpu
 
-        outputs = cuda.render(inputs)
+        outputs = gpu.render(inputs)
     return _result(outputs, inputs, camera, pose, chosen)
 
 
@@ -315,8 +311,8 @@ def _prepare(
     device = gaussians.means.device
     if on_cpu and device.type != "cpu":
         raise ValueError(
-            f"gaussians: lie on {device}, but this backend renders on the CPU; use"
-            " gaussians.to(device='cpu')"
+            f"gaussians: lie on {device}, but this backend renders on the CPU; use backend 'gpu',"
+            " or gaussians.to(device='cpu')"
         )
     mode = DEPTHS[kind][0] if depth is None else depth
     if kind == "3d" and mode == "intersection":

@@ -380,9 +380,6 @@ def render_surface(
     Returns:
         A surface of (H, W) tensors without gradients, on the CPU.
 
-    Raises:
-        ValueError: the settings take the median depth, and the backend has none.
-
     Example:
         >>> import torch
         >>> from attnwarp import Camera, Gaussians
@@ -402,11 +399,6 @@ def render_surface(
     with torch.no_grad():
         plane = near_plane(gaussians, camera) if near is None else near
         seen = render(gaussians, camera, backend=backend, depth=how, near=plane)
-    if settings.depth_statistic == "median" and seen.backend == "cuda":
-        raise ValueError(
-            "depth_statistic: got 'median', which backend 'cuda' does not have; use 'expected', or"
-            " gaussians.to(device='cpu')"
-        )
     z = seen.depth if settings.depth_statistic == "expected" else seen.median_depth
     return Surface(
         z.cpu(), seen.normal.cpu(), seen.alpha.cpu(), seen.color.cpu(), dict(seen.counters)

@@ -15,6 +15,7 @@ PACKAGES = {
     "scikit-image": "skimage",
     "trame-vtk": "trame_vtk",
     "trame-vuetify": "trame_vuetify",
+    "warp-lang": "warp",
 }
 """Names on the package index that differ from the module's."""
 BROUGHT_ALONG = {"dask": "distributed", "drjit": "mitsuba", "markupsafe": "jinja2"}
@@ -40,9 +41,9 @@ def test_the_extras_of_the_errors_are_those_of_the_package(extra):
 def test_a_missing_package_is_an_input_error_that_names_its_extra():
     named = pytest.raises(MissingExtraError, match=r"pip install -c constraints.txt '\.\[gpu\]'")
     with named as caught, optional_imports():
-        raise ModuleNotFoundError("No module named 'gsplat'", name="gsplat")
+        raise ModuleNotFoundError("No module named 'warp'", name="warp")
     assert isinstance(caught.value, InputError)
-    assert (caught.value.module, caught.value.extra) == ("gsplat", "gpu")
+    assert (caught.value.module, caught.value.extra) == ("warp", "gpu")
 
 
 @pytest.mark.door

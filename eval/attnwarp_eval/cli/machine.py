@@ -268,7 +268,7 @@ print(plotter.render_window.GetClassName(), int(picture.std() > 5))
 
 
 def graphics_card() -> Check:
-    """A GPU that torch and gsplat can use."""
+    """A GPU that torch and Warp can use."""
     program = """
 import json, torch
 names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
@@ -285,13 +285,14 @@ print(json.dumps([torch.__version__, torch.version.cuda, names]))
             f"nothing runs: {problem or printed}",
             "install attnwarp again",
         )
-    if names and util.find_spec("gsplat") is not None:
-        return Check("GPU", "ok", f"{', '.join(names)}, CUDA {cuda}, gsplat {_version('gsplat')}")
+    if names and util.find_spec("warp") is not None:
+        found = f"{', '.join(names)}, CUDA {cuda}, Warp {_version('warp-lang')}"
+        return Check("GPU", "ok", f"{found}: splats lie on it with --device auto or cuda")
     if names:
         return Check(
             "GPU",
             "lack",
-            f"{', '.join(names)}, CUDA {cuda}, without gsplat",
+            f"{', '.join(names)}, CUDA {cuda}, without Warp",
             "splats are rendered on the processor; editors use the GPU",
             install_command("gpu"),
         )

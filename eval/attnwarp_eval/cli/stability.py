@@ -66,7 +66,7 @@ def _show(chosen: list[Case], quick: bool) -> list[str]:
     lines: list[str] = []
     for hard in chosen:
         levels = hard.quick if quick else hard.levels
-        offered = [way for way in hard.ways if way.backend != "cuda" or has_cuda()]
+        offered = [way for way in hard.ways if way.backend != "gpu" or has_gpu()]
         swept = []
         with reporter() as report:
             for done, way in enumerate(offered):
@@ -100,7 +100,7 @@ def _study(quick: bool, out: Path | None, jobs: int) -> list[str]:
     from attnwarp_eval.study.study import load_study
 
     changes: dict[str, Any] = {
-        "stability": {"levels": "quick" if quick else "all", "cuda": has_cuda()}
+        "stability": {"levels": "quick" if quick else "all", "gpu": has_gpu()}
     }
     if quick:
         changes["name"] = "stability-quick"
@@ -108,10 +108,10 @@ def _study(quick: bool, out: Path | None, jobs: int) -> list[str]:
     return verdict_lines(read_sweeps(results))
 
 
-def has_cuda() -> bool:
-    """Return True if backend cuda can run here: a GPU, and gsplat for its kernels."""
+def has_gpu() -> bool:
+    """Return True if backend gpu can run here: a GPU, and Warp for its kernels."""
     import importlib.util
 
     import torch
 
-    return torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+    return torch.cuda.is_available() and importlib.util.find_spec("warp") is not None

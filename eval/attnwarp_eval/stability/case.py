@@ -25,7 +25,7 @@ class Way:
     """One implementation of what a case asks for.
 
     Attributes:
-        backend: ``reference``, ``cpu`` or ``cuda`` for what the library computes with several;
+        backend: ``reference``, ``cpu`` or ``gpu`` for what the library computes with several;
             else the module that answers, such as ``raycast`` or ``metrics``.
         precision: type of the input: ``float64``, ``float32``, ``float16`` or ``bfloat16``.
         direction: the values, or their gradient.

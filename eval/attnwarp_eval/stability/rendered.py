@@ -17,7 +17,7 @@ from attnwarp.render import Render, render
 from attnwarp_eval.stability.case import Bound, Direction, Way, both_directions, ways
 from attnwarp_eval.stability.exact import FIELDS, ExactSplats, Pixel
 
-RENDERERS = both_directions(ways("reference", "cpu") + ways("cuda", precisions=("float32",)))
+RENDERERS = both_directions(ways("reference", "cpu") + ways("gpu", precisions=("float32",)))
 """Every renderer, forward and backward."""
 
 UNDECIDED = 2e-7
@@ -56,7 +56,7 @@ class Shot:
     def render(self, way: Way, gaussians: Gaussians | None = None) -> Render:
         """The picture by a way."""
         splats = self.gaussians.to(dtype=way.dtype) if gaussians is None else gaussians
-        if way.backend == "cuda":
+        if way.backend == "gpu" and torch.cuda.is_available():
             splats = splats.to(device="cuda")
         return render(splats, self.camera, backend=way.backend, **self.options)
 

@@ -14,6 +14,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from backends import GPU
 
 from attnwarp import Camera
 from attnwarp.render import api, constants, reference, render
@@ -32,7 +33,7 @@ def scene(kind: str, make_splats, opacity: float = 0.5):
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", GPU])
 def test_3dgs_agrees_whole(backend, antialiased, make_splats) -> None:
     splats, camera = scene("3d", make_splats)
     judged = gsplat_torch.render(splats, camera, antialiased=antialiased, depth=True)
@@ -50,7 +51,7 @@ def test_3dgs_agrees_whole(backend, antialiased, make_splats) -> None:
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", GPU])
 def test_3dgs_gradients_agree(backend, antialiased, make_splats) -> None:
     splats, camera = scene("3d", make_splats)
     names = ("means", "quats", "scales", "opacities", "sh")
@@ -80,7 +81,7 @@ def test_3dgs_gradients_agree(backend, antialiased, make_splats) -> None:
         assert float((ours - theirs).abs().max()) < tolerance * scale, name
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", GPU])
 def test_2dgs_agrees_in_colour_alpha_and_normals(backend, make_splats) -> None:
     splats, camera = scene("2d", make_splats)
     judged = gsplat_torch.render(splats, camera, depth=True)

@@ -1,4 +1,4 @@
-"""The numba backend against the float64 definition: values and gradients, every output and every
+"""The fast backends against the float64 definition: values and gradients, every output and every
 parameter.
 """
 
@@ -12,6 +12,7 @@ import weakref
 import numpy as np
 import pytest
 import torch
+from backends import GPU
 
 from attnwarp import Camera, Gaussians
 from attnwarp.render import binned, constants, cpu, render
@@ -19,9 +20,12 @@ from attnwarp.render.interface import OUTPUTS
 from benchmarks.precision import MODES, excess, mixed_scales, prepared
 
 
+@pytest.mark.parametrize("backend", ["cpu", GPU])
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("block", range(8))
-def test_two_hundred_random_scenes_agree_to_1e_5(block: int, make_camera, make_splats) -> None:
+def test_two_hundred_random_scenes_agree_to_1e_5(
+    backend: str, block: int, make_camera, make_splats
+) -> None:
     """Crossing the camera plane, edge-on, opacity 0 and 1, equal depths are in every scene of 12
     splats or more.
     """
@@ -42,23 +46,25 @@ def test_two_hundred_random_scenes_agree_to_1e_5(block: int, make_camera, make_s
         if seed % 3 == 0:
             options["features"] = torch.tensor(rng.normal(size=(count, seed % 7 + 1)))
             options["background"] = torch.tensor(rng.normal(size=seed % 7 + 1))
-        for name, beyond in excess(prepared(splats, camera, **options)).items():
+        for name, beyond in excess(prepared(splats, camera, **options), backend=backend).items():
             worst[name] = max(worst[name], beyond)
     assert max(worst.values()) < 1e-5, worst
 
 
+@pytest.mark.parametrize("backend", ["cpu", GPU])
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(("kind", "mode", "antialiased"), MODES)
 @pytest.mark.parametrize(("width", "height"), [(300, 35), (32, 32), (49, 130)])
 def test_pictures_of_many_tiles_agree(
-    kind, mode, antialiased, width, height, make_camera, make_splats
+    backend, kind, mode, antialiased, width, height, make_camera, make_splats
 ) -> None:
     """Whole tiles and cut ones, and splats that cover more tiles than a row of bits holds."""
     camera = make_camera(11, width, height)
     splats = make_splats(11, kind, 40, camera)
     splats.scales[::4] *= 20
     options = {"depth": mode, "antialiased": antialiased if kind == "3d" else None}
-    worst = excess(prepared(splats, camera, ndc=(constants.NEAR, constants.NDC_FAR), **options))
+    inputs = prepared(splats, camera, ndc=(constants.NEAR, constants.NDC_FAR), **options)
+    worst = excess(inputs, backend=backend)
     assert max(worst.values()) < 1e-5, worst
     if width == 300:
         # A row of bits holds 14 tiles: some splat must be wider.
@@ -69,6 +75,7 @@ def test_pictures_of_many_tiles_agree(
         assert max(int((view.alpha > 0).any(0).sum()) for view in alone) > 15 * constants.TILE
 
 
+@pytest.mark.parametrize("backend", ["cpu", GPU])
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     ("kind", "mode", "antialiased", "seeds"),
@@ -78,7 +85,7 @@ def test_pictures_of_many_tiles_agree(
     ],
 )
 def test_scales_of_ratio_1e6_agree_to_1e_4(
-    kind, mode, antialiased, seeds, make_camera, make_splats
+    backend, kind, mode, antialiased, seeds, make_camera, make_splats
 ) -> None:
     """Needles and sheets of 1e-3 to 1e3 units in one picture.
 
@@ -92,15 +99,18 @@ def test_scales_of_ratio_1e6_agree_to_1e_4(
         splats = mixed_scales(make_splats(seed, kind, 24, camera, degree=1), seed + 77, 1e6)
         options = {"depth": mode, "antialiased": antialiased if kind == "3d" else None}
         displacements = 8 if kind == "2d" else 0
-        for name, beyond in excess(prepared(splats, camera, **options), displacements).items():
+        for name, beyond in excess(
+            prepared(splats, camera, **options), displacements, backend
+        ).items():
             worst[name] = max(worst[name], beyond)
     assert max(worst.values()) < 1e-4, worst
 
 
+@pytest.mark.parametrize("backend", ["cpu", GPU])
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(("kind", "mode", "antialiased"), MODES)
 def test_gradients_with_scales_of_ratio_1e6_agree_with_autograd(
-    kind, mode, antialiased, make_camera, make_splats
+    backend, kind, mode, antialiased, make_camera, make_splats
 ) -> None:
     camera = make_camera(1, 40, 30)
     start = mixed_scales(make_splats(1, kind, 24, camera, degree=1), 78, 1e6).to(
@@ -112,15 +122,15 @@ def test_gradients_with_scales_of_ratio_1e6_agree_with_autograd(
     def weights_of(value):
         return torch.linspace(-1, 1, value.numel(), dtype=torch.float64).sin().reshape(value.shape)
 
-    for backend in ("reference", "cpu"):
+    for each in ("reference", backend):
         leaves = [
             t.clone().requires_grad_()
             for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
         ]
-        view = render(Gaussians(kind, *leaves), camera, backend=backend, **options)
+        view = render(Gaussians(kind, *leaves), camera, backend=each, **options)
         for name in OUTPUTS:
             value = getattr(view, name).nan_to_num(0).double()
-            gradients[backend, name] = torch.autograd.grad(
+            gradients[each, name] = torch.autograd.grad(
                 (value * weights_of(value)).sum(),
                 leaves,
                 retain_graph=True,
@@ -136,7 +146,7 @@ def test_gradients_with_scales_of_ratio_1e6_agree_with_autograd(
     )
     for name in OUTPUTS:
         for leaf, (expected, actual) in enumerate(
-            zip(gradients["reference", name], gradients["cpu", name], strict=True)
+            zip(gradients["reference", name], gradients[backend, name], strict=True)
         ):
             scale = float(expected.abs().max())
             bound = 1e-4 * scale + 1e-9
@@ -163,6 +173,7 @@ def largest_terms_in_opacity(splats, camera, options, weights_of) -> float:
     return largest
 
 
+@pytest.mark.parametrize("backend", ["cpu", GPU])
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     ("kind", "mode", "antialiased", "harmonic", "size"),
@@ -175,7 +186,7 @@ def largest_terms_in_opacity(splats, camera, options, weights_of) -> float:
     ],
 )
 def test_gradients_of_every_output_agree_with_autograd(
-    kind, mode, antialiased, harmonic, size, make_camera, make_splats
+    backend, kind, mode, antialiased, harmonic, size, make_camera, make_splats
 ) -> None:
     camera = make_camera(5, *size)
     start = make_splats(5, kind, 30, camera)
@@ -183,7 +194,7 @@ def test_gradients_of_every_output_agree_with_autograd(
     features = torch.randn(30, 5, generator=generator, dtype=torch.float64)
     gradients: dict[str, dict[str, list[torch.Tensor]]] = {}
     weights: dict[str, torch.Tensor] = {}
-    for backend in ("reference", "cpu"):
+    for each in ("reference", backend):
         leaves = [
             t.clone().requires_grad_()
             for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
@@ -196,7 +207,7 @@ def test_gradients_of_every_output_agree_with_autograd(
         view = render(
             Gaussians(kind, *leaves, origin=np.array([0.2, -0.1, 0.05])),
             camera,
-            backend=backend,
+            backend=each,
             depth=mode,
             antialiased=antialiased if kind == "3d" else None,
             pose=pose,
@@ -204,7 +215,7 @@ def test_gradients_of_every_output_agree_with_autograd(
             features=None if harmonic else extra,
         )
         inputs = [*leaves, pose, behind, extra]
-        gradients[backend] = {}
+        gradients[each] = {}
         for name in OUTPUTS:
             value = getattr(view, name)
             value = torch.where(value.isnan(), 0.0, value).double()
@@ -213,14 +224,14 @@ def test_gradients_of_every_output_agree_with_autograd(
             grads = torch.autograd.grad(
                 (value * weights[name]).sum(), inputs, retain_graph=True, allow_unused=True
             )
-            gradients[backend][name] = [
+            gradients[each][name] = [
                 torch.zeros_like(leaf) if grad is None else grad
                 for leaf, grad in zip(inputs, grads, strict=True)
             ]
     names = ("means", "quats", "scales", "opacities", "sh", "pose", "background", "features")
     for name in OUTPUTS:
         for leaf, expected, actual in zip(
-            names, gradients["reference"][name], gradients["cpu"][name], strict=True
+            names, gradients["reference"][name], gradients[backend][name], strict=True
         ):
             assert torch.isfinite(actual).all(), (name, leaf)
             # Sums over 600 pixels in float32, of the largest entry: the smallest carry its

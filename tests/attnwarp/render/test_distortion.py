@@ -8,12 +8,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from backends import GPU
 
 from attnwarp import Camera, Gaussians
 from attnwarp.losses import depth_distortion
 from attnwarp.render import render
 
-BACKENDS = ("cpu", "reference")
+BACKENDS = ("cpu", "reference", GPU)
 
 
 def crossing_discs(count: int, seed: int) -> Gaussians:

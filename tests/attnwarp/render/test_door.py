@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from backends import GPU
 from imported_modules import modules_after
 
 from attnwarp import Camera, Gaussians
@@ -98,7 +99,7 @@ def test_a_background_that_is_no_numbers_is_named_with_how_many_are_expected(
         render(gaussians(), camera(), background=background)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("backend", ["cpu", "reference", GPU])
 @pytest.mark.parametrize("kind", ["2d", "3d"])
 @pytest.mark.parametrize("size", [(1, 1), (7, 1), (1, 9), (9, 17)])
 def test_no_splats_and_small_images_work(backend: str, kind: str, size: tuple[int, int]) -> None:
@@ -164,9 +165,9 @@ def test_normals_lie_where_their_depth_does() -> None:
     assert normal.shape == (view.height, view.width, 3)
 
 
-def test_importing_the_door_loads_neither_numba_nor_gsplat() -> None:
+def test_importing_the_door_loads_neither_numba_nor_warp() -> None:
     modules = modules_after("import attnwarp.render")
-    assert "attnwarp.render" in modules and not modules & {"numba", "gsplat", "scipy"}
+    assert "attnwarp.render" in modules and not modules & {"numba", "warp", "scipy"}
 
 
 @pytest.mark.door

@@ -10,12 +10,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from backends import GPU
 
 from attnwarp import Camera, Gaussians
 from attnwarp.render import binned, constants, render
 from attnwarp.render.interface import OUTPUTS
 
-BACKENDS = ("reference", "cpu")
+BACKENDS = ("reference", "cpu", GPU)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

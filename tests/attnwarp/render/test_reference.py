@@ -9,13 +9,14 @@ import math
 import numpy as np
 import pytest
 import torch
+from backends import GPU
 
 from attnwarp import Gaussians
 from attnwarp.render import constants, harmonics, render
 from attnwarp.render.api import normal_from_depth
 from attnwarp.render.interface import OUTPUTS
 
-BACKENDS = ("reference", "cpu")
+BACKENDS = ("reference", "cpu", GPU)
 
 
 @pytest.mark.usefixtures("one_thread")

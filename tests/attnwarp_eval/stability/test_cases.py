@@ -36,8 +36,8 @@ CASES = [pytest.param(case, id=case.name) for case in hard_cases().values()]
 
 
 def here(case):
-    """The ways that this machine has."""
-    return [way for way in case.ways if way.backend != "cuda"]
+    """The ways that need no GPU."""
+    return [way for way in case.ways if way.backend != "gpu"]
 
 
 def describe(case, way, outcome):
@@ -60,7 +60,8 @@ def test_a_hard_case_holds_where_it_must(case):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_a_hard_case_holds_at_every_level_that_it_must_by_every_way(case):
-    for way in here(case):
+    # Without a GPU its backend runs on Warp's CPU device.
+    for way in case.ways:
         for level in case.levels:
             outcome = case.outcome(level, way)
             if outcome.required or outcome.must_refuse:
@@ -118,7 +119,7 @@ def test_a_record_of_a_level_that_a_case_no_longer_has_is_a_failure_and_no_crash
 )
 def test_what_is_refused_says_why(name, level, message):
     case = hard_case(name)
-    way = next(way for way in reversed(case.ways) if way.backend != "cuda")
+    way = next(way for way in reversed(case.ways) if way.backend != "gpu")
     assert re.search(message, case.outcome(level, way).refusal)
 
 

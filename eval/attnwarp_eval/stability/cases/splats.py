@@ -401,7 +401,7 @@ CASES = [
         required=64,
         quick=(2, 64),
         bounds={"forward": Bound("of 1", 1e-5, "1/400 of a step of an 8-bit picture")},
-        ways=tuple(way for way in FORWARD if way.backend != "cuda"),
+        ways=FORWARD,
         measure=_permuted,
         version=2,
     ),

@@ -36,7 +36,7 @@ class Sweep(Part):
 
     cases: list[str] = Field(default_factory=list, description="by name; all of them if empty")
     levels: Literal["all", "quick"] = "all"
-    cuda: Annotated[bool, Field(description="also backend cuda, which needs a GPU")] = False
+    gpu: Annotated[bool, Field(description="also backend gpu; without a GPU on one thread")] = False
 
 
 class StudyPart(Part):
@@ -118,7 +118,7 @@ class Stability(Probe[Extra]):
         for hard in [hard_case(name) for name in sweep.cases] or hard_cases().values():
             levels = hard.levels if sweep.levels == "all" else hard.quick
             for way in hard.ways:
-                if way.backend == "cuda" and not sweep.cuda:
+                if way.backend == "gpu" and not sweep.gpu:
                     continue
                 spec = {
                     "probe": self.name,

@@ -1,0 +1,234 @@
+# mypy: ignore-errors
+"""Compositing, one thread a pixel: the pictures front to back, and the pairs out of order that the
+exact distortion needs.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from attnwarp.render import constants
+from attnwarp.render._gpu.evaluation import depth_from, evaluate
+from attnwarp.render._gpu.lanes import add_whole, any_lane
+from attnwarp.render._gpu.layout import MIDDLE, PIXELS, TILE, WEIGHT_UNIT, Of, View
+
+f32 = wp.float32
+STOP = f32(constants.TRANSMITTANCE_STOP)
+MEDIAN = f32(constants.MEDIAN_TRANSMITTANCE)
+UNIT = wp.float64(WEIGHT_UNIT)
+CENTER = f32(MIDDLE)
+NAN = f32(float("nan"))
+
+
+class Plane:
+    """Planes of the state that the forward pass leaves."""
+
+    # float32
+    transmittance = 0  # behind all splats
+    inverse_depth = 1  # mean of 1 / z
+    variance = 2  # of 1 / z, times alpha
+    # int32
+    last = 0  # 1 + place in the tile's list of the last splat drawn; 0: none
+    median = 1
+    hits = 2  # splats drawn
+
+
+class Past:
+    """Columns of a splat drawn at a pixel; see :func:`pair_up`.
+
+    ``lean`` and ``spread`` are what the pairs that are out of order change, each by half: in
+    sum_j w_j sign(z_i - z_j) and in sum_j w_j |z_i - z_j|.
+    """
+
+    weight = 0
+    depth = 1
+    deepest = 2  # the largest depth so far
+    lean = 3
+    spread = 4
+
+
+@wp.struct
+class Pixel:
+    """A thread's pixel: its place in the picture, and from its tile's middle."""
+
+    tile: wp.int32
+    column: wp.int32
+    row: wp.int32
+    inside: wp.bool  # of the picture
+    x: wp.float32
+    y: wp.float32
+
+
+@wp.func
+def pixel_of(view: View, thread: wp.int32) -> Pixel:
+    """The pixel of a thread: a warp's are 8 x 4 pixels of one tile."""
+    r = Pixel()
+    r.tile = thread / PIXELS
+    k = thread % PIXELS
+    column, row = k % TILE, k / TILE
+    r.column = (r.tile % view.across) * TILE + column
+    r.row = (r.tile / view.across) * TILE + row
+    r.inside = r.column < view.width and r.row < view.height
+    r.x = f32(column) - CENTER
+    r.y = f32(row) - CENTER
+    return r
+
+
+@wp.kernel(enable_backward=False)
+def composite(
+    view: View,
+    singles: wp.array2d(dtype=wp.float32),
+    features: wp.array2d(dtype=wp.float32),  # (N, C), read from the fourth channel on
+    terms: wp.array2d(dtype=wp.float32),
+    splats: wp.array(dtype=wp.int32),
+    bounds: wp.array2d(dtype=wp.int32),
+    background: wp.array(dtype=wp.float32),
+    color: wp.array3d(dtype=wp.float32),
+    alpha: wp.array2d(dtype=wp.float32),
+    depth: wp.array2d(dtype=wp.float32),
+    median: wp.array2d(dtype=wp.float32),
+    normal: wp.array3d(dtype=wp.float32),
+    ordered: wp.array2d(dtype=wp.float32),
+    l2: wp.array2d(dtype=wp.float32),
+    state: wp.array3d(dtype=wp.float32),
+    steps: wp.array3d(dtype=wp.int32),
+    weight: wp.array(dtype=wp.int64),
+):
+    """Draw a pixel: every picture, the state for the backward pass, and the splats' weights.
+
+    Depths are summed from the first splat's, which keeps the digits of thin layers far away.
+    """
+    here = pixel_of(view, wp.tid())
+    T = wp.where(here.inside, f32(1.0), f32(0.0))
+    A, depth_sum, inverse_sum, square_sum, pairs = f32(0.0), f32(0.0), f32(0.0), f32(0.0), f32(0.0)
+    first_depth, first_inverse, middle = f32(0.0), f32(0.0), f32(0.0)
+    n, c = wp.vec3f(), wp.vec3f()
+    last, median_step, hits = wp.int32(0), wp.int32(0), wp.int32(0)
+    begin, end = bounds[here.tile, 0], bounds[here.tile, 1]
+    if here.inside and view.channels > 3:
+        for k in range(3, view.channels):
+            color[here.row, here.column, k] = f32(0.0)
+    for e in range(begin, end):
+        alive = T > STOP
+        if not any_lane(alive):
+            break
+        i = splats[e]
+        r = evaluate(view, singles, terms, i, e, here.x, here.y)
+        drawn = alive and r.drawn
+        if any_lane(drawn):
+            w = f32(0.0)
+            if drawn:
+                w = r.alpha * T
+                if hits == 0:
+                    z = depth_from(view, singles, i, r, f32(0.0), f32(0.0))
+                    first_depth, first_inverse = z[0], z[1]
+                z = depth_from(view, singles, i, r, first_depth, first_inverse)
+                last = e - begin + 1
+                hits += 1
+                if T > MEDIAN:
+                    middle, median_step = z[0], last
+                w_depth, w_inverse = w * z[0], w * z[1]
+                pairs += w_depth * A - w * depth_sum
+                A += w
+                depth_sum += w_depth
+                inverse_sum += w_inverse
+                square_sum += w_inverse * z[1]
+                for k in range(3):
+                    n[k] += w * singles[i, Of.normal + k]
+                    c[k] += w * singles[i, Of.values + k]
+                for k in range(3, view.channels):
+                    color[here.row, here.column, k] = (
+                        color[here.row, here.column, k] + w * features[i, k]
+                    )
+                T -= w
+            add_whole(w, UNIT, weight, i)
+    if not here.inside:
+        return
+    covered = hits > 0
+    inverse = wp.where(covered, f32(1.0) / A, f32(0.0))
+    variance = wp.max(square_sum - inverse_sum * inverse_sum * inverse, f32(0.0))
+    for k in range(view.channels):
+        value = f32(0.0)
+        if k < 3:
+            value = c[k]
+        else:
+            value = color[here.row, here.column, k]
+        color[here.row, here.column, k] = value + (f32(1.0) - A) * background[k]
+    for k in range(3):
+        normal[here.row, here.column, k] = n[k]
+    alpha[here.row, here.column] = A
+    depth[here.row, here.column] = wp.where(covered, first_depth + depth_sum * inverse, NAN)
+    median[here.row, here.column] = wp.where(covered, first_depth + middle, NAN)
+    # Pairs were counted once.
+    ordered[here.row, here.column] = f32(2.0) * pairs
+    l2[here.row, here.column] = A * variance * view.ndc_scale
+    state[Plane.transmittance, here.row, here.column] = T
+    state[Plane.inverse_depth, here.row, here.column] = first_inverse + inverse_sum * inverse
+    state[Plane.variance, here.row, here.column] = variance
+    steps[Plane.last, here.row, here.column] = last
+    steps[Plane.median, here.row, here.column] = median_step
+    steps[Plane.hits, here.row, here.column] = hits
+
+
+@wp.kernel(enable_backward=False)
+def pair_up(
+    view: View,
+    singles: wp.array2d(dtype=wp.float32),
+    terms: wp.array2d(dtype=wp.float32),
+    splats: wp.array(dtype=wp.int32),
+    bounds: wp.array2d(dtype=wp.int32),
+    steps: wp.array3d(dtype=wp.int32),
+    ends: wp.array2d(dtype=wp.int64),  # of each pixel's rows of past
+    past: wp.array2d(dtype=wp.float32),
+    target: wp.array2d(dtype=wp.float32),
+):
+    """Write the exact distortion of a pixel, and what its pairs out of order change.
+
+    In compositing order the sum of w_i w_j (z_i - z_j) takes two running sums, and counts a pair
+    that is out of order with the wrong sign. So every splat walks back over those in front of it,
+    no further than the largest depth among them lies behind its own.
+    """
+    here = pixel_of(view, wp.tid())
+    if not here.inside:
+        return
+    T, A, depth_sum, pairs = f32(1.0), f32(0.0), f32(0.0), f32(0.0)
+    first_depth, deepest = f32(0.0), f32(-1e30)
+    begin, last = bounds[here.tile, 0], steps[Plane.last, here.row, here.column]
+    hits = steps[Plane.hits, here.row, here.column]
+    start = wp.int32(ends[here.row, here.column]) - hits
+    at = start
+    for e in range(begin, begin + last):
+        i = splats[e]
+        r = evaluate(view, singles, terms, i, e, here.x, here.y)
+        if r.drawn:
+            w = r.alpha * T
+            if at == start:
+                z = depth_from(view, singles, i, r, f32(0.0), f32(0.0))
+                first_depth = z[0]
+            z = depth_from(view, singles, i, r, first_depth, f32(0.0))
+            lean, spread = f32(0.0), f32(0.0)
+            k = at - 1
+            while k >= start:
+                if past[k, Past.deepest] <= z[0]:
+                    break
+                gap = past[k, Past.depth] - z[0]
+                if gap > f32(0.0):
+                    w_k = past[k, Past.weight]
+                    lean -= w_k
+                    spread += w_k * gap
+                    past[k, Past.lean] = past[k, Past.lean] + w
+                    past[k, Past.spread] = past[k, Past.spread] + w * gap
+                k -= 1
+            deepest = wp.max(deepest, z[0])
+            past[at, Past.weight] = w
+            past[at, Past.depth] = z[0]
+            past[at, Past.deepest] = deepest
+            past[at, Past.lean] = lean
+            past[at, Past.spread] = spread
+            at += 1
+            pairs += (w * z[0] * A - w * depth_sum) + f32(2.0) * w * spread
+            T -= w
+            A += w
+            depth_sum += w * z[0]
+    # Not negative: the running sums of equal depths leave what rounding leaves.
+    target[here.row, here.column] = f32(2.0) * wp.max(pairs, f32(0.0))
