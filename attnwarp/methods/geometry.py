@@ -16,7 +16,7 @@ from attnwarp.methods.pictures import Mask
 from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.methods.sight import Sight
 from attnwarp.methods.work import Work
-from attnwarp.warp import Surface, WarpedView, render_surface, warp_view
+from attnwarp.warp import Surface, WarpedView, parts_read, render_surface, warp_view
 
 Warps = Callable[[int, int], WarpedView]
 """The warp from a source view to a target view, by their numbers."""
@@ -51,10 +51,12 @@ class Geometry:
             return self._masked(self.outside(source, target))
         before = self.work.frozen if s.depth_from == "frozen" else model
         reads: dict[str, Any] = {}
-        if s.warp.photometric is not None:
+        wanted = parts_read(s.warp)
+        if "source_image" in wanted:
             reads["source_image"] = scene.picture(source)
+        if "target_image" in wanted:
             reads["target_image"] = scene.picture(target)
-        if s.warp.segment and scene.segments is not None:
+        if "target_segment" in wanted and scene.segments is not None:
             reads["target_segment"] = scene.segments[target]
         warp = warp_view(
             before,

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from attnwarp.camera import Camera
-from attnwarp.warp import FeatureWarp, WarpedView, depth_slope, sample, sample_depth
+from attnwarp.warp import FeatureWarp, WarpedView, depth_tolerance, sample, sample_depth
 from attnwarp.warp.depth import Array, as_float64, valid_depth
 from attnwarp.warp.masks import axis_weights
 from attnwarp.warp.sampling import work_type
@@ -46,7 +46,7 @@ def pixel_ratio(view: WarpedView) -> Tensor:
         >>> pixel_ratio(warp_surfaces(source, target, wall, back))[4, 4].item()
         0.25
     """
-    normal = as_float64(needed(view.target, "target", "normal", "pixel_ratio"), "normal")
+    normal = as_float64(needed(view.target.normal, "target.normal", "pixel_ratio"), "normal")
     both = view.correspondence
     ratio = _density(both.source, normal, both.points) / _density(
         both.target, normal, both.target_points
@@ -70,8 +70,7 @@ def depth_margin(view: WarpedView) -> Tensor:
         return torch.ones(both.z.shape, dtype=torch.float64)
     depth = as_float64(view.source.depth, "source_depth")
     seen = sample_depth(depth, both, spread=s.depth_spread)
-    change, _ = sample(depth_slope(depth)[None], both, mode="nearest")
-    tolerance = s.depth_relative * both.z + s.depth_slope * torch.nan_to_num(change[0], nan=0.0)
+    tolerance = depth_tolerance(both, depth, relative=s.depth_relative, slope=s.depth_slope)
     share = (both.z - seen).abs() / tolerance
     return torch.nan_to_num(1 - share**2, nan=0.0).clamp(0, 1)
 

@@ -7,6 +7,7 @@ number of them.
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,8 @@ from attnwarp.warp._kernels import pair, sampling
 from attnwarp.warp.correspondence import Correspondence, check_proportions
 from attnwarp.warp.depth import Array, as_tensor
 from attnwarp.warp.masks import axis_weights
-from attnwarp.warp.settings import DepthInterpolation, MaskResize, NormalTest, WarpSettings
-from attnwarp.warp.surface import Surface, needed
+from attnwarp.warp.rules import RULES, Rule
+from attnwarp.warp.settings import DepthInterpolation, MaskResize, WarpSettings
 from attnwarp.warp.taps import SNAP, Taps
 
 PIECE = 1 << 16
@@ -35,64 +36,43 @@ _STORED = {torch.float16: np.uint16, torch.bfloat16: np.int16}
 def correspond_and_mask(
     source: Camera,
     target: Camera,
-    target_surface: Surface,
-    source_surface: Surface | None,
+    parts: Mapping[str, Array],
+    rules: Sequence[Rule],
     settings: WarpSettings,
-    target_segment: Tensor | None,
 ) -> tuple[Correspondence, dict[str, Tensor], Tensor]:
-    """Compute :func:`attnwarp.warp.warp_surfaces` in one pass over the target's pixels.
+    """Compute the correspondence and the rules that have a kernel, in one pass over the pixels.
 
-    Pictures and ``target_segment``, (H, W) bool on the CPU, were checked there.
+    Args:
+        source, target: the cameras.
+        parts: of both surfaces, by :func:`attnwarp.warp.rules.parts_of`; pictures were checked.
+        rules: those of the settings.
+        settings: the choices.
 
     Returns:
-        The correspondence, each rule's (H, W) mask by name in order, and the mask of all.
+        The correspondence, the (H, W) mask of each rule that has a kernel, and the mask of all.
     """
     size = (target.height, target.width)
-    names = ["defined", "in_bounds"]
-    seen, other = _parts(source, target_surface, source_surface, settings, size)
-    for name, on in (
-        ("in_front", settings.in_front),
-        ("opaque", settings.opaque is not None),
-        ("depth_agrees", settings.depth_agreement),
-        ("photometric", settings.photometric is not None),
-        (settings.normal_test, settings.normal_test != "none"),
-    ):
-        if on:
-            names.append(name)
-    row = {name: k for k, name in enumerate(names)}
-    bounds = source if settings.bounds == "source" else target
-    rules = pair.Rules(
-        float(bounds.width),
-        float(bounds.height),
-        _limit(settings.opaque),
-        settings.depth_relative,
-        settings.depth_slope,
-        _limit(settings.depth_spread),
-        _limit(settings.photometric),
-        settings.normal_angle,
-        _NORMAL_TEST[settings.normal_test],
-        row.get("in_front", -1),
-        row.get("opaque", -1),
-        row.get("depth_agrees", -1),
-        row.get("photometric", -1),
-        row.get(settings.normal_test, -1),
+    kernels = [rule for name in pair.RULES for rule in RULES if rule.name == name]
+    asked = [rule for rule in rules if rule in kernels]
+    row = {name: k for k, name in enumerate(("defined", "in_bounds", *(r.name for r in asked)))}
+    rows = tuple(row.get(rule.name, -1) for rule in kernels)
+    limits = tuple(
+        tuple(_limit(getattr(settings, field)) for field in rule.limits.values())
+        for rule in kernels
     )
-    segment = np.zeros((0, 0), np.bool_)
-    if target_segment is not None:
-        segment = target_segment.contiguous().numpy()
+    read = {"target_depth", *(part for rule in asked for part in rule.parts)}
+    seen, other = _views(source, {k: part for k, part in parts.items() if k in read}, size)
     positions = _positions(size)
-    passes, mask = _pool.empty((len(names), *size), np.bool_), _pool.empty(size, np.bool_)
+    passes, mask = _pool.empty((len(row), *size), np.bool_), _pool.empty(size, np.bool_)
     views = _pair(source, target, settings)
     run_jobs(
         pair.rules_of_pair,
         [
-            (*piece, views, rules, seen, other, segment, positions, passes, mask)
+            (*piece, views, rows, limits, seen, other, positions, passes, mask)
             for piece in _rows(size[0])
         ],
     )
     masks = {name: torch.from_numpy(passes[k]) for name, k in row.items()}
-    if segment.size:
-        masks["segment"] = torch.from_numpy(segment)
     return _correspondence(source, target, positions, settings), masks, torch.from_numpy(mask)
 
 
@@ -316,12 +296,6 @@ _INTERPOLATION: dict[DepthInterpolation, int] = {
     "bilinear": pair.BILINEAR,
     "nearest": pair.NEAREST,
 }
-_NORMAL_TEST: dict[NormalTest, int] = {
-    "none": pair.FACING,  # not asked for
-    "facing": pair.FACING,
-    "source_incidence": pair.SOURCE_INCIDENCE,
-    "camera_frame": pair.CAMERA_FRAME,
-}
 
 
 @functools.lru_cache(maxsize=32)
@@ -346,6 +320,7 @@ def _lens(camera: Camera) -> pair.Lens:
 
 
 def _pair(source: Camera, target: Camera, settings: WarpSettings) -> pair.Pair:
+    bounds = source if settings.bounds == "source" else target
     return pair.Pair(
         _lens(source),
         _lens(target),
@@ -355,6 +330,8 @@ def _pair(source: Camera, target: Camera, settings: WarpSettings) -> pair.Pair:
         settings.pixel_centers == "integer",
         settings.in_front,
         SNAP,
+        float(bounds.width),
+        float(bounds.height),
     )
 
 
@@ -375,59 +352,39 @@ def _correspondence(
     )
 
 
-def _parts(
-    source_camera: Camera,
-    target: Surface,
-    source: Surface | None,
-    settings: WarpSettings,
-    size: tuple[int, int],
+def _views(
+    source: Camera, maps: Mapping[str, Array], size: tuple[int, int]
 ) -> tuple[pair.View, pair.View]:
-    """Maps of both surfaces that the rules read: all float32, or all float64."""
-    wanted: dict[str, tuple[Array, tuple[int | str, ...]]] = {"target_depth": (target.depth, size)}
-    if settings.opaque is not None:
-        if target.alpha is not None:
-            wanted["target_alpha"] = (target.alpha, size)
-        if source is not None and source.alpha is not None:
-            wanted["source_alpha"] = (source.alpha, ("H", "W"))
-    if settings.depth_agreement:
-        depth = needed(source, "source_surface", "depth", "depth_agreement")
-        wanted["source_depth"] = (depth, ("H", "W"))
-    if settings.photometric is not None:
-        image = needed(source, "source_surface", "image", "photometric")
-        wanted["source_image"] = (image, ("H", "W", "C"))
-        own = needed(target, "target_surface", "image", "photometric")
-        wanted["target_image"] = (own, (*size, image.shape[-1]))
-    if settings.normal_test != "none":
-        rule = f"normal_test={settings.normal_test!r}"
-        normal = needed(target, "target_surface", "normal", rule)
-        wanted["target_normal"] = (normal, (*size, 3))
-    arrays = {name: _floating(value, name) for name, (value, _) in wanted.items()}
-    for name, (_, expected) in wanted.items():
-        check.shape(arrays[name], expected, name)
-        if name in ("source_depth", "source_alpha"):
-            check_proportions(arrays[name].shape, source_camera, name)
+    """Maps of target and source that the rules read: all float32, or all float64."""
+    arrays = {name: _floating(value, name) for name, value in maps.items()}
+    for name, array in arrays.items():
+        view, _, part = name.partition("_")
+        axes = _AXES[part]
+        check.shape(array, (*(size if view == "target" else ("H", "W")), *axes), name)
+        if view == "source":
+            check_proportions(array.shape, source, name)
     single = all(array.dtype == np.float32 for array in arrays.values())
     kind = np.float32 if single else np.float64
 
-    def part(name: str, axes: int) -> np.ndarray:
-        if name not in arrays:
-            return np.zeros((0,) * axes, kind)
-        return np.ascontiguousarray(arrays[name], kind)
+    def view_of(view: str) -> pair.View:
+        nothing = {part: np.zeros((0, 0, *(0 for _ in axes)), kind) for part, axes in _AXES.items()}
+        return pair.View(
+            *(
+                np.ascontiguousarray(arrays.get(f"{view}_{part}", empty), kind)
+                for part, empty in nothing.items()
+            )
+        )
 
-    return (
-        pair.View(
-            part("target_depth", 2),
-            part("target_alpha", 2),
-            part("target_image", 3),
-            part("target_normal", 3),
-        ),
-        pair.View(
-            part("source_depth", 2),
-            part("source_alpha", 2),
-            part("source_image", 3),
-            part("source_normal", 3),
-        ),
-    )
+    return view_of("target"), view_of("source")
+
+
+_AXES: dict[str, tuple[int | str, ...]] = {
+    "depth": (),
+    "alpha": (),
+    "image": ("C",),
+    "normal": (3,),
+}
+"""Parts of a surface in the order of :class:`pair.View`, and their axes after (H, W)."""
 
 
 def _floating(value: Array, name: str) -> np.ndarray:

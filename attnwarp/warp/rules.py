@@ -1,12 +1,14 @@
 """Rules of visibility: each is a mask of the target pixels that pass.
 
 A rule is a pure function that returns an (H, W) bool tensor on the target's grid, True where the
-pixel passes. A pixel whose answer is undefined does not pass.
+pixel passes. A pixel whose answer is undefined does not pass. :data:`RULES` has a record of each.
 """
 
 from __future__ import annotations
 
-from typing import get_args
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -14,10 +16,11 @@ from torch import Tensor
 from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
-from attnwarp.warp.correspondence import Correspondence, check_proportions
+from attnwarp.warp.correspondence import Correspondence, check_proportions, in_bounds
 from attnwarp.warp.depth import TAP_SPREAD, Array, as_float64, depth_slope
 from attnwarp.warp.sampling import sample, sample_depth
-from attnwarp.warp.settings import GaussianFilter
+from attnwarp.warp.settings import GaussianFilter, WarpSettings
+from attnwarp.warp.surface import Surface, needed
 
 EXACT_DEPTH_TOLERANCE = 1e-4
 """Relative depth tolerance for depth that is exact (ray cast). With half a pixel's slope it missed
@@ -77,18 +80,7 @@ def opaque(
         >>> opaque(c, 0.5, target_alpha=np.eye(8))[0].tolist()
         [True, False, False, False, False, False, False, False]
     """
-    mask = torch.ones(correspondence.z.shape, dtype=torch.bool)
-    if target_alpha is not None:
-        alpha = as_float64(target_alpha, "target_alpha")
-        check.shape(alpha, tuple(mask.shape), "target_alpha")
-        mask &= alpha >= minimum
-    if source_alpha is not None:
-        alpha = as_float64(source_alpha, "source_alpha")
-        check.shape(alpha, ("H", "W"), "source_alpha")
-        check_proportions(alpha.shape, correspondence.source, "source_alpha")
-        sampled, inside = sample(alpha[None], correspondence)
-        mask &= (sampled[0] >= minimum) & inside
-    return mask
+    return _opacity(correspondence, target_alpha, source_alpha) >= minimum
 
 
 def depth_agrees(
@@ -126,11 +118,29 @@ def depth_agrees(
         >>> depth_agrees(c, np.full((8, 8), 1.5)).any().item()  # something stands before it
         False
     """
-    depth = as_float64(source_depth, "source_depth")
-    seen = sample_depth(depth, correspondence, spread=spread)
-    change, _ = sample(depth_slope(depth)[None], correspondence, mode="nearest")
-    tolerance = relative * correspondence.z + slope * torch.nan_to_num(change[0], nan=0.0)
+    seen = sample_depth(as_float64(source_depth, "source_depth"), correspondence, spread=spread)
+    tolerance = depth_tolerance(correspondence, source_depth, relative=relative, slope=slope)
     return (correspondence.z - seen).abs() <= tolerance
+
+
+def depth_tolerance(
+    correspondence: Correspondence, source_depth: Array, *, relative: float, slope: float
+) -> Tensor:
+    """(H, W) difference of depths that :func:`depth_agrees` allows; arguments as there.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import correspond, depth_tolerance
+        >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
+        >>> flat = np.full((8, 8), 2.0)
+        >>> c = correspond(camera, camera, flat)
+        >>> depth_tolerance(c, flat, relative=0.01, slope=0.5)[4, 4].item()
+        0.02
+    """
+    depth = as_float64(source_depth, "source_depth")
+    change, _ = sample(depth_slope(depth)[None], correspondence, mode="nearest")
+    return relative * correspondence.z + slope * torch.nan_to_num(change[0], nan=0.0)
 
 
 def photometric(
@@ -164,14 +174,7 @@ def photometric(
         >>> [photometric(c, black, grey, limit).all().item() for limit in (0.2, 0.1)]
         [True, False]
     """
-    source = as_float64(source_image, "source_image")
-    target = as_float64(target_image, "target_image")
-    check.shape(source, ("H", "W", "C"), "source_image")
-    check_proportions(source.shape[:2], correspondence.source, "source_image")
-    check.shape(target, (*correspondence.z.shape, source.shape[2]), "target_image")
-    warped, _ = sample(source.permute(2, 0, 1), correspondence)
-    difference = (warped.permute(1, 2, 0) - target).abs().mean(dim=-1)
-    return (difference <= limit) & correspondence.defined
+    return _difference(correspondence, source_image, target_image) <= limit
 
 
 def facing(correspondence: Correspondence, target_normal: Array) -> Tensor:
@@ -269,10 +272,7 @@ def camera_frame(
         >>> camera_frame(c, normal).all().item()
         True
     """
-    normal, defined = _normals(correspondence, target_normal)
-    source = _flip(_rotate(correspondence.source, normal), correspondence.points)
-    target = _flip(_rotate(correspondence.target, normal), correspondence.target_points)
-    return defined & (angle_between(source, target) < angle)
+    return _frame_angle(correspondence, target_normal) < angle
 
 
 def gaussian_filter(
@@ -349,6 +349,53 @@ def angle_between(a: Tensor, b: Tensor) -> Tensor:
     return torch.rad2deg(2 * half)
 
 
+def _opacity(
+    correspondence: Correspondence, target_alpha: Array | None, source_alpha: Array | None
+) -> Tensor:
+    """(H, W) smaller alpha of both views, infinite where neither has one, NaN outside the
+    source."""
+    smaller = torch.full(correspondence.z.shape, torch.inf, dtype=torch.float64)
+    if target_alpha is not None:
+        smaller = as_float64(target_alpha, "target_alpha")
+        check.shape(smaller, tuple(correspondence.z.shape), "target_alpha")
+    if source_alpha is not None:
+        alpha = as_float64(source_alpha, "source_alpha")
+        check.shape(alpha, ("H", "W"), "source_alpha")
+        check_proportions(alpha.shape, correspondence.source, "source_alpha")
+        sampled, inside = sample(alpha[None], correspondence)
+        smaller = torch.where(inside, torch.minimum(smaller, sampled[0]), torch.nan)
+    return smaller
+
+
+def _difference(correspondence: Correspondence, source_image: Array, target_image: Array) -> Tensor:
+    """(H, W) mean over channels of the warped source's absolute difference from the target."""
+    source = as_float64(source_image, "source_image")
+    target = as_float64(target_image, "target_image")
+    check.shape(source, ("H", "W", "C"), "source_image")
+    check_proportions(source.shape[:2], correspondence.source, "source_image")
+    check.shape(target, (*correspondence.z.shape, source.shape[2]), "target_image")
+    warped, _ = sample(source.permute(2, 0, 1), correspondence)
+    difference = (warped.permute(1, 2, 0) - target).abs().mean(dim=-1)
+    return torch.where(correspondence.defined, difference, torch.nan)
+
+
+def _frame_angle(correspondence: Correspondence, target_normal: Array) -> Tensor:
+    """(H, W) degrees between camera-space normals, each turned to its camera."""
+    normal, defined = _normals(correspondence, target_normal)
+    source = _flip(_rotate(correspondence.source, normal), correspondence.points)
+    target = _flip(_rotate(correspondence.target, normal), correspondence.target_points)
+    return torch.where(defined, angle_between(source, target), torch.nan)
+
+
+def _incidence(correspondence: Correspondence, target_normal: Array) -> Tensor:
+    """(H, W) degrees between the side that the target sees and the direction to the source."""
+    normal, defined = _normals(correspondence, target_normal)
+    n, points = _rotate(correspondence.source, normal), correspondence.points
+    centre = correspondence.source.relative_to(correspondence.target)[:3, 3]
+    seen = _flip(n, points - torch.from_numpy(centre.copy()))
+    return torch.where(defined, angle_between(seen, -points), torch.nan)
+
+
 def _normals(correspondence: Correspondence, target_normal: Array) -> tuple[Tensor, Tensor]:
     normal = as_float64(target_normal, "target_normal")
     check.shape(normal, (*correspondence.z.shape, 3), "target_normal")
@@ -375,3 +422,242 @@ def _side(source: Camera, normal: Tensor, points: Tensor, target: Camera) -> Ten
     n = _rotate(source, normal)
     centre = torch.from_numpy(source.relative_to(target)[:3, 3].copy())
     return -(n * points).sum(dim=-1) * (n * (centre - points)).sum(dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Rule:
+    """A rule of visibility: what turns it on, what it reads, and its mask.
+
+    A further rule is an entry of :data:`RULES`, with the field of
+    :class:`~attnwarp.warp.settings.WarpSettings` that turns it on. Where a kernel of its name
+    stands in ``attnwarp/warp/_kernels/pair.py``, that is computed in place of the definition.
+
+    Args:
+        name: of its mask in :attr:`~attnwarp.warp.view.WarpedView.rules`.
+        definition: function of the correspondence and, by keyword, of all that is read, to an (H,
+            W) bool mask, or to None where the rule has nothing to say.
+        setting: field of the settings that turns it on by True, a number, or the rule's name; None
+            for a rule of every view.
+        reads: parts of both surfaces that it needs, such as "source_depth" or "target_normal".
+        may_read: parts that are None where they are not given, such as "source_alpha" or
+            "target_segment".
+        limits: field of the settings for each further keyword.
+        margin: function of the same arguments to the (H, W) distance from the other verdict,
+            positive where the rule passes and NaN where that is undefined; None without one.
+        unit: of the margin.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import RULES, Rule, Surface, warp_surfaces
+        >>> def near(correspondence, target_depth):
+        ...     return target_depth < 3
+        >>> RULES.append(Rule("near", near, reads=("target_depth",)))
+        >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
+        >>> wall = Surface(np.full((8, 8), 4.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
+        >>> warp_surfaces(camera, camera, wall, wall).mask.any().item()
+        False
+        >>> RULES.pop().name
+        'near'
+    """
+
+    name: str
+    definition: Callable[..., Any]
+    setting: str | None = None
+    reads: tuple[str, ...] = ()
+    may_read: tuple[str, ...] = ()
+    limits: Mapping[str, str] = field(default_factory=dict)
+    margin: Callable[..., Tensor] | None = None
+    unit: str = "(yes or no)"
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Parts of the surfaces that it looks at."""
+        return (*self.reads, *self.may_read)
+
+    def on(self, settings: WarpSettings) -> bool:
+        """True where the settings have the rule."""
+        if self.setting is None:
+            return True
+        value = getattr(settings, self.setting, None)
+        if isinstance(value, str):
+            return value == self.name
+        return value is not None and value is not False
+
+    def arguments(self, settings: WarpSettings, parts: Mapping[str, Any]) -> dict[str, Any]:
+        """Keywords of the definition and of the margin.
+
+        Args:
+            settings: the choices.
+            parts: all that is given, by :func:`parts_of`.
+
+        Raises:
+            ValueError: a part that the rule needs is not given.
+        """
+        setting = self.setting or self.name
+        value = getattr(settings, setting, None)
+        asked = f"{setting}={value!r}" if isinstance(value, str) else setting
+        for name in self.reads:
+            needed(parts.get(name), name.replace("_", "_surface.", 1), asked)
+        return {name: parts.get(name) for name in self.parts} | {
+            keyword: getattr(settings, limit) for keyword, limit in self.limits.items()
+        }
+
+
+def parts_of(
+    target: Surface, source: Surface | None, segment: Tensor | None = None
+) -> dict[str, Any]:
+    """What rules may read, by name: parts of both surfaces, and ``target_segment``.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.warp import Surface
+        >>> parts_of(Surface(np.ones((2, 2))), None).keys()
+        dict_keys(['target_depth'])
+    """
+    parts = {
+        f"{view}_{part}": getattr(surface, part, None)
+        for view, surface in (("target", target), ("source", source))
+        for part in ("depth", "normal", "alpha", "image")
+    }
+    parts["target_segment"] = segment
+    return {name: part for name, part in parts.items() if part is not None}
+
+
+def parts_read(settings: WarpSettings) -> set[str]:
+    """Names of the parts that the settings' rules look at, as in :attr:`Rule.reads`.
+
+    Example:
+        >>> from attnwarp.warp import PRESETS, parts_read
+        >>> sorted(parts_read(PRESETS["released"]))
+        ['source_image', 'target_image', 'target_segment']
+    """
+    return {part for rule in RULES if rule.on(settings) for part in rule.parts}
+
+
+def _in_bounds(correspondence: Correspondence, bounds: str) -> Tensor:
+    camera = correspondence.source if bounds == "source" else correspondence.target
+    return in_bounds(correspondence, (camera.height, camera.width))
+
+
+def _border(correspondence: Correspondence, bounds: str) -> Tensor:
+    camera = correspondence.source if bounds == "source" else correspondence.target
+    # With integer centres the method holds the index against the border.
+    slip = 0.5 if correspondence.pixel_centers == "integer" else 0.0
+    low = correspondence.xy - slip
+    high = torch.tensor([camera.width, camera.height], dtype=torch.float64) - low
+    return torch.minimum(low, high).amin(dim=-1)
+
+
+def _opaque_margin(
+    correspondence: Correspondence,
+    minimum: float,
+    target_alpha: Array | None,
+    source_alpha: Array | None,
+) -> Tensor:
+    margin = _opacity(correspondence, target_alpha, source_alpha) - minimum
+    return torch.where(margin.isinf(), torch.nan, margin)
+
+
+def _depth_margin(
+    correspondence: Correspondence,
+    source_depth: Array,
+    relative: float,
+    slope: float,
+    spread: float | None,
+) -> Tensor:
+    seen = sample_depth(as_float64(source_depth, "source_depth"), correspondence, spread=spread)
+    tolerance = depth_tolerance(correspondence, source_depth, relative=relative, slope=slope)
+    return tolerance - (correspondence.z - seen).abs()
+
+
+_ANGLE = {"angle": "normal_angle"}
+
+RULES: list[Rule] = [
+    Rule(
+        "defined",
+        lambda c: c.defined,
+        margin=lambda c: c.target_depth,
+        unit="of depth",
+    ),
+    Rule(
+        "in_bounds",
+        _in_bounds,
+        limits={"bounds": "bounds"},
+        margin=_border,
+        unit="px to the border",
+    ),
+    Rule(
+        "in_front",
+        in_front,
+        setting="in_front",
+        margin=lambda c: c.z,
+        unit="of depth",
+    ),
+    Rule(
+        "opaque",
+        opaque,
+        setting="opaque",
+        may_read=("target_alpha", "source_alpha"),
+        limits={"minimum": "opaque"},
+        margin=_opaque_margin,
+        unit="of alpha",
+    ),
+    Rule(
+        "depth_agrees",
+        depth_agrees,
+        setting="depth_agreement",
+        reads=("source_depth",),
+        limits={"relative": "depth_relative", "slope": "depth_slope", "spread": "depth_spread"},
+        margin=_depth_margin,
+        unit="of depth",
+    ),
+    Rule(
+        "photometric",
+        photometric,
+        setting="photometric",
+        reads=("source_image", "target_image"),
+        limits={"limit": "photometric"},
+        margin=lambda correspondence, limit, **images: (
+            limit - _difference(correspondence, **images)
+        ),
+        unit="of colour",
+    ),
+    Rule(
+        "facing",
+        facing,
+        setting="normal_test",
+        reads=("target_normal",),
+        margin=lambda c, target_normal: 90.0 - _incidence(c, target_normal),
+        unit="degrees of incidence",
+    ),
+    Rule(
+        "source_incidence",
+        source_incidence,
+        setting="normal_test",
+        reads=("target_normal",),
+        limits=_ANGLE,
+        margin=lambda correspondence, target_normal, angle: (
+            min(90.0, angle) - _incidence(correspondence, target_normal)
+        ),
+        unit="degrees of incidence",
+    ),
+    Rule(
+        "camera_frame",
+        camera_frame,
+        setting="normal_test",
+        reads=("target_normal",),
+        limits=_ANGLE,
+        margin=lambda correspondence, target_normal, angle: (
+            angle - _frame_angle(correspondence, target_normal)
+        ),
+        unit="degrees between normals",
+    ),
+    Rule(
+        "segment",
+        lambda c, target_segment: target_segment,
+        setting="segment",
+        may_read=("target_segment",),
+    ),
+]
+"""Every rule, in the order in which a view lists them."""

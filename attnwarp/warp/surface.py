@@ -40,15 +40,14 @@ class Surface:
         return f"Surface({tuple(np.shape(self.depth))}: {given})"
 
 
-def needed(surface: Surface | None, view: str, part: str, rule: str) -> Array:
+def needed(value: Array | None, name: str, rule: str) -> Array:
     """A part of a surface that a rule cannot do without.
 
     Raises:
         ValueError: it is not given; the message names the rule.
     """
-    value: Array | None = getattr(surface, part, None)
     if value is None:
         raise ValueError(
-            f"{view}.{part}: got None, but the rule {rule} needs it; give it or turn the rule off"
+            f"{name}: got None, but the rule {rule} needs it; give it or turn the rule off"
         )
     return value

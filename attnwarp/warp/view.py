@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import get_args
 
@@ -18,25 +19,15 @@ from attnwarp.warp.correspondence import (
     Correspondence,
     correspond,
     correspond_at,
-    in_bounds,
     layer_size,
     share_of,
 )
 from attnwarp.warp.depth import Array
 from attnwarp.warp.features import Backend, FeatureWarp
 from attnwarp.warp.masks import resize_mask
-from attnwarp.warp.rules import (
-    camera_frame,
-    depth_agrees,
-    facing,
-    gaussian_filter,
-    in_front,
-    opaque,
-    photometric,
-    source_incidence,
-)
-from attnwarp.warp.settings import PRESETS, NormalTest, WarpSettings
-from attnwarp.warp.surface import Surface, needed
+from attnwarp.warp.rules import RULES, gaussian_filter, parts_of, parts_read
+from attnwarp.warp.settings import PRESETS, WarpSettings
+from attnwarp.warp.surface import Surface
 
 OVERSHOOT = 0.1
 """Largest distance beyond [0, 1] that a picture may reach: cubic resampling overshoots an edge by a
@@ -196,67 +187,36 @@ def warp_surfaces(
     check.instance(target_surface, Surface, "target_surface", "Surface, such as Surface(depth)")
     if source_surface is not None:
         check.instance(source_surface, Surface, "source_surface", "Surface, such as Surface(depth)")
-    if settings.photometric is not None:
-        _check_pictures(source, target, target_surface, source_surface)
-    segment = _checked_segment(target_segment, target, settings)
-    if backend != "reference":
+    _refuse_unread(settings, target_segment=target_segment)
+    segment = None if target_segment is None else _checked_segment(target_segment, target)
+    parts = parts_of(target_surface, source_surface, segment)
+    on = [rule for rule in RULES if rule.on(settings)]
+    arguments = {rule.name: rule.arguments(settings, parts) for rule in on}
+    _check_pictures(source, target, {k: parts[k] for k in parts_read(settings) & parts.keys()})
+    if backend == "reference":
+        correspondence = correspond(
+            source,
+            target,
+            target_surface.depth,
+            pixel_centers=settings.pixel_centers,
+            in_front=settings.in_front,
+        )
+        by_kernel, mask = dict[str, Tensor](), correspondence.defined
+    else:
         from attnwarp.warp import cpu
 
-        correspondence, rules, mask = cpu.correspond_and_mask(
-            source, target, target_surface, source_surface, settings, segment
+        correspondence, by_kernel, mask = cpu.correspond_and_mask(
+            source, target, parts, on, settings
         )
-        view = WarpedView(
-            settings, correspondence, mask, rules, target_surface, source_surface, backend
-        )
-        if warn_empty:
-            _warn_if_empty(view, NO_DEPTH)
-        return view
-    correspondence = correspond(
-        source,
-        target,
-        target_surface.depth,
-        pixel_centers=settings.pixel_centers,
-        in_front=settings.in_front,
-    )
-    bounds = source if settings.bounds == "source" else target
-    rules = {
-        "defined": correspondence.defined,
-        "in_bounds": in_bounds(correspondence, (bounds.height, bounds.width)),
-    }
-    if settings.in_front:
-        rules["in_front"] = in_front(correspondence)
-    if settings.opaque is not None:
-        rules["opaque"] = opaque(
-            correspondence,
-            settings.opaque,
-            target_alpha=target_surface.alpha,
-            source_alpha=source_surface.alpha if source_surface else None,
-        )
-    if settings.depth_agreement:
-        rules["depth_agrees"] = depth_agrees(
-            correspondence,
-            needed(source_surface, "source_surface", "depth", "depth_agreement"),
-            relative=settings.depth_relative,
-            slope=settings.depth_slope,
-            spread=settings.depth_spread,
-        )
-    if settings.photometric is not None:
-        rules["photometric"] = photometric(
-            correspondence,
-            needed(source_surface, "source_surface", "image", "photometric"),
-            needed(target_surface, "target_surface", "image", "photometric"),
-            settings.photometric,
-        )
-    if settings.normal_test != "none":
-        normal = needed(
-            target_surface, "target_surface", "normal", f"normal_test={settings.normal_test!r}"
-        )
-        rules[settings.normal_test] = _normal_rule(
-            correspondence, normal, settings.normal_test, settings.normal_angle
-        )
-    if segment is not None:
-        rules["segment"] = segment
-    mask = torch.stack(list(rules.values())).all(dim=0)
+    rules: dict[str, Tensor] = {}
+    for rule in on:
+        passes = by_kernel.get(rule.name)
+        if passes is None:
+            passes = rule.definition(correspondence, **arguments[rule.name])
+            if passes is None:
+                continue
+            mask = mask & passes
+        rules[rule.name] = passes
     view = WarpedView(
         settings, correspondence, mask, rules, target_surface, source_surface, backend
     )
@@ -318,27 +278,20 @@ def warp_view(
     """
     check.instance(gaussians, Gaussians, "gaussians", "attnwarp.Gaussians")
     _check_pair(source, target, settings)
-    for name, image in (("source_image", source_image), ("target_image", target_image)):
-        if image is not None and settings.photometric is None:
-            raise ValueError(
-                f"{name}: the settings have photometric=None and do not read it; set photometric,"
-                " such as preset('corrected', photometric=0.2), or leave it out"
-            )
+    read = parts_read(settings)
+    _refuse_unread(settings, source_image=source_image, target_image=target_image)
     keep = gaussian_filter(
         gaussians, source, target, settings.gaussian_filter, settings.normal_angle
     )
     filtered = gaussians if bool(keep.all()) else gaussians.select(keep.to(gaussians.means.device))
     seen = render_surface(filtered, target, settings, near=near, backend=backend)
-    if settings.photometric is not None:
+    if "target_image" in read:
         if target_image is None and filtered is not gaussians:
             whole = render_surface(gaussians, target, settings, near=near, backend=backend)
             target_image = whole.image
         if target_image is not None:
             seen = replace(seen, image=target_image)
-    needs_source = (
-        settings.depth_agreement or settings.photometric is not None or settings.opaque is not None
-    )
-    if source_surface is None and needs_source:
+    if source_surface is None and any(part.startswith("source_") for part in read):
         source_surface = render_surface(gaussians, source, settings, near=near, backend=backend)
     if source_surface is not None and source_image is not None:
         source_surface = replace(source_surface, image=source_image)
@@ -411,18 +364,20 @@ def _check_pair(source: Camera, target: Camera, settings: WarpSettings) -> None:
     check.instance(settings, WarpSettings, "settings", "WarpSettings, such as PRESETS['corrected']")
 
 
-def _check_pictures(
-    source: Camera, target: Camera, target_surface: Surface, source_surface: Surface | None
-) -> None:
-    """Check the pictures that the photometric test reads: of their views, in [0, 1]."""
-    first = needed(source_surface, "source_surface", "image", "photometric")
-    second = needed(target_surface, "target_surface", "image", "photometric")
-    check.shape(first, ("H", "W", "C"), "source_image")
-    # The source's is read at positions, so at any resolution.
-    size = (source.height, source.width)
-    check.same_aspect(tuple(first.shape[:2]), size, "source_image", "its axes are (H, W, C)")
-    check.shape(second, (target.height, target.width, first.shape[2]), "target_image")
+def _check_pictures(source: Camera, target: Camera, parts: Mapping[str, Array]) -> None:
+    """Check the pictures that rules read: of their views, in [0, 1]."""
+    first, second = parts.get("source_image"), parts.get("target_image")
+    if first is not None:
+        check.shape(first, ("H", "W", "C"), "source_image")
+        # The source's is read at positions, so at any resolution.
+        size = (source.height, source.width)
+        check.same_aspect(tuple(first.shape[:2]), size, "source_image", "its axes are (H, W, C)")
+    if second is not None:
+        channels = "C" if first is None else first.shape[2]
+        check.shape(second, (target.height, target.width, channels), "target_image")
     for name, image in (("source_image", first), ("target_image", second)):
+        if image is None:
+            continue
         # A render's colours may exceed 1 here and there, resampling may overshoot either end.
         # Tensors of 8 bits have no mean of their own.
         # A copy of arrays, since torch reads neither flipped nor big-endian ones.
@@ -454,17 +409,20 @@ def _warn_if_empty(view: WarpedView, without_surface: str) -> None:
     )
 
 
-def _checked_segment(
-    segment: Array | None, target: Camera, settings: WarpSettings
-) -> Tensor | None:
+def _refuse_unread(settings: WarpSettings, **given: Array | None) -> None:
+    """Raise ValueError if something is given that no rule of the settings reads."""
+    for name, value in given.items():
+        if value is not None and name not in parts_read(settings):
+            off = [rule.setting for rule in RULES if name in rule.parts and rule.setting]
+            have = " and ".join(f"{field}={getattr(settings, field)!r}" for field in off)
+            raise ValueError(
+                f"{name}: the settings have {have} and do not read it; set {' or '.join(off)}, or"
+                " leave it out"
+            )
+
+
+def _checked_segment(segment: Array, target: Camera) -> Tensor:
     """(H, W) bool on the CPU."""
-    if segment is None:
-        return None
-    if not settings.segment:
-        raise ValueError(
-            "target_segment: the settings have segment=False and do not read it; set segment=True,"
-            " such as preset('corrected', segment=True), or leave it out"
-        )
     tensor = segment if isinstance(segment, Tensor) else torch.from_numpy(np.array(segment))
     check.shape(tensor, (target.height, target.width), "target_segment")
     if tensor.dtype != torch.bool:
@@ -488,13 +446,3 @@ def near_plane(gaussians: Gaussians, camera: Camera) -> float:
     offset = gaussians.means.new_tensor(camera.position - gaussians.origin)
     away = torch.linalg.vector_norm(gaussians.means.detach() - offset, dim=1)
     return float(away.median()) / 100
-
-
-def _normal_rule(
-    correspondence: Correspondence, normal: Array, rule: NormalTest, angle: float
-) -> Tensor:
-    if rule == "facing":
-        return facing(correspondence, normal)
-    return (source_incidence if rule == "source_incidence" else camera_frame)(
-        correspondence, normal, angle
-    )

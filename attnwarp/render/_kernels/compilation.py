@@ -108,6 +108,12 @@ def exact_inlined(function: Any) -> Any:
     return by_one_process(numba.njit(forceinline=True, **_EXACT)(function))
 
 
+def exact_pasted(function: Any) -> Any:
+    """Compile as :func:`exact` does, as part of each caller: for closures, which numba's cache
+    never finds again, and for functions that take longer to compile than to run."""
+    return numba.njit(inline="always", **{**_EXACT, "cache": False})(function)
+
+
 _EXACT: Any = {"nogil": True, "cache": CACHE, "error_model": "numpy", "_nrt": False}
 
 

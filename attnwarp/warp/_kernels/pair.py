@@ -18,12 +18,10 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from attnwarp.render._kernels.compilation import exact, exact_inlined
+from attnwarp.render._kernels.compilation import exact, exact_inlined, exact_pasted
 
 INVERSE, BILINEAR, NEAREST = range(3)
 """Ways to interpolate depth."""
-FACING, SOURCE_INCIDENCE, CAMERA_FRAME = range(3)
-"""Tests of normals."""
 
 
 class Lens(NamedTuple):
@@ -49,6 +47,8 @@ class Pair(NamedTuple):
     integer: bool
     in_front: bool
     snap: float
+    bounds_width: float
+    bounds_height: float
 
 
 class Positions(NamedTuple):
@@ -68,23 +68,26 @@ class View(NamedTuple):
     normal: np.ndarray
 
 
-class Rules(NamedTuple):
-    """Limits of the rules, and the row of the result for each, -1 for a rule that is off."""
+class Pixel(NamedTuple):
+    """A pixel of the target: its place, depth, point in the source's axes and source position.
 
-    bounds_width: float
-    bounds_height: float
-    opaque: float
-    relative: float
-    slope: float
-    spread: float
-    photometric: float
-    angle: float
-    normal_test: int
-    row_in_front: int
-    row_opaque: int
-    row_depth: int
-    row_photometric: int
-    row_normal: int
+    ``u``, ``v`` and ``taps`` are the position's in pixels of the source's depth, where it lies
+    ``inside`` the source image.
+    """
+
+    i: int
+    j: int
+    depth: float
+    px: float
+    py: float
+    z: float
+    x: float
+    y: float
+    defined: bool
+    inside: bool
+    u: float
+    v: float
+    taps: tuple[int, int, int, int, float, float]
 
 
 class Axis(NamedTuple):
@@ -296,137 +299,191 @@ def _angle(ax, ay, az, bx, by, bz):
     return 2 * math.atan2(minus, plus) * (180 / math.pi)
 
 
+@exact_pasted
+def _in_front(pair, target, source, at, limits):
+    return at.z > 0
+
+
 @exact_inlined
-def _normal_passes(pair, rules, normal, i, j, positions):
-    x, y, z = float(normal[i, j, 0]), float(normal[i, j, 1]), float(normal[i, j, 2])
-    length = x * x + y * y + z * z
-    X, Y, Z = positions.points[i, j, 0], positions.points[i, j, 1], positions.points[i, j, 2]
-    if not (length > 0 and length < np.inf and abs(Z) < np.inf):
+def _opaque(pair, target, source, at, limits):
+    if target.alpha.size > 0 and not float(target.alpha[at.i, at.j]) >= limits[0]:
         return False
-    turn = pair.source_rotation
-    nx, ny, nz = _turn(turn, 0, x, y, z), _turn(turn, 1, x, y, z), _turn(turn, 2, x, y, z)
-    along = nx * X + ny * Y + nz * Z
-    if rules.normal_test == CAMERA_FRAME:
-        turn = pair.target_rotation
-        mx, my, mz = _turn(turn, 0, x, y, z), _turn(turn, 1, x, y, z), _turn(turn, 2, x, y, z)
-        lens, d = pair.target, positions.depth[i, j]
-        slip = 0.0 if pair.integer else 0.5
-        py = (i + slip - lens.cy) / lens.fy
-        px = (j + slip - lens.cx - lens.skew * py) / lens.fx
-        if mx * (px * d) + my * (py * d) + mz * d > 0:
-            mx, my, mz = -mx, -my, -mz
-        if along > 0:
-            nx, ny, nz = -nx, -ny, -nz
-        return _angle(nx, ny, nz, mx, my, mz) < rules.angle
-    pose = pair.pose
-    other = nx * (pose[0, 3] - X) + ny * (pose[1, 3] - Y) + nz * (pose[2, 3] - Z)
-    if not -along * other > 0:
-        return False
-    if rules.normal_test == FACING:
+    shape = source.alpha.shape
+    if shape[0] == 0:
         return True
-    if along > 0:
-        nx, ny, nz = -nx, -ny, -nz
-    return _angle(nx, ny, nz, -X, -Y, -Z) < rules.angle
+    if not at.inside:
+        return False
+    taps = at.taps
+    if shape != source.depth.shape:
+        u, v = _in_image(pair, shape, at.x, at.y)
+        taps = _taps(u, v, shape, pair.snap)
+    return _sample(source.alpha, taps) >= limits[0]
 
 
 @exact_inlined
-def _depth_passes(rules, depth, taps, u, v, z):
-    """Depth ``z`` is what the source sees at (u, v), in pixels of its depth map."""
-    h, w = depth.shape
-    d = _blend_depth(depth, taps, INVERSE, rules.spread)
-    error, tolerance = abs(z - d), rules.relative * z
+def _depth_agrees(pair, target, source, at, limits):
+    relative, slope, spread = limits
+    if not at.inside:
+        return False
+    h, w = source.depth.shape
+    d = _blend_depth(source.depth, at.taps, INVERSE, spread)
+    error, tolerance = abs(at.z - d), relative * at.z
     if error <= tolerance:  # most points; the slope only adds
         return True
-    change = _slope(depth, _clamp(np.floor(v), h), _clamp(np.floor(u), w))
-    return error <= tolerance + rules.slope * change
+    change = _slope(source.depth, _clamp(np.floor(at.v), h), _clamp(np.floor(at.u), w))
+    return error <= tolerance + slope * change
 
 
 @exact_inlined
-def _photometric_passes(pair, rules, source, target, i, j, x, y):
-    h, w, channels = source.shape
-    u, v = _in_image(pair, (h, w), x, y)
+def _photometric(pair, target, source, at, limits):
+    if not at.defined:
+        return False
+    h, w, channels = source.image.shape
+    u, v = _in_image(pair, (h, w), at.x, at.y)
     taps = _taps(u, v, (h, w), pair.snap)
     total = 0.0
     for c in range(channels):
-        total += abs(_sample(source[..., c], taps) - float(target[i, j, c]))
-    return total / channels <= rules.photometric
+        total += abs(_sample(source.image[..., c], taps) - float(target.image[at.i, at.j, c]))
+    return total / channels <= limits[0]
+
+
+@exact_inlined
+def _normal(pair, target, at):
+    """The target's normal in the source's axes, its product with the point, and its use."""
+    n = target.normal
+    x, y, z = float(n[at.i, at.j, 0]), float(n[at.i, at.j, 1]), float(n[at.i, at.j, 2])
+    length = x * x + y * y + z * z
+    usable = length > 0 and length < np.inf and abs(at.z) < np.inf
+    turn = pair.source_rotation
+    nx, ny, nz = _turn(turn, 0, x, y, z), _turn(turn, 1, x, y, z), _turn(turn, 2, x, y, z)
+    return nx, ny, nz, nx * at.px + ny * at.py + nz * at.z, usable
+
+
+@exact_pasted
+def _same_side(pair, at, nx, ny, nz, along):
+    pose = pair.pose
+    other = nx * (pose[0, 3] - at.px) + ny * (pose[1, 3] - at.py) + nz * (pose[2, 3] - at.z)
+    return -along * other > 0
+
+
+@exact_inlined
+def _facing(pair, target, source, at, limits):
+    nx, ny, nz, along, usable = _normal(pair, target, at)
+    return usable and _same_side(pair, at, nx, ny, nz, along)
+
+
+@exact_inlined
+def _source_incidence(pair, target, source, at, limits):
+    nx, ny, nz, along, usable = _normal(pair, target, at)
+    if not (usable and _same_side(pair, at, nx, ny, nz, along)):
+        return False
+    if along > 0:
+        nx, ny, nz = -nx, -ny, -nz
+    return _angle(nx, ny, nz, -at.px, -at.py, -at.z) < limits[0]
+
+
+@exact_inlined
+def _camera_frame(pair, target, source, at, limits):
+    nx, ny, nz, along, usable = _normal(pair, target, at)
+    if not usable:
+        return False
+    n, turn = target.normal, pair.target_rotation
+    x, y, z = float(n[at.i, at.j, 0]), float(n[at.i, at.j, 1]), float(n[at.i, at.j, 2])
+    mx, my, mz = _turn(turn, 0, x, y, z), _turn(turn, 1, x, y, z), _turn(turn, 2, x, y, z)
+    lens, d = pair.target, at.depth
+    slip = 0.0 if pair.integer else 0.5
+    py = (at.i + slip - lens.cy) / lens.fy
+    px = (at.j + slip - lens.cx - lens.skew * py) / lens.fx
+    if mx * (px * d) + my * (py * d) + mz * d > 0:
+        mx, my, mz = -mx, -my, -mz
+    if along > 0:
+        nx, ny, nz = -nx, -ny, -nz
+    return _angle(nx, ny, nz, mx, my, mz) < limits[0]
+
+
+RULES = {
+    "in_front": _in_front,
+    "opaque": _opaque,
+    "depth_agrees": _depth_agrees,
+    "photometric": _photometric,
+    "facing": _facing,
+    "source_incidence": _source_incidence,
+    "camera_frame": _camera_frame,
+}
+"""Kernels of rules: functions of the pair, a :class:`View` of the target and one of the source, a
+:class:`Pixel` and the rule's limits in the order of its record, infinite for None."""
+OPAQUE = list(RULES).index("opaque")
+
+
+def _then(before, k, kernel):
+    """``before``, and then rule ``k``: numba has no loop over functions."""
+
+    @exact_pasted
+    def passes_all(pair, target, source, at, rows, limits, passes):
+        every = before(pair, target, source, at, rows, limits, passes)
+        if rows[k] >= 0:
+            good = kernel(pair, target, source, at, limits[k])
+            passes[rows[k], at.i, at.j] = good
+            every = every and good
+        return every
+
+    return passes_all
+
+
+@exact_pasted
+def _always(pair, target, source, at, rows, limits, passes):
+    """The rules that every view has."""
+    bounds = _inside(at.x, at.y, pair.bounds_width, pair.bounds_height, pair.integer)
+    passes[0, at.i, at.j] = at.defined
+    passes[1, at.i, at.j] = bounds
+    return at.defined and bounds
+
+
+_passes_all = _always
+for _k, _kernel in enumerate(RULES.values()):
+    _passes_all = _then(_passes_all, _k, _kernel)
 
 
 @exact
-def rules_of_pair(begin, end, pair, rules, target, source, segment, positions, passes, mask):
+def rules_of_pair(begin, end, pair, rows, limits, target, source, positions, passes, mask):
     """Rows ``begin`` to ``end``: positions, rules and the mask.
 
     Args:
+        rows: the row of ``passes`` for each of :data:`RULES`, -1 for a rule that is off.
+        limits: a tuple of floats for each.
         target, source: a :class:`View` each.
-        segment: (H, W) bool, or (0, 0).
         positions: of the target's size.
-        passes: (R, H, W) bool, a row for each rule: defined, in_bounds, then those of ``rules``.
+        passes: (R, H, W) bool, a row for each rule: defined, in_bounds, then those of ``rows``.
         mask: (H, W) bool, all rules together.
     """
-    width = mask.shape[1]
     image = pair.source
-    of_depth, of_alpha = source.depth.shape, source.alpha.shape
-    together = of_depth == of_alpha
+    shape = source.depth.shape
     nowhere = _taps(0.5, 0.5, (1, 1), pair.snap)
     for i in range(begin, end):
-        for j in range(width):
+        for j in range(mask.shape[1]):
             depth = float(target.depth[i, j])
             defined = _locate(pair, i, j, depth, positions)
             if not _valid(depth):  # the background: every rule but that of alpha fails
                 for row in range(len(passes)):
                     passes[row, i, j] = False
-                if rules.row_opaque >= 0 and of_alpha[0] == 0:
-                    passes[rules.row_opaque, i, j] = (
-                        target.alpha.size == 0 or float(target.alpha[i, j]) >= rules.opaque
+                if rows[OPAQUE] >= 0 and source.alpha.shape[0] == 0:
+                    passes[rows[OPAQUE], i, j] = (
+                        target.alpha.size == 0 or float(target.alpha[i, j]) >= limits[OPAQUE][0]
                     )
                 mask[i, j] = False
                 continue
-            x, y, z = positions.xy[i, j, 0], positions.xy[i, j, 1], positions.points[i, j, 2]
+            x, y = positions.xy[i, j, 0], positions.xy[i, j, 1]
+            px, py = positions.points[i, j, 0], positions.points[i, j, 1]
             inside = _inside(x, y, image.width, image.height, pair.integer)
-            bounds = _inside(x, y, rules.bounds_width, rules.bounds_height, pair.integer)
-            passes[0, i, j] = defined
-            passes[1, i, j] = bounds
-            every = defined and bounds
-            if rules.row_in_front >= 0:
-                good = z > 0
-                passes[rules.row_in_front, i, j] = good
-                every = every and good
-            taps = nowhere
             u = v = 0.5
-            if inside and of_depth[0] > 0:
-                u, v = _in_image(pair, of_depth, x, y)
-                taps = _taps(u, v, of_depth, pair.snap)
-            if rules.row_opaque >= 0:
-                good = True
-                if target.alpha.size > 0:
-                    good = float(target.alpha[i, j]) >= rules.opaque
-                if of_alpha[0] > 0:
-                    good = good and inside
-                    if good:
-                        there = taps
-                        if not together:
-                            s, t = _in_image(pair, of_alpha, x, y)
-                            there = _taps(s, t, of_alpha, pair.snap)
-                        good = _sample(source.alpha, there) >= rules.opaque
-                passes[rules.row_opaque, i, j] = good
-                every = every and good
-            if rules.row_depth >= 0:
-                good = inside and _depth_passes(rules, source.depth, taps, u, v, z)
-                passes[rules.row_depth, i, j] = good
-                every = every and good
-            if rules.row_photometric >= 0:
-                good = defined and _photometric_passes(
-                    pair, rules, source.image, target.image, i, j, x, y
-                )
-                passes[rules.row_photometric, i, j] = good
-                every = every and good
-            if rules.row_normal >= 0:
-                good = _normal_passes(pair, rules, target.normal, i, j, positions)
-                passes[rules.row_normal, i, j] = good
-                every = every and good
-            if segment.size > 0:
-                every = every and segment[i, j]
-            mask[i, j] = every
+            taps = nowhere
+            if inside and shape[0] > 0:
+                u, v = _in_image(pair, shape, x, y)
+                taps = _taps(u, v, shape, pair.snap)
+            at = Pixel(
+                i, j, depth, px, py, positions.points[i, j, 2], x, y, defined, inside, u, v, taps
+            )
+            mask[i, j] = _passes_all(pair, target, source, at, rows, limits, passes)
 
 
 @exact

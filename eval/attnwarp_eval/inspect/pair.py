@@ -14,12 +14,14 @@ import torch
 from attnwarp import Camera, Gaussians
 from attnwarp.render import render
 from attnwarp.warp import (
+    RULES,
     FeatureWarp,
     Surface,
     WarpedView,
     WarpSettings,
-    angle_between,
-    depth_slope,
+    depth_tolerance,
+    parts_of,
+    parts_read,
     render_surface,
     sample,
     sample_depth,
@@ -194,7 +196,7 @@ class Pair:
             seen = replace(self.surfaces[1], image=target_image)
             return warp_surfaces(source, target, seen, own, self.settings, warn_empty=False)
         reads: dict[str, Any] = {}
-        if self.settings.photometric is not None:
+        if "source_image" in parts_read(self.settings):
             reads = {"source_image": source_image, "target_image": target_image}
         return warp_view(
             self.model,
@@ -250,12 +252,13 @@ class Pair:
     @cached_property
     def tolerance(self) -> Array:
         """(H, W) largest difference of depths that counts as agreement."""
-        depth = torch.as_tensor(np.asarray(self.surfaces[0].depth, dtype=np.float64))
-        correspondence = self.view.correspondence
-        slope = sample(depth_slope(depth)[None], correspondence, mode="nearest")[0][0]
-        tolerance = self.settings.depth_relative * correspondence.z
-        tolerance = tolerance + self.settings.depth_slope * torch.nan_to_num(slope, nan=0.0)
-        return tolerance.numpy()
+        s = self.settings
+        return depth_tolerance(
+            self.view.correspondence,
+            self.surfaces[0].depth,
+            relative=s.depth_relative,
+            slope=s.depth_slope,
+        ).numpy()
 
     @cached_property
     def margins(self) -> Mapping[str, tuple[Array, str]]:
@@ -263,76 +266,17 @@ class Pair:
 
         Positive where the rule passes, NaN where the quantity is undefined.
         """
-        return {rule: self._margin(rule) for rule in self.view.rules}
-
-    def _margin(self, rule: str) -> tuple[Array, str]:
-        settings, correspondence = self.settings, self.view.correspondence
-        if rule == "defined":
-            return correspondence.target_depth.numpy(), "of depth"
-        if rule == "in_bounds":
-            camera = correspondence.source if settings.bounds == "source" else self.cameras[1]
-            # With integer centres the method holds the index against the border.
-            slip = 0.5 if correspondence.pixel_centers == "integer" else 0.0
-            x, y = np.moveaxis(correspondence.xy.numpy() - slip, -1, 0)
-            border = np.minimum(np.minimum(x, y), np.minimum(camera.width - x, camera.height - y))
-            return border, "px to the border"
-        if rule == "in_front":
-            return correspondence.z.numpy(), "of depth"
-        if rule == "opaque" and settings.opaque is not None:
-            return self._opacity() - settings.opaque, "of alpha"
-        if rule == "depth_agrees":
-            return self.tolerance - abs(correspondence.z.numpy() - self.source_depth), "of depth"
-        if rule == "photometric" and settings.photometric is not None:
-            source = torch.as_tensor(np.asarray(self.images[0], dtype=np.float64))
-            warped = sample(source.permute(2, 0, 1), correspondence)[0].permute(1, 2, 0).numpy()
-            difference = np.abs(warped - np.asarray(self.images[1])).mean(axis=2)
-            difference[~correspondence.defined.numpy()] = np.nan
-            return settings.photometric - difference, "of colour"
-        if rule == "facing":
-            return 90.0 - self._warp_incidence(), "degrees of incidence"
-        if rule == "source_incidence":
-            return min(90.0, settings.normal_angle) - self._warp_incidence(), "degrees of incidence"
-        if rule == "camera_frame":
-            return settings.normal_angle - self._frame_angle(), "degrees between normals"
-        return np.full(self.size, np.nan), "(yes or no)"
-
-    def _opacity(self) -> Array:
-        """(H, W) smaller alpha of target and source; NaN outside the source image."""
-        alpha = np.full(self.size, np.inf)
-        if self.view.target.alpha is not None:
-            alpha = np.asarray(self.view.target.alpha, dtype=np.float64)
-        if self.surfaces[0].alpha is not None:
-            own = torch.as_tensor(np.asarray(self.surfaces[0].alpha, dtype=np.float64))
-            sampled, inside = sample(own[None], self.view.correspondence)
-            alpha = np.where(inside.numpy(), np.minimum(alpha, sampled[0].numpy()), np.nan)
-        return np.where(np.isinf(alpha), np.nan, alpha)
-
-    def _target_normals(self) -> torch.Tensor:
-        return torch.as_tensor(np.asarray(self.view.target.normal, dtype=np.float64))
-
-    def _warp_incidence(self) -> Array:
-        """(H, W) degrees between the warp's normal, flipped to the target, and the source."""
-        correspondence = self.view.correspondence
-        normal = self._target_normals()
-        rotation = torch.from_numpy(correspondence.source.rotation.copy())
-        to_source = -correspondence.points @ rotation
-        offset = correspondence.source.position - correspondence.target.position
-        to_target = to_source - torch.from_numpy(offset)
-        away = (normal * to_target).sum(dim=-1, keepdim=True) < 0
-        return angle_between(torch.where(away, -normal, normal), to_source).numpy()
-
-    def _frame_angle(self) -> Array:
-        """(H, W) degrees between camera-space normals, each turned to its camera."""
-        correspondence, normal = self.view.correspondence, self._target_normals()
-        turned = []
-        for camera, points in (
-            (correspondence.source, correspondence.points),
-            (correspondence.target, correspondence.target_points),
-        ):
-            own = normal @ torch.from_numpy(camera.rotation.T.copy())
-            away = (own * points).sum(dim=-1, keepdim=True) > 0
-            turned.append(torch.where(away, -own, own))
-        return angle_between(*turned).numpy()
+        view = self.view
+        parts = parts_of(view.target, view.source)
+        margins = {}
+        for rule in RULES:
+            if rule.name in view.rules:
+                distance = np.full(self.size, np.nan)
+                if rule.margin is not None:
+                    arguments = rule.arguments(self.settings, parts)
+                    distance = rule.margin(view.correspondence, **arguments).numpy()
+                margins[rule.name] = distance, rule.unit
+        return margins
 
     @cached_property
     def incidence(self) -> Array:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
-from attnwarp.warp import WarpSettings
+from attnwarp.warp import RULES, WarpSettings
 from attnwarp_eval.study.schema import Part, Study, Variant
 
 if TYPE_CHECKING:
@@ -24,11 +24,11 @@ DEPTH_READS = frozenset({"preset", "set.depth", "set.depth_statistic"})
 """Keys of a variant that decide how depth is read off splats."""
 
 MASK_RULES = frozenset(
-    f"set.{name}"
-    for name in (
-        "bounds", "depth_agreement", "depth_relative", "depth_slope", "photometric", "normal_test",
-    )
-)  # fmt: skip
+    f"set.{field}"
+    for rule in RULES
+    for field in (rule.setting, *rule.limits.values())
+    if field and field not in ("in_front", "segment", "depth_spread", "normal_angle")
+)
 """Keys of a variant that decide its mask and nothing else."""
 
 _WITHOUT_ANGLE = ("none", "facing")
@@ -58,13 +58,16 @@ def warp_reads(settings: WarpSettings, truth: bool = False) -> set[str]:
         truth: whether depth is the truth's own, which has no splats and no alpha.
     """
     idle = {"set.segment"}  # scenes have none
-    if not settings.depth_agreement:
-        idle |= {"set.depth_relative", "set.depth_slope"}
+    limits = {True: set[str](), False: set[str]()}  # of rules that are on, and of those off
+    for rule in RULES:
+        limits[rule.on(settings)] |= {f"set.{limit}" for limit in rule.limits.values()}
+    # A rule's own setting turns it on; the spread concerns feature grids as well.
+    idle |= limits[False] - limits[True] - {f"set.{rule.setting}" for rule in RULES}
+    idle -= {"set.depth_spread"}
     if truth:
         idle |= {"set.depth", "set.depth_statistic", "set.gaussian_filter", "set.opaque"}
-    filters = truth or settings.gaussian_filter in _WITHOUT_ANGLE
-    if settings.normal_test in _WITHOUT_ANGLE and filters:
-        idle.add("set.normal_angle")
+    elif settings.gaussian_filter not in _WITHOUT_ANGLE:
+        idle -= {"set.normal_angle"}
     return {"preset", *(f"set.{field.name}" for field in fields(WarpSettings))} - idle
 
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from attnwarp.warp import WarpSettings, render_surface, warp_view
+from attnwarp.warp import WarpSettings, parts_read, render_surface, warp_view
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number
@@ -136,7 +136,7 @@ class Warp(Probe[NoExtra]):
             with meter.stage("truth"):
                 truth = world.pair(name, size)
                 images: dict[str, Any] = {}
-                if settings.photometric is not None:
+                if "source_image" in parts_read(settings):
                     images = {
                         "source_image": world.image(world.source.name, spp),
                         "target_image": world.image(name, spp),
