@@ -149,7 +149,7 @@ def test_at_yaw_150_bounds_alone_accept_nothing_but_points_behind_the_source():
 
 def test_the_paper_as_printed_has_no_depth_for_the_same_view():
     camera = orbit(0, size=64)
-    view = warp_view(shell(500), camera, camera, PRESETS["paper"])
+    view = warp_view(shell(500), camera, camera, preset("paper", gaussian_filter="printed"))
     assert not view.mask.any()
     assert torch.isnan(view.correspondence.target_depth).all()
 
