@@ -507,7 +507,7 @@ class Rule:
 def parts_of(
     target: Surface, source: Surface | None, segment: Tensor | None = None
 ) -> dict[str, Any]:
-    """What rules may read, by name: parts of both surfaces, and ``target_segment``.
+    """Inputs of the rules by name: parts of both surfaces, and ``target_segment``.
 
     Example:
         >>> import numpy as np

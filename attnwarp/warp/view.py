@@ -212,9 +212,10 @@ def warp_surfaces(
     for rule in on:
         passes = by_kernel.get(rule.name)
         if passes is None:
-            passes = rule.definition(correspondence, **arguments[rule.name])
-            if passes is None:
+            found = rule.definition(correspondence, **arguments[rule.name])
+            if found is None:
                 continue
+            passes = torch.as_tensor(found)
             mask = mask & passes
         rules[rule.name] = passes
     view = WarpedView(

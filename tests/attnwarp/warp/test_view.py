@@ -8,11 +8,9 @@ import torch
 from closed_forms import faces, orbit, plane_depth, shell, sphere
 
 from attnwarp import Camera, Gaussians
+from attnwarp.settings import Weight
 from attnwarp.warp.depth import resize_depth
-from attnwarp.warp.rules import (
-    gaussian_filter,
-    in_front,
-)
+from attnwarp.warp.rules import RULES, Rule, gaussian_filter, in_front
 from attnwarp.warp.settings import PRESETS, WarpSettings, preset
 from attnwarp.warp.view import Surface, near_plane, render_surface, warp_surfaces, warp_view
 
@@ -265,6 +263,44 @@ def test_every_rule_can_be_varied_alone():
         view = run(dataclasses.replace(bare, **change), target_segment=edited)
         assert list(view.rules) == ["defined", "in_bounds", rule]
         assert view.mask.any() == (rule != "segment")
+
+
+@dataclasses.dataclass(frozen=True)
+class LimitedSettings(WarpSettings):
+    farthest: Weight | None = None
+
+
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_a_rule_of_ones_own_needs_no_kernel(backend, request):
+    # A wall at depth 2 with one row at 4, and a limit between them.
+    def near(correspondence, target_depth, target_normal, farthest):
+        return target_depth <= farthest
+
+    record = Rule(
+        "near",
+        near,
+        setting="farthest",
+        reads=("target_depth", "target_normal"),
+        limits={"farthest": "farthest"},
+    )
+    RULES.append(record)
+    request.addfinalizer(RULES.pop)
+    depth = np.full((6, 6), 2.0)
+    depth[2] = 4.0
+    camera = Camera(np.array([[6.0, 0, 3], [0, 6, 3], [0, 0, 1]]), np.eye(4), 6, 6)
+    wall = Surface(depth, np.broadcast_to([0.0, 0, -1], (6, 6, 3)))
+    off, on = (
+        warp_surfaces(camera, camera, wall, wall, LimitedSettings(farthest=f), backend=backend)
+        for f in (None, 3.0)
+    )
+    assert "near" not in off.rules and off.mask.all()
+    assert list(on.rules) == [*off.rules, "near"]
+    assert on.mask.any(dim=1).tolist() == [True, True, False, True, True, True]
+    with pytest.raises(
+        ValueError, match=r"target_surface\.normal: got None, but .* farthest needs"
+    ):
+        settings = LimitedSettings(farthest=3.0, normal_test="none")
+        warp_surfaces(camera, camera, Surface(depth), wall, settings, backend=backend)
 
 
 def test_bounds_are_held_against_the_size_that_is_asked_for():
