@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,6 +21,12 @@ from attnwarp_eval.study.store import Store
 BEFORE, AFTER = "before", "render"
 """Contents of an edited scene's pictures: the view before the edit, and the edited splats."""
 
+
+CAPTURED, MOST_VIEWS = "captured.json", 8
+"""File of a run with ``--data``, and the views of it that are shown, evenly spread."""
+
+LEAST = 256
+"""Least longest side of a picture that people see, in px."""
 
 OF_A_METHOD = (
     "method", "settings", "editor", "geometry", "mask", "fit", "splats", "budget", "by_hand",
@@ -78,7 +85,8 @@ def read_items(runs: Sequence[Path], methods: Sequence[str] | None = None) -> li
     items: dict[tuple[str, str, int], Item] = {}
     first: dict[tuple[str, str], tuple[str, Path]] = {}  # item and method -> how, and the run
     for run in runs:
-        for key, one, method, how in _edited(run):
+        captured = (run / CAPTURED).is_file()
+        for key, one, method, how in _captured(run) if captured else _edited(run):
             item = items.setdefault(key, one)
             if item.content != one.content:
                 raise InputError(
@@ -159,18 +167,48 @@ def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
             )
 
 
+def _captured(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
+    """The edited capture of a run with ``--data``, as :func:`_edited` gives a study's cells."""
+    try:
+        data = json.loads((run / CAPTURED).read_text(encoding="utf-8"))
+        instruction, count = data["words"]["instruction"], len(data["views"])
+        folders = {name: run / row["folder"] for name, row in data["variants"].items()}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{run / CAPTURED}: damaged ({error!r}); run the study again, finished edits are kept"
+        ) from None
+    views = sorted({k * count // MOST_VIEWS for k in range(MOST_VIEWS)} if count > MOST_VIEWS
+                   else range(count))  # fmt: skip
+    files = [f"view-{view:04d}.png" for view in views]
+    before = {Path(name).stem: run / "originals" / name for name in files}
+    key = (run.resolve().name, "edit", 0)
+    for method, folder in folders.items():
+        own = {Path(name).stem: folder / "renders" / name for name in files}
+        item = Item(*key, instruction, (str(run.resolve()), instruction), before, {method: own})
+        yield key, item, method, str(folder.resolve())
+
+
 def read_picture(path: Path) -> bytes:
-    """A picture's file.
+    """A picture as JPEG, enlarged smoothly to a longest side of :data:`LEAST` px if need be.
 
     Raises:
         InputError: it is missing.
     """
+    from PIL import Image
+
     try:
-        return path.read_bytes()
+        data = path.read_bytes()
     except OSError as error:
         raise InputError(
             f"{path}: {error.strerror}; run the study again to recompute its pictures"
         ) from None
+    with Image.open(io.BytesIO(data)) as picture:
+        scale = LEAST / max(picture.size)
+        if scale <= 1 and picture.format == "JPEG":
+            return data
+        size = [max(1, round(side * max(1.0, scale))) for side in picture.size]
+        pixels = picture.convert("RGB").resize((size[0], size[1]), Image.Resampling.LANCZOS)
+    return encode_picture(np.asarray(pixels), ".jpg")
 
 
 TILES = 4

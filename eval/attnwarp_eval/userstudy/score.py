@@ -72,6 +72,10 @@ class Score:
                             "pairs": shares(value.pairs),
                             "methods": list(value.methods),
                             "wins": value.wins.tolist(),
+                            "selection_frequency": {
+                                name: n / of if of else math.nan
+                                for name, (n, of) in selection(value).items()
+                            },
                             "agreement": asdict(self.agreement[name]),
                         }
                         for name, value in self.preferences.items()
@@ -130,7 +134,13 @@ def report(result: Score) -> Report:
     return Report(
         f"Preferences: {result.title}",
         lead,
-        [_shares(result), _method_pairs(whole), _agreement(result), _people(result)],
+        [
+            _shares(result),
+            _frequencies(result),
+            _method_pairs(whole),
+            _agreement(result),
+            _people(result),
+        ],
     )
 
 
@@ -153,6 +163,37 @@ def _shares(result: Score) -> Section:
         if value.unconnected
     ]
     return Section("Preferences", text, [Table(["method", *result.preferences], rows)])
+
+
+def selection(value: Preferences) -> dict[str, tuple[int, int]]:
+    """Times that each method was chosen, and times that it was shown.
+
+    Example:
+        >>> from attnwarp_eval.statistics.preferences import preferences
+        >>> selection(preferences({"one": [("a", "b"), ("a", "c"), ("b", "a")]}, ["a", "b", "c"]))
+        {'a': (2, 3), 'b': (1, 2), 'c': (0, 1)}
+    """
+    wins = value.wins
+    return {
+        name: (int(wins[k].sum()), int(wins[k].sum() + wins[:, k].sum()))
+        for k, name in enumerate(value.methods)
+    }
+
+
+def _frequencies(result: Score) -> Section:
+    columns = {name: selection(value) for name, value in result.preferences.items()}
+    chosen = columns[OVERALL]
+    names = sorted(chosen, key=lambda name: -chosen[name][0] / max(1, chosen[name][1]))
+    rows = [
+        [name, *(f"{n / of:.0%} of {of}" if of else "–" for n, of in own)]
+        for name in names
+        for own in [[column[name] for column in columns.values()]]
+    ]
+    text = [
+        "How often a method was chosen when it was one of the two, as user studies of the field"
+        " report it. It depends on what a method was shown against; the preferences above do not."
+    ]
+    return Section("Selection frequency", text, [Table(["method", *columns], rows)])
 
 
 def _method_pairs(whole: Preferences) -> Section:

@@ -202,3 +202,56 @@ def test_a_folder_that_is_no_run_and_a_missing_picture_are_one_line(run, tmp_pat
     assert done.exit_code == 2 and re.search(
         r"render\.jpg: No such file.*run the study again", done.stderr
     )
+
+
+def pixels_of(address):
+    picture = Image.open(io.BytesIO(base64.b64decode(address.split(",")[1])))
+    return np.asarray(picture.convert("RGB"))
+
+
+def test_people_see_pictures_of_256_px_and_more(run, tmp_path):
+    """The run's are of 64 px."""
+    assert build(run.root, "--out", tmp_path / "page.html").exit_code == 0
+    _, study = read(tmp_path / "page.html")
+    sizes = {pixels_of(address).shape for address in study["pictures"].values()}
+    assert sizes == {(256, 256, 3)}
+
+
+def captured(folder, views=20, size=320):
+    """The folder of a run on a capture, as `run --data` leaves it: a colour for each method."""
+    colors = {"alone": (200, 40, 40), "warped, twice": (40, 40, 200)}
+    rows = {name: {"folder": f"variant-{k + 1}"} for k, name in enumerate(colors)}
+    folders = {"originals": (90, 90, 90)} | {
+        f"{rows[name]['folder']}/renders": color for name, color in colors.items()
+    }
+    for part, color in folders.items():
+        (folder / part).mkdir(parents=True)
+        for view in range(views):
+            picture = Image.new("RGB", (size, size // 2), color)
+            picture.save(folder / part / f"view-{view:04d}.png")
+    data = {"study": "mine", "words": {"instruction": "make it snow"}, "views": ["v"] * views,
+            "variants": rows, "left_out": {}}  # fmt: skip
+    (folder / "captured.json").write_text(json.dumps(data))
+    return colors
+
+
+def test_a_run_on_a_capture_is_shown_with_eight_of_its_views(tmp_path):
+    colors = captured(tmp_path / "garden")
+    done = build(tmp_path / "garden", "--out", tmp_path / "page.html")
+    assert done.exit_code == 0, done.output
+    _, study = read(tmp_path / "page.html")
+    (item,) = study["items"]
+    assert (item["scene"], item["instruction"]) == ("garden", "make it snow")
+    for name, color in (*colors.items(), (None, (90, 90, 90))):
+        names = item["before"] if name is None else item["sides"][name]
+        assert len(names) == 8
+        for picture in names:
+            pixels = pixels_of(study["pictures"][picture])
+            assert pixels.shape == (160, 320, 3) and np.abs(pixels - np.array(color)).max() < 8
+
+
+def test_a_damaged_file_of_a_run_on_a_capture_is_one_line(tmp_path):
+    captured(tmp_path / "garden", views=1)
+    (tmp_path / "garden" / "captured.json").write_text("{}")
+    done = build(tmp_path / "garden", "--out", tmp_path / "page.html")
+    assert done.exit_code == 2 and "captured.json: damaged" in done.output

@@ -1,6 +1,7 @@
 """Oracles: simulated people with planted strengths, and choices counted by hand."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -73,6 +74,32 @@ def test_planted_preferences_of_simulated_people_are_recovered(tmp_path):
     page = (tmp_path / "out" / "preferences.md").read_text()
     assert "alone | warped" in page and "warped preferred" in page
     assert (tmp_path / "out" / "preferences.html").read_text().startswith("<!doctype html>")
+
+
+def test_selection_frequency_counts_how_often_what_was_shown_was_chosen(tmp_path):
+    """Oracle: counted by hand."""
+    made = [
+        choice("quality", "alone", "warped", "right", edit="a"),
+        choice("quality", "warped", "alone", "left", edit="b"),
+        choice("quality", "warped", "alone", "right", edit="c"),
+        choice("consistency", "warped", "third", "left", edit="d"),
+    ]
+    done = score(answers(tmp_path, "one", made), "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    questions = json.loads((tmp_path / "out" / "preferences.json").read_text())["questions"]
+    assert questions["overall"]["selection_frequency"] == {
+        "alone": 1 / 3,
+        "third": 0,
+        "warped": 3 / 4,
+    }
+    assert questions["quality"]["selection_frequency"] == {
+        "alone": 1 / 3, "third": None, "warped": 2 / 3,
+    }  # fmt: skip
+    text = (tmp_path / "out" / "preferences.md").read_text()
+    (row,) = re.findall(r"^\| warped +\|.*%.*$", text, re.MULTILINE)
+    assert [cell.strip() for cell in row.strip("|").split("|")] == [
+        "warped", "75% of 4", "100% of 1", "67% of 3",
+    ]  # fmt: skip
 
 
 def test_who_chose_a_scrambled_side_is_named_and_does_not_count(tmp_path):

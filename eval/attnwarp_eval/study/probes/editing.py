@@ -752,16 +752,17 @@ class _Measure:
         return row
 
     def _renders(self, model: Gaussians) -> dict[str, Image]:
-        from attnwarp.methods.scene import near_of
-        from attnwarp.render import render
+        return {name: self._render(model, name) for name in self.names}
 
-        cameras = [self.work.world.camera(name) for name in self.names]
-        near = near_of(cameras, self.before)
-        with torch.no_grad():
-            return {
-                name: np.asarray(render(model, camera, near=near).color.clamp(0, 1).float().numpy())
-                for name, camera in zip(self.names, cameras, strict=True)
-            }
+    def _render(self, model: Gaussians, name: str, least: int = 1) -> Image:
+        """(H, W, 3) of a view of splats, at a whole multiple of its size and at least so wide."""
+        from attnwarp.methods.scene import near_of, render_picture
+
+        cameras = {own: self.work.world.camera(own) for own in self.names}
+        near, camera = near_of(list(cameras.values()), self.before), cameras[name]
+        times = -(-least // camera.width)
+        larger = camera.resize(times * camera.width, times * camera.height)
+        return render_picture(model, larger, near, "auto")
 
     def _draw(self, name: str) -> dict[str, bytes]:
         """JPEG files of a view: before, the source's edit, the edited view, its render, and the
@@ -772,7 +773,7 @@ class _Measure:
             "by hand": source_by_hand(self.work, self.truth, self.source),
             "source edit": self.pictures["edit"].get(self.source),
             "edited": self.pictures["edit"].get(name),
-            "render": self.pictures["render"][name],
+            "render": self._render(self.after, name, pictures.WIDTH),
             "truth": None if answer is None else self.truth.answers[answer][name],
         }
         return {
