@@ -57,8 +57,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Append the reference to the navigation of mkdocs.yml."""
-    pages = ["api/index.md", *(f"api/{name}.md" for name in public_modules())]
-    config.nav = [*(config.nav or []), {"Reference": pages}]
+    modules = public_modules()
+    packages = [
+        {package: [f"api/{name}.md" for name in modules if name.split(".")[0] == package]}
+        for package in PACKAGES
+    ]
+    config.nav = [*(config.nav or []), {"Reference": ["api/index.md", *packages]}]
     return config
 
 
