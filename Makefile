@@ -50,9 +50,9 @@ measured: kernels
 	@rm -rf $(GATE)
 	ATTNWARP_CACHE=$(GATE)/derived ATTNWARP_MITSUBA=scalar_rgb $(BIN)/attnwarp-eval run gate --out $(GATE)
 
-## every benchmark, one after the other; the study `quick` and 3D scenes of 200,000 splats among them
+## every benchmark but that of a GPU, one after the other; the study `quick` and 3D scenes of 200,000 splats among them
 bench: venv
-	@for file in $$(grep -l '__main__' benchmarks/*.py); do \
+	@for file in $$(grep -l '__main__' benchmarks/*.py | grep -v benchmarks/gpu.py); do \
 		$(BIN)/python -m "benchmarks.$$(basename "$$file" .py)" || exit; \
 	done
 
