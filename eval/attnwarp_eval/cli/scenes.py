@@ -125,11 +125,16 @@ def draw(
             " highlights; or the number of things, 2 to 6. May be repeated.",
         ),
     ] = None,
+    meshes: Annotated[
+        Path | None, typer.Option(help="Folder of meshes (OBJ, PLY, STL, GLB, OFF) to put there.")
+    ] = None,
     stratify: Annotated[
         str | None, typer.Option(help="Axes spread evenly over the scenes (comma-separated).")
     ] = None,
 ) -> None:
     """Draw scenes that no one made by hand, with cameras, edits and bounces.
+
+    With --meshes other people's meshes stand on the drawn ground.
 
     The same seed draws the same files everywhere.
     """
@@ -145,12 +150,13 @@ def draw(
                 fixed[name] = float(value)
             except ValueError:
                 raise InputError(f"--axis: got {text!r}, expected such as occlusion=0.9") from None
+        what = {"drawn": count} if meshes is None else {"meshes": str(meshes), "n": count}
         wanted = population(
-            {"drawn": count, "seed": seed, "axes": fixed, "stratify": names(stratify) or []}
+            {**what, "seed": seed, "axes": fixed, "stratify": names(stratify) or []}
         )
         with reporter(title="drawing") as report:
             for k, scene in enumerate(wanted.scenes()):
-                write(scene.data, out)
+                write(scene, out)
                 report.step(k + 1, count, scene.spec.name)
     typer.echo(f"{wanted.words} -> {out}")
 

@@ -51,15 +51,16 @@ def edits(draft: Draft) -> list[Entry]:
 
     - ``colour``: the first thing in a look that training never shows it in
     - ``material``: it as a statue
-    - ``part``: its largest part in one colour
+    - ``part``: its largest part in one colour; not of a thing in one piece
     - ``ground``, ``light``: another ground, another time of day
     - ``several``: all other things in one colour
     - ``some_colour``: it in any bright colour, six answers
     - ``parts``: :data:`PARTS` parts of it in any of four colours; four answers, in which each part
       has each colour once
     """
+    part = [_part(draft)] if len(draft.things[0].objects) > 1 else []
     return [
-        _colour(draft), _material(draft), _part(draft), _ground(draft), _light(draft),
+        _colour(draft), _material(draft), *part, _ground(draft), _light(draft),
         _several(draft), _some_colour(draft), _parts(draft),
     ]  # fmt: skip
 
@@ -121,9 +122,10 @@ def _plain(rng: np.random.Generator, color: str) -> Entry:
 def _colour(draft: Draft) -> Entry:
     """The colour kept from training for this kind; in a pattern, where it has that already."""
     rng, thing = draft.stream("edit colour"), draft.things[0]
-    color = draft.unseen(thing.kind)
+    others = [c for c in draft.colors_of(thing.kind) if c != thing.look.color]
+    color = others[0] if others else thing.look.color
     finish, second = "plain", -1
-    if FINISHES[thing.look.finish] in ("plain", "shiny"):
+    if color == thing.look.color and thing.look.second < 0:
         finish, second = "striped", draft.other_color(rng, color)
     look = Look(
         FINISHES.index(finish), color, second, draft.ground, draft.time, int(rng.random() * 2**31)
@@ -262,13 +264,19 @@ def part_centers(thing: Thing, rng: np.random.Generator) -> Array:
     centers = points[far]
     for _ in range(12):
         own = ((points[:, None] - centers[None]) ** 2).sum(-1).argmin(1)
-        centers = np.stack([points[own == k].mean(0) for k in range(PARTS)])
+        # A centre that lost all its points stays where it is.
+        centers = np.stack(
+            [points[own == k].mean(0) if (own == k).any() else centers[k] for k in range(PARTS)]
+        )
     return centers
 
 
 def _near_surface(thing: Thing, rng: np.random.Generator) -> Iterator[Array]:
     """World points within a twentieth of the height of the surface, per object."""
     for item in thing.objects:
+        if item["shape"]["type"] == "mesh":
+            yield thing.points + np.array(item["shape"]["position"])
+            continue
         spec = BodySpec.model_validate(item["shape"])
         parts = spec.solid()
         boxes = [part.reach() for part in parts if not part.carve]

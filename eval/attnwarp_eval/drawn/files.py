@@ -8,6 +8,7 @@ from typing import Any
 
 import yaml
 
+from attnwarp_eval.drawn.scenes import Drawn
 from attnwarp_eval.files import write_atomic
 
 HEAD = (
@@ -79,8 +80,11 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-def write(data: Mapping[str, Any], folder: Path) -> Path:
-    """Write a scene into a folder, as ``NAME.yaml``; the file appears under its name when whole."""
-    path = folder / f"{data['name']}.yaml"
-    write_atomic(path, to_text(data).encode(), durable=False)
+def write(scene: Drawn, folder: Path) -> Path:
+    """Write a scene into a folder, as ``NAME.yaml`` with its meshes; each file appears when whole."""
+    for name, source in scene.files.items():
+        if not (folder / name).is_file():
+            write_atomic(folder / name, source.read_bytes(), durable=False)
+    path = folder / f"{scene.spec.name}.yaml"
+    write_atomic(path, to_text(scene.data).encode(), durable=False)
     return path

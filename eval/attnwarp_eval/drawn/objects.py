@@ -470,7 +470,9 @@ def body(word: str, instance: int, *, plain: bool = False, resolution: int = 64)
 
 
 def plain_numbers(value: Any) -> Any:
-    """A description with Python's own numbers, rounded."""
+    """A description with Python's own numbers, rounded but for the place of a mesh of any size."""
+    if isinstance(value, dict) and value.get("type") == "mesh":
+        return value
     if isinstance(value, dict):
         return {k: plain_numbers(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import hashlib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -13,6 +14,7 @@ from attnwarp.process import cache_dir
 from attnwarp_eval.cache import content_key
 from attnwarp_eval.drawn.axes import check_axes, spread
 from attnwarp_eval.drawn.files import write
+from attnwarp_eval.drawn.meshes import draw_meshes, mesh_files
 from attnwarp_eval.drawn.scenes import Drawn, draw
 from attnwarp_eval.scene.base import Spec
 from attnwarp_eval.scene.explain import explain
@@ -23,7 +25,83 @@ OTHER_SEED = 1_000_003
 Count = Annotated[int, Field(ge=1, le=10_000)]
 
 
-class DrawnScenes(Spec):
+class _Scenes(Spec):
+    """Keys of every population."""
+
+    generator: Literal[1] = 1
+    seed: Annotated[int, Field(ge=0, lt=2**32)]
+    axes: dict[str, float] = Field(default_factory=dict)
+    stratify: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _known_axes(self) -> Self:
+        check_axes(self.axes, self.stratify)
+        return self
+
+    @property
+    def count(self) -> int:
+        """Number of scenes."""
+        raise NotImplementedError
+
+    @property
+    def word(self) -> str:
+        """First word of the scenes' names."""
+        raise NotImplementedError
+
+    def scene(self, number: int) -> Drawn:
+        """Draw one of them."""
+        raise NotImplementedError
+
+    def _what(self) -> str:
+        raise NotImplementedError
+
+    def _decided_by(self) -> Any:
+        """Whatever decides the scenes beside the population's own keys."""
+        return None
+
+    @property
+    def words(self) -> str:
+        """The population in words, for a report."""
+        fixed = "".join(f", {name} {value:g}" for name, value in self.axes.items())
+        spreads = f", {' and '.join(self.stratify)} spread evenly" if self.stratify else ""
+        return f"{self._what()} by generator {self.generator}, seed {self.seed}{fixed}{spreads}"
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the scenes."""
+        return [f"{self.word}-{k}" for k in range(self.count)]
+
+    def scenes(self) -> Iterator[Drawn]:
+        """Draw them, one at a time."""
+        for k in range(self.count):
+            yield self.scene(k)
+
+    def places(self, number: int) -> dict[str, float]:
+        """Places of a scene on the axes that are fixed or spread."""
+        spreads = {name: spread(name, self.count, self.seed)[number] for name in self.stratify}
+        return {**self.axes, **spreads}
+
+    def pilot(self, count: int) -> Self:
+        """A few scenes of another seed, drawn in the same way."""
+        other = (self.seed + OTHER_SEED) % 2**32
+        return self.model_copy(update={self._number: count, "seed": other})
+
+    _number: ClassVar[str]
+
+    def files(self) -> list[Path]:
+        """Files of the scenes, drawn where they are missing; they may be deleted at any time."""
+        kept = self.model_dump(mode="json")
+        if not self.stratify:
+            kept.pop(self._number)  # a larger population has the scenes of a smaller one
+        folder = cache_dir() / "drawn" / content_key(kept, self._decided_by())[:16]
+        paths = [folder / f"{name}.yaml" for name in self.names]
+        for k, path in enumerate(paths):
+            if not path.is_file():
+                write(self.scene(k), folder)
+        return paths
+
+
+class DrawnScenes(_Scenes):
     """Scenes of a generator: ``scenes: {drawn: 48, generator: 1, seed: 7}`` in a study.
 
     Attributes:
@@ -42,15 +120,7 @@ class DrawnScenes(Spec):
     """
 
     drawn: Count
-    generator: Literal[1] = 1
-    seed: Annotated[int, Field(ge=0, lt=2**32)]
-    axes: dict[str, float] = Field(default_factory=dict)
-    stratify: tuple[str, ...] = ()
-
-    @model_validator(mode="after")
-    def _known_axes(self) -> DrawnScenes:
-        check_axes(self.axes, self.stratify)
-        return self
+    _number: ClassVar[str] = "drawn"
 
     @property
     def count(self) -> int:
@@ -62,48 +132,57 @@ class DrawnScenes(Spec):
         """First word of the scenes' names."""
         return "drawn"
 
-    def pilot(self, count: int) -> DrawnScenes:
-        """A few scenes of another seed, drawn in the same way."""
-        other = (self.seed + OTHER_SEED) % 2**32
-        return self.model_copy(update={"drawn": count, "seed": other})
-
-    @property
-    def words(self) -> str:
-        """The population in words, for a report."""
-        text = f"{self.drawn} scenes drawn by generator {self.generator}, seed {self.seed}"
-        fixed = "".join(f", {name} {value:g}" for name, value in self.axes.items())
-        spreads = f", {' and '.join(self.stratify)} spread evenly" if self.stratify else ""
-        return text + fixed + spreads
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the scenes."""
-        return [f"{self.word}-{k}" for k in range(self.count)]
-
-    def scenes(self) -> Iterator[Drawn]:
-        """Draw them, one at a time."""
-        for k in range(self.count):
-            yield self.scene(k)
+    def _what(self) -> str:
+        return f"{self.drawn} scenes drawn"
 
     def scene(self, number: int) -> Drawn:
         """Draw one of them."""
-        places = {name: spread(name, self.drawn, self.seed)[number] for name in self.stratify}
-        return draw(number, self.seed, {**self.axes, **places})
-
-    def files(self) -> list[Path]:
-        """Files of the scenes, drawn where they are missing; they may be deleted at any time."""
-        kept = self.model_dump(mode="json")
-        if not self.stratify:
-            kept.pop("drawn")  # a larger population has the scenes of a smaller one
-        folder = cache_dir() / "drawn" / content_key(kept)[:16]
-        paths = [folder / f"{name}.yaml" for name in self.names]
-        for k, path in enumerate(paths):
-            if not path.is_file():
-                write(self.scene(k).data, folder)
-        return paths
+        return draw(number, self.seed, self.places(number))
 
 
-def population(data: Any) -> DrawnScenes:
+class MeshScenes(_Scenes):
+    """Other people's meshes on drawn ground: ``scenes: {meshes: FOLDER, n: 12, seed: 7}``.
+
+    Attributes:
+        meshes: folder of OBJ, PLY, STL, GLB or OFF files.
+        n: how many scenes, numbered from 0.
+        up: upright axis of all files; that of their format if left out (z of STL and OFF, else y).
+    """
+
+    meshes: str
+    n: Count
+    up: Literal["y", "z"] | None = None
+    _number: ClassVar[str] = "n"
+
+    @property
+    def count(self) -> int:
+        """Number of scenes."""
+        return self.n
+
+    @property
+    def word(self) -> str:
+        """First word of the scenes' names."""
+        return "mesh"
+
+    @property
+    def _paths(self) -> list[Path]:
+        return mesh_files(Path(self.meshes).expanduser())
+
+    def _what(self) -> str:
+        return f"{self.n} scenes of meshes of {Path(self.meshes).name} drawn"
+
+    def _decided_by(self) -> Any:
+        return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in self._paths}
+
+    def scene(self, number: int) -> Drawn:
+        """Draw one of them."""
+        return draw_meshes(number, self.seed, self._paths, self.places(number), self.up)
+
+
+Population = DrawnScenes | MeshScenes
+
+
+def population(data: Any) -> Population:
     """The population that a study's ``scenes`` or a command names.
 
     Raises:
@@ -114,11 +193,10 @@ def population(data: Any) -> DrawnScenes:
         Traceback (most recent call last):
         attnwarp.errors.InputError: drawn: got 0, but input should be greater than or equal to 1
     """
+    kind = MeshScenes if isinstance(data, Mapping) and "meshes" in data else DrawnScenes
     try:
-        return DrawnScenes.model_validate(data)
+        return kind.model_validate(data)
     except ValidationError as error:
         problems = error.errors(include_url=False)
-        texts = [
-            explain(problem, DrawnScenes, "docs/truth/drawn-scenes.md") for problem in problems
-        ]
+        texts = [explain(problem, kind, "docs/truth/drawn-scenes.md") for problem in problems]
         raise InputError("; ".join(texts)) from None

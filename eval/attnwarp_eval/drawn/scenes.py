@@ -11,9 +11,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 from attnwarp_eval.drawn import asked
 from attnwarp_eval.drawn.assemblies import KINDS, USUAL, Assembly
@@ -32,6 +34,8 @@ from attnwarp_eval.drawn.worlds import (
 from attnwarp_eval.scene.bodies import BodySpec
 from attnwarp_eval.scene.spec import SceneSpec
 from attnwarp_eval.scene.transport import likely_bounces
+
+Array = npt.NDArray[np.float64]
 
 GENERATOR = 1
 """Raise it when the same seed and number would give another scene."""
@@ -68,6 +72,7 @@ class Thing:
         look: finish and colours; of the first thing, of its first part.
         objects: as the scene's file has them.
         reach: radius of the circle on the ground that holds it, and its height.
+        points: (N, 3) points on a mesh, turned and scaled, before it is moved to its place.
     """
 
     kind: str
@@ -75,6 +80,7 @@ class Thing:
     look: Look
     objects: list[dict[str, Any]]
     reach: tuple[float, float]
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def names(self) -> list[str]:
@@ -92,6 +98,7 @@ class Drawn:
         axes: its place on each axis of difficulty.
         things: those that stand there, the one with parts first.
         groups: by an object's name, what it belongs to: "thing 0" and so on, "fence", "around".
+        files: mesh files beside the scene's own, by their path from its folder.
     """
 
     spec: SceneSpec
@@ -99,6 +106,7 @@ class Drawn:
     axes: Axes
     things: tuple[Thing, ...]
     groups: Mapping[str, str]
+    files: Mapping[str, Path] = field(default_factory=dict)
 
 
 def draw(number: int, seed: int, axes: Mapping[str, float] | None = None) -> Drawn:
@@ -130,12 +138,14 @@ class Draft:
     places: list[tuple[float, float, float]] = field(default_factory=list)
     fences: list[dict[str, Any]] = field(default_factory=list)
     extras: list[dict[str, Any]] = field(default_factory=list)
+    files: dict[str, Path] = field(default_factory=dict)
+    word: ClassVar[str] = "drawn"
 
     def finished(self) -> Drawn:
         """The scene, after everything has been drawn in turn."""
         self.axes = drawn_axes(self.stream("axes"), self.fixed)
         self._choose_surroundings()
-        self._choose_things()
+        self.choose_things()
         self._place_things()
         self._place_extras()
         self._place_fences()
@@ -146,7 +156,7 @@ class Draft:
         groups |= {item["name"]: "around" for item in (*self.extras, *around)}
         objects = [o for one in self.things for o in one.objects]
         data: dict[str, Any] = {
-            "name": f"drawn-{self.number}",
+            "name": f"{self.word}-{self.number}",
             "title": self._title(),
             "description": f"Generator {GENERATOR}, seed {self.seed}, number {self.number};"
             f" {to_words(self.axes)}.",
@@ -160,7 +170,8 @@ class Draft:
         data["edits"] = asked.edits(self)
         data = plain_numbers(data)
         with_bounces(data)
-        return Drawn(SceneSpec.model_validate(data), data, self.axes, tuple(self.things), groups)
+        spec = SceneSpec.model_validate(data)
+        return Drawn(spec, data, self.axes, tuple(self.things), groups, self.files)
 
     def stream(self, what: str) -> np.random.Generator:
         """Random numbers for one aspect, which no other aspect's draws move."""
@@ -170,9 +181,13 @@ class Draft:
         """An index below ``count``."""
         return _index(rng, count)
 
-    def unseen(self, kind: str) -> int:
-        """A colour that training never shows this kind in."""
-        return unseen_colors(kind)[0]
+    def marks(self, rng: np.random.Generator, count: int, share: float) -> list[bool]:
+        """That share of ``count`` things, marked in an order of chance."""
+        return _marks(rng, count, share)
+
+    def colors_of(self, kind: str) -> list[int]:
+        """Colours that training never shows a thing of this kind in, of which its own is one."""
+        return unseen_colors(kind)
 
     def other_color(self, rng: np.random.Generator, color: int) -> int:
         """The accent of the scene, or a bright colour where that is ``color``."""
@@ -198,7 +213,8 @@ class Draft:
         if fog and not smooth:
             self.fog = {"sigma_t": _between(rng, 0.02, 0.06), "albedo": 0.95, "g": 0.4}
 
-    def _choose_things(self) -> None:
+    def choose_things(self) -> None:
+        """Draw what stands there."""
         rng = self.stream("things")
         count = self.axes.things
         shiny = _marks(rng, count, 0.7 * self.axes.highlights)
@@ -215,7 +231,7 @@ class Draft:
             kinds.append(kind)
         for k, kind in enumerate(kinds):
             own = self.stream(f"thing {k}")
-            look = self._look(own, kind, shiny[k], patterned[k])
+            look = self.look_of(own, kind, shiny[k], patterned[k])
             instance = FIRST_SHAPE + int(own.integers(2**32))
             size = 1.0 if k == 0 else 0.4 + 0.7 * self.axes.occlusion
             scale = round(size * _between(own, 0.95, 1.2), 3)
@@ -223,9 +239,10 @@ class Draft:
             make = self._assembly if k == 0 else self._single
             self.things.append(make(own, kind, instance, look, scale, yaw))
 
-    def _look(self, rng: np.random.Generator, kind: str, shiny: bool, patterned: bool) -> Look:
+    def look_of(self, rng: np.random.Generator, kind: str, shiny: bool, patterned: bool) -> Look:
         """A look that training never shows this kind in, or one without a colour."""
-        color = unseen_colors(kind)[_index(rng, len(unseen_colors(kind)))]
+        colors = self.colors_of(kind)
+        color = colors[_index(rng, len(colors))]
         second = self.other_color(rng, color)
         if shiny:
             finish = ("golden", "silver", "bronze")[_index(rng, 3)]
@@ -350,13 +367,15 @@ class Draft:
         if self.smooth:
             kind = ("mirror ball", "mirror", "glass ball", "pane")[_index(rng, 4)]
             r = round(_between(rng, 0.2, 0.34), 3)
-            wide = 0.6 if kind in ("mirror", "pane") else r
-            x, y = self._free(rng, wide, _between(rng, 0.05, 0.4), clear=50.0)
+            # A mirror hides what stands behind it from half of the views: small, and not near.
+            wide = {"mirror": 0.4, "pane": 0.6}.get(kind, r)
+            gap = _between(rng, 0.5, 0.9) if kind == "mirror" else _between(rng, 0.05, 0.4)
+            x, y = self._free(rng, wide, gap, clear=50.0)
             self.places.append((x, y, wide))
             ball = {"type": "sphere", "center": [x, y, r], "radius": r}
             away = math.hypot(x, y)
             upright = {
-                "type": "rectangle", "center": [x, y, 0.6], "size": [1.1, 1.2],
+                "type": "rectangle", "center": [x, y, 0.45], "size": [1.8 * wide, 0.9],
                 "facing": [-x / away, -y / away, 0.0],
             }  # fmt: skip
             glass = {"type": "glass", "tint": "#f4fbf6"}
@@ -577,8 +596,12 @@ def _reach(shapes: Sequence[dict[str, Any]]) -> tuple[float, float]:
 
 def _move(shapes: Sequence[dict[str, Any]], x: float, y: float) -> None:
     for shape in shapes:
-        if shape["type"] == "body":
-            shape["position"] = [round(x, 3), round(y, 3), 0.0]
+        if shape["type"] in ("body", "mesh"):
+            own = shape.get("position", (0.0, 0.0, 0.0))
+            digits = 3 if shape["type"] == "body" else 7
+            shape["position"] = [
+                round(a + b, digits) for a, b in zip(own, (x, y, 0.0), strict=True)
+            ]
         else:
             shape["center"] = [round(x, 3), round(y, 3), shape["center"][2]]
 

@@ -38,13 +38,16 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(scenes, Mapping):
         try:
             wanted = population(scenes)
+            result["scenes"] = [str(path) for path in wanted.files()]
         except InputError as error:
             raise InputError(f"scenes: {error}") from None
         result["population"] = wanted.model_dump(mode="json")
-        result["scenes"] = [str(path) for path in wanted.files()]
     elif result.get("population") and isinstance(scenes, list):
         wanted = population(result["population"])
-        files = {path.stem: path for path in wanted.files()}
+        try:
+            files = {path.stem: path for path in wanted.files()}
+        except InputError:
+            return result  # the folder of meshes is elsewhere, and only the figures are wanted
         named = [Path(str(name)) for name in scenes]
         if not all(_is_one_of(path, files) for path in named):
             # Other scenes beside them are no sample of anything.

@@ -21,7 +21,7 @@ from pydantic import (
 from attnwarp import check
 from attnwarp.errors import InputError, suggest
 from attnwarp.warp import PRESETS, WarpSettings
-from attnwarp_eval.drawn.population import DrawnScenes
+from attnwarp_eval.drawn.population import Population
 from attnwarp_eval.scene.file import scene_name
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ class Study(Part):
         default_factory=list,
         description="names, paths, or a population such as {drawn: 8, seed: 7}",
     )
-    population: DrawnScenes | None = Field(None, description="of which the scenes are a sample")
+    population: Population | None = Field(None, description="of which the scenes are a sample")
     views: list[str] = Field(
         default_factory=list, description="target views by name; all of them if empty"
     )

@@ -392,6 +392,9 @@ def _beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
     scenes, encoders = data.get("scenes"), data.get("encoders")
     if isinstance(scenes, list):
         data["scenes"] = [beside(name) if is_scene_file(name) else name for name in scenes]
+    elif isinstance(scenes, dict) and "meshes" in scenes:
+        meshes = beside(scenes["meshes"])
+        data["scenes"] = {**scenes, "meshes": str(Path(meshes).expanduser().absolute())}
     if isinstance(encoders, dict):
         data["encoders"] = {
             kind: f"{name.partition(':')[0]}:{beside(name.partition(':')[2])}"

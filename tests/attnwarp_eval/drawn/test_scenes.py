@@ -47,7 +47,7 @@ def test_another_process_with_other_locale_threads_and_hash_seed_draws_the_same_
     program = (
         "import sys\nfrom pathlib import Path\nfrom attnwarp_eval.drawn.files import write\n"
         "from attnwarp_eval.drawn.scenes import draw\n"
-        "for k in (3, 0, 2): write(draw(k, seed=5).data, Path(sys.argv[1]))"
+        "for k in (3, 0, 2): write(draw(k, seed=5), Path(sys.argv[1]))"
     )
     other = {
         "LC_ALL": "tr_TR.UTF-8",

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+import trimesh
 
 from attnwarp_eval.drawn.files import to_text
 from attnwarp_eval.drawn.scenes import draw
@@ -84,10 +85,41 @@ def test_an_entry_for_the_population_is_one_for_each_of_its_scenes(study_file):
     assert study.editing.edits == dict.fromkeys(study.scene_names, wanted)
 
 
+def test_meshes_of_a_folder_stand_upright_on_drawn_ground(tmp_path, monkeypatch):
+    models = tmp_path / "models"
+    models.mkdir()
+    box = trimesh.creation.box((2.0, 6.0, 2.0)).apply_translation((5, 40, -3))
+    box.export(models / "tower.obj")  # y is up
+    trimesh.creation.cone(radius=0.5, height=3.0).export(models / "cone.stl")  # z is up
+    path = tmp_path / "mine.yaml"
+    path.write_text(STUDY.replace("{drawn: 3, generator: 1,", "{meshes: models, n: 3,"))
+    study = load_study(str(path))
+    assert study.scene_names == ["mesh-0", "mesh-1", "mesh-2"]
+    assert study.sampled == "3 scenes of meshes of models drawn by generator 1, seed 7, thin 0.2"
+    for name in study.scenes:
+        scene = load_scene(name)
+        assert Path(name).with_name("meshes").is_dir() and len(scene.edits) == 7
+        shapes = scene.shapes()
+        for k, item in enumerate(scene.spec.objects):
+            if item.shape.type == "mesh":
+                low, high = next(s for s in shapes if s.object_id == k).bounds()
+                assert low[2] == pytest.approx(0, abs=1e-3)
+                assert (high - low)[2] > 1.3 * max((high - low)[:2]) and high[2] < 1.2
+                assert all(low[:2] < scene.spec.cameras.radius) and all(
+                    high[:2] > -scene.spec.cameras.radius
+                )
+    # A run is reported where its meshes are not.
+    stored = study.model_dump(mode="json")
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path / "elsewhere"))
+    models.rename(tmp_path / "gone")
+    assert parse_study(stored).scene_names == study.scene_names
+
+
 @pytest.mark.parametrize(
     ("scenes", "message"),
     [
         ("{drawn: 3, seed: 7, axes: {oclusion: 1}}", "did you mean 'occlusion'"),
+        pytest.param("{meshes: no, n: 3, seed: 7}", "no folder", marks=pytest.mark.door),
         pytest.param("{drawn: 3}", "seed: is missing", marks=pytest.mark.door),
         pytest.param(
             "{drawn: 3, seed: 7, generator: 2}", "generator: got 2", marks=pytest.mark.door
