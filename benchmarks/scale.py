@@ -29,8 +29,7 @@ from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cost import peak_memory_mb
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import METRICS, Registry
-from attnwarp_eval.study.probes import register
-from attnwarp_eval.study.probes.base import Probe, Work
+from attnwarp_eval.study.probe import Probe, Work, register
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Part, Study, Variant
 from attnwarp_eval.study.store import Store

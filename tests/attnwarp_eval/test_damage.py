@@ -18,7 +18,7 @@ from attnwarp.errors import InputError
 from attnwarp_eval import cache
 from attnwarp_eval.report.results import read_results
 from attnwarp_eval.study import Store, load_study
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probe import probe
 
 DATA = pathlib.Path(__file__).parent / "data" / "runs.tar.xz"
 

@@ -15,7 +15,7 @@ def run(monkeypatch, *arguments):
 
 @pytest.fixture(autouse=True)
 def probe_for_these_tests_alone():
-    from attnwarp_eval.study.probes import unregister
+    from attnwarp_eval.study.probe import unregister
 
     yield
     unregister("free")

@@ -11,7 +11,8 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.metrics.registry import Metric, Registry
 from attnwarp_eval.study.pictures import jpeg
-from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work
+from attnwarp_eval.study.probe import Probe, Work
+from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Part, Study, Variant
@@ -49,8 +50,6 @@ class Chord(Probe[Longest]):
     study_part = StudyPart
     variant_part = VariantPart
     metrics = Registry({CHORD.name: CHORD})
-    columns: ClassVar[Mapping[str, str]] = {"chord": CHORD.name}
-    contrasts = (CHORD.name,)
 
     def check(self, study: Study) -> None:
         if study.part(StudyPart).camera_unit <= 0:
@@ -77,6 +76,15 @@ class Chord(Probe[Longest]):
 
     def read_extra(self, data: Json) -> Longest:
         return Longest(**data["longest"])
+
+
+@register_report
+class ChordReport(ProbeReport):
+    """A table of variants, and the longest chord of each cell."""
+
+    name = "chord"
+    columns: ClassVar[Mapping[str, str]] = {"chord": CHORD.name}
+    contrasts = (CHORD.name,)
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         rows = [

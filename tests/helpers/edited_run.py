@@ -11,7 +11,7 @@ from written_runs import record
 
 from attnwarp_eval.study import Store, load_study
 from attnwarp_eval.study.edit_truth import Judgement
-from attnwarp_eval.study.probes.editing import EditResult
+from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.run import expected, plan
 
 METHODS = ("alone", "warped", "third")

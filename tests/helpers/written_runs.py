@@ -2,7 +2,7 @@
 
 import copy
 
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.results import Outcome, Results
 from attnwarp_eval.study.study import parse_study
 

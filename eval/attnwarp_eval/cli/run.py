@@ -256,8 +256,8 @@ def _run_pilot(
 
     from attnwarp_eval.document.write import terminal
     from attnwarp_eval.report.planning import PILOT_SCENES, plan_table
-    from attnwarp_eval.study.populations import pilot_of
     from attnwarp_eval.study.store import Store
+    from attnwarp_eval.study.study import pilot_of
 
     with clear_errors():
         loaded = load()
@@ -281,16 +281,16 @@ def _name_notices(planned: Plan) -> None:
 
 def _name_untabulated(study: Study) -> None:
     """Name the variants that a study measures and its report shows in no table or front."""
-    from attnwarp_eval.study.probes import probe
+    from attnwarp_eval.study.probe_report import report_of
 
     tabulated = {(a.probe, name) for a in study.ablations for name in (a.baseline, *a.variants)}
     tabulated |= {(front.probe, name) for front in study.fronts for name in front.variants}
     untabulated = {
         name: [variant for variant in variants if (name, variant) not in tabulated]
         for name, variants in study.probes.items()
-        if probe(name).columns and not probe(name).tabulates_all
+        if (own := report_of(name)).probe.tabled and not own.tabulates_all
     }
-    listed = "; ".join(f"{name} of {', '.join(own)}" for name, own in untabulated.items() if own)
+    listed = "; ".join(f"{name} of {', '.join(rest)}" for name, rest in untabulated.items() if rest)
     if listed:
         log(
             f"in no table of the report: {listed}; a table under 'ablations' shows"

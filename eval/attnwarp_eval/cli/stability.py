@@ -60,7 +60,8 @@ def _show(chosen: list[Case], quick: bool) -> list[str]:
     from rich.console import Console
 
     from attnwarp_eval.document.write import terminal
-    from attnwarp_eval.study.probes.stability import Swept, case_table, must_hold, verdict_lines
+    from attnwarp_eval.study.probes.stability.measure import Swept, must_hold
+    from attnwarp_eval.study.probes.stability.report import case_table, verdict_lines
 
     console = Console()
     lines: list[str] = []
@@ -96,7 +97,8 @@ def _show(chosen: list[Case], quick: bool) -> list[str]:
 def _study(quick: bool, out: Path | None, jobs: int) -> list[str]:
     """Run the study; return what fails."""
     from attnwarp_eval.cli.run import run_study
-    from attnwarp_eval.study.probes.stability import read_sweeps, verdict_lines
+    from attnwarp_eval.study.probes.stability.measure import read_sweeps
+    from attnwarp_eval.study.probes.stability.report import verdict_lines
     from attnwarp_eval.study.study import load_study
 
     changes: dict[str, Any] = {

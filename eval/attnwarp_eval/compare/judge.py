@@ -24,7 +24,7 @@ from attnwarp_eval.statistics.intervals import (
     paired,
     verdict,
 )
-from attnwarp_eval.study.probes import probe as probe_of
+from attnwarp_eval.study.probe import probe as probe_of
 
 Verdict = Literal["worse", "better", "equal", "can't tell"]
 

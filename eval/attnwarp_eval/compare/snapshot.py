@@ -13,7 +13,7 @@ from typing import Any
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.metrics.gates import gated
 from attnwarp_eval.report.results import read_results
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Outcome, Results
 from attnwarp_eval.study.store import Store

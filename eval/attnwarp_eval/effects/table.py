@@ -18,9 +18,7 @@ from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Tabl
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.effects.detect import detect
 from attnwarp_eval.effects.saving import measure
-from attnwarp_eval.scene.materials import NOT_SIMULATED
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.scene.transport import called_for
 from attnwarp_eval.statistics.equivalence import Equivalence
 from attnwarp_eval.truth.plan import everything_on, plan
 
@@ -313,14 +311,3 @@ def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Re
         ]  # fmt: skip
         sections.append(Section("Side by side", text, gallery=Gallery(rows)))
     return Report("What light does in each scene, and what of it is simulated", lead, sections)
-
-
-def transport_of(scene: Scene) -> dict[str, Any]:
-    """The effects that a scene's file calls for, each with the reason, and the plan, as JSON."""
-    reasons = called_for(scene.spec)
-    return {
-        "needed": {name: text for name, text in reasons.items() if name not in NOT_SIMULATED},
-        "not_simulated": {name: text for name, text in reasons.items() if name in NOT_SIMULATED},
-        "plan": plan(scene).to_dict(),
-        "everything_on": everything_on(scene, capped=False).integrator,
-    }

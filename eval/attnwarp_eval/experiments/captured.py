@@ -31,8 +31,10 @@ from attnwarp_eval.study.editing_methods import (
     needs_source_words,
     with_source_words,
 )
-from attnwarp_eval.study.probes import editing, fit, sensitivity
+from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.schema import Study, Variant
+from attnwarp_eval.study.shared import edits, fits, method_run
+from attnwarp_eval.study.shared.encoders import EncodersPart
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.user_images import measure
 
@@ -107,9 +109,9 @@ class Editors:
                     f" name it by {other}"
                 )
 
-    def of(self, study: Study, variant: Variant) -> editing.EditorPart:
+    def of(self, study: Study, variant: Variant) -> edits.EditorPart:
         """The editor of a variant."""
-        own = editing.editor_of(study, variant)
+        own = edits.editor_of(study, variant)
         if not self.named:
             return own
         return own.model_copy(update={"name": self.named.get(guide_of(own.name), own.name)})
@@ -130,14 +132,14 @@ class Comparison:
 
 def needs_truth(variant: Variant) -> str | None:
     """Reason why a variant cannot run without a scene whose truth is known; None where it can."""
-    own = variant.part(editing.VariantPart)
+    own = variant.part(edits.VariantPart)
     if own.method == "true pictures":
         return "its edits are the true pictures"
     if own.mask == "truth" or variant.geometry == "truth":
         return "its warp is the true one"
     if own.by_hand is not None:
         return "its source is drawn from the true picture"
-    if variant.part(fit.VariantPart).fitted:
+    if variant.part(fits.VariantPart).fitted:
         return "its splats are fitted to true pictures"
     return None
 
@@ -173,7 +175,7 @@ def compare(
         if (reason := needs_truth(study.variants[name])) is not None:
             result.left_out[f"variant {name}"] = reason
         elif words.source is None and needs_source_words(
-            editing.settings_of(study, study.variants[name], study.seeds[0])
+            edits.settings_of(study, study.variants[name], study.seeds[0])
         ):
             result.left_out[f"variant {name}"] = "it inverts with the words of --source-prompt"
     usable = [name for name in names if f"variant {name}" not in result.left_out]
@@ -191,7 +193,7 @@ def compare(
     usable.sort(key=lambda name: _reference(study.variants[name]) is not None)
     result.left_out |= {
         title: f"{metric} needs the true edited views or the true surface"
-        for title, metric in editing.EditingProbe.columns.items()
+        for title, metric in report_of("editing").columns.items()
         if not metric.startswith(WITHOUT_TRUTH)
     }
     originals = _originals(views, out / "originals")
@@ -199,11 +201,11 @@ def compare(
     for place, name in enumerate(usable):
         report.step(place, len(usable), name)
         folder = out / f"variant-{names.index(name) + 1}"
-        editor = editing.load(
-            parts[name].name, editing.editor_identity(parts[name]), editors.device
+        editor = method_run.load(
+            parts[name].name, edits.editor_identity(parts[name]), editors.device
         )
         edited = _edit(study, name, editor, views, splats, words, folder / "run", seconds)
-        seconds[name] = sum(edited.seconds.get(part, 0.0) for part in editing.OWN_WORK)
+        seconds[name] = sum(edited.seconds.get(part, 0.0) for part in method_run.PARTS)
         _write_pictures(views.cameras, splats, edited, originals, folder)
         page = _page(folder / "run", splats, views.cameras, originals, editor, parts[name].name)
         result.rows[name] = _measured(study, edited, words, folder, out / "originals", result)
@@ -222,7 +224,7 @@ def compare(
 
 
 def _reference(variant: Variant) -> str | None:
-    budget = variant.part(editing.VariantPart).budget
+    budget = variant.part(edits.VariantPart).budget
     return None if budget is None else budget.seconds_of
 
 
@@ -260,9 +262,9 @@ def _edit(
     from attnwarp.methods import Budget
 
     variant = study.variants[name]
-    own = variant.part(editing.VariantPart)
+    own = variant.part(edits.VariantPart)
     settings = with_source_words(
-        editing.settings_of(study, variant, study.seeds[0]), words.source or ""
+        edits.settings_of(study, variant, study.seeds[0]), words.source or ""
     )
     if settings.get("size") is None:
         settings["size"] = own_size(editor)
@@ -350,7 +352,7 @@ def _measured(
         source_prompt=words.source,
     )
     encoders: dict[Any, str | None] = {
-        str(kind): name for kind, name in study.part(sensitivity.StudyPart).encoders.items()
+        str(kind): name for kind, name in study.part(EncodersPart).encoders.items()
     }
     done = measure.measure(inputs, encoders, Store(folder / "measured"))
     result.left_out |= {

@@ -18,7 +18,7 @@ from attnwarp_eval.inspect.capture import BEFORE, EDITED, Image, read_picture
 from attnwarp_eval.study.store import Store
 
 if TYPE_CHECKING:
-    from attnwarp_eval.study.probes.base import Probe
+    from attnwarp_eval.study.probe import Probe
     from attnwarp_eval.study.record import PictureFile, Record
 
 
@@ -121,7 +121,7 @@ def measured(
         StoreError: a record is damaged.
         InputError: a cell was measured of the scene as it was before.
     """
-    from attnwarp_eval.study.probes import probes
+    from attnwarp_eval.study.probe import probes
 
     store = Store(folder)
     done, available = store.done(), {p.name: p for p in probes()}
@@ -156,7 +156,7 @@ def _measured(
     folder: Path, source: str, own: Probe[Any], data: dict[str, Any]
 ) -> tuple[str, Measured | None]:
     """Hash of the scene, and what a record has of it; None where it neither edits nor fits."""
-    from attnwarp_eval.study.probes.fit import folder_of
+    from attnwarp_eval.study.shared.fits import folder_of
 
     record = own.read(data)
     spec = record.spec

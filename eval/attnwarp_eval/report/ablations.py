@@ -16,8 +16,7 @@ from attnwarp_eval.statistics.intervals import (
     paired,
     verdict,
 )
-from attnwarp_eval.study.probes import probe
-from attnwarp_eval.study.probes.base import is_mse, mean_values
+from attnwarp_eval.study.probe_report import is_mse, mean_values, report_of
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Ablation
 
@@ -56,23 +55,20 @@ def ablations(results: Results) -> list[Section]:
     claimed = of_comparisons(judge(results, load_claims()))
     sections = [_section(results, ablation, claimed) for ablation in results.study.ablations]
     for section, ablation in zip(sections, results.study.ablations, strict=True):
-        if any(map(is_mse, probe(ablation.probe).columns.values())):
+        if any(map(is_mse, report_of(ablation.probe).columns_at(results.layer).values())):
             section.text.append(POOLED)
             break
     return sections
 
 
 def _section(results: Results, ablation: Ablation, claimed: Mapping[Comparison, float]) -> Section:
-    own, baseline = probe(ablation.probe), ablation.baseline
+    own, baseline = report_of(ablation.probe), ablation.baseline
     names = [baseline, *[v for v in ablation.variants if v != baseline]]
     section = Section(ablation.title, [ablation.note] if ablation.note else [])
     missing = [name for name in names if not results.records(own.name, name)]
     if missing:
         section.text.append(f"**Not measured:** {', '.join(missing)}.")
-    columns = {
-        title.format(layer=results.layer): metric.format(layer=results.layer)
-        for title, metric in own.columns.items()
-    }
+    columns = own.columns_at(results.layer)
     # Probes that render nothing for a view count no pairs.
     counted = any("pairs" in results.counters(own.name, name) for name in names)
     rows = []
@@ -116,7 +112,7 @@ def contrasts(
         ablation: of the study.
         claimed: from :func:`attnwarp_eval.report.claims.of_comparisons`.
     """
-    own, baseline = probe(ablation.probe), ablation.baseline
+    own, baseline = report_of(ablation.probe), ablation.baseline
     pairs = [
         (name, metric.format(layer=results.layer))
         for name in ablation.variants
@@ -138,7 +134,7 @@ def contrasts(
     for pair, difference, of_table, of_claim in zip(
         pairs, differences, adjusted, of_claims, strict=True
     ):
-        specification, judged = own.metric(pair[1]), of_claim is not None
+        specification, judged = own.probe.metric(pair[1]), of_claim is not None
         p = of_table if of_claim is None else of_claim
         outcome: Verdict | None = None
         if specification.direction in ("higher", "lower"):

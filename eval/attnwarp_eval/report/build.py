@@ -13,8 +13,7 @@ from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.galleries import galleries
 from attnwarp_eval.report.measured import failures, measured
 from attnwarp_eval.report.settling import settling
-from attnwarp_eval.study.probes import probes
-from attnwarp_eval.study.probes.base import Layout, Place
+from attnwarp_eval.study.probe_report import Layout, Place, reports
 from attnwarp_eval.study.results import Results
 
 
@@ -63,8 +62,8 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
         lead += ["**Scene {}**: `{}`".format(scene, line.replace("`", "'")) for line in lines]
     layout = Layout(root, timings)
     of_probes: dict[Place, list[Section]] = {place: [] for place in Place}
-    for probe in probes():
-        for place, section in probe.sections(results, layout):
+    for own in reports():
+        for place, section in own.sections(results, layout):
             of_probes[place].append(section)
     sections = [
         *([claims(results), *settling(results, timings)] if study.scenes else []),
@@ -96,4 +95,4 @@ def problems(results: Results) -> list[str]:
         >>> problems(Results(study, cells=[], failures=[]))  # nothing measured, nothing wrong
         []
     """
-    return [line for probe in probes() for line in probe.problems(results)]
+    return [line for own in reports() for line in own.problems(results)]

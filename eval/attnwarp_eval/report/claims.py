@@ -24,7 +24,7 @@ from attnwarp_eval.statistics.intervals import (
     paired,
 )
 from attnwarp_eval.statistics.planning import Parts, parts
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.study import parse_variant
 

@@ -20,7 +20,8 @@ from attnwarp_eval.report.claims import (
     of_comparisons,
 )
 from attnwarp_eval.statistics.intervals import Interval
-from attnwarp_eval.study.probes import probe, probes
+from attnwarp_eval.study.probe import probe, probes
+from attnwarp_eval.study.probe_report import reports
 from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Ablation
@@ -61,7 +62,7 @@ def findings(results: Results, problems: list[str], *, pictures: bool = True) ->
     claims = [_claim(results, judged) for judged in clearest]
     told = [set(judged.sides) for judged in clearest]
     effects = _effects(results, told, of_comparisons(judged_claims))
-    others = [finding for probe in probes() for finding in probe.findings(results)]
+    others = [finding for own in reports() for finding in own.findings(results)]
     chosen = [*first, *claims, *others, *effects][:MOST]
     return chosen if pictures else [replace(finding, picture=None) for finding in chosen]
 

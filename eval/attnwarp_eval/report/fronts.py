@@ -18,11 +18,11 @@ from attnwarp_eval.statistics.intervals import (
     interval,
 )
 from attnwarp_eval.statistics.intervals import front as pareto
-from attnwarp_eval.study.probes import probe, probes
-from attnwarp_eval.study.probes.base import Layout
-from attnwarp_eval.study.probes.turns import Timed, timed_in_turn
+from attnwarp_eval.study.probe import probes
+from attnwarp_eval.study.probe_report import Layout, report_of
 from attnwarp_eval.study.results import Results, Shared
 from attnwarp_eval.study.schema import Front
+from attnwarp_eval.study.turns import Timed, timed_in_turn
 
 DRAWS = 1000
 """Resamples of scenes and rounds."""
@@ -46,11 +46,11 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
         points, rows = _points(results, front, shared)
         if not points:
             continue
-        timed = timed_in_turn(results, probe(front.probe).stage)
+        timed = timed_in_turn(results, report_of(front.probe).stage)
         section.text += shared.text(front.title)
         path = layout.figure(f"front-{index}.svg")
-        own = probe(front.probe)
-        label = f"{metric} ({own.metric(metric).unit})"
+        own = report_of(front.probe)
+        label = f"{metric} ({own.probe.metric(metric).unit})"
         once = "" if timed else ", one pass"
         with charts.drawing(path) as (axes,):
             on_front = charts.cost_front(
@@ -60,7 +60,7 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
                 y=label,
                 title=front.title,
                 # A difference of colours above a floor may be negative.
-                log=own.metric(metric).unit != "dE00",
+                log=own.probe.metric(metric).unit != "dE00",
             )
         section.figures.append(Picture(f"figures/{path.name}", f"{front.title}{once}"))
         time = f"ms {own.cost_of}{once}"
@@ -126,12 +126,12 @@ def _cheapest(
 
 
 def _text(results: Results) -> list[str]:
-    contents = dict.fromkeys(probe(front.probe).cost_text for front in results.study.fronts)
+    contents = dict.fromkeys(report_of(front.probe).cost_text for front in results.study.fronts)
     text = [
         f"{' '.join(contents)} A point is on the front when nothing"
         " cheaper is as good, by the means."
     ]
-    for stage in dict.fromkeys(probe(front.probe).stage for front in results.study.fronts):
+    for stage in dict.fromkeys(report_of(front.probe).stage for front in results.study.fronts):
         timed = timed_in_turn(results, stage)
         text.append(_once(stage) if timed is None else _in_turn(timed))
     return list(dict.fromkeys(text))
@@ -166,7 +166,7 @@ def _points(
     results: Results, front: Front, shared: Shared
 ) -> tuple[dict[str, tuple[Interval, Interval]], list[list[str]]]:
     """Seconds and quality of each comparable variant; the rows but for their last column."""
-    timed = timed_in_turn(results, probe(front.probe).stage)
+    timed = timed_in_turn(results, report_of(front.probe).stage)
     points: dict[str, tuple[Interval, Interval]] = {}
     rows = []
     for name in front.variants:
@@ -184,7 +184,7 @@ def _points(
             text = "1" if base else ratio_text(ratio)
             judged = "baseline" if base else timed.judge(ratio)
         else:
-            once = results.seconds(front.probe, name, probe(front.probe).cost)
+            once = results.seconds(front.probe, name, report_of(front.probe).cost)
             if not once:
                 continue
             seconds, text, judged = (

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from attnwarp_eval.document.model import Gallery, Picture, Section
 from attnwarp_eval.study.pictures import CLASSES, DEPTH_RANGE, EPE_RANGE, ORDER, SHARED
-from attnwarp_eval.study.probes import probe, probes
+from attnwarp_eval.study.probe_report import report_of, reports
 from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.results import Results
 
 
 def galleries(results: Results) -> list[Section]:
     """Sections of pictures, none if no cell has any."""
-    own = {p.name: section for p in probes() if (section := p.gallery(results)) is not None}
+    own = {p.name: section for p in reports() if (section := p.gallery(results)) is not None}
     shared = _shared(results, set(own))
     return [*own.values(), *shared]
 
@@ -23,7 +23,7 @@ def _shared(results: Results, apart: set[str]) -> list[Section]:
         if cell.probe in apart:
             continue
         for picture in cell.record.pictures if cell.record else ():
-            label = probe(cell.probe).picture_label or cell.variants[0]
+            label = report_of(cell.probe).picture_label or cell.variants[0]
             by_view.setdefault((cell.scene, picture.view), []).append((label, picture))
     if not by_view:
         return []

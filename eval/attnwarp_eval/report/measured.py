@@ -6,7 +6,7 @@ from typing import Any
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
 

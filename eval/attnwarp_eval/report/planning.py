@@ -18,7 +18,8 @@ from attnwarp_eval.report.settling import seconds_of
 from attnwarp_eval.statistics.contrasts import Contrast, contrast
 from attnwarp_eval.statistics.planning import MOST_SCENES, scenes_needed
 from attnwarp_eval.statistics.signflips import FEWEST
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.results import Results
 
 PILOT_SCENES = 8
@@ -81,10 +82,10 @@ def _contrasts(results: Results) -> Iterator[tuple[str, str, Metric, Contrast]]:
             value = contrast(found.a, found.b, scale, floor=metric.atol)
             yield claim.text, found.metric, metric, value
     for table in results.study.ablations:
-        own = probe(table.probe)
+        own = report_of(table.probe)
         for name in table.variants:
             for key in (one.format(layer=results.layer) for one in own.contrasts):
-                metric = own.metric(key)
+                metric = own.probe.metric(key)
                 a, b = (results.views(own.name, who, key) for who in (table.baseline, name))
                 value = contrast(a, b, metric.scale, floor=metric.atol)
                 if name != table.baseline and metric.direction in ("higher", "lower"):

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from attnwarp_eval.canonical_json import canonical_json
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.record import Failure, Record
 from attnwarp_eval.study.results import Outcome, Results
 from attnwarp_eval.study.run import stored_study

@@ -12,10 +12,10 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.report.claims import JudgedClaim, judge, load_claims
 from attnwarp_eval.statistics.planning import MOST_SCENES, effect_interval, scenes_needed
-from attnwarp_eval.study.probes import probe
-from attnwarp_eval.study.probes.variant_splats import is_fitted
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.shared.splats import is_fitted
 
 HOURS = "hours"
 

@@ -22,7 +22,7 @@ from attnwarp.errors import InputError
 from attnwarp.process import core_count
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.record import Failure
 from attnwarp_eval.study.remote import (
     Code,

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from attnwarp.errors import InputError
 from attnwarp_eval.drawn.population import population
-
-if TYPE_CHECKING:
-    from attnwarp_eval.study.schema import Study
 
 
 def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -67,30 +64,18 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def pilot_of(study: Study, count: int) -> Study:
-    """A study on a few scenes of another seed of its population.
+def with_edits_of(data: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """A study's data with the edits of some scenes alone.
 
-    Raises:
-        InputError: its scenes are of no population.
+    Args:
+        data: of a study.
+        names: of the scenes.
     """
-    from attnwarp_eval.study.study import parse_study
-
-    if study.population is None:
-        raise InputError(
-            f"--plan: study {study.name!r} names its scenes one by one; a pilot needs a population"
-            " such as scenes: {drawn: 48, seed: 7}"
-        )
-    data = study.model_dump(mode="json", exclude_unset=True)
-    other = study.population.pilot(count)
     editing = data.get("editing")
-    if editing and editing.get("edits"):
-        names = set(other.names)
-        kept = {name: edits for name, edits in editing["edits"].items() if name in names}
-        data["editing"] = {**editing, "edits": kept}
-    scenes = other.model_dump(mode="json")
-    return parse_study(
-        {**data, "name": f"{study.name}-pilot", "population": None, "scenes": scenes}
-    )
+    if not (editing and editing.get("edits")):
+        return dict(data)
+    kept = {name: edits for name, edits in editing["edits"].items() if name in names}
+    return {**data, "editing": {**editing, "edits": kept}}
 
 
 def _is_one_of(path: Path, files: Mapping[str, Path]) -> bool:

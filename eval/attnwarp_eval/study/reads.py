@@ -13,7 +13,7 @@ from attnwarp.warp import RULES, WarpSettings
 from attnwarp_eval.study.schema import Part, Study, Variant
 
 if TYPE_CHECKING:
-    from attnwarp_eval.study.probes.base import Probe
+    from attnwarp_eval.study.probe import Probe
 
 Path = tuple[str, ...]
 

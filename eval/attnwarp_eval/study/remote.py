@@ -18,7 +18,7 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import MeshSpec
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.plugins import load_plugins
-from attnwarp_eval.study.probes.base import Probe
+from attnwarp_eval.study.probe import Probe
 from attnwarp_eval.study.record import Failure, Json
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.work import compute, failure

@@ -21,7 +21,7 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
 from attnwarp_eval.study.plugins import VARIABLE, load_plugins, plugin_modules
-from attnwarp_eval.study.probes import probe, probes
+from attnwarp_eval.study.probe import probe, probes
 from attnwarp_eval.study.record import Environment, Failure
 from attnwarp_eval.study.reporting import CellReporter
 from attnwarp_eval.study.schema import Study, StudyError, did_you_mean

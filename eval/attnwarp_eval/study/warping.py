@@ -8,7 +8,7 @@ import torch
 
 from attnwarp.warp import Surface, WarpedView, WarpSettings, warp_surfaces
 from attnwarp_eval import metrics
-from attnwarp_eval.study.probes.base import Work
+from attnwarp_eval.study.probe import Work
 from attnwarp_eval.two_view import TwoView
 from attnwarp_eval.world import World
 

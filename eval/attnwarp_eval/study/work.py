@@ -14,7 +14,7 @@ from attnwarp_eval.cost import Meter, environment, peak_memory_mb, reset_peak_me
 from attnwarp_eval.scene.base import silence_notices
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.plugins import load_plugins
-from attnwarp_eval.study.probes.base import Probe, Work
+from attnwarp_eval.study.probe import Probe, Work
 from attnwarp_eval.study.record import Cost, Environment, Failure, Record
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.world import changed, world

@@ -15,7 +15,7 @@ from attnwarp.errors import InputError, suggest
 from attnwarp.io.picture import encode_picture
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.report import read_results
-from attnwarp_eval.study.probes.editing import EditResult
+from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.store import Store
 
 BEFORE, AFTER = "before", "render"

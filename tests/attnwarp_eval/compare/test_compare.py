@@ -31,9 +31,10 @@ from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.report.results import read_results
 from attnwarp_eval.study import Store, load_study
 from attnwarp_eval.study.edit_truth import Judgement
-from attnwarp_eval.study.probes import probes, register, unregister
-from attnwarp_eval.study.probes.editing import EditResult
-from attnwarp_eval.study.probes.variability import Varied
+from attnwarp_eval.study.probe import register, unregister
+from attnwarp_eval.study.probe_report import reports
+from attnwarp_eval.study.probes.editing.result import EditResult
+from attnwarp_eval.study.probes.variability.measure import Varied
 from attnwarp_eval.study.run import plan
 
 DONE = Judgement("red", True, 25.0, 10.0, 10.0)
@@ -782,14 +783,14 @@ STANDS_IN = {
 """Headline figures that move with a gated one of the same pixels."""
 
 
-def headlines(probe):
-    for key in (*probe.columns.values(), *probe.contrasts):
+def headlines(report):
+    for key in (*report.columns.values(), *report.contrasts):
         whole = key.format(layer=64).removesuffix(".interior").removesuffix(".edge")
         yield STANDS_IN.get(whole, whole.replace("fidelity.psnr.", "fidelity.mse."))
 
 
 def test_every_headline_figure_is_gated_and_every_gate_is_a_figure_of_a_probe(stored):
-    keys = {key for probe in probes() for key in headlines(probe)}
+    keys = {key for report in reports() for key in headlines(report)}
     assert len(keys) > 20
     assert [key for key in keys if not gated(key)] == []
     keys |= {

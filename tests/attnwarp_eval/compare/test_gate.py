@@ -20,7 +20,8 @@ from attnwarp_eval.compare.pictures import pictures_of_baseline
 from attnwarp_eval.compare.snapshot import definition
 from attnwarp_eval.cost import Meter
 from attnwarp_eval.study import Store, load_study, parse_study
-from attnwarp_eval.study.probes import depth, warp
+from attnwarp_eval.study.probes.depth import measure as depth
+from attnwarp_eval.study.probes.warp import measure as warp
 from attnwarp_eval.study.run import execute, plan
 
 BASELINE = pathlib.Path(__file__).parents[3] / "reports" / "baseline" / "gate.jsonl"

@@ -16,7 +16,7 @@ from attnwarp_eval.inspect import subject
 from attnwarp_eval.inspect.scene import State
 from attnwarp_eval.inspect.window import Window
 from attnwarp_eval.study.pictures import jpeg
-from attnwarp_eval.study.probes.editing import EditResult, Judgement
+from attnwarp_eval.study.probes.editing.result import EditResult, Judgement
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.world import world
 

@@ -10,8 +10,7 @@ from attnwarp_eval.document.model import Slider
 from attnwarp_eval.report.findings import findings
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.edit_truth import Judgement
-from attnwarp_eval.study.probes import editing
-from attnwarp_eval.study.probes.editing import EditResult
+from attnwarp_eval.study.probes.editing.result import EditResult, Measurement
 from attnwarp_eval.study.record import PictureFile
 
 SCENES = ("one", "two", "three")
@@ -133,6 +132,6 @@ def test_every_content_that_a_finding_looks_for_is_one_that_a_picture_has():
     from attnwarp_eval.report.findings import CONTENTS
 
     # The keys of the dictionaries of pictures, and of nothing else in their modules.
-    drawing = (pictures.of_warp, pictures.of_depth, pictures.of_fit, editing._Measure._draw)
+    drawing = (pictures.of_warp, pictures.of_depth, pictures.of_fit, Measurement._draw)
     drawn = set(re.findall(r'"([a-z-]+)":', "".join(map(inspect.getsource, drawing))))
     assert {content for contents in CONTENTS.values() for content in contents} <= drawn

@@ -11,8 +11,7 @@ from typer.testing import CliRunner
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.report.planning import cost_of, needed
 from attnwarp_eval.statistics.contrasts import contrast
-from attnwarp_eval.study.populations import pilot_of
-from attnwarp_eval.study.study import load_study
+from attnwarp_eval.study.study import load_study, pilot_of
 
 STUDY = """\
 name: mine

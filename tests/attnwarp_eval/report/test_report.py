@@ -22,10 +22,10 @@ from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.settling import settling
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.edit_truth import EditTruth, Judgement
-from attnwarp_eval.study.probes import probe
-from attnwarp_eval.study.probes.base import Layout
-from attnwarp_eval.study.probes.editing import EditResult
-from attnwarp_eval.study.probes.editing_sections import abilities, by_scene
+from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.probe_report import Layout, report_of
+from attnwarp_eval.study.probes.editing.report import abilities, by_scene
+from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.study import load_study, parse_variant
 
 SCENES = ("one", "two", "three")
@@ -741,7 +741,7 @@ def test_an_instrument_that_is_off_is_reported(tmp_path, changes, says):
     assert problems(calibrated()) == []
     (problem,) = problems(calibrated(**changes))
     assert says in problem
-    (_, section), *_ = probe("calibration").sections(calibrated(**changes), Layout(tmp_path))
+    (_, section), *_ = report_of("calibration").sections(calibrated(**changes), Layout(tmp_path))
     assert section.tables[0].rows[0][1] == "FAILED"
     assert "not calibrated" in section.text[0]
 

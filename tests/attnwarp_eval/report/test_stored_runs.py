@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import write_report
 from attnwarp_eval.study import Store
-from attnwarp_eval.study.probes import probe
-from attnwarp_eval.study.probes.base import Layout
+from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.probe_report import Layout, report_of
 from attnwarp_eval.study.run import verify
 
 DATA = pathlib.Path(__file__).parents[1] / "data" / "runs.tar.xz"
@@ -79,7 +79,7 @@ def test_the_calibration_says_where_the_pictures_are_small(tmp_path, size, small
     study = {"name": "s", "scenes": ["a"], "size": size, "probes": {"calibration": []}}
     data = written_runs.record([])
     cell = written_runs.outcome("calibration", "a", ["calibration"], data)
-    made = probe("calibration").sections(written_runs.results(study, [cell]), Layout(tmp_path))
+    made = report_of("calibration").sections(written_runs.results(study, [cell]), Layout(tmp_path))
     (section,) = [section for _, section in made if section.title == "Calibration"]
     words = f"The pictures are small: at {size} px, "
     assert sum(text.startswith(words) for text in section.text) == small

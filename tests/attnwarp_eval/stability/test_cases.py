@@ -27,7 +27,8 @@ from attnwarp_eval.stability import Outcome, Way, bilinear, hard_case, hard_case
 from attnwarp_eval.stability.cases import editing
 from attnwarp_eval.stability.exact import FIELDS, ExactSplats
 from attnwarp_eval.stability.rendered import front_camera, splats
-from attnwarp_eval.study.probes.stability import Swept, read_sweeps, verdict_lines
+from attnwarp_eval.study.probes.stability.measure import Swept, read_sweeps
+from attnwarp_eval.study.probes.stability.report import verdict_lines
 from attnwarp_eval.study.run import execute, plan, verify
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.study import StudyError, load_study

@@ -14,14 +14,14 @@ from attnwarp.errors import InputError
 from attnwarp_eval import cost
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, editing_methods, parse_study, plugins
-from attnwarp_eval.study.probes import probe, unregister
+from attnwarp_eval.study.probe import probe, unregister
 from attnwarp_eval.study.run import expected, plan, stored_study, verify
 
 HELPERS = Path(__file__).parents[2] / "helpers"
 PLUGIN = """\
 from chord_probe import Chord
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, Method
-from attnwarp_eval.study.probes import register
+from attnwarp_eval.study.probe import register
 
 register(Chord)
 EDITING_METHODS["mine"] = Method(lambda preset, fields, seed: {"seed": seed}, None)

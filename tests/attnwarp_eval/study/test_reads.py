@@ -17,8 +17,9 @@ from attnwarp.warp import WarpSettings, warp_view
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import StudyError, cells_of, load_study, parse_study
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, Job
-from attnwarp_eval.study.probes import editing, probe, probes
+from attnwarp_eval.study.probe import probe, probes
 from attnwarp_eval.study.reads import MASK_RULES, warp_reads
+from attnwarp_eval.study.shared import edits
 from attnwarp_eval.study.warping import warp_truth
 from attnwarp_eval.world import splats as sampled
 from attnwarp_eval.world import world
@@ -55,7 +56,7 @@ def test_a_variant_has_the_preset_of_its_method_that_it_names(method, name, expe
     study = parse_study(
         {"name": "s", "scenes": ["bear"], "variants": {"v": variant}, "probes": {"editing": ["v"]}}
     )
-    settings = editing.settings_of(study, study.variants["v"], 0)
+    settings = edits.settings_of(study, study.variants["v"], 0)
     assert {key: settings[key] for key in expected} == expected
 
 

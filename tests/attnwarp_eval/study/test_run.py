@@ -25,7 +25,7 @@ from typer.testing import CliRunner
 from attnwarp.render.threads import set_thread_count
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.cost import environment
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.store import Store
 
 SMALL = {

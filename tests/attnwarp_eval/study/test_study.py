@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
-from attnwarp_eval.study.probes import editing, sensitivity
 from attnwarp_eval.study.run import expected, plan, stored_study, verify
+from attnwarp_eval.study.shared import edits, encoders
 from attnwarp_eval.study.study import shipped_studies
 
 SMALL = {
@@ -48,8 +48,8 @@ def cells(study):
 def test_every_shipped_study_loads_and_names_scenes_that_exist(name, monkeypatch):
     # Which weights an encoder or an editor has is part of a cell's id; that they are there is tested
     # where they are.
-    monkeypatch.setattr(sensitivity, "identity", lambda name, kind: {"weights_sha256": name})
-    monkeypatch.setattr(editing, "_files_digest", lambda name: name)
+    monkeypatch.setattr(encoders, "identity", lambda name, kind: {"weights_sha256": name})
+    monkeypatch.setattr(edits, "files_digest", lambda name: name)
     study = load_study(name)
     assert study.title
     planned = cells(study)

@@ -14,10 +14,11 @@ from attnwarp.warp.rules import EXACT_DEPTH_TOLERANCE
 from attnwarp.warp.settings import PRESETS, preset
 from attnwarp.warp.view import Surface, warp_surfaces
 from attnwarp_eval import metrics
-from attnwarp_eval.effects.table import plan_words, transport_of
+from attnwarp_eval.effects.table import plan_words
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.study.probes import probe
-from attnwarp_eval.study.probes.base import Layout, Place
+from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.probe_report import Layout, Place, report_of
+from attnwarp_eval.study.probes.calibration.measure import Extra, transport_of
 from attnwarp_eval.study.run import plan as plan_run
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.study import parse_study
@@ -174,11 +175,12 @@ def test_the_report_says_which_effects_the_studys_scenes_call_for(tmp_path):
             )
             for name, extra in scenes.items()
         ]
-        made = probe("calibration").sections(written_runs.results(study, cells), Layout(tmp_path))
+        made = report_of("calibration").sections(
+            written_runs.results(study, cells), Layout(tmp_path)
+        )
         return [section for place, section in made if place == Place.APPENDIX]
 
-    effects = {**transport_of(load_scene("fog")), "variant": "scalar_rgb"}
-    (section,) = sections(fog={"effects": effects})
+    (section,) = sections(fog=Extra(transport_of(load_scene("fog"))).to_json())
     ((scene, usual, beyond, missing, planned, full, why),) = section.tables[0].rows
     assert scene == "fog" and "shadows" in usual and "medium (" in beyond and missing == "–"
     assert planned == full == "volpath" and "medium" in why

@@ -29,9 +29,11 @@ from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.budgets import Spent, Stopwatch
 from attnwarp_eval.study.edit_truth import edit_truth
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Method
-from attnwarp_eval.study.probes import editing, probe
-from attnwarp_eval.study.probes.editing import EditResult
+from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.probes.editing import measure, result
+from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.run import execute, plan
+from attnwarp_eval.study.shared import edits
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.truth import Geometry, two_view
 from attnwarp_eval.world import world
@@ -166,7 +168,7 @@ def test_agreement_over_fewer_pixels_than_a_cell_of_the_latents_is_undefined(
     black = np.zeros((*mask.shape, 3))
     pair = of.between(of.source.name, "yaw030")
     count = metrics.cross_view(black, black, pair, mask=mask).counted.sum()
-    monkeypatch.setattr(editing, "LEAST_PIXELS", count + more)
+    monkeypatch.setattr(result, "LEAST_PIXELS", count + more)
     record = record_of(folder, tmp_path)
     view = next(v for v in record.views if v.name.endswith("yaw030"))
     for key in ("delta_e", "delta_e_floor", "delta_e_above"):
@@ -351,7 +353,7 @@ def test_the_seconds_of_another_variant_are_the_limit_and_the_report_names_who_d
         "slow",
         Method(EDITING_METHODS["attention_warping"].settings, cut_short, takes_budget=True),
     )
-    monkeypatch.setattr(editing, "STOPWATCH", Stopwatch())
+    monkeypatch.setattr(measure, "STOPWATCH", Stopwatch())
     study = load(
         folder,
         variants={
@@ -400,9 +402,9 @@ def test_studies_that_compare_methods_tune_attention_warping_alike(name):
     totals = {}
     for label in study.probes["editing"]:
         variant = study.variants[label]
-        fields = editing.settings_of(study, variant, 0)
+        fields = edits.settings_of(study, variant, 0)
         if (
-            variant.part(editing.VariantPart).method == "attention_warping"
+            variant.part(edits.VariantPart).method == "attention_warping"
             and fields["method"] == "warp"
         ):
             left = len(study.views) + 1 - fields["sources"]
@@ -533,7 +535,7 @@ def test_an_editor_is_known_by_its_files_wherever_its_controlnet_lies(tmp_path):
     (other / "controlnet" / "config.json").write_text("{}")
 
     def identity(name):
-        return editing.editor_identity(editing.EditorPart(name=name))
+        return edits.editor_identity(edits.EditorPart(name=name))
 
     both = identity(f"{other},{tmp_path / 'depth'}")
     assert both == identity(str(one))

@@ -12,10 +12,11 @@ from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.edit_truth import Judgement
-from attnwarp_eval.study.probes import editing, probe
-from attnwarp_eval.study.probes.base import Layout
-from attnwarp_eval.study.probes.editing import EditResult
+from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.probe_report import Layout, report_of
+from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.run import expected, plan, verify
+from attnwarp_eval.study.shared import method_run
 from attnwarp_eval.study.work import compute
 
 ROUNDS = 3
@@ -72,7 +73,7 @@ def test_every_setting_runs_once_a_round_with_the_network_passes_of_its_plan(
     scenes = {name: load_scene(name) for name in study.scenes}
     (cell,) = (c for c in cells_of(study, scenes) if c.probe == "editing-timing")
     rows = []
-    network = editing.load(cell.sources["editor 0"], cell.spec["contestants"][0]["editor"]).unet
+    network = method_run.load(cell.sources["editor 0"], cell.spec["contestants"][0]["editor"]).unet
     hook = network.register_forward_pre_hook(
         lambda _, args, kwargs: rows.append(len(args[0])), with_kwargs=True
     )
@@ -216,7 +217,7 @@ def test_the_front_has_the_seconds_of_one_pass_in_turn_where_they_are_there(tmp_
 def test_few_rounds_call_nothing_faster_and_say_how_few_they_are(tmp_path):
     for rounds in (3, 5):
         run = results(VARIANTS, drift=DRIFT[:rounds])
-        ((_, section),) = probe("editing-timing").sections(run, Layout(tmp_path))
+        ((_, section),) = report_of("editing-timing").sections(run, Layout(tmp_path))
         (front,) = fronts(run, Layout(tmp_path))
         for table in (section.tables[0], front.tables[0]):
             verdicts = {row[0]: row[table.columns.index("verdict")] for row in table.rows}
@@ -225,7 +226,7 @@ def test_few_rounds_call_nothing_faster_and_say_how_few_they_are(tmp_path):
 
 def test_a_variant_is_chosen_by_seconds_taken_in_turn_and_left_out_without_any(tmp_path):
     def chosen(run):
-        sections = {s.title: s for _, s in probe("editing").sections(run, Layout(tmp_path))}
+        sections = {s.title: s for _, s in report_of("editing").sections(run, Layout(tmp_path))}
         section = sections["Which variant for a given time"]
         return [row[:2] for row in section.tables[0].rows], section.text[-1]
 
@@ -243,7 +244,7 @@ def test_one_pass_has_the_same_seconds_in_the_front_the_choice_and_the_table_of_
     # A scene with two edits does not outvote the other: (s + 3 s) / 2 of bear, s of face.
     run = results(more=[edited("bear", name, "blue", 3.0) for name in VARIANTS])
     expected = {name: (2 * BY_CELLS[name] + BY_CELLS[name]) / 2 for name in VARIANTS}
-    sections = {s.title: s for _, s in probe("editing").sections(run, Layout(tmp_path))}
+    sections = {s.title: s for _, s in report_of("editing").sections(run, Layout(tmp_path))}
     (section,) = fronts(run, Layout(tmp_path))
     assert {row[0]: row[2] for row in section.tables[0].rows} == {
         name: number(1000 * seconds) for name, seconds in expected.items()
@@ -256,13 +257,13 @@ def test_one_pass_has_the_same_seconds_in_the_front_the_choice_and_the_table_of_
     row = sections["Which variant for a given time"].tables[0].rows[0]
     assert row[:2] == [number(expected["slow"]), "slow"]
     assert "no seconds taken in turn" in parts.text[0]
-    timed = probe("editing").sections(results(VARIANTS), Layout(tmp_path))
+    timed = report_of("editing").sections(results(VARIANTS), Layout(tmp_path))
     (parts,) = [s for _, s in timed if s.title == "Seconds by part"]
     assert "believe that one" in parts.text[0]
 
 
 def test_the_section_of_seconds_holds_medians_spreads_and_ratios(tmp_path):
-    ((_, section),) = probe("editing-timing").sections(results(VARIANTS), Layout(tmp_path))
+    ((_, section),) = report_of("editing-timing").sections(results(VARIANTS), Layout(tmp_path))
     table = section.tables[0]
     rows = {row[0]: dict(zip(table.columns, row, strict=True)) for row in table.rows}
     fast = rows["fast"]
@@ -273,5 +274,5 @@ def test_the_section_of_seconds_holds_medians_spreads_and_ratios(tmp_path):
     assert fast["network rows"] == "8"
     assert math.isclose(float(rows["full"]["tune, s"]), 2.0)
     assert not list(
-        probe("editing-timing").sections(results(VARIANTS), Layout(tmp_path, timings=False))
+        report_of("editing-timing").sections(results(VARIANTS), Layout(tmp_path, timings=False))
     )

@@ -8,9 +8,8 @@ import written_runs
 from scipy import stats
 
 from attnwarp_eval.document import charts
-from attnwarp_eval.study.probes import probe
-from attnwarp_eval.study.probes.base import Layout
-from attnwarp_eval.study.probes.fit import Point
+from attnwarp_eval.study.probe_report import Layout, report_of
+from attnwarp_eval.study.probes.fit.measure import Point
 
 SECONDS = {10: 0.5, 20: 1.0}
 PSNR = {"bear": [20.0, 20.1, 20.2], "fence": [30.0, 30.2, 30.4], "glass": [26.0, 26.0, 26.3]}
@@ -49,14 +48,14 @@ def test_curves_are_drawn_at_their_seconds(results, tmp_path, monkeypatch):
 
     draw = charts.lines
     monkeypatch.setattr(charts, "lines", lines)
-    probe("fit")._curves(results, Layout(tmp_path), NAMES)
+    report_of("fit")._curves(results, Layout(tmp_path), NAMES)
     assert len(drawn) > 2 * len(NAMES)
     for x in drawn:
         np.testing.assert_allclose(x, [*SECONDS.values()], rtol=1e-12)
 
 
 def test_intervals_of_curves_are_over_scenes_and_not_over_seeds(results):
-    _, values = probe("fit")._curve(results, NAMES[0], lambda point: point.psnr)
+    _, values = report_of("fit")._curve(results, NAMES[0], lambda point: point.psnr)
     means = [np.mean(v) for v in PSNR.values()]
     expected = stats.t.interval(0.95, 2, np.mean(means), stats.sem(means))
     for value in values:

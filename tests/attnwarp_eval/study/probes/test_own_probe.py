@@ -17,7 +17,7 @@ import attnwarp_eval
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, load_study
-from attnwarp_eval.study.probes import probes, register, unregister
+from attnwarp_eval.study.probe import probes, register, unregister
 from attnwarp_eval.study.run import execute, plan, verify
 from attnwarp_eval.study.work import compute
 
@@ -95,6 +95,28 @@ def test_a_probe_in_one_file_runs_through_study_store_resume_and_report(tmp_path
     assert {name: (store.root / name).read_bytes() for name in names} == before
 
 
+def test_a_probe_without_a_report_is_shown_by_a_table_of_its_metrics(tmp_path):
+    class Bare(Chord):
+        name = "bare"
+
+    unregister("chord")
+    register(Bare)
+    try:
+        tables = [{**STUDY["ablations"][0], "probe": "bare"}]
+        study = load(tmp_path, probes={"bare": ["plain", "double"]}, ablations=tables,
+                     variants={name: STUDY["variants"][name] for name in ("plain", "double")})  # fmt: skip
+        store = Store(tmp_path / "run")
+        assert execute(plan(study, store), store).complete
+        write_report(store, timings=False)
+    finally:
+        unregister("bare")
+    text = (store.root / "report.md").read_text()
+    mean = sum(map(chord, YAWS)) / len(YAWS) / 2
+    rows = f"| variant | chord.length |\n|---|---|\n| plain | {mean:.3g} |\n| double | {2 * mean:.3g} |"
+    assert f"## Figures of bare\n\n{rows}" in text
+    assert "## Stretch" in text and text.count(rows) == 2
+
+
 @pytest.mark.skipif(not pathlib.Path("/proc/self/clear_refs").exists(), reason="not Linux")
 def test_a_cells_peak_memory_leaves_out_what_an_earlier_cell_had_freed(tmp_path, monkeypatch):
     """Oracle: the array that the first cell held."""
@@ -135,9 +157,9 @@ def test_without_it_its_keys_are_unknown(tmp_path):
 
 
 def test_a_figure_that_its_metrics_do_not_specify_costs_the_cell(tmp_path, monkeypatch):
-    monkeypatch.setattr(Chord, "metrics", {})
     store = Store(tmp_path / "run")
     planned = plan(load(tmp_path), store)
+    monkeypatch.setattr(Chord, "metrics", {})
     summary = execute(planned, store)
     assert [failure.probe for failure in summary.failures] == ["chord", "chord"]
     assert "gives 'chord.length', which its metrics do not specify" in summary.failures[0].error
@@ -155,12 +177,11 @@ def test_two_probes_of_one_name_are_refused():
 def test_study_runner_store_report_and_command_line_name_no_probe():
     root = pathlib.Path(attnwarp_eval.__file__).parent
     files = [
-        *root.glob("study/*.py"),
-        root / "study/probes/__init__.py",
-        root / "study/probes/base.py",
+        # A population's word stands for its scenes under the key editing.edits, too.
+        *(path for path in root.glob("study/*.py") if path.name != "populations.py"),
         *root.glob("report/*.py"),
-        # This command is that of one study and of its probe.
-        *(path for path in root.glob("cli/*.py") if path.name != "stability.py"),
+        # One command is that of a study and of its probe; another asks for NVIDIA's package warp.
+        *(path for path in root.glob("cli/*.py") if path.stem not in ("stability", "machine")),
     ]
     assert len(files) > 20
     names = {probe.name for probe in probes()}

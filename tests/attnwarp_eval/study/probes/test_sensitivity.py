@@ -16,9 +16,9 @@ from attnwarp.encoders import EncoderInfo
 from attnwarp.errors import InputError
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.study import StudyError, cells_of, load_study
+from attnwarp_eval.study import StudyError, cells_of, load_study, shared
 from attnwarp_eval.study.flawed_edits import CONDITIONS, RIGHT, Shot, Task, opposite_hue, tasks
-from attnwarp_eval.study.probes import probe, sensitivity
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.truth import appearance
 
@@ -108,7 +108,7 @@ def encoders(monkeypatch):
     """The bundled encoders' names, with fakes behind them; ``weights`` says which."""
     state = SimpleNamespace(weights="w")
     monkeypatch.setattr(
-        sensitivity, "load_encoder", lambda name, kind=None: fake(name, state.weights)
+        shared.encoders, "load_encoder", lambda name, kind=None: fake(name, state.weights)
     )
     return state
 

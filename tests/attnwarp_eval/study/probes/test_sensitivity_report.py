@@ -13,9 +13,9 @@ from attnwarp_eval.report.build import build
 from attnwarp_eval.report.results import lines
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.flawed_edits import CONDITIONS, RIGHT
-from attnwarp_eval.study.probes import probe
-from attnwarp_eval.study.probes.base import Layout
-from attnwarp_eval.study.probes.sensitivity import FLAWS, ROWS, beats, curve, power, share
+from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.probe_report import Layout, report_of
+from attnwarp_eval.study.probes.sensitivity.report import FLAWS, ROWS, beats, curve, power, share
 
 MSE, CLIP = "fidelity.mse", "embedding.clip_similarity"
 SPEC = {"size": 32, "rounds": 3, "encoders": {"clip": {"weights_sha256": "c" * 64}}}
@@ -127,7 +127,7 @@ def test_power_is_the_mean_over_the_flaws_a_metric_is_meant_for():
 def test_the_report_shows_what_can_be_seen_and_says_where_a_metric_moves_the_wrong_way(tmp_path):
     views = [{RIGHT: 0.5, "blurred": 0.2, "strength_000": 0.9}]
     made = results({"one": record(views), "two": record(views)})
-    sections = [s for _, s in probe("sensitivity").sections(made, Layout(tmp_path))]
+    sections = [s for _, s in report_of("sensitivity").sections(made, Layout(tmp_path))]
     assert [s.title for s in sections] == [
         "Which metric can see what",
         "Metrics against the strength of an edit",
@@ -150,7 +150,7 @@ def test_the_report_shows_what_can_be_seen_and_says_where_a_metric_moves_the_wro
 def test_records_of_several_seeds_are_of_one_scene(tmp_path):
     cells = {"one": record([{RIGHT: 0.5}] * 2), "two": record([{RIGHT: 0.5}] * 2), "lost": None}
     made = results(cells, seeds=(0, 1))
-    first, strengths, _ = (s for _, s in probe("sensitivity").sections(made, Layout(tmp_path)))
+    first, strengths, _ = (s for _, s in report_of("sensitivity").sections(made, Layout(tmp_path)))
     assert first.text[0] == "**Measured on 2 of 3 scenes.**"
     assert first.text[1].startswith("2 right results of edits in 2 scenes, 4 pairs of a result")
     # No share lacks one of the two scenes.
@@ -171,7 +171,7 @@ def test_seconds_of_several_seeds_are_averaged(tmp_path):
     }
     outcomes = [written_runs.outcome("sensitivity", "one", ["metrics"], one) for one in both]
     made = written_runs.results(study, outcomes)
-    *_, costs = [s for _, s in probe("sensitivity").sections(made, Layout(tmp_path))]
+    *_, costs = [s for _, s in report_of("sensitivity").sections(made, Layout(tmp_path))]
     (table,) = costs.tables
     shown = dict(zip(table.columns, table.rows[0], strict=True))
     assert (shown["metric"], shown["ms a picture"]) == ("truth, PSNR", "200")
@@ -199,4 +199,4 @@ def test_results_keep_every_figure_with_what_is_undefined(tmp_path):
 
 def test_a_study_without_the_probe_has_no_such_section(tmp_path):
     made = results({"one": None})
-    assert list(probe("sensitivity").sections(made, Layout(tmp_path))) == []
+    assert list(report_of("sensitivity").sections(made, Layout(tmp_path))) == []

@@ -16,8 +16,8 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.edit_truth import edit_truth
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Method
-from attnwarp_eval.study.probes import probe
-from attnwarp_eval.study.probes.base import Layout
+from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.probe_report import Layout, report_of
 from attnwarp_eval.study.run import execute, plan
 
 VIEWS = ("source", "yaw015", "yaw030", "yaw120")
@@ -178,7 +178,7 @@ def written(table):
 
 
 def test_the_reports_words_need_an_interval_on_one_side_of_their_limit(tmp_path):
-    ((_, section),) = probe("variability").sections(written(THREE), Layout(tmp_path))
+    ((_, section),) = report_of("variability").sections(written(THREE), Layout(tmp_path))
     (table,) = section.tables
     assert {row[0]: row[-1] for row in table.rows} == {name: name for name in THREE}
     shown = next(row for row in table.rows if row[0] == "varies, and agrees within a seed")

@@ -16,8 +16,9 @@ from attnwarp_eval.inspect import subject
 from attnwarp_eval.report.claims import load_claims
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, cells_of, load_study, parse_study
-from attnwarp_eval.study.probes import fit, probe
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.run import execute, plan
+from attnwarp_eval.study.shared import fits
 from attnwarp_eval.study.study import parse_variant
 from attnwarp_eval.world import world
 
@@ -80,16 +81,16 @@ def test_probes_share_one_fit_and_its_depth_is_what_they_measure(folder):
 
 def test_a_fit_waits_for_the_process_that_is_at_it(tmp_path, monkeypatch):
     begun = threading.Event()
-    monkeypatch.setattr(fit.fitted, "fit_scene", lambda *given, **options: begun.set())
+    monkeypatch.setattr(fits.fitted, "fit_scene", lambda *given, **options: begun.set())
     spec = {"fit": {**FIT, "noise": 0.5}, "scene": "a" * 64, "size": 16, "spp": 1, "seed": 0}
     work = SimpleNamespace(
         spec=spec, root=tmp_path, world=SimpleNamespace(scene=None, geometry=None)
     )
-    folder = fit.folder_of(tmp_path, spec)
+    folder = fits.folder_of(tmp_path, spec)
     folder.mkdir(parents=True)
     with (folder / ".lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        other = threading.Thread(target=fit.fit_of, args=(work,))
+        other = threading.Thread(target=fits.fit_of, args=(work,))
         other.start()
         assert not begun.wait(0.1)
     other.join(timeout=60)

@@ -1,24 +1,27 @@
-"""The report's sections about edited scenes: what the editor can do, agreement by yaw and by scene,
-seconds by part, and which variant to choose for a given time.
+"""Report of edited scenes: what the editor can do, agreement by yaw and by scene, seconds by part,
+and which variant to choose for a given time.
 """
 
 from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Gallery, Picture, Section, Table
 from attnwarp_eval.document.numbers import decibels, number, pooled, spread
 from attnwarp_eval.metrics.multiview import BELOW_FLOOR
 from attnwarp_eval.statistics.intervals import Interval, common, interval
-from attnwarp_eval.study.probes.base import Layout, is_mse
-from attnwarp_eval.study.probes.turns import timed_in_turn
+from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, is_mse, register_report
 from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.shared.edits import EditingPart
+from attnwarp_eval.study.shared.encoders import encoders_named
+from attnwarp_eval.study.shared.method_run import PARTS, WHOLE, is_alone
+from attnwarp_eval.study.turns import timed_in_turn
 
 BY_YAW = {
     "multiview.same_answer.edit": "views with the source's answer",
@@ -41,22 +44,82 @@ BY_SCENE = {
 
 DISAGREEMENT = "multiview.delta_e_above.edit_inside"
 
-PARTS = ("source", "warp", "edit", "tune")
-
 FEWEST = 3
 """Scenes from which on intervals are drawn."""
 
-WHOLE = "whole"
-"""Stage of :class:`~attnwarp_eval.study.probes.base.InTurn`: all parts of an edit together."""
-
-OWN = "each view alone"
-"""The method of settings that edits every view by itself: the control."""
-
-FLOOR = "by_view"
-"""The method of a comparison that does so."""
-
 ONE_SOURCE = frozenset({"attention_warping", "true pictures"})
 """Methods whose source view is edited alike, whatever happens to the others."""
+
+
+CHOSEN_BY = ("multiview.delta_e_above.edit_inside", "fidelity.mse.edit_inside")
+"""Figures that choose the variant for a given time; less is better."""
+
+
+@register_report
+class EditingReport(ProbeReport):
+    """Agreement, fidelity and seconds of edits by variant."""
+
+    name = "editing"
+    tabulates_all = True
+    columns: ClassVar[Mapping[str, str]] = {
+        "same answer": "multiview.same_answer.edit",
+        "... where the source saw it": "multiview.same_answer.edit_seen",
+        "disagreement above floor, dE00": "multiview.delta_e_above.edit_inside",
+        "... of neighbours": "multiview.delta_e_above.edit_next",
+        "... in renders": "multiview.delta_e_above.render_inside",
+        "PSNR to truth inside, dB": "fidelity.psnr.edit_inside",
+        "... inside, pooled": "fidelity.mse.edit_inside",
+        "PSNR of renders, dB": "fidelity.psnr.render_inside",
+        "... of renders, pooled": "fidelity.mse.render_inside",
+        "Edit PSNR, dB": "image.psnr.edit_render",
+        "Edit PSNR, pooled": "image.mse.edit_render",
+        "CLIP direction": "embedding.clip_directional.render",
+        "CLIP image": "embedding.clip_image.render",
+        "DINO image": "embedding.dino_image.render",
+        "AbsRel of depth after": "depth.abs_rel.after",
+    }
+    contrasts = (
+        "multiview.same_answer.edit",
+        "multiview.delta_e_above.edit_inside",
+        "multiview.delta_e_above.render_inside",
+        "fidelity.psnr.edit_inside",
+        "fidelity.psnr.render_inside",
+        "embedding.clip_directional.render",
+        "depth.abs_rel.after",
+    )
+    stage = "whole"
+    cost = "whole"
+    cost_of = "an edit"
+    cost_text = (
+        "Seconds are those of one whole edit of a scene: source, warps, edited views and tuning."
+    )
+
+    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+        """Sections on the editor's abilities, budgets, figures by yaw, time by part."""
+        if not results.finished(self.name):
+            return
+        able = abilities(results, self.name)
+        spec = results.finished(self.name)[0][1].spec
+        if "encoders" in spec:
+            able.text.append(encoders_named(results.study, spec))
+        yield Place.INSTRUMENT, able
+        part = results.study.part(EditingPart).editing
+        if (section := budgets(results, self.name)) is not None:
+            yield Place.RESULT, section
+        if part.by_yaw:
+            yield Place.RESULT, by_yaw(results, self.name, part.by_yaw, layout)
+            yield Place.RESULT, by_scene(results, self.name, part.by_yaw)
+        if layout.timings:
+            yield Place.RESULT, parts_of_time(results, self.name)
+        if layout.timings and part.choice:
+            yield (
+                Place.RESULT,
+                choice(results, self.name, part.choice, CHOSEN_BY),
+            )
+
+    def gallery(self, results: Results) -> Section | None:
+        """Edited views side by side."""
+        return side_by_side(results, self.name)
 
 
 def abilities(results: Results, probe: str) -> Section:
@@ -138,14 +201,6 @@ def controls(results: Results, probe: str) -> list[str]:
     ]
     alone = [name for name, spec in measured if is_alone(spec)]
     return alone or [name for name, _ in measured[:1]]
-
-
-def is_alone(spec: Mapping[str, Any]) -> bool:
-    """Return True if a variant's spec says that it edits each view by itself, and as long as it
-    likes.
-    """
-    itself = spec["method"] == FLOOR or spec["settings"].get("method") == OWN
-    return itself and "budget" not in spec
 
 
 def _against(judgement: Any) -> str:

@@ -1,28 +1,19 @@
-"""Depth and normals of sampled splats against exact truth."""
+"""Report of the depth of splats: tables by region, and views without depth."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
-from functools import partial
-from typing import Any, ClassVar
+from collections.abc import Iterator, Mapping, Sequence
+from typing import ClassVar
 
-from attnwarp.warp import WarpSettings, render_surface
-from attnwarp_eval import metrics
 from attnwarp_eval.document.model import Finding, Section, Table
-from attnwarp_eval.study import pictures
-from attnwarp_eval.study.probes import register
-from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, mean_values, metrics_of
-from attnwarp_eval.study.probes.variant_splats import (
-    check_splats,
-    splats_of,
-    surface_meaning,
-    surface_reads,
-    surface_spec,
+from attnwarp_eval.study.probe_report import (
+    Layout,
+    Place,
+    ProbeReport,
+    mean_values,
+    register_report,
 )
-from attnwarp_eval.study.reads import DEPTH_READS
-from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.results import Results
-from attnwarp_eval.study.schema import Study, Variant
 
 PLACES = (
     "depth.abs_rel",
@@ -35,12 +26,11 @@ PLACES = (
 """Metrics with a table of their own for the inside of surfaces and for edges."""
 
 
-@register
-class Depth(Probe[NoExtra]):
-    """One render of splats for each view, and its error."""
+@register_report
+class DepthReport(ProbeReport):
+    """Depth and normals by variant."""
 
     name = "depth"
-    metrics = metrics_of("depth.")
     columns: ClassVar[Mapping[str, str]] = {
         "AbsRel": "depth.abs_rel",
         "RMSE": "depth.rmse",
@@ -57,52 +47,6 @@ class Depth(Probe[NoExtra]):
         "depth.normal_median",
     )
     stage = "render"
-    study_keys = frozenset({"size", "views", "seeds", "spp"})
-
-    def check(self, study: Study) -> None:
-        """A variant without splats renders nothing."""
-        check_splats(study, self.name, "depth to measure")
-
-    def reads(self, study: Study, variant: Variant) -> Set[str]:
-        """Splats, and how depth is read off them."""
-        return surface_reads(variant) | DEPTH_READS
-
-    def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """Splats, and how depth is read off them."""
-        settings = variant.settings()
-        return {
-            **surface_spec(study, variant, seed),
-            "depth": settings.depth,
-            "depth_statistic": settings.depth_statistic,
-        }
-
-    def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
-        """Splats may be fitted."""
-        return surface_meaning(study, variant)
-
-    def compute(self, work: Work) -> NoExtra:
-        """Render and measure, view by view."""
-        spec, world, meter = work.spec, work.world, work.meter
-        size = spec["size"]
-        with meter.stage("splats"):
-            model = splats_of(work)
-        settings = WarpSettings(depth=spec["depth"], depth_statistic=spec["depth_statistic"])
-        for name in spec["views"]:
-            with meter.stage("truth"):
-                hits = world.pair(name, size).hits
-            with meter.view():
-                surface = render_surface(model, world.targets[name], settings)
-            meter.count(pixels=size * size, **surface.counters)
-            with meter.stage("checks"):
-                figures = metrics.depth_error(
-                    surface.depth,
-                    hits.depth,
-                    normal=surface.normal,
-                    true_normal=hits.normal,
-                    edge=world.edge(name, size),
-                )
-            work.add(name, figures, partial(pictures.of_depth, surface, hits))
-        return NoExtra()
 
     def findings(self, results: Results) -> Iterator[Finding]:
         """Views without any depth: in tables their figures are dashes, which do not say why."""

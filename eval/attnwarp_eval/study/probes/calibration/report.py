@@ -1,43 +1,18 @@
-"""The instrument judged by itself, before it judges anything.
-
-The truth's own depth goes through the same warp, the exact mask is scored against itself, and
-Mitsuba must find the points that the ray caster finds.
-"""
+"""Report of the instrument itself: whether it is calibrated, and what its scenes' light needs."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
-
-from attnwarp.warp import EXACT_DEPTH_TOLERANCE, PRESETS, TAP_SPREAD
-from attnwarp_eval import metrics
+from attnwarp.warp import TAP_SPREAD
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
-from attnwarp_eval.effects.table import USUAL, plan_words, transport_of
-from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.pictures import of_warp
-from attnwarp_eval.study.probes import register
-from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
-from attnwarp_eval.study.record import Json, Record
+from attnwarp_eval.effects.table import USUAL, plan_words
+from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
+from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
-from attnwarp_eval.study.schema import Study
-from attnwarp_eval.study.warping import warp_figures, warp_truth
-from attnwarp_eval.truth.llvm import variant
-from attnwarp_eval.truth.mitsuba import position_and_shape
-from attnwarp_eval.two_view import TwoView
-from attnwarp_eval.world import World
-
-MITSUBA_TOLERANCE = 1e-4
-"""Tolerance, as a share of the distance: Mitsuba's positions are float32, so a point 10 m away is
-exact to about 1e-6 of that.
-"""
 
 SMALL = 256
 """Pixels: in smaller pictures, depth changes from pixel to pixel by more than the rules for exact
@@ -52,91 +27,13 @@ SMALLEST_SHARE = 0.99
 outlines may fall either way.
 """
 
-EXACT = dataclasses.replace(
-    PRESETS["corrected"], depth_relative=EXACT_DEPTH_TOLERANCE, depth_spread=TAP_SPREAD
-)
-"""The corrected rules with the tolerances for exact depth."""
 
-
-@dataclass(frozen=True)
-class Transport:
-    """The light transport that a scene calls for, and the plan of its pictures.
-
-    Attributes:
-        needed: effects that are simulated -> the words of the scene's file that call for them.
-        not_simulated: effects that are not -> the same.
-        plan: of the rendering, as JSON.
-        everything_on: the integrator that would simulate everything.
-        variant: of Mitsuba, which draws the pictures' noise.
-    """
-
-    needed: Mapping[str, str]
-    not_simulated: Mapping[str, str]
-    plan: Mapping[str, Any]
-    everything_on: str
-    variant: str
-
-
-@dataclass(frozen=True)
-class Extra:
-    """The transport of the cell's scene."""
-
-    transport: Transport
-
-    def to_json(self) -> Json:
-        """The record's entry ``effects``."""
-        return {"effects": dataclasses.asdict(self.transport)}
-
-
-@register
-class Calibration(Probe[Extra]):
-    """The error of the instrument itself, in every run."""
+@register_report
+class CalibrationReport(ProbeReport):
+    """The error of the instrument, in every report."""
 
     name = "calibration"
-    metrics = metrics_of("calibration.", "warp.", "occlusion.")
-    judges_variants = False
-    always = True
-    study_keys = frozenset({"size", "views", "seeds", "spp", "feature_sizes", "feature_channels"})
     picture_label = "truth's own depth"
-
-    def cells(
-        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
-    ) -> Iterator[Cell]:
-        """One for each scene."""
-        seed = study.seeds[0]
-        for name, scene in scenes.items():
-            spec = {
-                **self.common_spec(study, scene, seed),
-                "feature_sizes": study.feature_sizes,
-                "feature_channels": study.feature_channels,
-                "spp": study.spp,
-            }
-            pictures = study.pictures_of(spec["views"])
-            yield Cell(spec, name, self.name, self.name, seed, (self.name,), pictures)
-
-    def compute(self, work: Work) -> Extra:
-        """Warp the truth's own depth by the exact rules, view by view."""
-        spec, size = work.spec, work.spec["size"]
-        for name in spec["views"]:
-            with work.meter.stage("truth"):
-                truth = work.world.pair(name, size)
-            with work.meter.view():
-                view = warp_truth(work.world, truth, EXACT)
-            figures = warp_figures(work, name, view)
-            if name == spec["views"][0]:
-                figures["calibration.mitsuba_agrees"] = _mitsuba_agrees(work.world, truth)
-            own = metrics.mask_error(
-                truth.visible, truth.label, truth.hits.valid, truth.behind, truth.edge
-            )
-            figures |= {f"{key}.exact": value for key, value in own.items()}
-            work.meter.count(pixels=size * size)
-            draw = partial(of_warp, work.world, name, spec["spp"], truth, view)
-            work.add(name, figures, draw)
-        return Extra(Transport(**transport_of(work.world.scene), variant=variant()))
-
-    def read_extra(self, data: Json) -> Extra:
-        """Read from the record's entry ``effects``."""
-        return Extra(Transport(**data["effects"]))
 
     def problems(self, results: Results) -> list[str]:
         """One line a scene and figure; empty when the instrument is calibrated."""
@@ -280,18 +177,6 @@ class Calibration(Probe[Extra]):
         ]
         title = "What light does in these scenes, and what of it is simulated"
         return [Section(title, text, [Table(columns, rows)])]
-
-
-def _mitsuba_agrees(world: World, truth: TwoView) -> float:
-    """Share of a view's pixels where Mitsuba's own ray tracer finds the same surface point, or none
-    where there is none.
-    """
-    position, _ = position_and_shape(world.scene, truth.target)
-    error = np.linalg.norm(position - truth.hits.point, axis=-1)
-    distance = np.linalg.norm(truth.hits.point - truth.target.position, axis=-1)
-    empty = ~np.isfinite(position).all(axis=-1) & ~truth.hits.valid
-    with np.errstate(invalid="ignore"):
-        return float((empty | (error < MITSUBA_TOLERANCE * distance)).mean())
 
 
 def _values(record: Record[Any], metric: str) -> list[float]:

@@ -9,18 +9,12 @@ from attnwarp.warp import WarpSettings, render_surface, warp_view
 from attnwarp_eval.cost import in_turn
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.probes import register
-from attnwarp_eval.study.probes.base import InTurn, Probe, Work
-from attnwarp_eval.study.probes.variant_splats import (
-    check_splats,
-    splats_of,
-    surface_reads,
-    surface_spec,
-)
+from attnwarp_eval.study.probe import InTurn, Probe, Work, register
 from attnwarp_eval.study.reads import warp_reads
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Outcome
 from attnwarp_eval.study.schema import Study, Variant
+from attnwarp_eval.study.shared.splats import check_splats, splats_of, surface_reads, surface_spec
 
 
 @dataclass(frozen=True)

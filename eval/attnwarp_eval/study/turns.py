@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from attnwarp_eval.statistics.intervals import FloatArray, Interval, Ratio, time_ratio
-from attnwarp_eval.study.probes import probe
-from attnwarp_eval.study.probes.base import InTurn
+from attnwarp_eval.study.probe import InTurn, probe
 from attnwarp_eval.study.results import Results
 
 

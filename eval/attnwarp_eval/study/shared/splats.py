@@ -7,17 +7,17 @@ from typing import Any
 
 from attnwarp import Gaussians
 from attnwarp_eval.canonical_json import canonical_json
-from attnwarp_eval.study.probes import fit
-from attnwarp_eval.study.probes.base import Work
+from attnwarp_eval.study.probe import Work
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.schema import Study, Variant
+from attnwarp_eval.study.shared import fits
 from attnwarp_eval.world import splats
 
 
 def splats_spec(study: Study, variant: Variant, seed: int) -> Json:
     """Spec of a variant's splats in a cell's spec: an entry ``fit`` or ``splats``."""
-    if variant.part(fit.VariantPart).fitted:
-        return {"fit": fit.fit_spec(study, variant, seed)}
+    if variant.part(fits.VariantPart).fitted:
+        return {"fit": fits.fit_spec(study, variant, seed)}
     return {"splats": study.splats_of(variant).model_dump()}
 
 
@@ -25,7 +25,7 @@ def surface_spec(study: Study, variant: Variant, seed: int) -> Json:
     """Source of a variant's depth: the truth, or splats."""
     if variant.geometry == "truth":
         return {"geometry": "truth"}
-    if variant.part(fit.VariantPart).fitted:
+    if variant.part(fits.VariantPart).fitted:
         # A fit depends on the samples of the pictures that it sees.
         return {"spp": study.spp, **splats_spec(study, variant, seed)}
     return splats_spec(study, variant, seed)
@@ -48,7 +48,7 @@ def check_splats(study: Study, probe: str, what: str) -> None:
 
 def splats_reads(variant: Variant) -> set[str]:
     """Keys of a variant that decide its splats."""
-    return {"fitted", *fit.FIT_READS} if variant.part(fit.VariantPart).fitted else {"splats"}
+    return {"fitted", *fits.FIT_READS} if variant.part(fits.VariantPart).fitted else {"splats"}
 
 
 def surface_reads(variant: Variant) -> set[str]:
@@ -82,5 +82,5 @@ def splats_of(work: Work, spec: Mapping[str, Any] | None = None) -> Gaussians:
     """
     spec = work.spec if spec is None else spec
     if is_fitted(spec):
-        return fit.fit_of(work, spec).gaussians
+        return fits.fit_of(work, spec).gaussians
     return splats(work.cell.scene_file, spec["size"], spec["seed"], **spec["splats"])

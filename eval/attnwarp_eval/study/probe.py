@@ -1,60 +1,43 @@
-"""Definition of a probe: everything that a study, its runner, its store and its report ask of
-one.
+"""Definition of a probe: everything that a study, its runner and its store ask of one; and the
+probes by name.
+
+How a report shows one is in :mod:`attnwarp_eval.study.probe_report`.
+
+>>> [probe.name for probe in probes()]
+['calibration', 'depth', 'editing', 'editing-timing', 'fit', 'sensitivity', 'stability', 'timing',
+ 'variability', 'warp']
+>>> probe("depth").metric("depth.abs_rel").direction
+'lower'
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib
+import pkgutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
-from enum import IntEnum
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 from attnwarp_eval.cost import Meter
-from attnwarp_eval.document.model import Finding, Section, Table
-from attnwarp_eval.document.numbers import pooled, spread
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import METRICS, Metric, Registry
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.plugins import load_plugins
 from attnwarp_eval.study.record import Extra, Json, NoExtra, PictureFile, Record, View
-from attnwarp_eval.study.results import Outcome, Results
+from attnwarp_eval.study.results import Outcome
 from attnwarp_eval.study.schema import Part, Study, Variant
 from attnwarp_eval.world import World
 
 E = TypeVar("E", bound=Extra)
+K = TypeVar("K", bound="type[Probe[Any]]")
 
-
-class Place(IntEnum):
-    """Place of a probe's section in the report; probes of one place stand in their order."""
-
-    INSTRUMENT = 0
-    """Before the tables of variants: whether the instrument can be trusted."""
-
-    RESULT = 1
-    """After the tables of variants."""
-
-    APPENDIX = 2
-    """After everything that was measured."""
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Layout of a report.
-
-    Attributes:
-        root: the run's folder; figures go below it.
-        timings: whether anything measured in seconds or bytes of memory is shown.
-    """
-
-    root: Path
-    timings: bool = True
-
-    def figure(self, name: str) -> Path:
-        """Path of a figure's file; its link is ``figures/name``."""
-        return self.root / "figures" / name
+PROBES = "attnwarp_eval.study.probes"
+"""Package of the probes that ship."""
 
 
 @dataclass(frozen=True)
@@ -132,10 +115,11 @@ class Work:
 
 
 class Probe(ABC, Generic[E]):
-    """One kind of measurement, from a study's YAML to the report.
+    """One kind of measurement, from a study's YAML to its records.
 
-    A probe is a module of this folder with one class that
-    :func:`attnwarp_eval.study.probes.register` decorates. Nothing else names it.
+    A probe is a class that :func:`register` decorates: in a module of :data:`PROBES`, in
+    ``measure.py`` of a folder there, or in a module of a plugin. Nothing else names it. It knows no
+    table: a :class:`~attnwarp_eval.study.probe_report.ProbeReport` shows it.
 
     Attributes:
         name: in a study's ``probes`` and in every record.
@@ -147,15 +131,7 @@ class Probe(ABC, Generic[E]):
         judges_variants: whether it has cells for each variant.
         always: whether every run has its cells, with or without the study's asking.
         main: whether tables of a report speak of it where they name no probe.
-        columns: of the table of variants, title -> metric; ``{layer}`` stands for a feature grid.
-            Without any, no table of variants can be made of its figures.
-        tabulates_all: whether its own section has every variant, in a study's tables or not.
-        contrasts: metrics in which a variant is tested against a baseline.
         times_in_turn: stages of the :class:`InTurn` that its records have.
-        stage: of :class:`InTurn`, the one whose seconds its figures cost.
-        cost, cost_of, cost_text: stage of a cell's seconds that its figures cost where nothing was
-            taken in turn, what they are seconds of, and what is in them.
-        picture_label: title of its pictures; the variant's name if empty.
         draws: whether it can save pictures.
         edits: whether it measures methods that edit, whose presets are their own.
         study_keys: every key of a study that decides its cells; None for all of them.
@@ -171,23 +147,16 @@ class Probe(ABC, Generic[E]):
     judges_variants: ClassVar[bool] = True
     always: ClassVar[bool] = False
     main: ClassVar[bool] = False
-    columns: ClassVar[Mapping[str, str]] = {}
-    tabulates_all: ClassVar[bool] = False
-    contrasts: ClassVar[Sequence[str]] = ()
     times_in_turn: ClassVar[Sequence[str]] = ()
-    stage: ClassVar[str] = ""
-    cost: ClassVar[str] = "steady"
-    cost_of: ClassVar[str] = "a view"
-    cost_text: ClassVar[str] = (
-        "Seconds are those of the method alone: a render of the target for depth; render,"
-        " correspondence, mask and feature grids for a warp. The source's render serves all targets"
-        " and is not in them, nor are set-up and checks."
-    )
-    picture_label: ClassVar[str] = ""
     draws: ClassVar[bool] = True
     edits: ClassVar[bool] = False
     study_keys: ClassVar[Set[str] | None] = None
     shared: ClassVar[Mapping[tuple[str, ...], str]] = {}
+
+    @property
+    def tabled(self) -> bool:
+        """True if a table of variants can be made of its figures."""
+        return self.judges_variants and bool(self.metrics)
 
     # From a study to cells
 
@@ -294,33 +263,6 @@ class Probe(ABC, Generic[E]):
         """
         return True
 
-    # From records to the report
-
-    def problems(self, results: Results) -> list[str]:
-        """Faults of the instrument by this probe's records, one line each."""
-        return []
-
-    def findings(self, results: Results) -> Iterator[Finding]:
-        """Findings that a reader should know first, where no table of variants tells it."""
-        return iter(())
-
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """Sections of the report; none where the run has no record of this probe."""
-        return iter(())
-
-    def gallery(self, results: Results) -> Section | None:
-        """A section of its own for its pictures; None where they stand with those of others."""
-        return None
-
-    def details(self, results: Results, names: Sequence[str]) -> list[Table]:
-        """Folded tables below a table of variants.
-
-        Args:
-            results: of the run.
-            names: of the variants, the baseline first.
-        """
-        return []
-
     def in_turn(self, cell: Outcome, record: Record[E]) -> InTurn | None:
         """Seconds of contestants, where this probe times them."""
         return None
@@ -331,17 +273,46 @@ def metrics_of(*prefixes: str) -> Registry:
     return Registry({k: m for k, m in METRICS.items() if k.startswith(prefixes)})
 
 
-def mean_values(results: Results, probe: str, name: str, metrics: Iterable[str]) -> list[str]:
-    """Cells of a table: the means over scenes of a variant's metrics, with their intervals. A mean
-    squared error is shown in decibels, as a pooled PSNR.
+_registered: dict[str, Probe[Any]] = {}
+
+
+def register(kind: K) -> K:
+    """Class decorator: make a probe available under its name.
+
+    Raises:
+        ValueError: another class has that name.
     """
-    scenes = len(results.study.scenes)
+    other = _registered.get(kind.name)
+    if other is not None and type(other) is not kind:
+        raise ValueError(f"probe {kind.name!r}: {type(other).__qualname__} has that name already")
+    _registered[kind.name] = kind()
+    return kind
+
+
+def unregister(name: str) -> None:
+    """Take back :func:`register`."""
+    _registered.pop(name, None)
+
+
+@cache
+def _discover() -> None:
+    folder = importlib.import_module(PROBES).__path__
+    for module in sorted(pkgutil.iter_modules(folder), key=lambda module: module.name):
+        importlib.import_module(f"{PROBES}.{module.name}{'.measure' if module.ispkg else ''}")
+    load_plugins()
+
+
+def probes() -> list[Probe[Any]]:
+    """Every probe: those that ship by their names, then those registered elsewhere."""
+    _discover()
+    own = {name: p for name, p in _registered.items() if type(p).__module__.startswith(PROBES)}
     return [
-        (pooled if is_mse(metric) else spread)(results.mean(probe, name, metric), scenes)
-        for metric in metrics
+        *(own[name] for name in sorted(own)),
+        *(p for p in _registered.values() if p.name not in own),
     ]
 
 
-def is_mse(metric: str) -> bool:
-    """Return True if a figure is the mean squared error behind a PSNR."""
-    return "mse" in metric.split(".")[1].split("_")
+def probe(name: str) -> Probe[Any]:
+    """The probe of a name. KeyError: there is none."""
+    _discover()
+    return _registered[name]

@@ -1,168 +1,26 @@
-"""Hard cases swept over their hardness: where the numerics hold, break, or refuse."""
+"""Report of hard cases: where the numerics hold, break, or refuse."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from itertools import groupby
-from typing import Annotated, Any, Literal
-
-from pydantic import Field
+from typing import Any
 
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number
-from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.stability import (
-    DECADES,
-    Case,
-    Outcome,
-    Way,
-    hard_case,
-    hard_cases,
-    level_name,
-)
-from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.probes import register
-from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
-from attnwarp_eval.study.record import Json, Record, View
+from attnwarp_eval.stability import DECADES, Outcome, level_name
+from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
+from attnwarp_eval.study.probes.stability.measure import Swept, must_hold, read_sweeps
 from attnwarp_eval.study.results import Results
-from attnwarp_eval.study.schema import Part, Study
 
 
-class Sweep(Part):
-    """Hard cases that a study sweeps."""
-
-    cases: list[str] = Field(default_factory=list, description="by name; all of them if empty")
-    levels: Literal["all", "quick"] = "all"
-    gpu: Annotated[bool, Field(description="also backend gpu; without a GPU on one thread")] = False
-
-
-class StudyPart(Part):
-    """Keys of a study that only this probe reads."""
-
-    stability: Sweep | None = Field(default=None, exclude_if=lambda value: value is None)
-
-
-@dataclass(frozen=True)
-class Extra:
-    """The error messages of the levels that were refused."""
-
-    refusals: Mapping[str, str]
-
-    def to_json(self) -> Json:
-        """The record's entry ``refusals``."""
-        return {"refusals": dict(self.refusals)}
-
-
-@dataclass(frozen=True)
-class Swept:
-    """One way of one case, as it was measured.
-
-    Attributes:
-        case, way: what was swept.
-        outcomes: the easiest level first.
-    """
-
-    case: Case
-    way: Way
-    outcomes: tuple[Outcome, ...]
-
-    @property
-    def failures(self) -> list[Outcome]:
-        """Levels that had to hold and do not."""
-        return [o for o in self.outcomes if o.verdict == "breaks" and must_hold(o)]
-
-    @property
-    def end(self) -> Outcome | None:
-        """The first level that breaks or is refused; None where all hold."""
-        return next((o for o in self.outcomes if o.verdict != "holds"), None)
-
-
-def must_hold(outcome: Outcome) -> bool:
-    """Return True if a level is required, as a result or as a refusal."""
-    return outcome.required or outcome.must_refuse
-
-
-@register
-class Stability(Probe[Extra]):
-    """Numerically hard inputs against independent oracles."""
+@register_report
+class StabilityReport(ProbeReport):
+    """Verdicts, errors against hardness, and every error."""
 
     name = "stability"
-    study_part = StudyPart
-    metrics = metrics_of("stability.")
-    needs_scenes = False
-    judges_variants = False
-    draws = False
-    study_keys = frozenset({"stability"})
-
-    def check(self, study: Study) -> None:
-        """Cases have names; variants change none of them."""
-        sweep = study.part(StudyPart).stability
-        if study.probes.get(self.name):
-            raise ValueError(
-                "probes.stability: got variants, expected []; a hard case has ways of its own"
-            )
-        for name in sweep.cases if sweep else ():
-            try:
-                hard_case(name)
-            except ValueError as error:
-                raise ValueError(f"stability.cases: {error}") from None
-
-    def cells(
-        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
-    ) -> Iterator[Cell]:
-        """One for each way of each case."""
-        sweep = study.part(StudyPart).stability or Sweep()
-        for hard in [hard_case(name) for name in sweep.cases] or hard_cases().values():
-            levels = hard.levels if sweep.levels == "all" else hard.quick
-            for way in hard.ways:
-                if way.backend == "gpu" and not sweep.gpu:
-                    continue
-                spec = {
-                    "probe": self.name,
-                    "protocol": self.protocol,
-                    "case": hard.name,
-                    "version": hard.version,
-                    "backend": way.backend,
-                    "precision": way.precision,
-                    "direction": way.direction,
-                    "levels": [level_name(level) for level in levels],
-                }
-                yield Cell(spec, hard.name, way.name, self.name, 0, (way.name,))
-
-    def compute(self, work: Work) -> Extra:
-        """Evaluate one way of one case at each of its levels."""
-        hard, way, levels = _definition(work.spec)
-        refusals = {}
-        for level in levels:
-            with work.meter.view():
-                outcome = hard.outcome(level, way)
-            name = level_name(level)
-            if outcome.refusal:
-                refusals[name] = outcome.refusal
-            work.views.append(
-                View(
-                    name,
-                    0.0,
-                    {
-                        "stability.margin": outcome.margin,
-                        "stability.error": outcome.error,
-                        "stability.refused": float(bool(outcome.refusal)),
-                    },
-                )
-            )
-        return Extra(refusals)
-
-    def read_extra(self, data: Json) -> Extra:
-        """Read from the record's entry ``refusals``."""
-        return Extra(data["refusals"])
-
-    def read(self, data: Json) -> Record[Extra]:
-        """A record from its JSON. ValueError: today's cases have no such case or level."""
-        _definition(data["spec"])
-        return super().read(data)
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """The verdicts, the errors against hardness, and every error."""
@@ -172,31 +30,6 @@ class Stability(Probe[Extra]):
         yield Place.RESULT, _verdicts(swept)
         yield Place.RESULT, _figures(swept, layout)
         yield Place.APPENDIX, _every_error(swept)
-
-
-def _definition(spec: Json) -> tuple[Case, Way, list[float]]:
-    hard = hard_case(spec["case"])
-    by_name = {level_name(level): level for level in hard.levels}
-    former = [name for name in spec["levels"] if name not in by_name]
-    if former:
-        raise ValueError(f"hard case {hard.name!r} has no level {former[0]} today")
-    way = Way(spec["backend"], spec["precision"], spec["direction"])
-    return hard, way, [by_name[name] for name in spec["levels"]]
-
-
-def read_sweeps(results: Results) -> list[Swept]:
-    """The sweeps of a run, as its records hold them, in the order of the cases."""
-    swept = []
-    for _, record in results.finished(Stability.name):
-        hard, way, levels = _definition(record.spec)
-        refusals = record.extra.refusals
-        # JSON has no infinity: an error that was infinite is NaN in a record.
-        outcomes = [
-            hard.judge(level, way, view.metrics["stability.error"], refusals.get(view.name, ""))
-            for level, view in zip(levels, record.views, strict=True)
-        ]
-        swept.append(Swept(hard, way, tuple(outcomes)))
-    return swept
 
 
 def verdict_lines(swept: Sequence[Swept]) -> list[str]:

@@ -1,42 +1,26 @@
-"""Warp and mask of a variant against exact correspondences and visibility."""
+"""Report of warps: feature error by grid size, and masks by yaw."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence, Set
-from functools import partial
-from typing import Any, ClassVar
+from collections.abc import Iterator, Mapping, Sequence
+from typing import ClassVar
 
-from pydantic import Field
-
-from attnwarp.warp import WarpSettings, parts_read, render_surface, warp_view
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.metrics.occlusion import COUNTS, by_yaw
 from attnwarp_eval.statistics.intervals import Interval, interval
-from attnwarp_eval.study import pictures
-from attnwarp_eval.study.probes import register
-from attnwarp_eval.study.probes.base import (
+from attnwarp_eval.study.probe_report import (
     Layout,
     Place,
-    Probe,
-    Work,
+    ProbeReport,
     mean_values,
-    metrics_of,
+    register_report,
 )
-from attnwarp_eval.study.probes.variant_splats import (
-    splats_of,
-    surface_meaning,
-    surface_reads,
-    surface_spec,
-)
-from attnwarp_eval.study.reads import warp_reads
-from attnwarp_eval.study.record import Json, NoExtra
+from attnwarp_eval.study.probes.warp.measure import StudyPart
 from attnwarp_eval.study.results import Results
-from attnwarp_eval.study.schema import Part, Study, Variant
-from attnwarp_eval.study.warping import warp_figures, warp_truth
 
 YAW_EDGES = (0, 15, 45, 75, 105, 135, 165, 180)
 """Bins around the yaws 30, 60, ... 150 that studies like to take, with the ends apart."""
@@ -53,26 +37,11 @@ RATES = {
 }
 
 
-class Yaw(Part):
-    """The variants whose masks the report shows by yaw."""
-
-    variants: list[str] = Field(default_factory=list)
-
-
-class StudyPart(Part):
-    """Keys of a study that only this probe reads."""
-
-    yaw: Yaw = Yaw()
-
-
-@register
-class Warp(Probe[NoExtra]):
-    """One warp for each view: endpoint error, feature error and mask scores."""
+@register_report
+class WarpReport(ProbeReport):
+    """Endpoint error, feature error and mask scores by variant."""
 
     name = "warp"
-    study_part = StudyPart
-    metrics = metrics_of("warp.", "occlusion.")
-    main = True
     columns: ClassVar[Mapping[str, str]] = {
         "EPE, image px": "warp.epe_median",
         "EPE p95": "warp.epe_p95",
@@ -90,76 +59,6 @@ class Warp(Probe[NoExtra]):
         "occlusion.recall",
     )
     stage = "pair"
-    study_keys = frozenset(
-        {"size", "views", "seeds", "spp", "feature_sizes", "feature_channels", "yaw"}
-    )
-
-    def check(self, study: Study) -> None:
-        """Masks by yaw need their variants measured."""
-        names = study.part(StudyPart).yaw.variants
-        study.check_variants(names, "yaw.variants", self.name)
-
-    def reads(self, study: Study, variant: Variant) -> Set[str]:
-        """Depth and rules."""
-        truth = variant.geometry == "truth"
-        return surface_reads(variant) | warp_reads(variant.settings(), truth)
-
-    def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """Depth, rules and feature grids."""
-        return {
-            **surface_spec(study, variant, seed),
-            "spp": study.spp,
-            "settings": variant.settings().to_dict(),
-            "feature_sizes": study.feature_sizes,
-            "feature_channels": study.feature_channels,
-        }
-
-    def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
-        """Splats may be fitted."""
-        return surface_meaning(study, variant)
-
-    def compute(self, work: Work) -> NoExtra:
-        """Warp and measure, view by view."""
-        spec, world, meter = work.spec, work.world, work.meter
-        size, spp = spec["size"], spec["spp"]
-        settings = WarpSettings.from_dict(spec["settings"])
-        model = source_surface = None
-        if spec.get("geometry") != "truth":
-            with meter.stage("splats"):
-                model = splats_of(work)
-            # One source serves every target, so its render is no part of what a target costs.
-            with meter.stage("source"):
-                source_surface = render_surface(model, world.source, settings)
-            meter.count(source_pairs=source_surface.counters["pairs"])
-        for name in spec["views"]:
-            target = world.targets[name]
-            with meter.stage("truth"):
-                truth = world.pair(name, size)
-                images: dict[str, Any] = {}
-                if "source_image" in parts_read(settings):
-                    images = {
-                        "source_image": world.image(world.source.name, spp),
-                        "target_image": world.image(name, spp),
-                    }
-            with meter.view():
-                if model is None:
-                    view = warp_truth(world, truth, settings, **images)
-                else:
-                    view = warp_view(
-                        model,
-                        world.source,
-                        target,
-                        settings,
-                        source_surface=source_surface,
-                        **images,
-                        warn_empty=False,
-                    )
-                for layer in spec["feature_sizes"]:
-                    view.at((layer, layer))
-            meter.count(**view.target.counters)
-            measured = warp_figures(work, name, view)
-            work.add(name, measured, partial(pictures.of_warp, world, name, spp, truth, view))
-        return NoExtra()
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
         """Feature error by grid size."""

@@ -1,0 +1,193 @@
+"""Report of a probe: columns, contrasts, findings and sections of what it measured.
+
+>>> report_of("depth").columns["AbsRel"]
+'depth.abs_rel'
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+from attnwarp_eval.document.model import Finding, Section, Table
+from attnwarp_eval.document.numbers import pooled, spread
+from attnwarp_eval.study.probe import Probe, probe, probes
+from attnwarp_eval.study.results import Results
+
+K = TypeVar("K", bound="type[ProbeReport]")
+
+
+class Place(IntEnum):
+    """Place of a probe's section in the report; probes of one place stand in their order."""
+
+    INSTRUMENT = 0
+    """Before the tables of variants: whether the instrument can be trusted."""
+
+    RESULT = 1
+    """After the tables of variants."""
+
+    APPENDIX = 2
+    """After everything that was measured."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Layout of a report.
+
+    Attributes:
+        root: the run's folder; figures go below it.
+        timings: whether anything measured in seconds or bytes of memory is shown.
+    """
+
+    root: Path
+    timings: bool = True
+
+    def figure(self, name: str) -> Path:
+        """Path of a figure's file; its link is ``figures/name``."""
+        return self.root / "figures" / name
+
+
+class ProbeReport:
+    """Presentation of a probe's records in a report.
+
+    It stands in the probe's module, or in ``report.py`` beside the probe's ``measure.py``, and
+    :func:`register_report` decorates it. It measures nothing.
+
+    Attributes:
+        name: of the probe.
+        columns: of the table of variants, title -> metric; ``{layer}`` stands for a feature grid.
+            Every metric of the probe under its own name where there are none.
+        tabulates_all: whether its own section has every variant, in a study's tables or not.
+        contrasts: metrics in which a variant is tested against a baseline.
+        stage: of :class:`~attnwarp_eval.study.probe.InTurn`, the one whose seconds its figures
+            cost.
+        cost, cost_of, cost_text: stage of a cell's seconds that its figures cost where nothing was
+            taken in turn, what they are seconds of, and what is in them.
+        picture_label: title of its pictures; the variant's name if empty.
+    """
+
+    name: str = ""
+    columns: ClassVar[Mapping[str, str]] = {}
+    tabulates_all: ClassVar[bool] = False
+    contrasts: ClassVar[Sequence[str]] = ()
+    stage: ClassVar[str] = ""
+    cost: ClassVar[str] = "steady"
+    cost_of: ClassVar[str] = "a view"
+    cost_text: ClassVar[str] = (
+        "Seconds are those of the method alone: a render of the target for depth; render,"
+        " correspondence, mask and feature grids for a warp. The source's render serves all targets"
+        " and is not in them, nor are set-up and checks."
+    )
+    picture_label: ClassVar[str] = ""
+
+    def __init__(self, own: Probe[Any]) -> None:
+        self.probe, self.name = own, own.name
+
+    def columns_at(self, layer: int) -> dict[str, str]:
+        """Columns of the table of variants, title -> metric.
+
+        Args:
+            layer: size of the feature grid that tables show.
+        """
+        columns = self.columns or {
+            name: name for name, metric in self.probe.metrics.items() if not metric.is_count
+        }
+        return {
+            title.format(layer=layer): metric.format(layer=layer)
+            for title, metric in columns.items()
+        }
+
+    def problems(self, results: Results) -> list[str]:
+        """Faults of the instrument by this probe's records, one line each."""
+        return []
+
+    def findings(self, results: Results) -> Iterator[Finding]:
+        """Findings that a reader should know first, where no table of variants tells it."""
+        return iter(())
+
+    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+        """Sections of the report; none where the run has no record of this probe."""
+        return iter(())
+
+    def gallery(self, results: Results) -> Section | None:
+        """A section of its own for its pictures; None where they stand with those of others."""
+        return None
+
+    def details(self, results: Results, names: Sequence[str]) -> list[Table]:
+        """Folded tables below a table of variants.
+
+        Args:
+            results: of the run.
+            names: of the variants, the baseline first.
+        """
+        return []
+
+
+class PlainReport(ProbeReport):
+    """Report of a probe that has none of its own: a table of its metrics."""
+
+    tabulates_all = True
+
+    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+        """The table, where the probe gives figures."""
+        columns = self.columns_at(results.layer)
+        measured = dict.fromkeys(
+            v for cell, _ in results.finished(self.name) for v in cell.variants
+        )
+        rows = [[v, *mean_values(results, self.name, v, columns.values())] for v in measured]
+        if rows and columns:
+            yield (
+                Place.RESULT,
+                Section(f"Figures of {self.name}", [], [Table(["variant", *columns], rows)]),
+            )
+
+
+_registered: dict[str, type[ProbeReport]] = {}
+
+
+def register_report(kind: K) -> K:
+    """Class decorator: make a report available under its probe's name."""
+    _registered[kind.name] = kind
+    return kind
+
+
+def report_of(name: str) -> ProbeReport:
+    """The report of a probe; a plain one where it has none. KeyError: no probe of that name."""
+    own = probe(name)
+    _discover(type(own).__module__)
+    return _registered.get(name, PlainReport)(own)
+
+
+@cache
+def _discover(module: str) -> None:
+    """Import ``report.py`` beside a probe's ``measure.py``."""
+    folder, _, last = module.rpartition(".")
+    if last == "measure" and find_spec(f"{folder}.report"):
+        importlib.import_module(f"{folder}.report")
+
+
+def reports() -> list[ProbeReport]:
+    """Reports of all probes, in their order."""
+    return [report_of(each.name) for each in probes()]
+
+
+def mean_values(results: Results, probe: str, name: str, metrics: Iterable[str]) -> list[str]:
+    """Cells of a table: the means over scenes of a variant's metrics, with their intervals. A mean
+    squared error is shown in decibels, as a pooled PSNR.
+    """
+    scenes = len(results.study.scenes)
+    return [
+        (pooled if is_mse(metric) else spread)(results.mean(probe, name, metric), scenes)
+        for metric in metrics
+    ]
+
+
+def is_mse(metric: str) -> bool:
+    """Return True if a figure is the mean squared error behind a PSNR."""
+    return "mse" in metric.split(".")[1].split("_")

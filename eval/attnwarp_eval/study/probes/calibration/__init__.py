@@ -1,0 +1,1 @@
+"""The instrument judged by itself."""

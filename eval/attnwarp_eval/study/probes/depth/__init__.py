@@ -1,0 +1,1 @@
+"""Depth and normals of sampled splats against exact truth."""

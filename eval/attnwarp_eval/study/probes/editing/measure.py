@@ -1,0 +1,225 @@
+"""A scene edited by a method, against the true pictures of the edit.
+
+Views of a record are named ``edit/view``. Figures end in ``.edit`` for the edited views and in
+``.render`` for renders of the edited splats. Where the editor did not do the edit in the source
+view, figures of agreement between views are undefined: there was nothing to carry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import replace
+from functools import cache
+from typing import TYPE_CHECKING, Literal
+
+import torch
+
+from attnwarp import Camera, Gaussians, check
+from attnwarp.fit import compile_kernels
+from attnwarp.warp import warp_view
+from attnwarp_eval.cost import Meter
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.budgets import Spent, Stopwatch, timed
+from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.edit_truth import EditTruth, planned_truth
+from attnwarp_eval.study.editing_methods import EDITING_METHODS
+from attnwarp_eval.study.probe import Work, metrics_of, probe, register
+from attnwarp_eval.study.probes.editing.result import EditResult, Measurement
+from attnwarp_eval.study.record import Json, Record
+from attnwarp_eval.study.schema import Study, StudyError, Variant, did_you_mean
+from attnwarp_eval.study.shared.edits import (
+    EditingPart,
+    MethodProbe,
+    VariantPart,
+    editor_of,
+    edits_of,
+    reference_of,
+    settings_of,
+)
+from attnwarp_eval.study.shared.encoders import EncodersPart, encoder_identities, loaded
+from attnwarp_eval.study.shared.method_run import own_seconds, run_method
+from attnwarp_eval.study.shared.splats import splats_of
+
+if TYPE_CHECKING:
+    from attnwarp.methods import Budget
+
+STOPWATCH = Stopwatch()
+"""Seconds of the methods that this process has run."""
+
+
+@register
+class EditingProbe(MethodProbe[EditResult]):
+    """One edit of one scene by one method."""
+
+    name = "editing"
+    protocol = 2
+    study_part = EditingPart
+    variant_part = VariantPart
+    metrics = metrics_of("multiview.", "fidelity.", "embedding.", "depth.", "image.")
+    study_keys = frozenset({"size", "views", "seeds", "spp", "editing", "encoders"})
+
+    # From a study to cells
+
+    def check(self, study: Study) -> None:
+        """Figures by yaw need their variants measured."""
+        part = study.part(EditingPart).editing
+        study.check_variants(part.by_yaw, "editing.by_yaw", self.name)
+        study.check_variants(part.choice, "editing.choice", self.name)
+        for name, variant in study.variants.items():
+            budget = variant.part(VariantPart).budget
+            if budget is None or budget.seconds_of is None:
+                continue
+            key = f"variants.{name}.budget.seconds_of"
+            study.check_variants([budget.seconds_of], key)
+            other = study.variants[budget.seconds_of].part(VariantPart).budget
+            if other is not None and other.seconds_of is not None:
+                raise ValueError(
+                    f"{key}: {budget.seconds_of!r} has seconds_of itself; name a variant that has"
+                    " none"
+                )
+
+    def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
+        """A scene without an entry has all of its edits measured, so a misspelt one matters."""
+        names = [scene.name for scene in scenes]
+        for name in study.part(EditingPart).editing.edits:
+            if name not in names:
+                raise StudyError(
+                    f"editing.edits: the study has no scene {name!r}{did_you_mean(name, names)}"
+                )
+
+    def check_variant(self, study: Study, variant: Variant) -> None:
+        """Settings are refused even where nothing is edited."""
+        own = variant.part(VariantPart)
+        check.one_of(own.method, list(EDITING_METHODS), "method")
+        if own.budget is not None and not EDITING_METHODS[own.method].takes_budget:
+            able = ", ".join(
+                repr(name) for name, method in EDITING_METHODS.items() if method.takes_budget
+            )
+            raise ValueError(
+                f"budget: method {own.method!r} runs to its end; methods with a budget are {able}"
+            )
+        if own.by_hand is not None and not EDITING_METHODS[own.method].takes_picture:
+            able = ", ".join(
+                repr(name) for name, method in EDITING_METHODS.items() if method.takes_picture
+            )
+            raise ValueError(
+                f"by_hand: method {own.method!r} edits its source itself; methods that take a"
+                f" picture are {able}"
+            )
+        if own.options or any(probe(name).edits for name in study.probes):
+            settings_of(study, variant, 0)
+
+    def measured(self, study: Study) -> Set[str]:
+        """Variants whose seconds limit others are run too."""
+        names = study.variants.keys() & super().measured(study)
+        references = {reference_of(study.variants[name]) for name in names}
+        return names | {name for name in references if name is not None}
+
+    def cells(
+        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
+    ) -> Iterator[Cell]:
+        """One for each scene, edit, variant and seed."""
+        wanted = study.part(EncodersPart)
+        encoders = encoder_identities(wanted)
+        sources = {str(kind): name for kind, name in wanted.encoders.items()}
+        for name, scene in scenes.items():
+            edits = list(edits_of(study, scene))
+            for label in names:
+                variant = study.variants[label]
+                names_of = {"editor": editor_of(study, variant).name}
+                reference = reference_of(variant)
+                if reference is not None:
+                    names_of["reference"] = reference
+                    other = study.variants[reference]
+                    names_of["reference editor"] = editor_of(study, other).name
+                for seed in study.seeds:
+                    decided = {
+                        **self.common_spec(study, scene, seed),
+                        **self.variant_spec(study, variant, seed),
+                    }
+                    views = study.pictures_of(decided["views"], label)
+                    for edit in edits:
+                        yield Cell(
+                            {**decided, "edit": edit, "encoders": encoders},
+                            name, label, self.name, seed, (label,),
+                            tuple(f"{edit['name']}/{view}" for view in views),
+                            {**sources, **names_of},
+                        )  # fmt: skip
+
+    # From a cell to its record
+
+    def compute(self, work: Work) -> EditResult:
+        """Edit the scene, then measure every target."""
+        spec, world, meter = work.spec, work.world, work.meter
+        names = [world.source.name, *spec["views"]]
+        with meter.stage("truth"):
+            truth = planned_truth(work.cell, names)
+        with meter.stage("splats"):
+            before = splats_of(work)
+        with meter.stage("setup"):
+            encoders = loaded(work.cell.sources, spec["encoders"])
+            _compile(before.kind)
+        budget = self._budget(work, truth, names)
+        result = run_method(work, truth, names, before, budget)
+        STOPWATCH.note(_decisive(spec), own_seconds(result))
+        for part, seconds in result.seconds.items():
+            meter.add(f"method: {part}", seconds)
+        meter.add("whole", own_seconds(result))
+        meter.count(**{k: int(v) for k, v in result.counters.items() if k != "injected"})
+        with meter.stage("checks"):
+            extra = Measurement(work, truth, names, before, result, encoders).record()
+        if budget is None:
+            return extra
+        given = work.cell.sources.get("reference")
+        return replace(extra, budget=Spent(budget.seconds, given, budget.network_rows, result.cut))
+
+    def _budget(self, work: Work, truth: EditTruth, names: Sequence[str]) -> Budget | None:
+        """Limits of the work's method; a variant whose seconds are the limit is run if need be."""
+        from attnwarp.methods import Budget
+
+        given = work.spec.get("budget")
+        if given is None:
+            return None
+        seconds = given.get("seconds")
+        if "seconds_of" in given:
+            shared = {k: work.spec[k] for k in _SHARED if k in work.spec}
+            sources = {**work.cell.sources, "editor": work.cell.sources["reference editor"]}
+            cell = replace(work.cell, spec={**shared, **given["seconds_of"]}, sources=sources)
+            other = Work(cell, work.root, work.scene_world, Meter())
+
+            def run() -> float:
+                limits = self._budget(other, truth, names)
+                return own_seconds(run_method(other, truth, names, splats_of(other), limits))
+
+            with work.meter.stage("budget"):
+                seconds = STOPWATCH.seconds(_decisive(cell.spec), run)
+        return Budget(seconds, given.get("network_rows"))
+
+    def read_extra(self, data: Json) -> EditResult:
+        """Read from the record's entry ``edit``."""
+        return EditResult.from_json(data["edit"])
+
+    def repeatable(self, record: Record[EditResult]) -> bool:
+        """False when a time budget limited the method."""
+        return not timed(record.spec)
+
+
+@cache
+def _compile(kind: Literal["2d", "3d"]) -> None:
+    """Compile what renders, tunes and warps, so that a first edit's seconds do not hold it."""
+    compile_kernels(kind)
+    splats = Gaussians(
+        kind, torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 2 + (kind == "3d")),
+        torch.ones(1), torch.zeros(1, 1, 3),
+    )  # fmt: skip
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), width=16, height=16, fov_y=40, up=(0, 1, 0))
+    warp_view(splats, camera, camera).at((4, 4)).warp_tokens(torch.zeros(1, 16, 4))
+
+
+_SHARED = ("probe", "protocol", "scene", "size", "views", "seed", "edit", "encoders")
+"""Entries of a cell's spec that all variants share."""
+
+
+def _decisive(spec: Json) -> Json:
+    """Entries of a cell's spec that decide its method's run; the encoders measure it afterwards."""
+    return {key: value for key, value in spec.items() if key != "encoders"}

@@ -1,0 +1,326 @@
+"""Result of an edit: its record, and the figures of its views against the truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp import Gaussians
+from attnwarp_eval import metrics
+from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.splats.fitted import surface_error
+from attnwarp_eval.study import pictures
+from attnwarp_eval.study.budgets import Spent
+from attnwarp_eval.study.edit_truth import EditTruth, Judgement, neighbours
+from attnwarp_eval.study.editing_methods import EditedScene
+from attnwarp_eval.study.probe import Work
+from attnwarp_eval.study.record import Json, with_nan
+from attnwarp_eval.study.schema import StudyError
+from attnwarp_eval.study.shared.method_run import source_by_hand
+
+if TYPE_CHECKING:
+    from attnwarp_eval.two_view import Hits
+
+Image = npt.NDArray[np.float32]
+
+FIDELITY = ("psnr", "mse", "ssim")
+"""Figures of :func:`attnwarp_eval.metrics.fidelity` that a record has, of the whole picture and
+inside the edited object."""
+
+
+LEAST_PIXELS = 16
+"""Agreement is undefined where fewer pixels of a view are compared, the area of one cell of the
+bundled editors' latents. Views count alike in a mean, so a single pixel would weigh as much as a
+whole view."""
+
+
+@dataclass(frozen=True)
+class EditResult:
+    """Entries of a cell's record beside the figures of its views.
+
+    Attributes:
+        name, instruction: of the edit.
+        source: what the source's edit shows.
+        alone: what all edited views together show, the source's included.
+        answers: by "edit" and "render": by view, the nearest answer; None where nothing of the
+            object shows.
+        overall: by "edit" and "render", the answer nearest to all views together.
+        edit_psnr: dB, edited views against renders, pooled, where a surface shows.
+        edited: number of edited views.
+        injected: mean share of the targets' pixels that got features; 0 without a warp.
+        budget: of the method; None for none.
+    """
+
+    name: str
+    instruction: str
+    source: Judgement
+    alone: Judgement
+    answers: Mapping[str, Mapping[str, str | None]]
+    overall: Mapping[str, str | None]
+    edit_psnr: float
+    edited: int
+    injected: float
+    budget: Spent | None = None
+
+    def to_json(self) -> Json:
+        """The record's entry ``edit``."""
+        data = dict(without_nan(asdict(self)))
+        if self.budget is None:
+            del data["budget"]
+        return {"edit": data}
+
+    @classmethod
+    def from_json(cls, data: Json) -> EditResult:
+        """Rebuild from :meth:`to_json`."""
+        judgements = {
+            key: Judgement(
+                data[key]["answer"],
+                data[key]["done"],
+                **with_nan({k: data[key][k] for k in ("psnr", "unedited", "unchanged")}),
+            )
+            for key in ("source", "alone")
+        }
+        own = with_nan({"edit_psnr": data["edit_psnr"]})
+        budget = {"budget": Spent(**data["budget"])} if data.get("budget") else {}
+        return cls(**{**data, **judgements, **own, **budget})
+
+
+class Measurement:
+    """The figures of one edited scene.
+
+    Args:
+        work: the cell.
+        truth: of the edit.
+        names: of the views, the source first.
+        before: the splats before the edit.
+        result: of the method.
+        encoders: by kind.
+    """
+
+    def __init__(
+        self,
+        work: Work,
+        truth: EditTruth,
+        names: list[str],
+        before: Gaussians,
+        result: EditedScene,
+        encoders: Mapping[str, Any],
+    ) -> None:
+        self.work, self.truth, self.names = work, truth, names
+        self.injected = float(result.counters.get("injected", 0.0))
+        self.before, self.after, self.encoders = before, result.gaussians, encoders
+        self.source = names[0]
+        if not result.edited:
+            method = f"method {work.spec['method']!r}"
+            raise StudyError(
+                f"{method} gave no edited view, expected at least one"
+                if result.cut is None
+                else f"budget: it ended {method} before its first edit; give more"
+            )
+        edited = {names[k]: _full(truth.originals[names[k]], v) for k, v in result.edited.items()}
+        self.pictures = {"edit": edited, "render": self._renders(result.gaussians)}
+        # A method that was cut short may not have edited the source: it shows no edit then.
+        image = edited.get(self.source, truth.originals[self.source])
+        self.judged = truth.judge({self.source: image})
+        self.nearest = {k: self._nearest(pictures) for k, pictures in self.pictures.items()}
+        self.neighbours = neighbours(work.world, work.spec["views"])
+
+    def record(self) -> EditResult:
+        """Add the figures of every target to the work; return the rest."""
+        work, truth = self.work, self.truth
+        figures: dict[str, dict[str, float]] = {name: {} for name in self.names[1:]}
+        overall: dict[str, str | None] = {}
+        for kind, images in self.pictures.items():
+            part = truth.of(list(images))
+            overall[kind], fidelity = metrics.edit_fidelity(
+                images, part.answers, part.masks, originals=part.originals
+            )
+            for name, row in figures.items():
+                row |= self._fidelity(kind, fidelity.get(name))
+                row |= self._agreement(kind, name, overall[kind])
+        embedded = self._embedded()
+        both = [name for name in self.pictures["edit"] if name != self.source]
+        psnr = metrics.edit_psnr(
+            {name: self.pictures["edit"][name] for name in both},
+            {name: self.pictures["render"][name] for name in both},
+            # Sampled splats lie on surfaces: the sky has none.
+            {name: self._hits(name).valid for name in both},
+        )
+        errors = dict(zip(psnr.views, zip(psnr.psnr, psnr.mse, strict=True), strict=True))
+        for name, row in figures.items():
+            decibels, error = errors.get(name, (math.nan, math.nan))
+            row |= {"image.psnr.edit_render": decibels, "image.mse.edit_render": error}
+            row |= embedded[name]
+            row |= self._depth(name)
+            edit = work.spec["edit"]["name"]
+            work.add(f"{edit}/{name}", row, partial(self._draw, name))
+        return EditResult(
+            work.spec["edit"]["name"],
+            work.spec["edit"]["instruction"],
+            self.judged,
+            truth.judge(self.pictures["edit"]),
+            self.nearest,
+            overall,
+            psnr.pooled,
+            len(self.pictures["edit"]),
+            self.injected,
+        )
+
+    def _nearest(self, images: Mapping[str, Image]) -> dict[str, str | None]:
+        part = self.truth.of(list(images))
+        return metrics.answers_by_view(images, part.answers, part.union)
+
+    def _pair(self, first: str, second: str) -> Any:
+        return self.work.world.between(first, second)
+
+    def _fidelity(self, kind: str, figures: Mapping[str, float] | None) -> dict[str, float]:
+        if figures is None:
+            figures = {}
+        return {
+            f"fidelity.{key}.{kind}{place}": figures.get(
+                f"fidelity.{key}{'.inside' if place else ''}", math.nan
+            )
+            for key in FIDELITY
+            for place in ("", "_inside")
+        } | {
+            f"fidelity.{key}.{kind}": figures.get(f"fidelity.{key}", math.nan)
+            for key in ("preserved_psnr", "preserved_mse")
+        }
+
+    def _agreement(self, kind: str, name: str, answer: str | None) -> dict[str, float]:
+        """Agreement of a target with the source, and with its neighbour; NaN where it was not
+        edited or the source's edit is not one.
+        """
+        keys = ("same_answer", "delta_e", "delta_e_floor", "delta_e_above")
+        row = dict.fromkeys(
+            [
+                *(f"multiview.same_answer.{kind}{end}" for end in ("", "_seen")),
+                *(f"multiview.{k}.{kind}{end}" for k in keys[1:] for end in ("", "_inside")),
+                f"multiview.delta_e_above.{kind}_next",
+            ],
+            math.nan,
+        )
+        images, truth = self.pictures[kind], self.truth
+        if not self.judged.done or answer is None or name not in images:
+            return row
+        pair = self._pair(self.source, name)
+        own = self.nearest[kind][name]
+        if truth.ambiguous:
+            row[f"multiview.same_answer.{kind}"] = _equal(own, self.judged.answer)
+            part = truth.of([name])
+            seen = {name: truth.union[name] & pair.visible}
+            if seen[name].sum() >= LEAST_PIXELS:
+                there = metrics.answers_by_view({name: images[name]}, part.answers, seen)[name]
+                row[f"multiview.same_answer.{kind}_seen"] = _equal(there, self.judged.answer)
+        for end, mask in (("", None), ("_inside", truth.masks[answer][name])):
+            figures = self._above(images, answer, self.source, name, mask)
+            for key in keys[1:]:
+                row[f"multiview.{key}.{kind}{end}"] = figures[f"multiview.{key}"]
+        other = self.neighbours[name]
+        if other in images:
+            mask = truth.masks[answer][name]
+            figures = self._above(images, answer, other, name, mask)
+            row[f"multiview.delta_e_above.{kind}_next"] = figures["multiview.delta_e_above"]
+        return row
+
+    def _above(
+        self, images: Mapping[str, Image], answer: str, first: str, second: str, mask: Any
+    ) -> dict[str, float]:
+        """Disagreement of two views above its floor; NaN where fewer than :data:`LEAST_PIXELS` are
+        compared.
+        """
+        true = self.truth.answers[answer]
+        figures = metrics.above_floor(
+            (images[first], images[second]),
+            (true[first], true[second]),
+            self._pair(first, second),
+            mask=mask,
+        )
+        few = figures["multiview.pixels"] < LEAST_PIXELS
+        return dict.fromkeys(figures, math.nan) if few else figures
+
+    def _embedded(self) -> dict[str, dict[str, float]]:
+        """The paper's similarities of renders; none without encoders."""
+        targets = self.names[1:]
+        rows: dict[str, dict[str, float]] = {name: {} for name in targets}
+        renders = [self.pictures["render"][name] for name in targets]
+        source = self.pictures["edit"].get(self.source)
+        values: dict[str, Any] = {}
+        if (clip := self.encoders.get("clip")) is not None:
+            words = clip.texts([self.work.spec["edit"][key] for key in ("source", "target")])
+            images = clip.images(renders)
+            befores = clip.images([self.truth.originals[name] for name in targets])
+            values["clip_similarity"] = metrics.clip_similarity(images, words[1])
+            values["clip_directional"] = metrics.directional_similarity(
+                befores, images, words[0], words[1]
+            )
+            if source is not None:
+                values["clip_image"] = metrics.image_similarity(clip.images([source]), images)
+        if source is not None and (dino := self.encoders.get("dino")) is not None:
+            values["dino_image"] = metrics.image_similarity(
+                dino.images([source]), dino.images(renders)
+            )
+        for key, similarity in values.items():
+            for name, value in zip(targets, similarity.values, strict=True):
+                rows[name][f"embedding.{key}.render"] = float(value)
+        return rows
+
+    def _hits(self, name: str) -> Hits:
+        return self.work.world.geometry.trace(self.work.world.camera(name))
+
+    def _depth(self, name: str) -> dict[str, float]:
+        hits = self._hits(name)
+        camera = self.work.world.camera(name)
+        row = {}
+        for when, model in (("before", self.before), ("after", self.after)):
+            _, error = surface_error(model, camera, hits)
+            row[f"depth.abs_rel.{when}"] = error["depth.abs_rel"]
+        return row
+
+    def _renders(self, model: Gaussians) -> dict[str, Image]:
+        return {name: self._render(model, name) for name in self.names}
+
+    def _render(self, model: Gaussians, name: str, least: int = 1) -> Image:
+        """(H, W, 3) of a view of splats, at a whole multiple of its size and at least so wide."""
+        from attnwarp.methods.scene import near_of, render_picture
+
+        cameras = {own: self.work.world.camera(own) for own in self.names}
+        near, camera = near_of(list(cameras.values()), self.before), cameras[name]
+        times = -(-least // camera.width)
+        larger = camera.resize(times * camera.width, times * camera.height)
+        return render_picture(model, larger, near, "auto")
+
+    def _draw(self, name: str) -> dict[str, bytes]:
+        """JPEG files of a view: before, the source's edit, the edited view, its render, and the
+        truth of the source's answer."""
+        answer = self.judged.answer
+        images = {
+            "before": self.truth.originals[name],
+            "by hand": source_by_hand(self.work, self.truth, self.source),
+            "source edit": self.pictures["edit"].get(self.source),
+            "edited": self.pictures["edit"].get(name),
+            "render": self._render(self.after, name, pictures.WIDTH),
+            "truth": None if answer is None else self.truth.answers[answer][name],
+        }
+        return {
+            content.replace(" ", "-"): pictures.jpeg(pictures.enlarged(image))
+            for content, image in images.items()
+            if image is not None
+        }
+
+
+def _full(original: Image, edited: npt.NDArray[np.uint8]) -> Image:
+    """An edited view at the size of the original."""
+    from attnwarp.methods.pictures import enlarged_change
+
+    return enlarged_change(original, edited.astype(np.float32) / np.float32(255))
+
+
+def _equal(answer: str | None, expected: str | None) -> float:
+    return math.nan if answer is None else float(answer == expected)

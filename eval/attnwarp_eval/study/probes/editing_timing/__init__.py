@@ -1,0 +1,1 @@
+"""Seconds of whole edits taken in turn in one process."""

@@ -1,0 +1,1 @@
+"""Splats fitted to true pictures, measured on views held out."""

@@ -1,0 +1,1 @@
+"""Sensitivity of metrics to flaws of an edit."""

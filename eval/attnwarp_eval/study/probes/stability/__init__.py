@@ -1,0 +1,1 @@
+"""Hard cases swept over their hardness."""

@@ -1,0 +1,1 @@
+"""Seconds of variants taken in turn in one process."""

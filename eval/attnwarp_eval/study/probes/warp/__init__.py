@@ -1,0 +1,1 @@
+"""Warp and mask of a variant against exact correspondences and visibility."""

@@ -1,0 +1,252 @@
+"""Edits of scenes by methods: the keys of a study that several probes read, and a cell's spec."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Set
+from functools import lru_cache
+from typing import Any, ClassVar, Literal, TypeVar
+
+from pydantic import Field
+
+from attnwarp.errors import InputError
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.budgets import BudgetPart
+from attnwarp_eval.study.edit_truth import answers_of
+from attnwarp_eval.study.editing_methods import EDITING_METHODS
+from attnwarp_eval.study.hand_made import Kind
+from attnwarp_eval.study.probe import Probe
+from attnwarp_eval.study.reads import MASK_RULES
+from attnwarp_eval.study.record import Extra, Json
+from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, did_you_mean
+from attnwarp_eval.study.shared.splats import splats_meaning, splats_reads, splats_spec
+
+E = TypeVar("E", bound=Extra)
+
+
+class EditorPart(Part):
+    """An editor of single views.
+
+    ``name`` is bundled or a folder in diffusers' format. Guidance left out is the editor's own.
+    """
+
+    name: str = "small-plain"
+    text_guidance: float | None = Field(default=None, ge=0)
+    image_guidance: float | None = Field(default=None, ge=0)
+
+
+class Editing(Part):
+    """Settings that all variants share.
+
+    ``edits``: by scene, an edit's name, or ``edit=answer`` for one of its answers alone, with the
+    words that the editor is given; the edit's own words where they are null. Scenes that are left
+    out have all their edits. ``by_yaw``: variants whose figures the report shows by yaw.
+    """
+
+    editor: EditorPart = EditorPart()
+    edits: dict[str, dict[str, str | None]] = Field(default_factory=dict)
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="fields of attnwarp.methods.AttentionWarpingSettings"
+    )
+    by_yaw: list[str] = Field(default_factory=list)
+    choice: list[str] = Field(
+        default_factory=list, description="variants, one of which is chosen for a given time"
+    )
+
+
+class EditingPart(Part):
+    """Keys of a study: what is edited, and by which editor."""
+
+    editing: Editing = Editing()
+
+
+class VariantPart(Part):
+    """Keys of a variant: the method, and what limits it.
+
+    ``options`` are fields of the method's settings, over the study's; ``preset`` among them goes
+    before the variant's. ``{source}`` in ``source_prompt`` stands for the edit's
+    ``source`` words. ``mask: truth`` injects where the source truly sees the
+    surface, ``geometry: truth`` warps by exact depth. ``budget`` cuts the method short.
+    ``by_hand`` gives the method a source view that was edited by hand
+    (:mod:`attnwarp_eval.study.hand_made`) instead of letting the editor edit it.
+    """
+
+    method: str = "attention_warping"
+    options: dict[str, Any] = Field(default_factory=dict)
+    mask: Literal["rules", "truth"] = "rules"
+    editor: EditorPart | None = None
+    budget: BudgetPart | None = None
+    by_hand: Kind | None = None
+
+
+class MethodProbe(Probe[E]):
+    """Base of probes that run a variant's method of editing."""
+
+    edits = True
+    shared: ClassVar[Mapping[tuple[str, ...], str]] = {
+        ("editing", "options"): "options",
+        ("editing", "editor"): "editor",
+    }
+
+    def reads(self, study: Study, variant: Variant) -> Set[str]:
+        """Keys that the method reads, and those of its editor and its splats."""
+        own = variant.part(VariantPart)
+        settings = settings_of(study, variant, 0)
+        read = {"method", "budget", "by_hand", *splats_reads(variant)}
+        read |= EDITING_METHODS[own.method].reads(settings)
+        one_mask = settings.get("sources", 1) == 1 and not settings.get("confidence")
+        if own.mask == "truth" and one_mask:
+            read -= MASK_RULES
+        if "preset" in own.options:
+            read -= {"preset"}
+        if "editor" in read:
+            guidance = ("text_guidance", "image_guidance")
+            read -= {"editor"}
+            read |= {"editor.name"}
+            read |= {f"editor.{name}" for name in guidance if settings.get(name) is None}
+        return read
+
+    def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
+        """The method with all its settings, the editor, and where splats and warps come from."""
+        own = variant.part(VariantPart)
+        settings = settings_of(study, variant, seed)
+        return {
+            "spp": study.spp,
+            "method": own.method,
+            "settings": settings,
+            "editor": editor_identity(editor_of(study, variant)),
+            "geometry": variant.geometry,
+            "mask": own.mask,
+            **splats_spec(study, variant, seed),
+            **self._budget_spec(study, variant, seed),
+            **({"by_hand": own.by_hand} if own.by_hand is not None else {}),
+        }
+
+    def _budget_spec(self, study: Study, variant: Variant, seed: int) -> Json:
+        """Limits of the method; for the seconds of another variant, all that decides its run."""
+        part = variant.part(VariantPart).budget
+        if part is None:
+            return {}
+        budget = part.model_dump(exclude_none=True)
+        reference = reference_of(variant)
+        if reference is not None:
+            other = study.variants[reference]
+            budget["seconds_of"] = self.variant_spec(study, other, seed)
+        return {"budget": budget}
+
+    def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
+        """Everything that decides a cell but for its seed."""
+        own = variant.part(VariantPart)
+        settings = settings_of(study, variant, 0)
+        return (
+            own.method, settings, variant.geometry, own.mask, splats_meaning(study, variant),
+            editor_of(study, variant), own.budget, own.by_hand,
+        )  # fmt: skip
+
+    def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:
+        """Return True if method, editor, splats, warp and budget are the same. Of the method's
+        other settings, only those count that ``wanted`` names.
+        """
+        if variant.part(VariantPart).method != wanted.part(VariantPart).method:
+            return False  # the study's options need not fit the other method
+        counts = {"warp", *wanted.part(VariantPart).options}
+
+        def kind(of: Variant) -> list[Any]:
+            return [
+                {k: v for k, v in part.items() if k in counts} if isinstance(part, dict) else part
+                for part in self.meaning(study, of)
+            ]
+
+        return kind(variant) == kind(wanted)
+
+
+def settings_of(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
+    """The settings of a variant's method: a preset, the study's fields, the variant's, and the
+    fields of its warp.
+
+    Raises:
+        ValueError: an unknown preset or field, or a value out of range.
+    """
+    own, shared = variant.part(VariantPart), study.part(EditingPart).editing.options
+    fields = {**shared, **own.options}
+    if "seed" in fields:
+        raise ValueError("options.seed: the seeds are the study's own; set seeds there")
+    presets = (own.options.get("preset"), variant.preset, fields.pop("preset", None))
+    name = next((preset for preset in presets if preset is not None), None)
+    warp = {f"warp.{key}": value for key, value in variant.set.items()}
+    return EDITING_METHODS[own.method].settings(name, {**fields, **warp}, seed)
+
+
+def reference_of(variant: Variant) -> str | None:
+    """The name of the variant whose seconds limit this one."""
+    budget = variant.part(VariantPart).budget
+    return None if budget is None else budget.seconds_of
+
+
+def editor_of(study: Study, variant: Variant) -> EditorPart:
+    """The variant's own editor, else the study's."""
+    return variant.part(VariantPart).editor or study.part(EditingPart).editing.editor
+
+
+def editor_identity(editor: EditorPart) -> Json:
+    """Parts of an editor that decide its pictures: its files and its guidance, not its folder."""
+    guidance = {"text": editor.text_guidance, "image": editor.image_guidance}
+    return {"sha256": files_digest(editor.name), "guidance": guidance}
+
+
+@lru_cache
+def files_digest(name: str) -> str:
+    """SHA-256 of an editor's files.
+
+    Raises:
+        StudyError: there is none of that name.
+    """
+    from attnwarp.editing.small import SUMS, folders_of
+
+    try:
+        folder, control = folders_of(name)
+    except InputError as error:
+        raise StudyError(str(error)) from None
+    files = {path.relative_to(folder): path for path in folder.rglob("*")}
+    if control is not None and control != folder / "controlnet":
+        # As if it stood there; a ControlNet that does is not read.
+        files = {place: path for place, path in files.items() if place.parts[0] != "controlnet"}
+        files |= {"controlnet" / path.relative_to(control): path for path in control.rglob("*")}
+    sums = [
+        [place.as_posix(), hashlib.sha256(path.read_bytes()).hexdigest()]
+        for place, path in sorted(files.items())
+        if path.suffix in (".json", ".safetensors") and path.name != SUMS
+    ]
+    return hashlib.sha256(json.dumps(sums).encode()).hexdigest()
+
+
+def edits_of(study: Study, scene: Scene) -> Iterator[Json]:
+    """Entries for a cell's spec, one for each of a scene's edits.
+
+    Raises:
+        StudyError: the study names an edit or an answer that the scene lacks.
+    """
+    own = {edit.name: edit for edit in scene.edits}
+    wanted = study.part(EditingPart).editing.edits.get(scene.name) or dict.fromkeys(own)
+    if not wanted:
+        raise StudyError(f"probes.editing: scene {scene.name!r} names no edits; leave it out")
+    for key, words in wanted.items():
+        title, _, answer = key.partition("=")
+        if title not in own:
+            raise StudyError(
+                f"editing.edits.{scene.name}: no edit {title!r}{did_you_mean(title, own)}"
+            )
+        try:
+            answers = answers_of(scene, key)
+        except ValueError as error:
+            raise StudyError(f"editing.edits.{scene.name}: {error}") from None
+        edit = own[title]
+        targets = [one.target for one in edit.answers if one.name == answer]
+        yield {
+            "name": key,
+            "instruction": words or edit.instruction,
+            "source": edit.source,
+            "target": targets[0] if targets else edit.target,
+            "answers": [[one, scene.edited(title, of).content_hash] for one, of in answers],
+        }

@@ -1,0 +1,165 @@
+"""Run of a method that edits a scene, as a cell's spec names it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp import Gaussians
+from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
+from attnwarp_eval.study.edit_truth import EditTruth
+from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Job, with_source_words
+from attnwarp_eval.study.hand_made import hand_made
+from attnwarp_eval.study.probe import Work
+from attnwarp_eval.study.record import Json
+from attnwarp_eval.study.schema import StudyError
+from attnwarp_eval.study.shared.edits import files_digest
+from attnwarp_eval.study.warping import warp_truth
+
+if TYPE_CHECKING:
+    from attnwarp.editing.controlnet import DepthControlNet
+    from attnwarp.editing.pix2pix import InstructPix2Pix
+    from attnwarp.methods import Budget
+
+Image = npt.NDArray[np.float32]
+
+EDITING_PARTS = ("source", "warp", "edit")
+"""Parts of a method's seconds that are neither tuning nor for people."""
+
+PARTS = (*EDITING_PARTS, "tune")
+"""Parts of a method's seconds that are its own; renders and files are for people."""
+
+WHOLE = "whole"
+"""Stage of :class:`~attnwarp_eval.study.probe.InTurn`: all parts of an edit together."""
+
+OWN = "each view alone"
+"""The method of settings that edits every view by itself: the control."""
+
+FLOOR = "by_view"
+"""The method of a comparison that does so."""
+
+
+def run_method(
+    work: Work,
+    truth: EditTruth,
+    names: Sequence[str],
+    before: Gaussians,
+    budget: Budget | None = None,
+) -> EditedScene:
+    """Edit a scene by the method of a cell.
+
+    Args:
+        work: of the cell, whose spec has ``method``, ``settings``, ``editor`` and ``edit``.
+        truth: of the edit.
+        names: of the views, the source first.
+        before: the splats to edit.
+        budget: limits of the method.
+    """
+    spec, world = work.spec, work.world
+    with work.meter.stage("setup"):
+        editor = load(work.cell.sources["editor"], spec["editor"])
+    with tempfile.TemporaryDirectory() as folder:
+        job = Job(
+            before,
+            [world.camera(name) for name in names],
+            [truth.originals[name] for name in names],
+            editor,
+            spec["edit"]["target" if editor.guide == "depth" else "instruction"],
+            with_source_words(spec["settings"], spec["edit"]["source"]),
+            Path(folder),
+            _warps(work, before, names),
+            {a: [views[n] for n in names] for a, views in truth.answers.items()},
+            budget,
+            source_by_hand(work, truth, names[0]),
+        )
+        return EDITING_METHODS[spec["method"]].run(job)
+
+
+def source_by_hand(work: Work, truth: EditTruth, source: str) -> Image | None:
+    """The source view that a cell's spec has edited by hand: the first answer; None for none."""
+    kind = work.spec.get("by_hand")
+    if kind is None:
+        return None
+    answer = next(iter(truth.answers))
+    return hand_made(
+        kind,
+        truth.originals[source],
+        truth.answers[answer][source],
+        truth.masks[answer][source],
+        work.spec["seed"],
+    )
+
+
+def own_seconds(result: EditedScene) -> float:
+    """Seconds of a method's own parts together."""
+    return sum(result.seconds.get(part, 0.0) for part in PARTS)
+
+
+@lru_cache(maxsize=2)
+def _loaded(
+    name: str, guidance: tuple[tuple[str, float], ...], device: str
+) -> InstructPix2Pix | DepthControlNet:
+    from attnwarp.editing.small import guide_of, load_editor
+
+    given: dict[str, Any] = {f"{kind}_guidance": value for kind, value in guidance}
+    if guide_of(name) == "depth" and "text_guidance" in given:
+        given["guidance"] = given.pop("text_guidance")
+    return load_editor(name, device=device, **given)
+
+
+def load(name: str, planned: Json, device: str = "cpu") -> InstructPix2Pix | DepthControlNet:
+    """An editor whose identity is the planned one.
+
+    Raises:
+        StudyError: its files have changed since the run was planned.
+        InputError: no such device.
+    """
+    if files_digest(name) != planned["sha256"]:
+        raise StudyError(
+            f"editor {name!r}: its files have changed since the run was planned; start the run"
+            " again"
+        )
+    given = planned["guidance"].items()
+    guidance = tuple((kind, value) for kind, value in given if value is not None)
+    return _loaded(name, guidance, device)
+
+
+def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
+    """Warps by exact depth, or with the exact mask; None for the method's own."""
+    spec, world = work.spec, work.world
+    if spec["geometry"] == "splats" and spec["mask"] == "rules":
+        return None
+    warp = spec["settings"].get("warp")
+    settings = PRESETS["corrected"] if warp is None else WarpSettings.from_dict(warp)
+    made: dict[tuple[int, int], WarpedView] = {}
+
+    def of(source: int, target: int) -> WarpedView:
+        if (source, target) not in made:
+            pair = world.between(names[source], names[target])
+            if spec["geometry"] == "truth":
+                view = warp_truth(world, pair, settings)
+            else:
+                view = warp_view(model, pair.source, pair.target, settings, warn_empty=False)
+            if spec["mask"] == "truth":
+                visible = torch.from_numpy(np.ascontiguousarray(pair.visible))
+                view = replace(view, mask=visible & view.correspondence.defined, _at={})
+            made[source, target] = view
+        return made[source, target]
+
+    return of
+
+
+def is_alone(spec: Mapping[str, Any]) -> bool:
+    """Return True if a variant's spec says that it edits each view by itself, and as long as it
+    likes.
+    """
+    itself = spec["method"] == FLOOR or spec["settings"].get("method") == OWN
+    return itself and "budget" not in spec
