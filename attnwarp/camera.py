@@ -70,8 +70,8 @@ class Camera:
     name: str = ""
 
     def __post_init__(self) -> None:
-        K = np.array(self.K, dtype=np.float64)
-        pose = np.array(self.world_to_camera, dtype=np.float64)
+        K = np.array(np.asarray(self.K), dtype=np.float64)
+        pose = np.array(np.asarray(self.world_to_camera), dtype=np.float64)
         check.shape(K, (3, 3), "K")
         check.shape(pose, (4, 4), "world_to_camera")
         check.finite(K, "K")

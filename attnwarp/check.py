@@ -7,7 +7,7 @@ import numbers
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from attnwarp.errors import suggest
 
 if TYPE_CHECKING:
     import torch
+
+Array: TypeAlias = "torch.Tensor | np.ndarray[Any, Any]"
+"""Array of either library."""
 
 
 def shape(
@@ -77,6 +80,32 @@ def finite(value: torch.Tensor | np.ndarray, name: str) -> None:
             f"{name}: {array[index]} at index {index}; {int(bad.sum())} of {array.size} values are"
             " not finite"
         )
+
+
+def tensor(value: Array, name: str) -> torch.Tensor:
+    """Take a tensor as it is, and an array as one that shares its memory where torch can read it.
+
+    Raises:
+        TypeError: neither.
+
+    Example:
+        >>> import numpy as np
+        >>> tensor(np.eye(2)[::-1], "pose").tolist()  # flipped: torch needs a copy
+        [[0.0, 1.0], [1.0, 0.0]]
+    """
+    import torch
+
+    if isinstance(value, torch.Tensor):
+        return value
+    if not isinstance(value, np.ndarray):
+        raise TypeError(
+            f"{name}: got {type(value).__name__}, expected a torch.Tensor or a NumPy array"
+        )
+    # torch takes no array that is flipped, of the other byte order or may not be written.
+    native = value.dtype.newbyteorder("=")
+    if min(value.strides, default=0) < 0:  # also along a side of 1, where NumPy sees no flip
+        value = value.copy()
+    return torch.from_numpy(np.require(value, native, ("C", "W")))
 
 
 def instance(value: Any, kind: type, name: str, expected: str) -> None:

@@ -54,7 +54,7 @@ class Gaussians:
         ValueError: a wrong shape, a value that is not finite, a zero quaternion, a scale that is
             not positive, an opacity outside [0, 1]; the message names the argument and the first
             bad row.
-        TypeError: an array in place of a tensor.
+        TypeError: neither a tensor nor a NumPy array, which becomes one.
 
     Example:
         >>> import torch
@@ -84,7 +84,7 @@ class Gaussians:
     def __post_init__(self) -> None:
         check.one_of(self.kind, ("2d", "3d"), "kind")
         for name in ("means", "quats", "scales", "opacities", "sh"):
-            check.instance(getattr(self, name), torch.Tensor, name, "torch.Tensor")
+            setattr(self, name, check.tensor(getattr(self, name), name))
         n = self.means.shape[0] if self.means.ndim else 0
         check.shape(self.means, ("N", 3), "means")
         check.shape(self.quats, (n, 4), "quats")
@@ -130,8 +130,9 @@ class Gaussians:
         return round(self.sh.shape[1] ** 0.5) - 1
 
     @staticmethod
-    def sh_from_rgb(rgb: torch.Tensor) -> torch.Tensor:
+    def sh_from_rgb(rgb: check.Array) -> torch.Tensor:
         """(N, 1, 3) degree-0 coefficients of (N, 3) sRGB colours in [0, 1]."""
+        rgb = check.tensor(rgb, "rgb")
         check.shape(rgb, ("N", 3), "rgb")
         return ((rgb - 0.5) / SH_C0)[:, None, :]
 

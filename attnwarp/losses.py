@@ -32,7 +32,7 @@ SSIM_C2 = 0.03**2
 """Its two stabilising constants, for values in [0, 1]."""
 
 
-def l1(image: Tensor, target: Tensor) -> Tensor:
+def l1(image: check.Array, target: check.Array) -> Tensor:
     """Mean absolute difference of two pictures, over pixels and channels.
 
     Args:
@@ -46,11 +46,11 @@ def l1(image: Tensor, target: Tensor) -> Tensor:
         >>> l1(torch.zeros(2, 2, 3), torch.full((2, 2, 3), 0.25))
         tensor(0.2500)
     """
-    _same(image, target)
+    image, target = _same(image, target)
     return (image - target).abs().mean()
 
 
-def psnr(image: Tensor, target: Tensor) -> float:
+def psnr(image: check.Array, target: check.Array) -> float:
     """Peak signal-to-noise ratio in dB, -10 log10 of the mean squared error; infinite when they are
     equal. The error is a mean in float64.
 
@@ -65,7 +65,7 @@ def psnr(image: Tensor, target: Tensor) -> float:
         >>> psnr(torch.zeros(1, 1, 3), torch.full((1, 1, 3), 0.5)) - 20 * math.log10(2)
         0.0
     """
-    _same(image, target)
+    image, target = _same(image, target)
     error = float((image.detach().double() - target.detach().double()).square().mean())
     return psnr_of_mse(error)
 
@@ -82,7 +82,7 @@ def psnr_of_mse(error: float) -> float:
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
-def ssim(image: Tensor, target: Tensor) -> Tensor:
+def ssim(image: check.Array, target: check.Array) -> Tensor:
     """Mean structural similarity (Wang et al. 2004) of two (H, W, C) pictures in [0, 1]; 1 when
     they are equal.
 
@@ -107,7 +107,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     return ssim_map(image, target).mean()
 
 
-def ssim_map(image: Tensor, target: Tensor) -> Tensor:
+def ssim_map(image: check.Array, target: check.Array) -> Tensor:
     """(H - 10, W - 10, C) structural similarity of each window; see :func:`ssim`.
 
     Args:
@@ -122,12 +122,12 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
         >>> ssim_map(picture, picture).shape  # one value a window
         torch.Size([6, 2, 3])
     """
-    _windowed(image, target)
+    image, target = _windowed(image, target)
     result: Tensor = _Ssim.apply(image, target)
     return result
 
 
-def ssim_terms(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+def ssim_terms(image: check.Array, target: check.Array) -> tuple[Tensor, Tensor]:
     """The two factors of :func:`ssim_map`, which scales weigh apart in MS-SSIM: luminance, and
     contrast and structure.
 
@@ -147,7 +147,7 @@ def ssim_terms(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         >>> luminance.max().item() < 1e-3, bool((structure > 0.99).all())  # both are flat
         (True, True)
     """
-    _windowed(image, target)
+    image, target = _windowed(image, target)
     _, _, a1, a2, b1, b2 = _moments(image.detach(), target.detach())
     return a1 / b1, a2 / b2
 
@@ -187,8 +187,9 @@ def check_sizes(
             )
 
 
-def _windowed(image: Tensor, target: Tensor) -> None:
-    _same(image, target)
+def _windowed(image: check.Array, target: check.Array) -> tuple[Tensor, Tensor]:
+    """Two pictures that SSIM is defined for, as tensors."""
+    image, target = _same(image, target)
     if image.ndim != 3:
         raise ValueError(f"image: got shape {tuple(image.shape)}, expected (H, W, C)")
     if min(image.shape[:2]) < SSIM_WINDOW:
@@ -202,6 +203,7 @@ def _windowed(image: Tensor, target: Tensor) -> None:
                 f"{name}: got {picture.dtype}, expected float32 or float64; convert it to values in"
                 " [0, 1]"
             )
+    return image, target
 
 
 def _moments(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -377,8 +379,11 @@ def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.
     return (view.distortion_l1 if form == "l1" else view.distortion_ordered).mean() / scale
 
 
-def _same(image: Tensor, target: Tensor) -> None:
+def _same(image: check.Array, target: check.Array) -> tuple[Tensor, Tensor]:
+    """Two pictures of one shape, as tensors."""
+    image, target = check.tensor(image, "image"), check.tensor(target, "target")
     if image.shape != target.shape:
         raise ValueError(
             f"target: got shape {tuple(target.shape)}, expected that of image, {tuple(image.shape)}"
         )
+    return image, target

@@ -68,7 +68,9 @@ class Views:
             raise ValueError(
                 f"images: got {len(self.images)}, expected {len(self.cameras)}, as cameras"
             )
-        for i, (camera, image) in enumerate(zip(self.cameras, self.images, strict=True)):
+        arrays = [i.numpy() if isinstance(i, torch.Tensor) else i for i in self.images]
+        object.__setattr__(self, "images", arrays)
+        for i, (camera, image) in enumerate(zip(self.cameras, arrays, strict=True)):
             name = f"images[{i}] ({camera.name})"
             if image.ndim != 3 or image.shape[2] not in (3, 4):
                 raise ValueError(
@@ -101,10 +103,10 @@ class Views:
             for image in self.images
         )
 
-    def target(self, index: int, background: torch.Tensor) -> torch.Tensor:
+    def target(self, index: int, background: check.Array) -> torch.Tensor:
         """(H, W, 3) float32 picture in [0, 1], over ``background`` (3,) where it is transparent;
         on the background's device."""
-        image = self.images[index]
+        image, background = self.images[index], check.tensor(background, "background")
         if background.device.type == "cpu":
             pixels = torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32))
         else:

@@ -127,7 +127,9 @@ class Render:
         return normal_from_depth(self.depth, self.camera, self._pose)
 
 
-def normal_from_depth(depth: Tensor, camera: Camera, pose: Tensor | None = None) -> Tensor:
+def normal_from_depth(
+    depth: check.Array, camera: Camera, pose: check.Array | None = None
+) -> Tensor:
     """(H, W, 3) unit normals in world axes, facing the camera, of a depth map; see :class:`Render`.
 
     Args:
@@ -144,6 +146,8 @@ def normal_from_depth(depth: Tensor, camera: Camera, pose: Tensor | None = None)
         >>> (normal[4, 4] + 0.0).tolist(), bool(normal[0, 0].isnan().all())
         ([0.0, 0.0, -1.0], True)
     """
+    depth = check.tensor(depth, "depth")
+    pose = None if pose is None else check.tensor(pose, "pose")
     check.shape(depth, (camera.height, camera.width), "depth")
     rays = torch.as_tensor(camera.directions(), dtype=depth.dtype, device=depth.device)
     defined = torch.isfinite(depth)
@@ -177,12 +181,12 @@ def render(
     *,
     backend: str = "auto",
     depth: str | None = None,
-    background: Tensor | Sequence[float] | None = None,
-    features: Tensor | None = None,
+    background: check.Array | Sequence[float] | None = None,
+    features: check.Array | None = None,
     sh_degree: int | None = None,
     near: float = constants.NEAR,
     antialiased: bool | None = None,
-    pose: Tensor | None = None,
+    pose: check.Array | None = None,
     ndc: tuple[float, float] = (constants.NDC_NEAR, constants.NDC_FAR),
 ) -> Render:
     """Render Gaussian splats: colour, coverage, depth, normals, distortion; differentiable.
@@ -276,7 +280,7 @@ def render(
 
 
 def _result(
-    outputs: Outputs, inputs: Inputs, camera: Camera, pose: Tensor | None, backend: str
+    outputs: Outputs, inputs: Inputs, camera: Camera, pose: check.Array | None, backend: str
 ) -> Render:
     used = camera
     if pose is not None:
@@ -297,12 +301,12 @@ def _prepare(
     gaussians: Gaussians,
     camera: Camera,
     depth: str | None,
-    background: Tensor | Sequence[float] | None,
-    features: Tensor | None,
+    background: check.Array | Sequence[float] | None,
+    features: check.Array | None,
     sh_degree: int | None,
     near: float,
     antialiased: bool | None,
-    pose: Tensor | None,
+    pose: check.Array | None,
     ndc: tuple[float, float],
     *,
     on_cpu: bool,
@@ -338,7 +342,7 @@ def _prepare(
             raise ValueError(
                 "sh_degree: has no meaning beside features, which replace the spherical harmonics"
             )
-        check.instance(features, Tensor, "features", "a torch.Tensor")
+        features = check.tensor(features, "features")
         check.shape(features, (len(gaussians), "C"), "features")
         if features.shape[1] < 1:
             raise ValueError("features: got 0 channels, expected at least 1")
@@ -387,7 +391,9 @@ def _prepare(
     )
 
 
-def _as_tensor(background: Tensor | Sequence[float], channels: int, device: torch.device) -> Tensor:
+def _as_tensor(
+    background: check.Array | Sequence[float], channels: int, device: torch.device
+) -> Tensor:
     if isinstance(background, Tensor):
         return background
     try:
@@ -405,11 +411,10 @@ def _floating(tensor: Tensor, name: str, device: torch.device) -> None:
         raise ValueError(f"{name}: lies on {tensor.device}, the splats on {device}")
 
 
-def _checked_pose(pose: Tensor | None, camera: Camera) -> Tensor:
+def _checked_pose(pose: check.Array | None, camera: Camera) -> Tensor:
     if pose is None:
         return torch.tensor(camera.world_to_camera)
-    if not isinstance(pose, Tensor):
-        raise TypeError(f"pose: got {type(pose).__name__}, expected a (4, 4) tensor")
+    pose = check.tensor(pose, "pose")
     check.shape(pose, (4, 4), "pose")
     if pose.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"pose: got {pose.dtype}, expected float32 or float64")

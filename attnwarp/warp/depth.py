@@ -73,13 +73,8 @@ def as_tensor(value: Array, name: str) -> Tensor:
     Raises:
         ValueError: the values are not of a floating type.
     """
-    if isinstance(value, Tensor):
-        tensor = value.detach()
-    else:
-        # torch takes no array that is flipped, of the other byte order or may not be written.
-        array = np.asarray(value)
-        native = array.dtype.newbyteorder("=")
-        tensor = torch.from_numpy(np.require(array, native, ("C", "W")))
+    given = value if isinstance(value, Tensor) else np.asarray(value)
+    tensor = check.tensor(given, name).detach()
     if not tensor.dtype.is_floating_point:
         raise ValueError(f"{name}: got {tensor.dtype}, expected a floating type")
     return tensor

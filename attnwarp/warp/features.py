@@ -81,7 +81,7 @@ class FeatureWarp:
         warped = self._engine(features).sample_maps(features.flatten(-2), taps)
         return warped.unflatten(-1, tuple(self.mask.shape))
 
-    def warp_tokens(self, source: Tensor) -> Tensor:
+    def warp_tokens(self, source: check.Array) -> Tensor:
         """The source's tokens, warped to the target's grid.
 
         Args:
@@ -108,12 +108,18 @@ class FeatureWarp:
             >>> layer.warp_tokens(column)[0, :4, 0].tolist()
             [1.0, 2.0, 3.0, 3.0]
         """
+        source = check.tensor(source, "source")
         self._check_tokens(source)
         taps = self._tokens_taps(source)
         return self._engine(source).sample_tokens(source, taps).to(source.dtype)
 
     def blend_tokens(
-        self, source: Tensor, new: Tensor, alpha: float | Tensor, *, in_place: bool = False
+        self,
+        source: check.Array,
+        new: check.Array,
+        alpha: float | Tensor,
+        *,
+        in_place: bool = False,
     ) -> Tensor:
         """Warp, mask and blend: a (M warp(source) + (1 - M) new) + (1 - a) new, M = ``mask``.
 
@@ -149,6 +155,7 @@ class FeatureWarp:
             >>> layer.blend_tokens(column, torch.zeros(1, 16, 1), 0.5)[0, :4, 0].tolist()
             [0.5, 1.0, 1.5, 0.0]
         """
+        source, new = check.tensor(source, "source"), check.tensor(new, "new")
         self._check_tokens(source)
         self._check_blend(source, new, alpha, in_place)
         source = source.to(new.dtype)

@@ -13,7 +13,7 @@ from attnwarp import check
 from attnwarp.warp.settings import MaskResize
 
 
-def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize = "area") -> Tensor:
+def resize_mask(mask: check.Array, size: tuple[int, int], mode: MaskResize = "area") -> Tensor:
     """A mask on another grid; more than half counts.
 
     Args:
@@ -36,6 +36,7 @@ def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize = "area") 
         [[True, False]]
     """
     check.one_of(mode, get_args(MaskResize), "mode")
+    mask = check.tensor(mask, "mask")
     if mask.dtype != torch.bool:
         raise ValueError(f"mask: got {mask.dtype}, expected bool")
     check.shape(mask, ("H", "W"), "mask")

@@ -329,7 +329,7 @@ def gaussian_filter(
     return same if rule == "facing" else same & (angle_between(seen[0], -points[0]) < angle)
 
 
-def angle_between(a: Tensor, b: Tensor) -> Tensor:
+def angle_between(a: check.Array, b: check.Array) -> Tensor:
     """(...) angle in degrees between vectors (..., 3) of any length; NaN for a zero vector.
 
     2 atan2(|a/|a| - b/|b||, |a/|a| + b/|b||) (Kahan, "How futile are mindless assessments of
@@ -341,6 +341,7 @@ def angle_between(a: Tensor, b: Tensor) -> Tensor:
         >>> round(float(angle_between(torch.tensor([2.0, 0, 0]), torch.tensor([0, 1.0, 0]))), 4)
         90.0
     """
+    a, b = check.tensor(a, "a"), check.tensor(b, "b")
     a = a / torch.linalg.vector_norm(a, dim=-1, keepdim=True)
     b = b / torch.linalg.vector_norm(b, dim=-1, keepdim=True)
     half = torch.atan2(

@@ -24,7 +24,7 @@ from attnwarp.warp.taps import Taps, clamp_index, taps_of
 
 
 def sample(
-    features: Tensor,
+    features: check.Array,
     correspondence: Correspondence,
     *,
     mode: Literal["bilinear", "nearest"] = "bilinear",
@@ -63,6 +63,7 @@ def sample(
         >>> warped[0, 0].tolist()  # beyond the border its value is taken
         [2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 7.0, 7.0]
     """
+    features = check.tensor(features, "features")
     if features.ndim not in (3, 4):
         raise ValueError(
             f"features: got shape {tuple(features.shape)}, expected (C, h, w) or (B, C, h, w)"
@@ -73,7 +74,7 @@ def sample(
 
 
 def sample_at(
-    features: Tensor, xy: Tensor, *, mode: Literal["bilinear", "nearest"] = "bilinear"
+    features: check.Array, xy: check.Array, *, mode: Literal["bilinear", "nearest"] = "bilinear"
 ) -> Tensor:
     """Features at positions of their own image.
 
@@ -96,6 +97,7 @@ def sample_at(
         [[[2.0]]]
     """
     check.one_of(mode, ("bilinear", "nearest"), "mode")
+    features, xy = check.tensor(features, "features"), check.tensor(xy, "xy")
     if xy.dtype not in (torch.float32, torch.float64):
         raise ValueError(
             f"xy: got {xy.dtype}, expected float32 or float64; half precision moves positions by up"

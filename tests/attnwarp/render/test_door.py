@@ -83,8 +83,8 @@ def test_other_types_are_refused() -> None:
         render(3, camera())  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="camera: got str"):
         render(gaussians(), "front")  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="pose: got ndarray"):
-        render(gaussians(), camera(), pose=np.eye(4))  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="pose: got list"):
+        render(gaussians(), camera(), pose=np.eye(4).tolist())  # type: ignore[arg-type]
 
 
 @pytest.mark.door
@@ -171,7 +171,7 @@ def test_importing_the_door_loads_neither_numba_nor_warp() -> None:
 
 
 @pytest.mark.door
-@pytest.mark.parametrize("features", [[[1.0], [2.0], [3.0]], np.zeros((3, 1), np.float32)])
-def test_features_that_are_no_tensor_are_refused_by_name(features) -> None:
+@pytest.mark.parametrize("features", [[[1.0], [2.0], [3.0]], "red"])
+def test_features_that_are_no_array_are_refused_by_name(features) -> None:
     with pytest.raises(TypeError, match=r"features: got \w+, expected a torch.Tensor"):
         render(gaussians(), camera(), features=features)
