@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -37,18 +36,12 @@ from attnwarp.editing.small import check_words, guide_of
 from attnwarp.reporting import reporter
 
 
-class BaselineMethod(StrEnum):
-    """Values of the option for the method that edits are compared with."""
-
-    by_view = "by_view"
-    igs2gs = "igs2gs"
-    dge = "dge"
-    gaussctrl = "gaussctrl"
-
-
 @reading_options()
 def baseline(
-    method: Annotated[BaselineMethod, typer.Argument(help="Of docs/method/baselines.md.")],
+    method: Annotated[
+        str,
+        typer.Argument(help="by_view, igs2gs, dge or gaussctrl; see docs/method/baselines.md."),
+    ],
     data: DataArgument,
     ply: Annotated[Path, typer.Option(help="Splats of the scene, such as attnwarp fit makes.")],
     instruction: InstructionOption,
@@ -90,9 +83,11 @@ def baseline(
         check_inputs_stay([out / "edited.ply"], [ply])
         check_words(instruction)
         guide_of(editor)  # refuses what is no editor
-        from attnwarp import methods
+        from attnwarp import check, methods
 
-        settings = methods.preset(method.value, preset, **changes)
+        others = [name for name in methods.METHODS if name != "attention_warping"]
+        check.one_of(method, others, "METHOD")
+        settings = methods.preset(method, preset, **changes)
         budget = methods.Budget(seconds, network_rows)
         use_threads(threads)
         from attnwarp.methods.command import run_baseline
@@ -102,7 +97,7 @@ def baseline(
         check_seen(ply, splats, dataset.cameras, report)
         warn_of_misfit(ply, splats, dataset)
         result, page = run_baseline(
-            method.value, dataset, splats, editor, instruction, settings, out,
+            method, dataset, splats, editor, instruction, settings, out,
             budget=budget, max_size=max_size, device=device, threads=threads,
             control=control, turntable=turntable, report=report,
         )  # fmt: skip

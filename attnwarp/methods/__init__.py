@@ -7,6 +7,7 @@ folder=..., budget=..., report=...)``, and return a :class:`Result`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 
 from attnwarp.errors import Named
 from attnwarp.methods.attention_warping import attention_warping
@@ -28,13 +29,9 @@ from attnwarp.methods.settings import (
 from attnwarp.workdir import Budget
 
 METHODS: Named[Callable[..., Result]] = Named(
-    attention_warping=attention_warping,
-    by_view=by_view,
-    igs2gs=igs2gs,
-    dge=dge,
-    gaussctrl=gaussctrl,
+    {name: getattr(import_module(f"{__name__}.{name}"), name) for name in PRESETS}
 )
-"""The methods by name."""
+"""The methods by name: for each that has presets, the function of its module."""
 
 __all__ = [
     "METHODS",

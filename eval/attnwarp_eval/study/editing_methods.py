@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.methods.settings import PRESETS
 from attnwarp_eval.study.reads import MASK_RULES, warp_reads
 
 if TYPE_CHECKING:
@@ -328,7 +329,7 @@ EDITING_METHODS: dict[str, Method] = {
         takes_picture=True,
     ),
     "true pictures": Method(_attention_warping_settings, _true_pictures, _true_pictures_reads),
-    **{name: _baseline(name) for name in ("by_view", "igs2gs", "dge", "gaussctrl")},
+    **{name: _baseline(name) for name in PRESETS if name != "attention_warping"},
 }
 """Every method by name, as in :mod:`attnwarp.methods`. ``attention_warping`` with ``method: each
 view alone`` is the control."""
