@@ -1,0 +1,153 @@
+"""The tasks of docs/project/extending, each as a diff that is applied to a copy and run there.
+
+Each touches at most two files of the packages. What a copy computes is held against a closed form,
+or against the method without the change.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DIFFS = ROOT / "docs/project/extending"
+PAGE = ROOT / "docs/project/extending.md"
+MOST_FILES = 2
+
+EDITED = """
+import importlib, math, sys
+import numpy as np
+from tiny_scenes import cameras, splats
+from attnwarp.editing.small import load_editor
+from attnwarp.methods import METHODS, preset
+
+module = importlib.import_module("attnwarp.methods.attention_warping")
+weights, inject = [], module.inject
+
+def noted(*values, weight, **more):
+    weights.append(weight)
+    return inject(*values, weight=weight, **more)
+
+module.inject = noted
+
+def edited(method="attention_warping", **changes):
+    settings = preset(method, steps=3, iterations=0, **changes)
+    scene, views = splats(), cameras(2)
+    result = METHODS[method](scene, views, None, load_editor("small-plain"), "red", settings)
+    return result.edited
+"""
+
+TASKS = {
+    "schedule": EDITED
+    + """
+linear = edited()
+cosine = edited(decay="cosine")
+for t in range(8):
+    assert math.isclose(weights[-1](t, 8), 0.9 * math.cos(math.pi * t / 16) ** 2)
+assert (cosine[0] == linear[0]).all() and (cosine[1] != linear[1]).any()
+""",
+    "last-steps": EDITED
+    + """
+# Without its last two of three steps, the injection is the first step's alone.
+last, first, none = (
+    edited(**changes)[1]
+    for changes in ({"last_steps_alone": 2}, {"feature_steps": (0.0, 0.3)}, {"a0": 0.0})
+)
+assert (last == first).all() and (last != none).any()
+assert (edited(last_steps_alone=3)[1] == none).all()
+""",
+    "rule": """
+import numpy as np
+from attnwarp import Camera
+from attnwarp.warp import Surface, preset, warp_surfaces
+
+# A wall across the axis: a pixel sees it at the angle of its ray from the axis.
+camera = Camera(np.array([[20.0, 0, 16], [0, 20, 16], [0, 0, 1]]), np.eye(4), 32, 32)
+wall = Surface(np.full((32, 32), 2.0), np.broadcast_to([0.0, 0, 1], (32, 32, 3)))
+x, y = np.moveaxis(camera.pixel_centers() - 16, -1, 0) / 20
+angle = np.degrees(np.arctan(np.hypot(x, y)))
+for backend in ("auto", "reference"):
+    settings = preset("corrected", target_incidence=30.0)
+    view = warp_surfaces(camera, camera, wall, wall, settings, backend=backend)
+    assert (view.rules["target_incidence"].numpy() == (angle <= 30)).all()
+    assert (view.mask.numpy() == (angle <= 30)).all() and 0.1 < view.mask.double().mean() < 0.9
+    plain = warp_surfaces(camera, camera, wall, wall, preset("corrected"), backend=backend)
+    assert "target_incidence" not in plain.rules and plain.mask.all()
+""",
+    "metric": """
+import json, subprocess, sys
+import numpy as np
+from attnwarp_eval import metrics
+
+exact = np.zeros((4, 4, 2))
+moved = exact.copy()
+moved[1, 2] = [3, 4]
+figures = metrics.endpoint_error(moved, exact, np.ones((4, 4), bool))
+assert figures["warp.epe_max"] == 5 and metrics.METRICS["warp.epe_max"].unit == "px"
+study = {
+    "name": "own", "size": 32, "scenes": ["spheres"], "views": ["yaw030"], "spp": 1,
+    "splats": {"count": 500}, "feature_sizes": [8],
+    "variants": {"plain": {}}, "probes": {"warp": ["plain"]},
+}
+json.dump(study, open("own.yaml", "w"))
+subprocess.run([sys.executable, "-m", "attnwarp_eval", "run", "own.yaml", "--out", "run"], check=True)
+rows = map(json.loads, open("run/results.jsonl"))
+found = {row["metric"]: row["value"] for row in rows if row["metric"].startswith("warp.epe_")}
+assert found["warp.epe_max"] >= found["warp.epe_p95"] > 0
+""",
+    "method": EDITED
+    + """
+from attnwarp.render import render
+from attnwarp_eval.study.editing_methods import EDITING_METHODS
+
+assert "softened" in EDITING_METHODS
+alone = edited("by_view")
+for share in (0.0, 0.5, 1.0):
+    softened = edited("softened", share=share)
+    for k, camera in enumerate(cameras(2)):
+        before = 255 * render(splats(), camera).color.clamp(0, 1).double().numpy()
+        expected = before + share * (alone[k] - before)
+        assert np.abs(softened[k] - expected).max() <= 1
+    assert (alone[1] != np.rint(before)).any()
+""",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TASKS)
+def test_a_newcomers_task_touches_two_files_at_most_and_takes_effect(name, tmp_path):
+    for package in ("attnwarp", "eval/attnwarp_eval"):
+        # With the compiled kernels beside the modules, which numba knows by their times.
+        shutil.copytree(ROOT / package, tmp_path / package)
+    diff = DIFFS / f"{name}.diff"
+    count = subprocess.run(
+        ["git", "apply", "--numstat", diff], capture_output=True, text=True, check=True
+    )
+    assert 1 <= len(count.stdout.splitlines()) <= MOST_FILES
+    paths = [tmp_path, tmp_path / "eval", ROOT / "tests/helpers"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))}
+
+    def run(code):
+        return subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+        )
+
+    where = run("import attnwarp, attnwarp_eval\nprint(attnwarp.__file__, attnwarp_eval.__file__)")
+    assert all(Path(file).is_relative_to(tmp_path) for file in where.stdout.split()), where.stderr
+    assert run(TASKS[name]).returncode != 0  # so it is the diff that makes it pass
+    subprocess.run(["git", "apply", diff], cwd=tmp_path, check=True)
+    done = run(TASKS[name])
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_page_links_every_task():
+    files = {path.stem for path in DIFFS.glob("*.diff")}
+    assert files == TASKS.keys()
+    assert all(f"(extending/{name}.diff)" in PAGE.read_text() for name in files)
