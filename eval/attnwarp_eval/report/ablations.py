@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.report.claims import Comparison, judge, load_claims, of_comparisons
+from attnwarp_eval.report.claims import Comparison, JudgedClaim, of_comparisons
 from attnwarp_eval.statistics.intervals import (
     Interval,
     Verdict,
@@ -50,10 +51,14 @@ class Contrast:
     verdict: Verdict | None
 
 
-def ablations(results: Results) -> list[Section]:
-    """A section for each ablation that the study names."""
-    claimed = of_comparisons(judge(results, load_claims()))
-    sections = [_section(results, ablation, claimed) for ablation in results.study.ablations]
+def ablations(results: Results, compared: Sequence[Sequence[Contrast]]) -> list[Section]:
+    """A section for each ablation that the study names.
+
+    Args:
+        results: of the run.
+        compared: of each, from :func:`compared_of`.
+    """
+    sections = list(map(partial(_section, results), results.study.ablations, compared))
     for section, ablation in zip(sections, results.study.ablations, strict=True):
         if any(map(is_mse, report_of(ablation.probe).columns_at(results.layer).values())):
             section.text.append(POOLED)
@@ -61,7 +66,7 @@ def ablations(results: Results) -> list[Section]:
     return sections
 
 
-def _section(results: Results, ablation: Ablation, claimed: Mapping[Comparison, float]) -> Section:
+def _section(results: Results, ablation: Ablation, compared: Sequence[Contrast]) -> Section:
     own, baseline = report_of(ablation.probe), ablation.baseline
     names = [baseline, *[v for v in ablation.variants if v != baseline]]
     section = Section(ablation.title, [ablation.note] if ablation.note else [])
@@ -89,7 +94,6 @@ def _section(results: Results, ablation: Ablation, claimed: Mapping[Comparison, 
     section.tables.append(Table(["variant", *columns, *pairs, time], rows, timed=(time,)))
     section.tables += own.details(results, names)
     if len(names) > 1:
-        compared = contrasts(results, ablation, claimed)
         section.tables.append(_table(compared, ablation.baseline))
         if any(contrast.claimed for contrast in compared):
             section.text.append(
@@ -97,6 +101,17 @@ def _section(results: Results, ablation: Ablation, claimed: Mapping[Comparison, 
                 " verdict are the claim's, adjusted over the claims and not over the table."
             )
     return section
+
+
+def compared_of(results: Results, judged: Sequence[JudgedClaim]) -> list[list[Contrast]]:
+    """The :func:`contrasts` of each table of variants of the study.
+
+    Args:
+        results: of the run.
+        judged: the claims that it has measurements for.
+    """
+    claimed = of_comparisons(judged)
+    return [contrasts(results, ablation, claimed) for ablation in results.study.ablations]
 
 
 def contrasts(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from attnwarp_eval.document.model import Report, Section
-from attnwarp_eval.report.ablations import ablations
-from attnwarp_eval.report.claims import claims
+from attnwarp_eval.report.ablations import ablations, compared_of
+from attnwarp_eval.report.claims import claims, judge, load_claims
 from attnwarp_eval.report.commands import add_commands
 from attnwarp_eval.report.findings import findings
 from attnwarp_eval.report.fronts import fronts
@@ -61,15 +61,17 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
         # As code: names of files may have asterisks.
         lead += ["**Scene {}**: `{}`".format(scene, line.replace("`", "'")) for line in lines]
     layout = Layout(root, timings)
+    judged = judge(results, load_claims())
+    compared = compared_of(results, judged)
     of_probes: dict[Place, list[Section]] = {place: [] for place in Place}
     for own in reports():
         for place, section in own.sections(results, layout):
             of_probes[place].append(section)
     sections = [
-        *([claims(results), *settling(results, timings)] if study.scenes else []),
+        *([claims(results, judged), *settling(results, judged, timings)] if study.scenes else []),
         *(galleries(results) if pictures else []),
         *of_probes[Place.INSTRUMENT],
-        *ablations(results),
+        *ablations(results, compared),
         *of_probes[Place.RESULT],
         *(fronts(results, layout) if timings else []),
         *failures(results),
@@ -79,7 +81,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
     if not timings:
         for section in sections:
             section.tables = [table.without_timings() for table in section.tables]
-    first = findings(results, problems(results), pictures=pictures)
+    first = findings(results, problems(results), judged, compared, pictures=pictures)
     add_commands(results, sections, first)
     return Report(study.title or study.name, lead, sections, first)
 

@@ -299,10 +299,14 @@ def _scenes(finding: JudgedClaim, scenes: int) -> str:
     return f"{text}; below the floor: {below}" if below else text
 
 
-def claims(results: Results) -> Section:
-    """The section of the report."""
+def claims(results: Results, findings: Sequence[JudgedClaim]) -> Section:
+    """The section of the report.
+
+    Args:
+        results: of the run.
+        findings: the claims that it has measurements for.
+    """
     declared = {claim.id: claim for claim in load_claims()}
-    findings = judge(results, list(declared.values()))
     rows, scenes = [], len(results.study.scenes)
     for finding in findings:
         claim = finding.claim

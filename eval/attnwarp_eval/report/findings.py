@@ -6,19 +6,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from attnwarp_eval.document.model import Finding, Picture, Slider
 from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.report.ablations import contrasts
-from attnwarp_eval.report.claims import (
-    Comparison,
-    JudgedClaim,
-    judge,
-    load_claims,
-    of_comparisons,
-)
+from attnwarp_eval.report.ablations import Contrast
+from attnwarp_eval.report.claims import JudgedClaim
 from attnwarp_eval.statistics.intervals import Interval
 from attnwarp_eval.study.probe import probe, probes
 from attnwarp_eval.study.probe_report import reports
@@ -47,21 +41,29 @@ RENDERED = {"render", "render_inside", "after"}
 """Parts of a metric's name that speak of the tuned splats, not of the edited views."""
 
 
-def findings(results: Results, problems: list[str], *, pictures: bool = True) -> list[Finding]:
+def findings(
+    results: Results,
+    problems: list[str],
+    judged: Sequence[JudgedClaim],
+    compared: Sequence[Sequence[Contrast]],
+    *,
+    pictures: bool = True,
+) -> list[Finding]:
     """Findings of a run: whether the instrument is calibrated, then claims, then the largest
     effects of the tables.
 
     Args:
         results: of the run.
         problems: of the instrument, one line each.
+        judged: the claims that it has measurements for.
+        compared: of :func:`attnwarp_eval.report.ablations.compared_of`.
         pictures: whether each has its picture.
     """
     first = [_calibration(results, problems)] if results.finished(_instrument()) else []
-    judged_claims = judge(results, load_claims())
-    clearest = _clearest(judged_claims)
-    claims = [_claim(results, judged) for judged in clearest]
-    told = [set(judged.sides) for judged in clearest]
-    effects = _effects(results, told, of_comparisons(judged_claims))
+    clearest = _clearest(judged)
+    claims = [_claim(results, one) for one in clearest]
+    told = [set(one.sides) for one in clearest]
+    effects = _effects(results, told, compared)
     others = [finding for own in reports() for finding in own.findings(results)]
     chosen = [*first, *claims, *others, *effects][:MOST]
     return chosen if pictures else [replace(finding, picture=None) for finding in chosen]
@@ -116,12 +118,15 @@ def _claim(results: Results, judged: JudgedClaim) -> Finding:
 
 
 def _effects(
-    results: Results, told: list[set[str]], claimed: Mapping[Comparison, float]
+    results: Results, told: list[set[str]], compared: Sequence[Sequence[Contrast]]
 ) -> list[Finding]:
     """The clearest difference of each table of variants, then the next ones; pairs of variants of
     which a claim has told are left out.
     """
-    tables = [_of_table(results, ablation, told, claimed) for ablation in results.study.ablations]
+    tables = [
+        _of_table(results, ablation, told, own)
+        for ablation, own in zip(results.study.ablations, compared, strict=True)
+    ]
     rounds = itertools.zip_longest(*tables)
     return [finding for row in rounds for finding in row if finding is not None]
 
@@ -130,11 +135,11 @@ def _of_table(
     results: Results,
     ablation: Ablation,
     told: list[set[str]],
-    claimed: Mapping[Comparison, float],
+    compared: Sequence[Contrast],
 ) -> list[Finding]:
     """The clearest difference of each variant from the baseline, those with pictures first."""
     own, clearest = probe(ablation.probe), dict[str, tuple[bool, float, Finding]]()
-    for contrast in contrasts(results, ablation, claimed):
+    for contrast in compared:
         name, metric, p, outcome = contrast.variant, contrast.metric, contrast.p, contrast.verdict
         if outcome not in ("better", "worse") or {name, ablation.baseline} in told:
             continue

@@ -5,12 +5,13 @@ their cost.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from statistics import fmean
 from typing import Any
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.report.claims import JudgedClaim, judge, load_claims
+from attnwarp_eval.report.claims import JudgedClaim
 from attnwarp_eval.statistics.planning import MOST_SCENES, effect_interval, scenes_needed
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.record import Record
@@ -20,16 +21,19 @@ from attnwarp_eval.study.shared.splats import is_fitted
 HOURS = "hours"
 
 
-def settling(results: Results, timings: bool = True) -> list[Section]:
+def settling(
+    results: Results, judged: Sequence[JudgedClaim], timings: bool = True
+) -> list[Section]:
     """The section of the report; none where every claim has a verdict.
 
     Args:
         results: of the run.
+        judged: the claims that it has measurements for.
         timings: whether it says what that would take.
     """
     findings = [
         finding
-        for finding in judge(results, load_claims())
+        for finding in judged
         if finding.verdict == "can't tell"
         and finding.contrast.bounded
         and finding.parts

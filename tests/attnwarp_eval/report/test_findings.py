@@ -7,6 +7,8 @@ import pytest
 import written_runs
 
 from attnwarp_eval.document.model import Slider
+from attnwarp_eval.report.ablations import compared_of
+from attnwarp_eval.report.claims import judge, load_claims
 from attnwarp_eval.report.findings import findings
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.edit_truth import Judgement
@@ -17,6 +19,11 @@ SCENES = ("one", "two", "three")
 SLIP = "warp.epe_median_layer.64"
 DONE = Judgement("red", True, 25.0, 10.0, 10.0)
 EDIT = EditResult("colour=red", "make it red", DONE, DONE, {}, {}, 25.0, 2, 1.0)
+
+
+def found(run, problems, **options):
+    judged = judge(run, load_claims())
+    return findings(run, problems, judged, compared_of(run, judged), **options)
 
 
 def results(variants, values, *, pictures=True, calibration=None):
@@ -54,7 +61,7 @@ VALUES = {
 
 
 def test_a_claim_comes_with_its_difference_and_the_view_in_which_it_is_largest():
-    (finding,) = findings(results(CLAIMED, VALUES), [])
+    (finding,) = found(results(CLAIMED, VALUES), [])
     assert finding.text.startswith("Integer pixel centres")
     assert finding.text.endswith("seen here, holds in general.")
     assert finding.value == "+0.500 ± 0.025 layer px"
@@ -67,27 +74,27 @@ def test_a_claim_comes_with_its_difference_and_the_view_in_which_it_is_largest()
 
 def test_a_claim_that_some_scenes_lack_says_in_how_many_it_is_seen():
     values = {**VALUES, "slipped": [*VALUES["slipped"][:2], [None, None]]}
-    (finding,) = findings(results(CLAIMED, values), [])
+    (finding,) = found(results(CLAIMED, values), [])
     assert finding.text.endswith("seen here in 2 of 3 scenes, holds in general.")
     assert finding.outcome == "holds"
 
 
 def test_a_difference_that_no_claim_names_is_told_once_with_its_verdict():
-    (finding,) = findings(results(OTHER, VALUES), [])
+    (finding,) = found(results(OTHER, VALUES), [])
     assert finding.text.startswith("Slip: `slipped` is worse than `good` (")
     assert (finding.value, finding.outcome) == ("+0.500 ± 0.025 layer px", "fails")
-    (bare,) = findings(results(OTHER, VALUES), [], pictures=False)
+    (bare,) = found(results(OTHER, VALUES), [], pictures=False)
     assert bare.picture is None
 
 
 def test_what_cannot_be_told_is_no_finding():
     mixed = {"good": VALUES["good"], "slipped": [[0.2, 0.1], [0.1, 0.0], [0.1, 0.1]]}
-    assert findings(results(OTHER, mixed), []) == []
+    assert found(results(OTHER, mixed), []) == []
 
 
 @pytest.mark.parametrize("problems", [[], ["one: warp.epe_median is 3, expected below 0.001 px"]])
 def test_the_instrument_comes_first(problems):
-    first, _ = findings(results(CLAIMED, VALUES, calibration=3.0), problems)
+    first, _ = found(results(CLAIMED, VALUES, calibration=3.0), problems)
     assert ("not calibrated" in first.text) == bool(problems)
     assert first.value == "3.0 px"
     assert first.outcome == ("fails" if problems else "holds")
@@ -119,7 +126,7 @@ def test_an_edit_is_shown_beside_its_counterpart_or_else_beside_the_unedited_vie
                 if name in pictured
             )
             cells.append(cell)
-    (finding,) = findings(written_runs.results(study, cells), [])
+    (finding,) = found(written_runs.results(study, cells), [])
     assert finding.picture.after.path == ("propagated-one-red/near-edited.jpg")
     assert finding.picture.before.path == (
         "alone-one-red/near-edited.jpg"

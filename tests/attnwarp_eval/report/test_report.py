@@ -14,8 +14,7 @@ from scipy import stats
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.document.write import inline, markdown
 from attnwarp_eval.metrics.occlusion import COUNTS
-from attnwarp_eval.report import settling as settling_module
-from attnwarp_eval.report.ablations import ablations
+from attnwarp_eval.report.ablations import ablations, compared_of
 from attnwarp_eval.report.build import build, problems
 from attnwarp_eval.report.claims import Claim, JudgedClaim, claims, judge, load_claims, together
 from attnwarp_eval.report.fronts import fronts
@@ -30,6 +29,14 @@ from attnwarp_eval.study.study import load_study, parse_variant
 
 SCENES = ("one", "two", "three")
 SLIP = "warp.epe_median_layer.64"
+
+
+def settled(run, timings=True):
+    return settling(run, judge(run, load_claims()), timings)
+
+
+def tabulated(run):
+    return ablations(run, compared_of(run, judge(run, load_claims())))
 
 
 def study(**changes):
@@ -118,7 +125,7 @@ def test_a_mean_says_what_was_undefined_and_which_scenes_are_missing():
 
 
 def test_an_ablation_table_shows_means_differences_and_verdicts():
-    (section,) = ablations(results(CLEAR))
+    (section,) = tabulated(results(CLEAR))
     main, _, contrasts = section.tables
     column = main.columns.index("EPE on 64, layer px")
     assert [row[column] for row in main.rows] == ["0.100 ± 0", "0.600 ± 0.025"]
@@ -155,7 +162,7 @@ def test_a_pooled_psnr_is_that_of_the_views_mean_error(views, mean, pooled):
             {"title": "Mine", "baseline": "mine", "variants": ["other"], "probe": "editing"}
         ],
     }
-    (section,) = ablations(written_runs.results({**content, "scenes": ["one"]}, [cell]))
+    (section,) = tabulated(written_runs.results({**content, "scenes": ["one"]}, [cell]))
     row = dict(zip(section.tables[0].columns, section.tables[0].rows[0], strict=True))
     assert row["Edit PSNR, dB"] == mean
     shown = float(row["Edit PSNR, pooled"].split()[0])
@@ -183,7 +190,7 @@ def test_a_comparison_that_a_claim_makes_has_its_verdict_in_the_tables_and_no_pa
     run = written_runs.results(study(), cells)
     p = {metric: stats.ttest_1samp(values, 0).pvalue for metric, values in differences.items()}
     (claim,) = judge(run, load_claims())
-    (section,) = ablations(run)
+    (section,) = tabulated(run)
     rows = {row[1]: row for row in section.tables[-1].rows}
     # One claim, so its p-value is not multiplied; with the table's two others it would be by 3/1.
     assert rows[SLIP][5] == f"{number(p[SLIP])} †" == f"{number(claim.p)} †"
@@ -196,7 +203,7 @@ def test_a_comparison_that_a_claim_makes_has_its_verdict_in_the_tables_and_no_pa
 
 
 def test_a_baseline_that_was_not_measured_stays_in_the_table_and_is_named():
-    (section,) = ablations(results({"good": [None] * 3, "slipped": CLEAR["slipped"]}))
+    (section,) = tabulated(results({"good": [None] * 3, "slipped": CLEAR["slipped"]}))
     assert section.text == ["**Not measured:** good."]
     assert [row[0] for row in section.tables[0].rows] == ["good", "slipped"]
     contrasts = section.tables[-1]
@@ -204,7 +211,7 @@ def test_a_baseline_that_was_not_measured_stays_in_the_table_and_is_named():
 
 
 def test_a_variant_measured_on_fewer_scenes_says_so():
-    (section,) = ablations(
+    (section,) = tabulated(
         results({"good": CLEAR["good"], "slipped": [[0.6, 0.6], None, [0.6, 0.6]]})
     )
     column = section.tables[0].columns.index("EPE on 64, layer px")
@@ -212,7 +219,7 @@ def test_a_variant_measured_on_fewer_scenes_says_so():
 
 
 def test_differences_that_vanish_in_every_view_are_called_the_same_values_and_never_equal():
-    (section,) = ablations(results({"good": CLEAR["good"], "slipped": CLEAR["good"]}))
+    (section,) = tabulated(results({"good": CLEAR["good"], "slipped": CLEAR["good"]}))
     row = next(row for row in section.tables[-1].rows if row[1] == SLIP)
     assert row[3] == "same values"
 
@@ -257,7 +264,7 @@ def test_what_would_settle_a_claim_is_worked_out_from_the_scenes_differences():
     """Oracle: scipy's power of the t test for the number shown, and for one scene less."""
     differences = [0.5, -0.05, 0.6]
     run = results({"good": [[0.1]] * 3, "slipped": [[0.1 + d] for d in differences]})
-    (section,) = settling(run)
+    (section,) = settled(run)
     row = dict(zip(section.tables[0].columns, section.tables[0].rows[0], strict=True))
     needed, fewest, most = re.fullmatch(r"(\d+) \((\d+) to (.+)\)", row["scenes needed"]).groups()
     needed, effect = int(needed), np.mean(differences) / np.std(differences, ddof=1)
@@ -274,7 +281,7 @@ def test_what_would_settle_a_claim_is_worked_out_from_the_scenes_differences():
     assert "share of seeds" not in row
     assert "hours" not in section.tables[0].without_timings().columns
     # A claim with a verdict needs nothing.
-    assert settling(results(CLEAR)) == []
+    assert settled(results(CLEAR)) == []
 
 
 def test_hours_to_settle_a_claim_are_those_of_the_studys_cells_without_what_others_contain():
@@ -287,7 +294,7 @@ def test_hours_to_settle_a_claim_are_those_of_the_studys_cells_without_what_othe
         timed(scene, 0.1 + d, "slipped", {"truth": 0.0})
         for scene, d in zip(SCENES, [0.5, -0.05, 0.6], strict=True)
     ]
-    (section,) = settling(written_runs.results(study(), cells))
+    (section,) = settled(written_runs.results(study(), cells))
     row = dict(zip(section.tables[0].columns, section.tables[0].rows[0], strict=True))
     assert row["hours"] == row["scenes needed"].split()[0]  # 3600 s a scene
     assert "1.00 a scene, as here" in section.text[1]
@@ -296,13 +303,13 @@ def test_hours_to_settle_a_claim_are_those_of_the_studys_cells_without_what_othe
     cells[0] = timed("one", 0.1, "good", parts_alone)
     cells[1] = written_runs.outcome("warp", "two", ["good"], None, "good-two")
     cells.append(timed("two", 0.1, "good", {"truth": 1e6}))
-    (section,) = settling(written_runs.results(study(), cells))
+    (section,) = settled(written_runs.results(study(), cells))
     assert "1.00 a scene, as here" in section.text[1]
-    assert "hours" not in settling(written_runs.results(study(), cells), False)[0].text[1].lower()
+    assert "hours" not in settled(written_runs.results(study(), cells), False)[0].text[1].lower()
     # Hard cases are no scenes: however many there are, a scene takes as long.
     case = timed("thin_disc", 0.1, "good", {"truth": 1.0})
     cells.append(dataclasses.replace(case, probe="stability"))
-    (section,) = settling(written_runs.results(study(), cells))
+    (section,) = settled(written_runs.results(study(), cells))
     assert "1.00 a scene, as here" in section.text[1]
 
 
@@ -311,16 +318,15 @@ def test_hours_are_not_said_where_splats_were_fitted():
     record = run.cells[0].record
     fitted = dataclasses.replace(record, spec={**record.spec, "fit": {"iterations": 9}})
     cells = [dataclasses.replace(run.cells[0], record=fitted), *run.cells[1:]]
-    (section,) = settling(dataclasses.replace(run, cells=cells))
+    (section,) = settled(dataclasses.replace(run, cells=cells))
     assert "hours" not in section.tables[0].columns
 
 
-def test_claims_with_and_without_a_share_of_seeds_stand_in_one_table(monkeypatch):
+def test_claims_with_and_without_a_share_of_seeds_stand_in_one_table():
     """A claim about ranges of yaw has no views in common, so its seeds cannot be told apart."""
     ranges = dataclasses.replace(
         SLIP_CLAIM, id="range", b=None, compare_yaw=((0.0, 45.0), (45.0, 180.0))
     )
-    monkeypatch.setattr(settling_module, "load_claims", lambda: [SLIP_CLAIM, ranges])
     cells = [
         cell(
             variant,
@@ -333,7 +339,7 @@ def test_claims_with_and_without_a_share_of_seeds_stand_in_one_table(monkeypatch
         for variant, base in (("good", 0.1), ("slipped", 0.1 + middle + 0.2 * sign))
     ]
     run = written_runs.results(study(seeds=[0, 1]), cells)
-    (section,) = settling(run)
+    (section,) = settling(run, judge(run, [SLIP_CLAIM, ranges]))
     (table,) = section.tables
     assert [len(row) for row in table.rows] == [len(table.columns)] * 2
     assert [row[table.columns.index("share of seeds")] == "–" for row in table.rows] == [
@@ -343,15 +349,14 @@ def test_claims_with_and_without_a_share_of_seeds_stand_in_one_table(monkeypatch
     assert table.without_timings().rows
 
 
-def test_more_scenes_are_needed_where_more_claims_are_told_apart(monkeypatch):
+def test_more_scenes_are_needed_where_more_claims_are_told_apart():
     """Oracle: the level that Benjamini and Hochberg leave the larger of two p-values, and scipy."""
     differences = [0.5, -0.05, 0.6]
     run = results({"good": [[0.1]] * 3, "slipped": [[0.1 + d] for d in differences]})
     (finding,) = judge(run, [SLIP_CLAIM])
     adjusted = dataclasses.replace(finding, p=min(1.0, 4 * finding.contrast.p))
     level = 1 - 0.05 * finding.contrast.p / adjusted.p
-    monkeypatch.setattr(settling_module, "judge", lambda *_: [adjusted])
-    (section,) = settling(run)
+    (section,) = settling(run, [adjusted])
     needed = int(section.tables[0].rows[0][3].split()[0])
     effect = np.mean(differences) / np.std(differences, ddof=1)
 
@@ -366,7 +371,7 @@ def test_a_claim_of_the_sign_test_has_no_spread_to_plan_with():
     run = results({"good": [[0.1], [0.7], [0.3]], "slipped": [[0.3], [0.9], [0.5]]})
     (finding,) = judge(run, [SLIP_CLAIM])
     assert finding.verdict == "can't tell"
-    assert settling(run) == []
+    assert settled(run) == []
 
 
 def test_the_share_of_seeds_and_the_narrower_interval_are_shown_where_scenes_have_several():
@@ -377,7 +382,7 @@ def test_the_share_of_seeds_and_the_narrower_interval_are_shown_where_scenes_hav
         for scene, middle in zip(SCENES, [0.6, 0.0, 0.6], strict=True)
         for variant, value in (("good", 0.1), ("slipped", 0.1 + middle + 0.2 * sign))
     ]
-    (section,) = settling(written_runs.results(study(seeds=[0, 1]), cells))
+    (section,) = settled(written_runs.results(study(seeds=[0, 1]), cells))
     row = dict(zip(section.tables[0].columns, section.tables[0].rows[0], strict=True))
     between, within = np.var([0.6, 0.0, 0.6], ddof=1), np.var([-0.2, 0.2], ddof=1) / 2
     assert row["share of seeds"] == f"{100 * within / between:.0f} %"  # 33 %
@@ -661,7 +666,7 @@ def test_an_undefined_scene_neither_agrees_nor_disagrees_and_seen_needs_every_sc
     assert (finding.here, finding.agreement, finding.contrast.scenes) == (here, (2, 2), 2)
     missing = results({"good": [[0.1]] * 3, "slipped": [[0.6], None, [0.7]]})
     assert [one.here for one in judge(missing, [SLIP_CLAIM])] == [here]
-    (table,) = claims(missing).tables
+    (table,) = claims(missing, judge(missing, load_claims())).tables
     assert {row[table.columns.index("scenes")] for row in table.rows} == {"2 of 3"}
     (finding,) = judge(
         results({"good": [[0.9], [None], [0.9]], "slipped": [[0.6]] * 3}), [SLIP_CLAIM]
