@@ -98,6 +98,34 @@ rows = map(json.loads, open("run/results.jsonl"))
 found = {row["metric"]: row["value"] for row in rows if row["metric"].startswith("warp.epe_")}
 assert found["warp.epe_max"] >= found["warp.epe_p95"] > 0
 """,
+    "probe": """
+import json, subprocess, sys
+import numpy as np
+from attnwarp_eval.scene.file import load_scene
+
+study = {
+    "name": "own", "size": 16, "scenes": ["spheres"], "views": ["yaw030", "yaw090"], "spp": 1,
+    "variants": {"plain": {}}, "probes": {"turn": ["plain"]},
+}
+json.dump(study, open("own.yaml", "w"))
+subprocess.run([sys.executable, "-m", "attnwarp_eval", "run", "own.yaml", "--out", "run"], check=True)
+rows = map(json.loads, open("run/results.jsonl"))
+(found,) = [row["views"] for row in rows if row["metric"] == "turn.angle"]
+# All look at one point, from a circle: the sine of half the angle is half the chord of their rays.
+spec = load_scene("spheres").spec.cameras
+for name, angle in found.items():
+    (target,) = [t for t in spec.targets if round(t.yaw - spec.source.yaw) == int(name[3:])]
+    rays = []
+    for view in (spec.source, target):
+        yaw = np.radians(view.yaw)
+        around = spec.radius * np.array([np.cos(yaw), np.sin(yaw)])
+        ray = np.array([*around, view.height]) - np.array([0, 0, spec.look_at[2]])
+        rays.append(ray / np.linalg.norm(ray))
+    chord = np.linalg.norm(rays[0] - rays[1])
+    assert abs(angle - np.degrees(2 * np.arcsin(chord / 2))) < 1e-6, (name, angle)
+assert found.keys() == {"yaw030", "yaw090"}
+assert "turn.angle" in open("run/report.md").read()
+""",
     "method": EDITED
     + """
 from attnwarp.render import render
