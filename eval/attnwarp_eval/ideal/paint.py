@@ -11,6 +11,9 @@ from attnwarp_eval.scene.edits import apply
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import EditSpec, ObjectChange
 
+EDIT = "Paint its parts"
+"""Words of the edit."""
+
 LIGHTNESS, CHROMA = 62.0, 30.0
 """CIELAB of the colours: hues at equal angles, all within sRGB, all equally far from their mean. An
 answer nearer to the mean would come more often."""
@@ -61,7 +64,7 @@ def painted(scene: Scene, objects: Sequence[str], color: str) -> Scene:
     """
     edit = EditSpec(
         name="parts",
-        instruction="Paint its parts",
+        instruction=EDIT,
         source=f"a photo of {scene.name}",
         target=f"a photo of {scene.name} in colours",
         changes=tuple(ObjectChange(object=name, paint=color) for name in objects),

@@ -17,6 +17,7 @@ from attnwarp_eval.ideal.share import Grams
 from attnwarp_eval.metrics.parts import PartTruth
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.truth import Geometry, appearance
+from attnwarp_eval.two_view import TwoView
 
 
 def labels_of(
@@ -129,3 +130,19 @@ class Thing:
         return PartTruth.of(
             self.before[view], self.after[view], self.labels[view], self.tokens(view)
         )
+
+
+def in_front(pair: TwoView, source: Labels) -> Labels:
+    """(H, W) part of the surface that the source shows where a target's point falls into it; -1 for
+    none, and for a point that does not fall into it.
+
+    Args:
+        pair: the exact relation of the two views.
+        source: (H, W) part of each pixel of the source.
+    """
+    result = np.full(pair.label.shape, -1, dtype=np.int16)
+    inside = pair.in_source_image
+    column, row = np.floor(pair.xy[inside]).astype(np.int64).T
+    h, w = source.shape
+    result[inside] = source[np.clip(row, 0, h - 1), np.clip(column, 0, w - 1)]
+    return result

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import partial
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.report.claims import Comparison, JudgedClaim, of_comparisons
+from attnwarp_eval.report.controls import BLIND, blind
 from attnwarp_eval.statistics.intervals import (
     Interval,
     Verdict,
@@ -94,7 +95,20 @@ def _section(results: Results, ablation: Ablation, compared: Sequence[Contrast])
     section.tables.append(Table(["variant", *columns, *pairs, time], rows, timed=(time,)))
     section.tables += own.details(results, names)
     if len(names) > 1:
-        section.tables.append(_table(compared, ablation.baseline))
+        unseen = {
+            metric
+            for metric in {
+                c.metric for c in compared if c.verdict == "can't tell" and c.difference.views
+            }
+            if own.probe.edits and blind(results, own.name, metric, baseline)
+        }
+        section.tables.append(_table(compared, ablation.baseline, unseen))
+        if unseen:
+            section.text.append(
+                f"**{BLIND.capitalize()}:** {', '.join(sorted(unseen))}. Features from the wrong"
+                " place did not do worse here, so this study cannot see where features come from"
+                f' by these figures; {BLIND!r} stands for "can\'t tell".'
+            )
         if any(contrast.claimed for contrast in compared):
             section.text.append(
                 f"{CLAIMED} in the table of differences: a claim makes this comparison. p-value and"
@@ -160,11 +174,13 @@ def contrasts(
     return rows
 
 
-def _table(compared: Sequence[Contrast], baseline: str) -> Table:
+def _table(compared: Sequence[Contrast], baseline: str, unseen: Set[str]) -> Table:
     rows = []
     for contrast in compared:
         difference = contrast.difference
         judged: str = contrast.verdict or "–"
+        if judged == "can't tell" and contrast.metric in unseen:
+            judged = BLIND
         if difference.views == 0:
             judged = "not measured"
         elif difference.mean == difference.low == difference.high == 0:

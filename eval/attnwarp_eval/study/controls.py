@@ -20,16 +20,16 @@ DISPLACEMENT = 1 / 8
 """Share of the source's width by which ``displaced`` moves what is taken."""
 
 
-def moved(xy: Tensor, width: int, control: Control) -> Tensor:
+def moved(xy: Tensor, width: int, control: Control, share: float = DISPLACEMENT) -> Tensor:
     """(H, W, 2) positions in a source of some width, mirrored left to right or displaced to the
-    right; what leaves the picture enters it on the other side.
+    right by a share of it; what leaves the picture enters it on the other side.
 
     Example:
         >>> xy = torch.tensor([[[0.5, 0.5], [7.5, 0.5]]])
         >>> moved(xy, 8, "mirrored")[0, :, 0].tolist(), moved(xy, 8, "displaced")[0, :, 0].tolist()
         ([7.5, 0.5], [1.5, 0.5])
     """
-    x = width - xy[..., 0] if control == "mirrored" else xy[..., 0] + DISPLACEMENT * width
+    x = width - xy[..., 0] if control == "mirrored" else xy[..., 0] + share * width
     return torch.stack([x.remainder(width) if control == "displaced" else x, xy[..., 1]], dim=-1)
 
 
@@ -39,16 +39,18 @@ class MovedView(WarpedView):
 
     Args:
         control: "mirrored" or "displaced".
+        share: of the source's width, for "displaced".
     """
 
     control: Control = "mirrored"
+    share: float = DISPLACEMENT
     _moved: dict[tuple[int, ...], FeatureWarp] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, view: WarpedView, control: Control) -> MovedView:
+    def of(cls, view: WarpedView, control: Control, share: float = DISPLACEMENT) -> MovedView:
         """The wrong warp of a right one."""
         own = {f.name: getattr(view, f.name) for f in fields(view) if f.name != "_at"}
-        return cls(**own, control=control)
+        return cls(**own, control=control, share=share)
 
     def at(
         self, size: tuple[int, int], *, source_size: tuple[int, int] | None = None
@@ -58,6 +60,7 @@ class MovedView(WarpedView):
         if key not in self._moved:
             layer = super().at(size, source_size=source_size)
             right = layer.correspondence
-            wrong = replace(right, xy=moved(right.xy, right.source.width, self.control))
+            xy = moved(right.xy, right.source.width, self.control, self.share)
+            wrong = replace(right, xy=xy)
             self._moved[key] = FeatureWarp(wrong, layer.mask, layer.backend)
         return self._moved[key]

@@ -168,6 +168,13 @@ VARIANT = {
 }  # fmt: skip
 
 
+OWN = {"ideal": {"editing": {"editor": {"ideal": {"parts": 6}}}}}
+"""Keys that a study of a probe has to have."""
+
+OTHER = {"ideal": {"editing": {"editor": {"ideal": {"parts": 7}}}}}
+"""Changes of keys in place of those that would take away what a probe has to have."""
+
+
 def nested(key, value):
     first, _, rest = key.partition(".")
     return {first: {rest: value} if rest else value}
@@ -184,7 +191,13 @@ def folder(tmp_path, monkeypatch):
 def planned(name, variant, **changes):
     """The study with one probe, and the specs of its cells; None where it cannot be measured."""
     named = {"v": variant} if probe(name).judges_variants else {}
-    content = {**BASE, "variants": named, "probes": {name: list(named)}, **changes}
+    content = {
+        **BASE,
+        "variants": named,
+        "probes": {name: list(named)},
+        **OWN.get(name, {}),
+        **changes,
+    }
     try:
         study = parse_study(content)
     except ValidationError:
@@ -203,7 +216,9 @@ def test_keys_of_a_study_are_read_by_the_probes_whose_cells_they_change(name, fo
         for own in study.variants.values():
             read |= {key.partition(".")[0] for key in probe(name).reads(study, own)}
         changing |= {
-            key for key, new in KEYS.items() if planned(name, variant, **{key: new})[1] != before
+            key
+            for key, new in {**KEYS, **OTHER.get(name, {})}.items()
+            if planned(name, variant, **{key: new})[1] != before
         }
     assert read & KEYS.keys() == changing
 
@@ -221,7 +236,7 @@ def test_keys_of_a_variant_are_read_by_the_probes_whose_cells_they_change(name, 
             is_read = key in read or key.partition(".")[0] in read
             if (name, key) == ("fit", "fitted"):
                 continue  # says what is so
-            of_truth = name == "warp" and "truth" in (plain.get("geometry"), new)
+            of_truth = name in ("warp", "labels") and "truth" in (plain.get("geometry"), new)
             if (probe(name).edits and key == "geometry") or (of_truth and key.startswith("set.")):
                 continue  # an id tells what changes nothing, too; results are compared below
             assert is_read == (before != after), (plain, key)

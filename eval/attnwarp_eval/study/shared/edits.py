@@ -6,34 +6,50 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Set
 from functools import lru_cache
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import Field
 
 from attnwarp.errors import InputError
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.budgets import BudgetPart
+from attnwarp_eval.study.controls import Control
 from attnwarp_eval.study.edit_truth import answers_of
 from attnwarp_eval.study.editing_methods import EDITING_METHODS
 from attnwarp_eval.study.hand_made import Kind
 from attnwarp_eval.study.probe import Probe
 from attnwarp_eval.study.reads import MASK_RULES
 from attnwarp_eval.study.record import Extra, Json
-from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, did_you_mean
+from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, Whole, did_you_mean
 from attnwarp_eval.study.shared.splats import splats_meaning, splats_reads, splats_spec
 
 E = TypeVar("E", bound=Extra)
+
+
+class IdealPart(Part):
+    """The ideal editor (docs/measuring/ideal-editor.md).
+
+    ``parts`` of the thing, each in one of ``colors``; ``settled``: mean share of the steps before
+    an answer holds; ``cross``: what cross-attention gives.
+    """
+
+    parts: Annotated[Whole, Field(ge=1, le=1000)] = 12
+    colors: Annotated[Whole, Field(ge=2, le=12)] = 4
+    settled: Annotated[float, Field(gt=0, lt=1)] = 0.4
+    cross: Literal["paint", "word"] = "paint"
 
 
 class EditorPart(Part):
     """An editor of single views.
 
     ``name`` is bundled or a folder in diffusers' format. Guidance left out is the editor's own.
+    ``ideal`` takes the ideal editor in place of these, for the probe ``ideal``.
     """
 
     name: str = "small-plain"
     text_guidance: float | None = Field(default=None, ge=0)
     image_guidance: float | None = Field(default=None, ge=0)
+    ideal: IdealPart | None = None
 
 
 class Editing(Part):
@@ -69,7 +85,8 @@ class VariantPart(Part):
     ``source`` words. ``mask: truth`` injects where the source truly sees the
     surface, ``geometry: truth`` warps by exact depth. ``budget`` cuts the method short.
     ``by_hand`` gives the method a source view that was edited by hand
-    (:mod:`attnwarp_eval.study.hand_made`) instead of letting the editor edit it.
+    (:mod:`attnwarp_eval.study.hand_made`) instead of letting the editor edit it. ``control`` takes
+    features from the wrong place (:mod:`attnwarp_eval.study.controls`).
     """
 
     method: str = "attention_warping"
@@ -78,6 +95,16 @@ class VariantPart(Part):
     editor: EditorPart | None = None
     budget: BudgetPart | None = None
     by_hand: Kind | None = None
+    control: Control | None = None
+
+
+GUIDANCE = frozenset(
+    {
+        "options.text_guidance", "options.image_guidance", "options.guidance_drop",
+        "options.source_text_guidance", "options.suffix", "options.negative_prompt",
+    }
+)  # fmt: skip
+"""Settings of words and their guidance, which decide nothing for the ideal editor."""
 
 
 class MethodProbe(Probe[E]):
@@ -94,6 +121,8 @@ class MethodProbe(Probe[E]):
         own = variant.part(VariantPart)
         settings = settings_of(study, variant, 0)
         read = {"method", "budget", "by_hand", *splats_reads(variant)}
+        if EDITING_METHODS[own.method].takes_picture and settings["method"] == "warp":
+            read.add("control")
         read |= EDITING_METHODS[own.method].reads(settings)
         one_mask = settings.get("sources", 1) == 1 and not settings.get("confidence")
         if own.mask == "truth" and one_mask:
@@ -103,6 +132,8 @@ class MethodProbe(Probe[E]):
         if "editor" in read:
             guidance = ("text_guidance", "image_guidance")
             read -= {"editor"}
+            if editor_of(study, variant).ideal is not None:
+                return (read | {"editor.ideal"}) - GUIDANCE
             read |= {"editor.name"}
             read |= {f"editor.{name}" for name in guidance if settings.get(name) is None}
         return read
@@ -121,6 +152,7 @@ class MethodProbe(Probe[E]):
             **splats_spec(study, variant, seed),
             **self._budget_spec(study, variant, seed),
             **({"by_hand": own.by_hand} if own.by_hand is not None else {}),
+            **({"control": own.control} if own.control is not None else {}),
         }
 
     def _budget_spec(self, study: Study, variant: Variant, seed: int) -> Json:
@@ -141,7 +173,7 @@ class MethodProbe(Probe[E]):
         settings = settings_of(study, variant, 0)
         return (
             own.method, settings, variant.geometry, own.mask, splats_meaning(study, variant),
-            editor_of(study, variant), own.budget, own.by_hand,
+            editor_of(study, variant), own.budget, own.by_hand, own.control,
         )  # fmt: skip
 
     def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:
@@ -191,6 +223,8 @@ def editor_of(study: Study, variant: Variant) -> EditorPart:
 
 def editor_identity(editor: EditorPart) -> Json:
     """Parts of an editor that decide its pictures: its files and its guidance, not its folder."""
+    if editor.ideal is not None:
+        return {"ideal": editor.ideal.model_dump()}
     guidance = {"text": editor.text_guidance, "image": editor.image_guidance}
     return {"sha256": files_digest(editor.name), "guidance": guidance}
 

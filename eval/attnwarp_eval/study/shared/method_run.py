@@ -15,6 +15,7 @@ import torch
 
 from attnwarp import Gaussians
 from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
+from attnwarp_eval.study.controls import MovedView
 from attnwarp_eval.study.edit_truth import EditTruth
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Job, with_source_words
 from attnwarp_eval.study.hand_made import hand_made
@@ -26,6 +27,7 @@ from attnwarp_eval.study.warping import warp_truth
 
 if TYPE_CHECKING:
     from attnwarp.editing.controlnet import DepthControlNet
+    from attnwarp.editing.editor import Editor
     from attnwarp.editing.pix2pix import InstructPix2Pix
     from attnwarp.methods import Budget
 
@@ -53,6 +55,7 @@ def run_method(
     names: Sequence[str],
     before: Gaussians,
     budget: Budget | None = None,
+    editor: Editor | None = None,
 ) -> EditedScene:
     """Edit a scene by the method of a cell.
 
@@ -62,10 +65,12 @@ def run_method(
         names: of the views, the source first.
         before: the splats to edit.
         budget: limits of the method.
+        editor: in place of the one that the spec names.
     """
     spec, world = work.spec, work.world
     with work.meter.stage("setup"):
-        editor = load(work.cell.sources["editor"], spec["editor"])
+        if editor is None:
+            editor = load(work.cell.sources["editor"], spec["editor"])
     with tempfile.TemporaryDirectory() as folder:
         job = Job(
             before,
@@ -133,9 +138,10 @@ def load(name: str, planned: Json, device: str = "cpu") -> InstructPix2Pix | Dep
 
 
 def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
-    """Warps by exact depth, or with the exact mask; None for the method's own."""
+    """Warps by exact depth, with the exact mask, or wrong ones; None for the method's own."""
     spec, world = work.spec, work.world
-    if spec["geometry"] == "splats" and spec["mask"] == "rules":
+    control = spec.get("control")
+    if spec["geometry"] == "splats" and spec["mask"] == "rules" and control is None:
         return None
     warp = spec["settings"].get("warp")
     settings = PRESETS["corrected"] if warp is None else WarpSettings.from_dict(warp)
@@ -151,7 +157,7 @@ def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
             if spec["mask"] == "truth":
                 visible = torch.from_numpy(np.ascontiguousarray(pair.visible))
                 view = replace(view, mask=visible & view.correspondence.defined, _at={})
-            made[source, target] = view
+            made[source, target] = view if control is None else MovedView.of(view, control)
         return made[source, target]
 
     return of

@@ -63,6 +63,12 @@ class EditingProbe(MethodProbe[EditResult]):
     def check(self, study: Study) -> None:
         """Figures by yaw need their variants measured."""
         part = study.part(EditingPart).editing
+        for name in sorted(self.measured(study)):
+            if editor_of(study, study.variants[name]).ideal is not None:
+                raise ValueError(
+                    f"probes.{self.name}: {name!r} has the ideal editor, whose answers are those of"
+                    " parts; measure it by probes.ideal"
+                )
         study.check_variants(part.by_yaw, "editing.by_yaw", self.name)
         study.check_variants(part.choice, "editing.choice", self.name)
         for name, variant in study.variants.items():

@@ -8,19 +8,14 @@ from typing import Any
 
 from pydantic import Field
 
-from attnwarp.warp import WarpSettings, parts_read, render_surface, warp_view
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.probe import Probe, Work, metrics_of, register
 from attnwarp_eval.study.reads import warp_reads
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Part, Study, Variant
-from attnwarp_eval.study.shared.splats import (
-    splats_of,
-    surface_meaning,
-    surface_reads,
-    surface_spec,
-)
-from attnwarp_eval.study.warping import warp_figures, warp_truth
+from attnwarp_eval.study.shared.splats import surface_meaning, surface_reads, surface_spec
+from attnwarp_eval.study.shared.warps import warped_views
+from attnwarp_eval.study.warping import warp_figures
 
 
 class Yaw(Part):
@@ -73,43 +68,9 @@ class Warp(Probe[NoExtra]):
 
     def compute(self, work: Work) -> NoExtra:
         """Warp and measure, view by view."""
-        spec, world, meter = work.spec, work.world, work.meter
-        size, spp = spec["size"], spec["spp"]
-        settings = WarpSettings.from_dict(spec["settings"])
-        model = source_surface = None
-        if spec.get("geometry") != "truth":
-            with meter.stage("splats"):
-                model = splats_of(work)
-            # One source serves every target, so its render is no part of what a target costs.
-            with meter.stage("source"):
-                source_surface = render_surface(model, world.source, settings)
-            meter.count(source_pairs=source_surface.counters["pairs"])
-        for name in spec["views"]:
-            target = world.targets[name]
-            with meter.stage("truth"):
-                truth = world.pair(name, size)
-                images: dict[str, Any] = {}
-                if "source_image" in parts_read(settings):
-                    images = {
-                        "source_image": world.image(world.source.name, spp),
-                        "target_image": world.image(name, spp),
-                    }
-            with meter.view():
-                if model is None:
-                    view = warp_truth(world, truth, settings, **images)
-                else:
-                    view = warp_view(
-                        model,
-                        world.source,
-                        target,
-                        settings,
-                        source_surface=source_surface,
-                        **images,
-                        warn_empty=False,
-                    )
-                for layer in spec["feature_sizes"]:
-                    view.at((layer, layer))
-            meter.count(**view.target.counters)
+        spec, world = work.spec, work.world
+        for name, truth, view in warped_views(work, spec["feature_sizes"]):
             measured = warp_figures(work, name, view)
-            work.add(name, measured, partial(pictures.of_warp, world, name, spp, truth, view))
+            draw = partial(pictures.of_warp, world, name, spec["spp"], truth, view)
+            work.add(name, measured, draw)
         return NoExtra()

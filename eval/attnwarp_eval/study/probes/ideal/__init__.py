@@ -1,0 +1,1 @@
+"""Edits in parts by the ideal editor."""

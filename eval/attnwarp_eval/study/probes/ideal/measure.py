@@ -1,0 +1,242 @@
+"""An edit in parts by the ideal editor, against the answers that its source shows.
+
+Views of a record are named ``parts/view``. Figures end in ``.edit`` for the edited views and in
+``.render`` for renders of the edited splats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp_eval.ideal.paint import EDIT
+from attnwarp_eval.ideal.share import alone, solve_share
+from attnwarp_eval.ideal.thing import Thing, in_front
+from attnwarp_eval.metrics.parts import part_answers, part_figures
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.edit_truth import EditTruth
+from attnwarp_eval.study.probe import Work, metrics_of, register
+from attnwarp_eval.study.record import Json
+from attnwarp_eval.study.schema import Study, Variant
+from attnwarp_eval.study.shared.edits import (
+    MethodProbe,
+    VariantPart,
+    editor_of,
+)
+from attnwarp_eval.study.shared.method_run import own_seconds, run_method
+from attnwarp_eval.study.shared.splats import splats_of
+from attnwarp_eval.study.shared.things import ThingsPart, check_things, thing_of
+from attnwarp_eval.two_view import HIDDEN
+from attnwarp_eval.world import World
+
+Image = npt.NDArray[np.float32]
+
+UNABLE = ("dge", "gaussctrl")
+"""Methods that change how attention is computed, which the ideal editor does not compute."""
+
+
+@dataclass(frozen=True)
+class IdealResult:
+    """Entries of a cell's record beside the figures of its views.
+
+    Attributes:
+        share: of signal, solved from the editor's ``settled``.
+        settled, frequencies, agreement: of views edited alone,
+            :class:`attnwarp_eval.ideal.share.Alone`.
+        fault: reason why the editor is not ideal; None where it is.
+        part_share: mean share of a view's pixels that a part takes, of those that show it.
+        answers: of each part in the source's edit, -1 where it does not show.
+        edited: number of edited views.
+    """
+
+    share: float
+    settled: float
+    frequencies: tuple[float, ...]
+    agreement: float
+    fault: str | None
+    part_share: float
+    answers: tuple[int, ...]
+    edited: int
+
+    def to_json(self) -> Json:
+        """The record's entry ``ideal``."""
+        return {"ideal": asdict(self)}
+
+    @classmethod
+    def from_json(cls, data: Json) -> IdealResult:
+        """Rebuild from :meth:`to_json`."""
+        lists = {key: tuple(data[key]) for key in ("frequencies", "answers")}
+        return cls(**{**data, **lists})
+
+
+@register
+class IdealProbe(MethodProbe[IdealResult]):
+    """One edit of a thing in parts by one method and the ideal editor."""
+
+    name = "ideal"
+    study_part = ThingsPart
+    metrics = metrics_of("parts.")
+    study_keys = frozenset({"size", "views", "seeds", "spp", "editing", "things"})
+    draws = False
+
+    def check(self, study: Study) -> None:
+        """Every variant needs the ideal editor, and a method that it can serve."""
+        for name in study.probes.get(self.name, []):
+            variant = study.variants[name]
+            own = variant.part(VariantPart)
+            if editor_of(study, variant).ideal is None:
+                raise ValueError(
+                    f"probes.{self.name}: {name!r} has no ideal editor; give it editor:"
+                    " {ideal: {}}"
+                )
+            if own.method in UNABLE:
+                raise ValueError(
+                    f"probes.{self.name}: method {own.method!r} of {name!r} changes attention"
+                    " itself, which the ideal editor has none of; leave it out"
+                )
+
+    def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
+        """A thing of a scene that is not there would be measured nowhere."""
+        check_things(study, [scene.name for scene in scenes])
+
+    def reads(self, study: Study, variant: Variant) -> Set[str]:
+        """Keys of the method and the editor; it runs whole, and edits its source itself."""
+        return set(super().reads(study, variant)) - {"budget", "by_hand"}
+
+    def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
+        """The method, the editor, and where splats and warps come from."""
+        spec = super().variant_spec(study, variant, seed)
+        return {key: value for key, value in spec.items() if key not in ("budget", "by_hand")}
+
+    def cells(
+        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
+    ) -> Iterator[Cell]:
+        """One for each scene, variant and seed."""
+        for name, scene in scenes.items():
+            thing = thing_of(study, scene)
+            for label in names:
+                for seed in study.seeds:
+                    spec = {
+                        **self.common_spec(study, scene, seed),
+                        **self.variant_spec(study, study.variants[label], seed),
+                        "thing": thing,
+                    }
+                    yield Cell(spec, name, label, self.name, seed, (label,))
+
+    def compute(self, work: Work) -> IdealResult:
+        """Solve the share, edit the scene, and measure every target."""
+        spec, world, meter = work.spec, work.world, work.meter
+        ideal, names = spec["editor"]["ideal"], [world.source.name, *spec["views"]]
+        with meter.stage("truth"):
+            thing = _thing(
+                world, tuple(names), tuple(spec["thing"]), ideal["parts"], ideal["colors"],
+                spec["spp"],
+            )  # fmt: skip
+        with meter.stage("setup"):
+            steps = spec["settings"]["steps"]
+            share = solve_share(thing.grams, ideal["settled"], steps)
+            checked = alone(thing.grams, share, steps)
+            editor = thing.editor(share, ideal["cross"])
+        with meter.stage("splats"):
+            before = splats_of(work)
+        # The words decide nothing; the method asks for some.
+        spec["edit"] = {"instruction": EDIT, "target": EDIT, "source": world.scene.title}
+        result = run_method(work, _truth(thing), names, before, editor=editor)
+        del spec["edit"]
+        for part, seconds in result.seconds.items():
+            meter.add(f"method: {part}", seconds)
+        meter.add("whole", own_seconds(result))
+        with meter.stage("checks"):
+            edited: dict[str, Image] = {
+                names[k]: picture.astype(np.float32) / np.float32(255)
+                for k, picture in result.edited.items()
+            }
+            pictures = {
+                "edit": edited,
+                "render": _renders(world, names, before, result.gaussians),
+            }
+            answers = part_answers(edited[names[0]], thing.truth(names[0]), thing.parts)
+            for name in names[1:]:
+                work.add(f"parts/{name}", self._figures(world, thing, name, pictures, answers))
+        shown = [labels[labels >= 0] for labels in thing.labels.values()]
+        counts = [np.unique(own, return_counts=True)[1] for own in shown]
+        return IdealResult(
+            share,
+            checked.settled,
+            checked.frequencies,
+            checked.agreement,
+            checked.fault(),
+            float(np.concatenate(counts).mean()) / spec["size"] ** 2,
+            tuple(int(answer) for answer in answers),
+            len(edited),
+        )
+
+    def _figures(
+        self,
+        world: World,
+        thing: Thing,
+        name: str,
+        pictures: Mapping[str, Mapping[str, Image]],
+        answers: npt.NDArray[np.int64],
+    ) -> dict[str, float]:
+        pair = world.pair(name, world.source.width)
+        front = in_front(pair, thing.labels[world.source.name])
+        row: dict[str, float] = {}
+        for kind, images in pictures.items():
+            if name in images:
+                figures = part_figures(
+                    images[name], thing.truth(name), answers, pair.visible, pair.label == HIDDEN,
+                    front,
+                )  # fmt: skip
+                row |= {f"{key}.{kind}": value for key, value in figures.items()}
+        return row
+
+    def read_extra(self, data: Json) -> IdealResult:
+        """Read from the record's entry ``ideal``."""
+        return IdealResult.from_json(data["ideal"])
+
+
+@lru_cache(maxsize=2)
+def _thing(
+    world: World,
+    names: tuple[str, ...],
+    objects: tuple[str, ...],
+    parts: int,
+    colors: int,
+    spp: int,
+) -> Thing:
+    """The thing of a scene; the last ones are kept, since all variants share them."""
+    cameras = [world.camera(name) for name in names]
+    return Thing.of(
+        world.scene, world.geometry, cameras, objects, parts=parts, colors=colors, spp=spp
+    )
+
+
+def _truth(thing: Thing) -> EditTruth:
+    """The thing's true pictures as a method may ask for them: whole in one answer."""
+    masks = {name: labels >= 0 for name, labels in thing.labels.items()}
+    count = len(next(iter(thing.after.values())))
+    answers = {
+        str(k): {name: after[k] for name, after in thing.after.items()} for k in range(count)
+    }
+    return EditTruth(thing.before, answers, dict.fromkeys(answers, masks), masks)
+
+
+def _renders(world: World, names: Sequence[str], before: Any, after: Any) -> dict[str, Image]:
+    from attnwarp.methods.scene import near_of
+    from attnwarp.render import render
+
+    cameras = [world.camera(name) for name in names]
+    near = near_of(cameras, before)
+    with torch.no_grad():
+        return {
+            name: np.asarray(render(after, camera, near=near).color.clamp(0, 1).float().numpy())
+            for name, camera in zip(names, cameras, strict=True)
+        }

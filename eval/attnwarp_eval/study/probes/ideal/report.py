@@ -1,0 +1,83 @@
+"""Report of edits in parts by the ideal editor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
+
+from attnwarp_eval.document.model import Section, Table
+from attnwarp_eval.document.numbers import number
+from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
+from attnwarp_eval.study.results import Results
+
+
+@register_report
+class IdealReport(ProbeReport):
+    """Seen, through, bleed and dE by variant; they are read together."""
+
+    name = "ideal"
+    columns: ClassVar[Mapping[str, str]] = {
+        "seen": "parts.seen.edit",
+        "through": "parts.through.edit",
+        "bleed, dE00": "parts.bleed.edit",
+        "dE00 where seen": "parts.delta_e.edit",
+        "seen, renders": "parts.seen.render",
+        "through, renders": "parts.through.render",
+        "dE00 where seen, renders": "parts.delta_e.render",
+    }
+    contrasts = (
+        "parts.seen.edit",
+        "parts.through.edit",
+        "parts.bleed.edit",
+        "parts.delta_e.edit",
+        "parts.seen.render",
+        "parts.delta_e.render",
+    )
+    cost = "whole"
+    cost_of = "an edit"
+    cost_text = "Seconds are those of one whole edit of a scene by the ideal editor, with tuning."
+
+    def problems(self, results: Results) -> list[str]:
+        """Editors that are not ideal: they have favourite answers, or agree without features."""
+        faults = {
+            f"{cell.scene}: not ideal: {record.extra.fault}"
+            for cell, record in results.finished(self.name)
+            if record.extra.fault is not None
+        }
+        return sorted(faults)
+
+    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+        """The editor by scene: share of signal, when answers settle, and what it is alone."""
+        found: dict[tuple[object, ...], list[str]] = {}
+        for cell, record in results.finished(self.name):
+            ideal, extra = record.spec["editor"]["ideal"], record.extra
+            key = (cell.scene, *ideal.values(), record.spec["settings"]["steps"])
+            found[key] = [
+                cell.scene,
+                str(ideal["parts"]),
+                f"{100 * extra.part_share:.1f} %",
+                str(ideal["colors"]),
+                f"{extra.settled * record.spec['settings']['steps']:.1f}"
+                f" of {record.spec['settings']['steps']}",
+                ideal["cross"],
+                number(extra.share),
+                ", ".join(f"{100 * f:.0f} %" for f in extra.frequencies),
+                f"{100 * extra.agreement:.0f} %",
+            ]
+        if not found:
+            return
+        columns = [
+            "scene", "parts", "size of a part", "answers", "settled at step", "cross-attention",
+            "share of signal", "alone: answers", "alone: agreement",
+        ]  # fmt: skip
+        text = [
+            (
+                "An editor that repairs whatever it can tell to be wrong. Damage by wrong features"
+                " is a lower bound for a real one, and no difference means: below a part's size."
+                " Alone, with fresh noise, answers come alike often and agree by chance."
+            )
+        ]
+        yield (
+            Place.INSTRUMENT,
+            Section("The ideal editor", text, [Table(columns, [found[k] for k in found])]),
+        )

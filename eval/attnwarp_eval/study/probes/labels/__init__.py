@@ -1,0 +1,1 @@
+"""Part labels carried along a warp."""

@@ -1,0 +1,128 @@
+"""Part labels that a variant's warp carries, against exact truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import replace
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from attnwarp_eval import metrics
+from attnwarp_eval.ideal.editor import FACTOR
+from attnwarp_eval.ideal.parts import token_parts
+from attnwarp_eval.ideal.thing import labels_of
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.probe import Probe, Work, metrics_of, register
+from attnwarp_eval.study.reads import warp_reads
+from attnwarp_eval.study.record import Json, NoExtra
+from attnwarp_eval.study.schema import Part, Study, Variant, Whole
+from attnwarp_eval.study.shared.splats import surface_meaning, surface_reads, surface_spec
+from attnwarp_eval.study.shared.things import check_things, thing_of
+from attnwarp_eval.study.shared.warps import warped_views
+
+GRIDS = (8, 16, 32, 64)
+"""Sides of the token grids that are measured where a study names none."""
+
+
+class Labels(Part):
+    """Tokens and parts.
+
+    ``grids``: tokens along a side, divisors of the image size; of 8, 16, 32 and 64 those that are,
+    where it is left out. ``parts``: numbers of parts; a figure without a grid in its name is of the
+    first, on tokens of 4 px, as the ideal editor's are.
+    """
+
+    grids: list[Annotated[Whole, Field(ge=1)]] = Field(default_factory=list)
+    parts: Annotated[list[Annotated[Whole, Field(ge=2, le=10_000)]], Field(min_length=1)] = Field(
+        default_factory=lambda: [12, 48]
+    )
+
+
+class StudyPart(Part):
+    """Keys of a study that only this probe reads; the thing is that of the probe ``ideal``."""
+
+    labels: Labels = Labels()
+
+
+@register
+class LabelTransport(Probe[NoExtra]):
+    """Labels of a thing's parts, carried along the tokens of a warp."""
+
+    name = "labels"
+    study_part = StudyPart
+    metrics = metrics_of("labels.")
+    study_keys = frozenset({"size", "views", "seeds", "spp", "labels", "things"})
+    draws = False
+
+    def check(self, study: Study) -> None:
+        """Grids need to divide the pictures."""
+        for grid in study.part(StudyPart).labels.grids:
+            if study.size % grid:
+                raise ValueError(
+                    f"labels.grids: got {grid}, expected divisors of the image size, {study.size}"
+                )
+
+    def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
+        """A thing of a scene that is not there would be measured nowhere."""
+        check_things(study, [scene.name for scene in scenes])
+
+    def reads(self, study: Study, variant: Variant) -> Set[str]:
+        """Depth and rules."""
+        truth = variant.geometry == "truth"
+        return surface_reads(variant) | warp_reads(variant.settings(), truth)
+
+    def cells(
+        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
+    ) -> Iterator[Cell]:
+        """One for each scene, variant and seed."""
+        things = {name: thing_of(study, scene) for name, scene in scenes.items()}
+        for cell in super().cells(study, names, scenes):
+            yield replace(cell, spec={**cell.spec, "thing": things[cell.scene]}, pictures=())
+
+    def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
+        """Depth, rules, grids and parts."""
+        part = study.part(StudyPart).labels
+        return {
+            **surface_spec(study, variant, seed),
+            "spp": study.spp,
+            "settings": variant.settings().to_dict(),
+            "grids": part.grids or [grid for grid in GRIDS if study.size % grid == 0],
+            "parts": part.parts,
+        }
+
+    def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
+        """Splats may be fitted."""
+        return surface_meaning(study, variant)
+
+    def compute(self, work: Work) -> NoExtra:
+        """Warp, carry and count, view by view."""
+        spec, world, meter = work.spec, work.world, work.meter
+        names = [world.source.name, *spec["views"]]
+        with meter.stage("truth"):
+            cameras = [world.camera(name) for name in names]
+            labels = {
+                count: labels_of(world.scene, world.geometry, cameras, spec["thing"], count)
+                for count in spec["parts"]
+            }
+        grids: list[int] = spec["grids"]
+        near = min(grids, key=lambda grid: abs(grid - spec["size"] / FACTOR))
+        for name, truth, view in warped_views(work, grids):
+            figures: dict[str, float] = {}
+            for count in spec["parts"]:
+                for grid in grids:
+                    source, target = (
+                        token_parts(labels[count][one], (grid, grid)) for one in (names[0], name)
+                    )
+                    with meter.stage("carry"):
+                        carried = metrics.carried_labels(view.at((grid, grid)), source)
+                    with meter.stage("checks"):
+                        one = metrics.label_transport(
+                            carried, target, labels[count][name], truth.visible, truth.unseen
+                        )
+                    if (count, grid) == (spec["parts"][0], near):
+                        figures |= one
+                    figures |= {f"{key}.{grid}.{count}": value for key, value in one.items()}
+            work.add(name, figures)
+        return NoExtra()

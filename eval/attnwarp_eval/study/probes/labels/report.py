@@ -1,0 +1,50 @@
+"""Report of labels: right, wrong, none and painted by grid and number of parts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+from attnwarp_eval.document.model import Table
+from attnwarp_eval.study.probe_report import ProbeReport, mean_values, register_report
+from attnwarp_eval.study.results import Results
+
+
+@register_report
+class LabelReport(ProbeReport):
+    """Labels of a thing's parts that arrive, by variant."""
+
+    name = "labels"
+    columns: ClassVar[Mapping[str, str]] = {
+        "right": "labels.right",
+        "wrong": "labels.wrong",
+        "none": "labels.none",
+        "painted, hidden": "labels.painted_hidden",
+        "painted, outside": "labels.painted_outside",
+    }
+    contrasts = tuple(columns.values())
+
+    def details(self, results: Results, names: Sequence[str]) -> list[Table]:
+        """Figures by the grid's side, a table for each number of parts."""
+        specs = [record.spec for _, record in results.finished(self.name)]
+        if not specs:
+            return []
+        grids, counts = specs[0]["grids"], specs[0]["parts"]
+        tables = []
+        for count in counts:
+            rows = [
+                [
+                    name,
+                    title,
+                    *mean_values(
+                        results, self.name, name, [f"{key}.{grid}.{count}" for grid in grids]
+                    ),
+                ]
+                for name in names
+                for title, key in self.columns.items()
+            ]
+            caption = f"{count} parts, by tokens along a side"
+            tables.append(
+                Table(["variant", "labels", *map(str, grids)], rows, caption, folded=True)
+            )
+        return tables

@@ -1,0 +1,53 @@
+"""The thing of a scene: the objects whose parts are told apart."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.schema import Part, Study, StudyError, did_you_mean
+
+
+class ThingsPart(Part):
+    """Keys of a study: by scene, the names of the objects that make up the thing.
+
+    A scene that is left out has the objects of its first edit that several answers are right for.
+    """
+
+    things: dict[str, list[str]] = Field(default_factory=dict)
+
+
+def thing_of(study: Study, scene: Scene) -> list[str]:
+    """Names of the objects that make up a scene's thing.
+
+    Raises:
+        StudyError: an object that the scene lacks, or a scene that names neither objects nor such
+            an edit.
+    """
+    named = study.part(ThingsPart).things.get(scene.name)
+    if named is None:
+        edit = next((edit for edit in scene.edits if edit.ambiguous), None)
+        if edit is None:
+            raise StudyError(
+                f"things: scene {scene.name!r} has no edit with several answers; name the objects"
+                f" of its thing in things.{scene.name}"
+            )
+        return [change.object for change in edit.answers[0].changes]
+    for name in named:
+        if name not in scene.object_names:
+            near = did_you_mean(name, scene.object_names)
+            raise StudyError(f"things.{scene.name}: no object {name!r}{near}")
+    if not named:
+        raise StudyError(f"things.{scene.name}: names no object, expected at least one")
+    return list(named)
+
+
+def check_things(study: Study, scenes: list[str]) -> None:
+    """Refuse things of scenes that the study lacks.
+
+    Raises:
+        StudyError: a name that is no scene's.
+    """
+    for name in study.part(ThingsPart).things:
+        if name not in scenes and name not in study.left_out:
+            raise StudyError(f"things: the study has no scene {name!r}{did_you_mean(name, scenes)}")

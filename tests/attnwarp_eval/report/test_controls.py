@@ -1,0 +1,66 @@
+"""Oracle: figures written by hand, which a control moves or does not."""
+
+import written_runs
+
+from attnwarp_eval.document.write import markdown
+from attnwarp_eval.report.build import build
+
+SCENES = [f"scene{k}" for k in range(8)]
+STUDY = {
+    "name": "hand-made",
+    "scenes": SCENES,
+    "editing": {"editor": {"ideal": {}}},
+    "variants": {"full": {}, "half": {"options": {"a0": 0.5}}, "mirrored": {"control": "mirrored"}},
+    "probes": {"ideal": ["full", "half", "mirrored"]},
+    "ablations": [{"title": "Weights", "probe": "ideal", "baseline": "full", "variants": ["half"]}],
+}
+IDEAL = {
+    "share": 1.0, "settled": 0.4, "frequencies": [0.5, 0.5], "agreement": 0.5, "fault": None,
+    "part_share": 0.01, "answers": [0], "edited": 2,
+}  # fmt: skip
+SPEC = {
+    "editor": {"ideal": {"parts": 12, "colors": 2, "settled": 0.4, "cross": "paint"}},
+    "settings": {"steps": 8},
+}
+
+
+def report(folder, mirrored, study=STUDY):
+    """A run in which half the weight moves nothing that can be told; ``mirrored`` is the control's own figure."""
+    cells = []
+    for k, scene in enumerate(SCENES):
+        wobble = 0.01 * (-1) ** k
+        figures = {
+            "full": 0.8 + 0.002 * k,
+            "half": 0.8 + 0.002 * k + wobble,
+            "mirrored": mirrored + 0.003 * k,
+        }
+        for name in study["variants"]:
+            views = [("parts/a", 30.0, {"parts.seen.edit": figures[name]})]
+            data = written_runs.record(views, spec=SPEC, ideal=IDEAL)
+            cells.append(written_runs.outcome("ideal", scene, [name], data, f"{scene}-{name}"))
+    return markdown(build(written_runs.results(study, cells), folder, timings=False))
+
+
+def row(text):
+    return next(line for line in text.splitlines() if line.startswith("| half | parts.seen.edit"))
+
+
+def test_a_figure_that_no_control_moves_is_blind(tmp_path):
+    text = report(tmp_path, 0.8)
+    assert "| blind |" in row(text) and "can't tell" not in row(text)
+    assert "**Blind:**" in text and "parts.seen.edit" in text
+
+
+def test_a_figure_that_a_control_moves_cannot_tell(tmp_path):
+    text = report(tmp_path, 0.3)
+    assert "| can't tell |" in row(text) and "**Blind:**" not in text
+
+
+def test_a_control_that_does_better_is_no_control(tmp_path):
+    assert "| blind |" in row(report(tmp_path, 0.95))
+
+
+def test_without_controls_nothing_is_blind(tmp_path):
+    variants = {name: STUDY["variants"][name] for name in ("full", "half")}
+    study = {**STUDY, "variants": variants, "probes": {"ideal": ["full", "half"]}}
+    assert "| can't tell |" in row(report(tmp_path, 0.8, study))
