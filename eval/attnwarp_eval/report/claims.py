@@ -13,6 +13,7 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.metrics.multiview import ABOVE_FLOOR, BELOW_FLOOR
 from attnwarp_eval.scene.yaml import read_yaml
+from attnwarp_eval.statistics.contrasts import Contrast, contrast
 from attnwarp_eval.statistics.intervals import (
     ROUNDING,
     ByView,
@@ -142,7 +143,17 @@ class JudgedClaim:
     """Scenes in which both sides disagree less than true views do."""
     parts: Parts | None = None
     """Parts of the contrast's spread between scenes."""
+    flips: Contrast | None = None
+    """Sign-flip test on the metric's scale that decides where the scenes are a sample."""
 
+
+SAMPLED = (
+    "**In general** is said of {scenes}, and scenes like these. Flipped signs of the scenes'"
+    " differences decide; errors are compared as ratios (×). The interval is the test's, at the"
+    " level that the adjustment leaves, so it agrees with the verdict. **p by t** is Student's on"
+    " the same scale, not adjusted. Below six scenes there is no verdict."
+)
+"""Paragraph on a report whose scenes are a sample."""
 
 Comparison = tuple[str, str, frozenset[str]]
 """A probe, a metric and two variants."""
@@ -200,28 +211,37 @@ def _tuples(entry: dict[str, Any]) -> dict[str, Any]:
 def judge(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
     """Every claim that the run has measurements for, with its verdict.
 
-    p-values are adjusted over the claims (Benjamini-Hochberg). A claim about the editor's working
+    Where the scenes are a sample of a population, flipped signs decide, else Student's t. p-values
+    are adjusted over the claims (Benjamini-Hochberg). A claim about the editor's working
     is judged for each of its editors; :func:`together` makes one verdict of them.
     """
     each = [one for claim in claims for one in claim.of_each_editor()]
     measurements = [(claim, m) for claim in each if (m := claim.measure(results)) is not None]
     contrasts = [paired(m.a, m.b) for _, m in measurements]
-    adjusted = benjamini_hochberg([contrast.p for contrast in contrasts])
+    sampled = bool(results.study.sampled)
+    flips = [of_scale(claim, m) if sampled else None for claim, m in measurements]
+    adjusted = benjamini_hochberg(
+        [
+            by_t.p if test is None else test.flips.p
+            for by_t, test in zip(contrasts, flips, strict=True)
+        ]
+    )
     return [
         JudgedClaim(
             claim,
             m.metric,
             m.sides,
-            contrast,
+            by_t,
             agreement(m.a, m.b, claim.sign),
             _here(claim, m, len(results.study.scenes)),
-            _in_general(claim, contrast, p),
+            _in_general(claim, by_t, p) if test is None else _of_sample(claim, test, p),
             p,
             _below_floor(m),
             parts(m.a, m.b),
+            test,
         )
-        for (claim, m), contrast, p in zip(measurements, contrasts, adjusted, strict=True)
-        if contrast.views
+        for (claim, m), by_t, test, p in zip(measurements, contrasts, flips, adjusted, strict=True)
+        if by_t.views
     ]
 
 
@@ -268,6 +288,29 @@ def _in_general(claim: Claim, contrast: Interval, adjusted_p: float) -> Verdict:
     return "holds" if claim.sign * contrast.mean > 0 else "does not hold"
 
 
+def of_scale(claim: Claim, measured: Measured) -> Contrast:
+    """The difference that a claim predicts, on the scale of its metric.
+
+    A side that is compared with a number is compared plainly.
+    """
+    metric = probe(claim.probe).metric(measured.metric)
+    scale = metric.scale if len(measured.sides) > 1 else "plain"
+    return contrast(measured.a, measured.b, scale, floor=metric.atol)
+
+
+def _of_sample(claim: Claim, test: Contrast, adjusted_p: float) -> Verdict:
+    found = test.verdict(claim.expect, adjusted_p=adjusted_p)
+    told: dict[str, Verdict] = {"better": "holds", "worse": "does not hold"}
+    return told.get(found, "can't tell")
+
+
+def _shown(test: Contrast, adjusted_p: float) -> str:
+    """A difference with the interval that agrees with its verdict; ratios as factors."""
+    mean, low, high = map(number, test.shown(test.level(adjusted_p)))
+    sign = "× " if test.scale == "ratio" else ""
+    return f"{sign}{mean} ({low} to {high})"
+
+
 def variant_like(
     results: Results, data: Mapping[str, Any], name: str, *, own: bool = False
 ) -> str | None:
@@ -312,7 +355,10 @@ def claims(results: Results, findings: Sequence[JudgedClaim]) -> Section:
         claim = finding.claim
         sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
         alone = len(finding.sides) == 1
-        contrast = f"against {number(claim.against)}" if alone else spread(finding.contrast)
+        difference = f"against {number(claim.against)}" if alone else spread(finding.contrast)
+        if finding.flips is not None:
+            difference = _shown(finding.flips, finding.p)
+        student = [] if finding.flips is None else [number(finding.flips.student.p)]
         agree, views = finding.agreement
         rows.append(
             [
@@ -321,8 +367,9 @@ def claims(results: Results, findings: Sequence[JudgedClaim]) -> Section:
                 finding.verdict,
                 _scenes(finding, scenes),
                 f"{agree} of {views}",
-                contrast,
+                difference,
                 number(finding.p),
+                *student,
                 sides,
                 finding.metric,
             ]
@@ -332,7 +379,7 @@ def claims(results: Results, findings: Sequence[JudgedClaim]) -> Section:
         if editors and finding is own[-1]:
             here, verdict = together(own, editors)
             text = f"**{declared[claim.id].text}: both editors together**"
-            rows.append([text, here, verdict, *["–"] * 5, finding.metric])
+            rows.append([text, here, verdict, *["–"] * (5 + len(student)), finding.metric])
     section = Section("What was expected, and what was seen")
     if not rows:
         section.text = ["Nothing that a claim speaks of was measured."]
@@ -351,6 +398,8 @@ def claims(results: Results, findings: Sequence[JudgedClaim]) -> Section:
             " that the difference is theirs."
         ),
     ]
+    if results.study.sampled:
+        section.text.append(SAMPLED.format(scenes=results.study.sampled))
     if any(finding.metric.startswith(ABOVE_FLOOR) for finding in findings):
         section.text.append(
             f"{BELOW_FLOOR} The column of scenes names those in which both sides are."
@@ -363,6 +412,7 @@ def claims(results: Results, findings: Sequence[JudgedClaim]) -> Section:
         "views that agree",
         "difference",
         "adjusted p",
+        *(["p by t"] if results.study.sampled else []),
         "measured",
         "metric",
     ]

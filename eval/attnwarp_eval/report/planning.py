@@ -13,7 +13,7 @@ import numpy as np
 from attnwarp_eval.document.model import Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.metrics.registry import Metric
-from attnwarp_eval.report.claims import load_claims
+from attnwarp_eval.report.claims import load_claims, of_scale
 from attnwarp_eval.report.settling import seconds_of
 from attnwarp_eval.statistics.contrasts import Contrast, contrast
 from attnwarp_eval.statistics.planning import MOST_SCENES, scenes_needed
@@ -78,9 +78,7 @@ def _contrasts(results: Results) -> Iterator[tuple[str, str, Metric, Contrast]]:
         found = claim.measure(results)
         if found is not None:
             metric = probe(claim.probe).metric(found.metric)
-            scale = metric.scale if len(found.sides) > 1 else "plain"
-            value = contrast(found.a, found.b, scale, floor=metric.atol)
-            yield claim.text, found.metric, metric, value
+            yield claim.text, found.metric, metric, of_scale(claim, found)
     for table in results.study.ablations:
         own = report_of(table.probe)
         for name in table.variants:

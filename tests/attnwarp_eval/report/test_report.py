@@ -231,6 +231,27 @@ def test_a_claim_is_seen_here_and_holds_in_general_when_every_scene_agrees():
     assert set(finding.sides) == {"good", "slipped"}
 
 
+@pytest.mark.parametrize(("drawn", "verdict"), [(8, "holds"), (5, "can't tell")])
+def test_of_a_population_flipped_signs_decide_on_the_metrics_scale(drawn, verdict):
+    names = [f"drawn-{k}" for k in range(drawn)]
+    # A skewed difference, of the same sign in every scene: t cannot tell it.
+    gains = [3.0**k for k in range(drawn)]
+    cells = [
+        written_runs.outcome("warp", scene, [who], record([value]), f"{who}-{scene}")
+        for scene, gain in zip(names, gains, strict=True)
+        for who, value in (("good", 0.1), ("slipped", 0.1 * (1 + gain)))
+    ]
+    content = study(scenes={"drawn": drawn, "seed": 7})
+    run = written_runs.results(content, cells)
+    (finding,) = judge(run, [SLIP_CLAIM])
+    logs = np.log1p(gains)
+    signs = np.array(list(itertools.product([1, -1], repeat=drawn)))
+    expected = (np.abs(signs @ logs) >= logs.sum() - 1e-9).mean()
+    assert finding.p == pytest.approx(expected) and finding.verdict == verdict
+    assert finding.flips.student.p == pytest.approx(stats.ttest_1samp(logs, 0).pvalue)
+    assert finding.flips.shown()[0] == pytest.approx(np.exp(logs.mean()))
+
+
 def test_a_claim_finds_its_sides_by_content_and_not_by_name():
     renamed = results(
         CLEAR, variants={"good": {"set": {"pixel_centers": "integer"}}, "slipped": {}}
