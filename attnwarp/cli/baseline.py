@@ -25,6 +25,7 @@ from attnwarp.cli.options import (
     AntialiasedOption,
     DataArgument,
     DeviceOption,
+    DtypeOption,
     MaxSizeOption,
     Reading,
     ScreenFilterOption,
@@ -69,6 +70,7 @@ def baseline(
     screen_filter: ScreenFilterOption = None,
     max_size: MaxSizeOption = None,
     device: DeviceOption = "auto",
+    dtype: DtypeOption = "auto",
     threads: ThreadsOption = None,
     control: ControlOption = None,
     turntable: TurntableOption = None,
@@ -98,7 +100,7 @@ def baseline(
         warn_of_misfit(ply, splats, dataset)
         result, page = run_baseline(
             method, dataset, splats, editor, instruction, settings, out,
-            budget=budget, max_size=max_size, device=device, threads=threads,
+            budget=budget, max_size=max_size, device=device, dtype=dtype, threads=threads,
             control=control, turntable=turntable, report=report,
         )  # fmt: skip
         ended = f", cut short by its {result.cut.replace('_', ' ')}" if result.cut else ""

@@ -33,6 +33,7 @@ from attnwarp.cli.options import (
     AntialiasedOption,
     DataArgument,
     DeviceOption,
+    DtypeOption,
     Kind,
     MaxSizeOption,
     Reading,
@@ -125,6 +126,7 @@ def edit(
     max_size: MaxSizeOption = None,
     store: Annotated[Store, typer.Option(help="Where recorded features are kept.")] = Store.cpu,
     device: DeviceOption = "auto",
+    dtype: DtypeOption = "auto",
     threads: ThreadsOption = None,
     control: ControlOption = None,
     turntable: TurntableOption = None,
@@ -189,8 +191,8 @@ def edit(
             ),
             source=source,
             source_picture=source_picture, masks=masks, words=words,
-            segmenter=segmenter or SEGMENTER, max_size=max_size, store=store.value, device=device,
-            threads=threads, control=control, turntable=turntable,
+            segmenter=segmenter or SEGMENTER, max_size=max_size, store=store.value,
+            device=device, dtype=dtype, threads=threads, control=control, turntable=turntable,
             report=report,
         )  # fmt: skip
         seconds = sum(result.seconds.values())

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from attnwarp.cli.options import DeviceOption
+from attnwarp.cli.options import DeviceOption, DtypeOption
 from attnwarp.editing.small import check_words, guide_of
 from attnwarp.errors import InputWarning
 from attnwarp.reporting import reporter
@@ -103,6 +103,7 @@ def edit_image(
         Path | None, typer.Option("--mask", help="PNG file for the mask that --where gives.")
     ] = None,
     device: DeviceOption = "auto",
+    dtype: DtypeOption = "auto",
     threads: ThreadsOption = None,
 ) -> None:
     """Edit a picture by an instruction."""
@@ -130,7 +131,7 @@ def edit_image(
     import numpy as np
     import torch
 
-    from attnwarp.devices import choose
+    from attnwarp.devices import choose, type_of
     from attnwarp.editing.editor import edit, own_size, side_multiple
     from attnwarp.editing.segment import load_segmenter
     from attnwarp.editing.small import check_instruction, load_editor, thread_count
@@ -139,7 +140,7 @@ def edit_image(
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
     given = {name: value for name, value in guidance.items() if value is not None}
     device = choose(device, splats=False)
-    model = load_editor(editor, device=device, **given)
+    model = load_editor(editor, device=device, dtype=type_of(dtype, device), **given)
     check_instruction(editor, model, instruction)
     torch.set_num_threads(thread_count(model, threads))
     longest = size or own_size(model)

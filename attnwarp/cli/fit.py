@@ -135,11 +135,14 @@ def fit(
             device,
             report,
         )
+        from attnwarp.devices import peak_memory
+
+        place = result.gaussians.means.device
         last = result.history[-1]
         held = f", held-out PSNR {last.psnr:.2f} dB" if last.psnr is not None else ""
         typer.echo(
             f"{out / 'splats.ply'}: {len(result.gaussians)} splats, {result.iteration} iterations"
-            f" in {result.seconds:.0f} s{held}"
+            f" in {result.seconds:.0f} s{peak_memory(str(place))}{held}"
         )
         if result.stopped == "asked":
             report.log("stopped; the same command goes on from here")

@@ -57,6 +57,14 @@ DeviceOption = Annotated[
     str, typer.Option(help="cpu, cuda, or auto: a GPU where there is one.", metavar="DEVICE")
 ]
 
+DtypeOption = Annotated[
+    str,
+    typer.Option(
+        help="Of the editor: float32, float16, bfloat16, or auto: float16 on a GPU.",
+        metavar="TYPE",
+    ),
+]
+
 DataArgument = Annotated[
     Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
 ]

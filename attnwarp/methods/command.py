@@ -13,7 +13,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp.camera import Camera
-from attnwarp.devices import choose
+from attnwarp.devices import choose, peak_memory, type_of
 from attnwarp.editing.editor import own_size
 from attnwarp.editing.segment import load_segmenter
 from attnwarp.editing.small import bundled, check_instruction, load_editor, thread_count
@@ -88,6 +88,7 @@ def edit_dataset(
     max_size: int | None,
     store: Any,
     device: str,
+    dtype: str = "auto",
     threads: int | None,
     control: bool | None = None,
     turntable: Path | None = None,
@@ -111,6 +112,7 @@ def edit_dataset(
         max_size: larger pictures are averaged down to it.
         store: see :func:`attnwarp.methods.attention_warping`.
         device: of the editor and the splats, "auto", "cpu" or "cuda".
+        dtype: of the editor; see :func:`attnwarp.devices.type_of`.
         threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
         control: also edit the page's views each alone; None does so with a bundled editor.
         turntable: file of the scene's turn, GIF or MP4.
@@ -143,7 +145,7 @@ def edit_dataset(
         # Again in the edit, but here before an editor is loaded and a fit spends its minutes.
         check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
     segments = None if masks is None else _masks(masks, views.cameras, pictures, report)
-    editor = load_editor(editor_name, device=device)
+    editor = load_editor(editor_name, device=device, dtype=type_of(dtype, device))
     check_instruction(editor_name, editor, instruction)
     if words is not None:
         segments = _by_words(words, segmenter, device, views.cameras, images, out, report)
@@ -172,6 +174,7 @@ def edit_dataset(
         store=store,
         report=report,
     )
+    _report_memory(device, report)
     if result.gaussians.kind == "2d":
         # Other programs take no splats of two scales.
         write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
@@ -199,6 +202,7 @@ def run_baseline(
     budget: Budget,
     max_size: int | None,
     device: str,
+    dtype: str = "auto",
     threads: int | None,
     control: bool | None = None,
     turntable: Path | None = None,
@@ -217,6 +221,7 @@ def run_baseline(
         budget: limits of the run.
         max_size: larger pictures are averaged down to it.
         device: of the editor and the splats, "auto", "cpu" or "cuda".
+        dtype: of the editor; see :func:`attnwarp.devices.type_of`.
         threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
         control: also edit the page's views each alone; None does so with a bundled editor.
         turntable: file of the scene's turn, GIF or MP4.
@@ -234,7 +239,7 @@ def run_baseline(
     device = choose(device, report)
     views = load_views(dataset, max_size=max_size)
     images = images_of(views)
-    editor = load_editor(editor_name, device=device)
+    editor = load_editor(editor_name, device=device, dtype=type_of(dtype, device))
     check_instruction(editor_name, editor, instruction)
     torch.set_num_threads(thread_count(editor, threads))
     if settings.size is None:
@@ -252,11 +257,18 @@ def run_baseline(
         budget=budget,
         report=report,
     )
+    _report_memory(device, report)
     page = show_edit(
         workdir_of(out), splats, views.cameras, images, turntable=turntable, report=report,
         editor=editor if _has_control(control, editor_name) else None,
     )  # fmt: skip
     return result, page
+
+
+def _report_memory(device: str, report: Reporter) -> None:
+    """Say how much of a GPU's memory was taken."""
+    if peak := peak_memory(device):
+        report.log(f"edited{peak}")
 
 
 def _by_words(

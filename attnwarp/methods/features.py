@@ -68,10 +68,15 @@ class Features:
             branches,
             self._kept(branches),
             s.steps,
-            dtype=getattr(torch, s.feature_type),
+            dtype=self._stored(),
             store=self.store / str(view) if isinstance(self.store, Path) else self.store,  # type: ignore[arg-type]
             chosen=s.feature_range(),
         )
+
+    def _stored(self) -> torch.dtype:
+        """Precision of what is recorded: no wider than the editor's own, which loses nothing."""
+        own, chosen = self.editor.unet.dtype, getattr(torch, self.settings.feature_type)
+        return own if own.itemsize < chosen.itemsize else chosen
 
     def branches(self, guidance: float | None) -> tuple[str, ...]:
         """Guidance branches of a batch with a text guidance."""

@@ -6,7 +6,7 @@ import pytest
 import torch
 from edit_folders import Watched
 
-from attnwarp.devices import choose, device_of
+from attnwarp.devices import choose, device_of, type_of
 from attnwarp.errors import InputError, MissingExtraError
 
 
@@ -51,3 +51,8 @@ def test_splats_on_a_gpu_need_the_extra(gpu, without_warp):
 def test_an_unknown_device_is_refused():
     with pytest.raises(InputError, match="device 'gpu': unknown, expected cpu or cuda"):
         device_of("gpu")
+
+
+def test_an_unknown_precision_is_refused_with_the_known_ones():
+    with pytest.raises(InputError, match="dtype 'half': unknown, expected one of auto, float32"):
+        type_of("half", "cpu")

@@ -94,3 +94,27 @@ def test_words_that_no_training_text_has_are_named_and_no_others():
         for text in ("Make the ground snow!", "turn the man into bronze, at night", "striped"):
             check_instruction("small-plain", editor, text)
         check_instruction("a/folder", editor, "zorgoblatt")
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [
+        *((name, torch.bfloat16) for name in ("small", "small-plain")),
+        *(
+            pytest.param(name, torch.float16, marks=pytest.mark.slow)
+            for name in ("small", "small-plain")
+        ),
+    ],
+)
+def test_half_precision_changes_an_edit_by_less_than_40_db(name, dtype):
+    """Oracle: the same edit in float32."""
+    ramp = np.linspace(0, 1, 32, dtype=np.float32)
+    picture = np.stack(
+        [np.broadcast_to(ramp, (32, 32)), np.full((32, 32), 0.4), ramp[:, None] + 0 * ramp], -1
+    )
+    whole, half = (
+        edit(load_editor(name, dtype=each), [picture], "make it red", steps=4).images[0]
+        for each in (torch.float32, dtype)
+    )
+    assert np.abs(whole - picture).max() > 0.1
+    assert -10 * np.log10(np.square(whole - half).mean()) > 40
