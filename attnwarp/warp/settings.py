@@ -19,6 +19,7 @@ GaussianFilter = Literal["none", "printed", "facing", "camera_frame", "source_in
 SplatDepth = Literal["intersection", "center"]
 DepthStatistic = Literal["expected", "median"]
 MaskResize = Literal["area", "bilinear", "nearest"]
+UndefinedDepth = Literal["none", "farthest"]
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,8 @@ class WarpSettings(Settings):
             peak along the ray for a 3D one) or "center" (the z of the splat's centre, as in
             gsplat).
         depth_statistic: "expected" or "median" depth along the ray.
+        undefined_depth: what stands where the render has no depth: "none", or the view's largest
+            depth ("farthest").
         depth_interpolation: how depth reaches the centres of a feature grid, see
             :func:`attnwarp.warp.resize_depth`.
         depth_spread: taps that differ by more than this fraction are not blended; None blends
@@ -91,6 +94,7 @@ class WarpSettings(Settings):
     normal_angle: Annotated[float, Range(0, 180)] = 60.0
     depth: SplatDepth = "intersection"
     depth_statistic: DepthStatistic = "median"
+    undefined_depth: UndefinedDepth = "none"
     depth_interpolation: DepthInterpolation = "inverse"
     depth_spread: Weight | None = 0.05
     mask_resize: MaskResize = "area"
@@ -118,6 +122,7 @@ PRESETS: Named[WarpSettings] = Named(
         gaussian_filter="camera_frame",
         depth="center",
         depth_statistic="expected",
+        undefined_depth="farthest",
         depth_interpolation="bilinear",
         depth_spread=None,
         mask_resize="bilinear",
@@ -139,7 +144,8 @@ has to be right, so that this preset fails only where the text does.
 where the rasteriser samples at +0.5; no test of the sign of z; the source's size in the bounds
 test; a photometric test of 0.2 on the unedited images and the target's segment in the mask;
 camera-space normals, flipped to the camera and compared across two different camera frames, of
-which pairs within 60 degrees are kept; depth of the splats' centres; the mask made at image size
+which pairs within 60 degrees are kept; depth of the splats' centres, and the view's largest where
+there is none; the mask made at image size
 and resized bilinearly, which looks at 4 of its pixels.
 
 ``corrected``: what measurement against truth says is right, and the default. Half-pixel centres;

@@ -325,8 +325,8 @@ def render_surface(
     Args:
         gaussians: to render.
         camera: whose view is rendered; (H, W) is its size.
-        settings: their ``depth`` and ``depth_statistic`` choose the depth. 3D splats have "peak"
-            depth in place of "intersection".
+        settings: their ``depth``, ``depth_statistic`` and ``undefined_depth`` choose the depth. 3D
+            splats have "peak" depth in place of "intersection".
         near: nothing nearer than this depth is seen, in scene units; a hundredth of the splats'
             median distance if left out.
         backend: of :func:`attnwarp.render.render`.
@@ -354,6 +354,10 @@ def render_surface(
         plane = near_plane(gaussians, camera) if near is None else near
         seen = render(gaussians, camera, backend=backend, depth=how, near=plane)
     z = seen.depth if settings.depth_statistic == "expected" else seen.median_depth
+    if settings.undefined_depth == "farthest":
+        undefined = z.isnan()
+        farthest = torch.where(undefined, -torch.inf, z).max()
+        z = torch.where(undefined & farthest.isfinite(), farthest, z)  # none where nothing is seen
     return Surface(
         z.cpu(), seen.normal.cpu(), seen.alpha.cpu(), seen.color.cpu(), dict(seen.counters)
     )

@@ -65,7 +65,8 @@ def warp_reads(settings: WarpSettings, truth: bool = False) -> set[str]:
     idle |= limits[False] - limits[True] - {f"set.{rule.setting}" for rule in RULES}
     idle -= {"set.depth_spread"}
     if truth:
-        idle |= {"set.depth", "set.depth_statistic", "set.gaussian_filter", "set.opaque"}
+        idle |= {"set.depth", "set.depth_statistic", "set.undefined_depth"}
+        idle |= {"set.gaussian_filter", "set.opaque"}
     elif settings.gaussian_filter not in _WITHOUT_ANGLE:
         idle -= {"set.normal_angle"}
     return {"preset", *(f"set.{field.name}" for field in fields(WarpSettings))} - idle

@@ -67,6 +67,7 @@ def test_every_field_changes_what_it_says():
         "normal_angle": (20.0, incidence),
         "depth": ("intersection", {}),
         "depth_statistic": ("median", {}),
+        "undefined_depth": ("none", {}),
         "depth_interpolation": ("nearest", {}),
         "depth_spread": (0.001, {}),
         "mask_resize": ("nearest", {}),

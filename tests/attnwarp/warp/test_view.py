@@ -480,3 +480,17 @@ def test_a_layers_mask_drops_pixels_whose_own_correspondence_is_undefined():
     assert not view.at((32, 32)).mask[undefined].any()
     features = torch.ones(2, 32, 32)
     assert view.at((32, 32)).warp(features).shape == (2, 32, 32)
+
+
+def test_undefined_depth_is_the_views_largest():
+    splats, camera = shell(300), orbit(0, size=40)
+    plain = render_surface(splats, camera, preset("corrected"))
+    filled = render_surface(splats, camera, preset("corrected", undefined_depth="farthest"))
+    depth, other = plain.depth.numpy(), filled.depth.numpy()
+    undefined = np.isnan(depth)
+    assert undefined.any() and not undefined.all()
+    assert np.array_equal(other[~undefined], depth[~undefined])
+    assert (other[undefined] == np.nanmax(depth)).all()
+    away = Camera.look_at((9, 0, 0), (18, 0, 0), width=8, height=8, fov_y=20, up=(0, 0, 1))
+    far = preset("corrected", undefined_depth="farthest")
+    assert torch.isnan(torch.as_tensor(render_surface(splats, away, far).depth)).all()
