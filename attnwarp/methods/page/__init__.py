@@ -40,10 +40,10 @@ MOST_VIEWS = 5
 MOST_SPLATS = 100_000
 """Splats on the page, those that cover most; ``edited.ply`` has the rest."""
 
-LONGEST = 768
+LONGEST = 512
 """Longest side of a picture on the page, in px."""
 
-EXACT, QUALITY = 256, 90
+EXACT, QUALITY = 128, 85
 """Longest side in px of pictures that are kept exactly, and JPEG quality of larger ones, of 100."""
 
 CANVAS = 512
@@ -77,7 +77,8 @@ def show_edit(
         The path of the page.
     """
     page = _Page(folder, cameras, images, before)
-    if editor is not None:
+    # Views that a method edits alone are their own control.
+    if editor is not None and not page.edits_alone:
         views = [page.names.index(name) for name in page.shown]
         scene = Scene.checked(cameras, images, page.segments)
         edited_alone(folder, before, scene, editor, views, report)
@@ -130,16 +131,22 @@ class _Page:
         self.points = before.world_means()
         self.turn = orbit(cameras, self.points, first=self.first)
 
+    @property
+    def edits_alone(self) -> bool:
+        """True of a method that edits each view alone, with noise of its own."""
+        method, noise = self.manifest["method"], self.manifest["settings"]["noise"]
+        return bool(method == "by_view" and noise == "fresh")
+
     def head(self) -> str:
         """The instruction and what was done."""
-        method = self.manifest["method"].replace("_", " ")
+        method = self.manifest["method"]
         cut = self.result["cut"]
         ended = f", cut short by its {cut.replace('_', ' ')}" if cut else ""
         lines = [
             f"<h1>{escape(self.manifest['instruction'])}</h1>",
-            f"<p>Edited by {escape(method)}: {len(self.edited)} of {len(self.names)} views were"
-            f" edited, and the splats were tuned on them{ended}. The edited scene is"
-            " <code>edited.ply</code> in this folder"
+            f"<p>Edited by the method <code>{escape(method)}</code>: {len(self.edited)} of"
+            f" {len(self.names)} views were edited, and the splats were tuned on them{ended}."
+            " The edited scene is <code>edited.ply</code> in this folder"
             + (
                 f"; viewers of 3DGS open <code>{VIEWER_PLY}</code>"
                 if self.folder.has(VIEWER_PLY)

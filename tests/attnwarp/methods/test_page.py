@@ -130,6 +130,11 @@ def test_a_view_edited_alone_is_the_one_of_the_method_that_edits_every_view_alon
         assert np.array_equal(read_image(folder / "control" / f"v{view}.png"), picture)
 
 
+def test_a_method_that_edits_views_alone_has_no_other_control(edits):
+    folder, text = edits("by_view", steps=1)
+    assert not (folder / "control").exists() and "edited alone" not in text
+
+
 def test_views_disagree_by_the_difference_of_shifted_pictures():
     """Two cameras before a wall, 4 px apart: the closed form is a shift."""
     wall = Gaussians(

@@ -101,7 +101,7 @@ def test_nothing_is_cut_no_text_overlaps_and_every_picture_enlarges(edit, width)
     wide, cut, overlaps, large = asyncio.run(person())
     assert wide <= width
     assert cut == [] and overlaps == []
-    assert len(large) == 5 * 5 and all(large)
+    assert len(large) == 5 * 4 and all(large)
 
 
 @pytest.mark.parametrize("width", WIDTHS)
