@@ -37,7 +37,8 @@ def notices(scene: Scene) -> list[str]:
         return []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        shapes = scene.shapes()
+        # Built anew: shapes that are there already give no notice again.
+        shapes = Scene(scene.spec, scene.path).shapes()
         warn_of_strays(scene, shapes)
         for shape in shapes:
             item = objects[shape.object_id]

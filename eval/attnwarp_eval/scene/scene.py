@@ -187,17 +187,24 @@ class Scene:
         stays.
         """
         cameras = self.spec.cameras.model_copy(update={"size": (int(width), int(height))})
-        return Scene(self.spec.model_copy(update={"cameras": cameras}), self.path)
+        copy = Scene(self.spec.model_copy(update={"cameras": cameras}), self.path)
+        if "_shapes" in self.__dict__:
+            copy.__dict__["_shapes"] = self._shapes
+        return copy
 
-    def shapes(self) -> list[Shape]:
+    def shapes(self) -> tuple[Shape, ...]:
         """Everything that has a surface, in world coordinates, each with its object's index as
-        ``object_id``.
+        ``object_id``. Built at the first call; notices of meshes are given then.
 
         Raises:
             SceneError: an object reaches farther than coordinates may, a mesh file is damaged, or a
                 body cannot be meshed.
         """
-        shapes = []
+        return self._shapes
+
+    @functools.cached_property
+    def _shapes(self) -> tuple[Shape, ...]:
+        shapes: list[Shape] = []
         for k, item in enumerate(self.spec.objects):
             for shape in self._build(item, k):
                 reach = float(np.abs(shape.bounds()).max())
@@ -208,7 +215,7 @@ class Scene:
                         self.path,
                     )
                 shapes.append(shape)
-        return shapes
+        return tuple(shapes)
 
     def _build(self, item: ObjectSpec, object_id: int) -> Iterator[Shape]:
         spec = item.shape

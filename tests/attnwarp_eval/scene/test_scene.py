@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from attnwarp_eval.scene.file import list_scenes, load_scene
+from attnwarp_eval.scene.meshes import read_mesh
 from attnwarp_eval.scene.scene import Scene, SceneError
 from attnwarp_eval.scene.shapes import MeshNotice
 from attnwarp_eval.truth import Geometry, two_view
@@ -251,6 +252,20 @@ def octahedron(extra=""):
         + "".join(f"f {face}\n" for face in faces)
         + extra
     )
+
+
+def test_shapes_are_built_once_for_a_scene_and_its_other_sizes(tmp_path, monkeypatch):
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans" / "ball.obj").write_text(octahedron())
+    read = []
+    monkeypatch.setattr(
+        "attnwarp_eval.scene.scene.read_mesh", lambda path: read.append(path) or read_mesh(path)
+    )
+    scene = load_scene(write(tmp_path, OWN))
+    read.clear()  # loading has checked the file
+    built = scene.shapes()
+    assert scene.shapes() is built and scene.with_size(8, 8).with_size(9, 9).shapes() is built
+    assert len(read) == 1
 
 
 def test_an_own_mesh_is_read_relative_to_the_file_and_its_bytes_are_part_of_the_content(tmp_path):
