@@ -137,6 +137,7 @@ def edit(
     latents: Tensor | None = None,
     on_step: Callable[[int, int, Tensor], None] | None = None,
     estimate: Callable[[int, Tensor], Tensor] | None = None,
+    regions: Sequence[npt.NDArray[Any]] | None = None,
 ) -> Edit:
     """Edit views together. Record or inject attention by running this inside
     :func:`attnwarp.editing.recording.record` or :func:`~attnwarp.editing.injection.inject`.
@@ -159,6 +160,8 @@ def edit(
         on_step: called with the step, the number of steps and the latents after each step.
         estimate: called with the step and the (B, C, h, w) clean latents that are predicted there;
             what it returns takes their place.
+        regions: (H, W) of each view in [0, 1]: what is edited, over which a bundled editor's noise
+            draws what the prompt leaves open. None for all of it; other editors pass over it.
 
     Returns:
         The edited views.
@@ -181,7 +184,9 @@ def edit(
             raise ValueError(f"latents: got latents and {name}, expected one of them")
     if pictures is not None and start is None:
         raise ValueError("pictures: got pictures without start, which alone begins from them")
-    task = editor.task(guides, prompt)
+    pools = regions is not None and hasattr(editor.unet, "region")
+    own: Any = editor
+    task = own.task(guides, prompt, regions) if pools else editor.task(guides, prompt)
     device, dtype = editor.unet.device, editor.unet.dtype
     timesteps = (
         editor.timesteps(steps)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
@@ -95,8 +96,20 @@ class InstructPix2Pix(Latent):
         """The guidance branches that run, in the order of the UNet's batch."""
         return tuple(branch_shares(self.text_guidance, self.image_guidance))
 
-    def task(self, guides: Sequence[npt.NDArray[Any]], prompt: str) -> Pix2PixTask:
-        """An edit of (H, W, 3) pictures in [0, 1] by one instruction."""
+    def task(
+        self,
+        guides: Sequence[npt.NDArray[Any]],
+        prompt: str,
+        regions: Sequence[npt.NDArray[Any]] | None = None,
+    ) -> Pix2PixTask:
+        """An edit of (H, W, 3) pictures in [0, 1] by one instruction.
+
+        Args:
+            guides: the pictures.
+            prompt: the instruction.
+            regions: (H, W) of each in [0, 1]: what is edited, over which a bundled editor's noise
+                draws what the instruction leaves open; None for all of it.
+        """
         pictures = tensor_of(guides, "guides", self.factor)
         before = self.raw_latents(pictures)  # not scaled, as the model was trained
         shares = branch_shares(self.text_guidance, self.image_guidance)
@@ -111,7 +124,14 @@ class InstructPix2Pix(Latent):
             torch.cat([source[name] for name in shares]).to(self.unet.dtype),
             views,
             shares,
+            None if regions is None else _on_grid(regions, (before.shape[2], before.shape[3])),
         )
+
+
+def _on_grid(regions: Sequence[npt.NDArray[Any]], size: tuple[int, int]) -> Tensor:
+    """(B, h, w) shares of each latent's pixels that regions cover."""
+    rows = [torch.from_numpy(np.asarray(region, np.float32))[None, None] for region in regions]
+    return torch.cat([torch.nn.functional.adaptive_avg_pool2d(row, size)[0] for row in rows])
 
 
 def branch_shares(text_guidance: float, image_guidance: float) -> dict[str, float]:
@@ -139,6 +159,7 @@ class Pix2PixTask:
         before: (branches x B, C, h, w).
         views: B.
         shares: of the branches in the output, in the order of the UNet's batch.
+        region: (B, h, w) of what is edited, for :class:`attnwarp.editing.small_unet.EditUNet`.
     """
 
     editor: InstructPix2Pix
@@ -146,6 +167,7 @@ class Pix2PixTask:
     before: Tensor
     views: int
     shares: dict[str, float]
+    region: Tensor | None = None
 
     @property
     def branches(self) -> tuple[str, ...]:
@@ -163,6 +185,8 @@ class Pix2PixTask:
         editor = self.editor
         noisy = torch.cat([latents] * len(self.branches))
         step = torch.tensor(timestep, device=latents.device)
+        if hasattr(editor.unet, "region"):
+            editor.unet.region = self.region
         output = editor.unet(
             torch.cat([noisy, self.before], dim=1),
             step,

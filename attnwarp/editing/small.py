@@ -206,7 +206,8 @@ def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | Depth
         name_or_folder: a bundled editor's name, a path, or "BASE,CONTROLNET", the paths of a
             Stable Diffusion and of its ControlNet.
         settings: as in :meth:`attnwarp.editing.pix2pix.InstructPix2Pix.from_folder` or in
-            :meth:`attnwarp.editing.controlnet.DepthControlNet.from_folder`.
+            :meth:`attnwarp.editing.controlnet.DepthControlNet.from_folder`. ``draws=False`` takes
+            from a bundled editor what lets the noise's mean choose an answer.
 
     Raises:
         InputError: no such editor or folder, or files that are missing, by name.
@@ -232,6 +233,12 @@ def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | Depth
             else {"guidance": DEPTH_GUIDANCE}
         )
         settings = {**guidance, **settings}
+    draws = settings.pop("draws", True)
     if control is None:
-        return InstructPix2Pix.from_folder(folder, **settings)
+        editor = InstructPix2Pix.from_folder(folder, **settings)
+        if not draws:
+            if not hasattr(editor.unet, "draw"):
+                raise InputError(f"draws: the editor {name_or_folder!r} has no draw; leave it out")
+            editor.unet.draw = None
+        return editor
     return DepthControlNet.from_folder(folder, control, **settings)

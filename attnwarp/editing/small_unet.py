@@ -35,16 +35,21 @@ class EditUNet(UNet2DConditionModel):
     and most of that is the picture before.
 
     Where the text leaves the answer open, the noise draws it: the mean of the noisy latents over
-    the picture, seen together with the text, is added to the text's tokens. So the first step
+    a region, seen together with the text, is added to the text's tokens. So the first step
     settles the answer, as low frequencies of the noise do in large models, and cross-attention is
     what the answer acts through.
 
     Attributes:
         draw: from the mean, at unit variance where all is noise, and the text's last token to what
             is added to all tokens; None adds nothing.
+        region: (V, h, w) weights in [0, 1] of where the noise is pooled, for each view of a batch
+            of V views times branches: what is edited. None is the whole picture, as in training.
+            The sum is divided by the root of the summed squares, so that white noise keeps its
+            variance whatever the region. Where a region is empty the whole picture counts.
     """
 
     draw: torch.nn.Module | None
+    region: Tensor | None = None
 
     # diffusers reads the configuration's names from this signature; it has no types.
     @functools.wraps(UNet2DConditionModel.__init__)  # type: ignore[misc]
@@ -72,8 +77,7 @@ class EditUNet(UNet2DConditionModel):
         """
         noisy, before = sample.split(self.config.out_channels, dim=1)
         if self.draw is not None:
-            cells = noisy.shape[2] * noisy.shape[3]
-            mean = noisy.mean(dim=(2, 3)) * cells**0.5
+            mean = self._pooled(noisy)
             drawn = self.draw(torch.cat([mean, encoder_hidden_states[:, -1]], dim=1))
             time = torch.as_tensor(timestep, dtype=sample.dtype, device=sample.device)
             share = ((time - SETTLED) / (OPEN - SETTLED)).clamp(0, 1)
@@ -84,3 +88,15 @@ class EditUNet(UNet2DConditionModel):
         )[0]
         result = before + change
         return UNet2DConditionOutput(sample=result) if return_dict else (result,)
+
+    def _pooled(self, noisy: Tensor) -> Tensor:
+        """(B, C) mean over the region at unit variance where all is white noise."""
+        if self.region is None:
+            cells = noisy.shape[2] * noisy.shape[3]
+            return noisy.mean(dim=(2, 3)) * cells**0.5
+        weights = self.region.to(noisy)
+        empty = weights.flatten(1).sum(1) == 0
+        weights = torch.where(empty[:, None, None], torch.ones_like(weights), weights)
+        weights = weights / weights.square().sum(dim=(1, 2), keepdim=True).sqrt()
+        tiled = weights.repeat(len(noisy) // len(weights), 1, 1)
+        return torch.einsum("bchw,bhw->bc", noisy, tiled)

@@ -23,7 +23,6 @@ from typing import Any, Protocol, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from attnwarp import check, losses
 from attnwarp.camera import Camera
@@ -37,7 +36,6 @@ from attnwarp.methods.pictures import (
     Image,
     enlarged,
     full_size,
-    mask_picture,
     resized,
     to_bytes,
 )
@@ -80,8 +78,8 @@ class Options(TypedDict, total=False):
             uninterrupted run, on one machine, with the same number of threads and without a budget
             in seconds.
         budget: limits of the run, :class:`Budget`; None for a whole run.
-        segments: what is edited: (H, W) bool masks of the views, or a function of a view's number
-            and picture. The original stays outside.
+        segments: what is edited: (H, W) masks of the views, bool or soft in [0, 1], or a function
+            of a view's number and picture. The original stays outside.
         checkpoint_seconds: between two checkpoints of tuning (30); more where one takes long.
         backend: of :func:`attnwarp.render.render` ("auto").
         report: receives how the run stands, :class:`attnwarp.reporting.Reporter`.
@@ -583,7 +581,8 @@ class _Run:
         for name, segment in zip(self.names, self.work.scene.segments or (), strict=False):
             path = f"segments/{name}.png"
             if not self.folder.has_picture(path):
-                self.folder.write_picture(path, mask_picture(torch.from_numpy(segment)))
+                share = np.repeat(segment[..., None].astype(np.float32), 3, axis=2)
+                self.folder.write_picture(path, to_bytes(share))
 
     def _sheet(self) -> Bytes:
         """Rows: before, the edits (black where none), the edited scene. Columns: views."""

@@ -99,6 +99,7 @@ class ByView(Method):
                 pictures=None if start is None else [work.picture(view) for view in batch],
                 noise=work.noise(0, batch),
                 on_step=lambda *_: step(),
+                regions=work.regions(batch),
             )
         about: dict[str, Any] = {"start": start}
         if start is not None:

@@ -107,7 +107,7 @@ class DGE(Method):
         drawn: list[list[str]] = []
         with work.guided(s.text_guidance), torch.no_grad():
             guides = [work.render(view, work.frozen) for view in group]
-            task = editor.task(guides, work.instruction)
+            task = editor.task(guides, work.instruction, work.regions(group))
             before = editor.encode([work.render(view, model) for view in group])
             noise = work.noise(number, group).to(before)
             x = editor.schedule.add_noise(before, noise, noised)
@@ -195,4 +195,7 @@ def _drawn(batch: Sequence[int], generator: torch.Generator) -> int:
 def _part(task: Any, views: Sequence[int]) -> Any:
     """The edit of some of the views of an InstructPix2Pix task."""
     rows = [branch * task.views + view for branch in range(len(task.branches)) for view in views]
-    return replace(task, text=task.text[rows], before=task.before[rows], views=len(views))
+    region = None if task.region is None else task.region[list(views)]
+    return replace(
+        task, text=task.text[rows], before=task.before[rows], views=len(views), region=region
+    )

@@ -57,7 +57,7 @@ class Geometry:
         if "target_image" in wanted:
             reads["target_image"] = scene.picture(target)
         if "target_segment" in wanted and scene.segments is not None:
-            reads["target_segment"] = scene.segments[target]
+            reads["target_segment"] = scene.segments[target] > 0.5
         warp = warp_view(
             before,
             scene.cameras[source],
@@ -126,7 +126,7 @@ class Geometry:
             warp = self.warp(first, target, self.work.frozen)
             surface = warp.rules["defined"].numpy()
             if scene.segments is not None:
-                surface = surface & scene.segments[target]
+                surface = surface & (scene.segments[target] > 0.5)
             return warp.mask.numpy(), surface
 
         return choose_chain(len(scene.cameras), source, s.sources, s.chain_coverage, seen)

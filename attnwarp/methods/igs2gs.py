@@ -97,5 +97,6 @@ class IGS2GS(Method):
                 pictures=[work.render(view, model)],
                 noise=work.noise(number, (view,)),
                 on_step=lambda *_: step(),
+                regions=work.regions([view]),
             )
         return [ViewEdit(result.images[0], {"start": start, "timesteps": result.timesteps})]

@@ -19,6 +19,8 @@ from attnwarp.methods.sight import Sight
 Image = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
+Segment = npt.NDArray[Any]
+"""(H, W) bool, or float32 in [0, 1] where a mask has soft edges: above 1/2 is inside."""
 Size = tuple[int, int]
 
 
@@ -97,12 +99,12 @@ def enlarged_change(original: Image, edited: Image) -> Image:
     return np.clip(original + fitted, 0, 1).astype(np.float32)
 
 
-def composite(edited: Image, original: Image, segment: Mask, how: str, blur: float) -> Image:
+def composite(edited: Image, original: Image, segment: Segment, how: str, blur: float) -> Image:
     """The edit inside a segment; the original or black outside.
 
     Args:
         edited, original: (h, w, 3) in [0, 1].
-        segment: (H, W) bool at any size.
+        segment: (H, W) bool or in [0, 1], at any size.
         how: "none", "black" or "original".
         blur: sigma in px of the edit's picture.
     """
@@ -121,7 +123,9 @@ def composite(edited: Image, original: Image, segment: Mask, how: str, blur: flo
     return np.clip(share * edited + (1 - share) * behind, 0, 1).astype(np.float32)
 
 
-def full_size(original: Image, edited: Image, segment: Mask | None, how: str, blur: float) -> Image:
+def full_size(
+    original: Image, edited: Image, segment: Segment | None, how: str, blur: float
+) -> Image:
     """:func:`enlarged_change` of an edit that was composited, held to its segment.
 
     An enlarged change reaches beyond the pixels of the edit that it comes from, and brings back the
@@ -130,13 +134,13 @@ def full_size(original: Image, edited: Image, segment: Mask | None, how: str, bl
     Args:
         original: (H, W, 3) in [0, 1].
         edited: (h, w, 3) in [0, 1], of :func:`composite`.
-        segment: (H, W) bool; None where all is edited.
+        segment: (H, W) bool or in [0, 1]; None where all is edited.
         how, blur: of :func:`composite`.
     """
     picture = enlarged_change(original, edited)
     if segment is None or how == "none" or edited.shape == original.shape:
         return picture
-    reached = segment
+    reached = segment > 0
     if blur > 0:
         import cv2
 

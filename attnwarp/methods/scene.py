@@ -17,12 +17,12 @@ from attnwarp.camera import Camera
 from attnwarp.digest import digest, digest_each
 from attnwarp.fit import FitSettings, Views, extent_of
 from attnwarp.gaussians import Gaussians
-from attnwarp.methods.pictures import Image, Mask
+from attnwarp.methods.pictures import Image, Segment
 from attnwarp.render import render
 
 Segments: TypeAlias = Sequence[npt.NDArray[Any]] | Callable[[int, Image], npt.NDArray[Any]]
-"""(H, W) bool masks of what is edited: one for each view, or a function of a view's number and its
-picture."""
+"""(H, W) masks of what is edited, bool or soft in [0, 1]: one for each view, or a function of a
+view's number and its picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +33,12 @@ class Scene:
         cameras: one for each view.
         images: (H, W, 3) sRGB, uint8, uint16 or float32 in [0, 1]. Photographs keep their type in
             memory; :meth:`picture` converts one.
-        segments: (H, W) bool, or None where all is edited.
+        segments: (H, W) bool, or float32 in [0, 1] with soft edges; None where all is edited.
     """
 
     cameras: list[Camera]
     images: list[npt.NDArray[Any]]
-    segments: list[Mask] | None
+    segments: list[Segment] | None
 
     @classmethod
     def checked(
@@ -75,9 +75,11 @@ class Scene:
             mask = np.asarray(segment)
             check.shape(mask, (camera.height, camera.width), name)
             if mask.dtype != np.bool_:
-                raise ValueError(f"{name}: got {mask.dtype}, expected bool")
+                if mask.dtype.kind != "f":
+                    raise ValueError(f"{name}: got {mask.dtype}, expected bool, or floating")
+                mask = checked_image(mask, name)
             masks.append(mask)
-        if not any(mask.any() for mask in masks):
+        if not any((mask > 0.5).any() for mask in masks):
             raise ValueError("segments: every one is empty, so nothing may change; True is edited")
         return cls(list(cameras), stored, masks)
 

@@ -312,6 +312,7 @@ class ViewEdits:
             noise=self.noise.of(start.views, shape, sights) if start.latents is None else None,
             latents=start.latents,
             on_step=lambda *_: step(),
+            regions=work.regions(start.views),
             estimate=self.estimates.change(sights, sources, kept if len(sights) == 1 else None),
         )
         return result.images, kept

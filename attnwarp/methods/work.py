@@ -15,7 +15,7 @@ from attnwarp.editing.editor import Editor, guided, shared_noise, side_multiple
 from attnwarp.editing.schedule import Grid, steps_as_published
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.noise import own_seed
-from attnwarp.methods.pictures import Image, Size, composite, edit_size, resized
+from attnwarp.methods.pictures import Image, Segment, Size, composite, edit_size, resized
 from attnwarp.methods.scene import Scene, near_of, render_picture
 from attnwarp.methods.settings import MethodSettings
 from attnwarp.reporting import Reporter
@@ -99,6 +99,11 @@ class Work:
             return picture
         s, segment = self.settings, self.scene.segments[view]
         return composite(picture, self.picture(view), segment, s.composite, s.composite_blur)
+
+    def regions(self, views: Sequence[int]) -> list[Segment] | None:
+        """Masks of views, for the noise of a bundled editor; None where everything is edited."""
+        segments = self.scene.segments
+        return None if segments is None else [segments[view] for view in views]
 
     def one_size(self, method: str) -> None:
         """Raise ValueError unless all views are edited at one size."""

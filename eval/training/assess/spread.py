@@ -128,7 +128,8 @@ def spread_section(
         "## Which answers an open instruction gets", "",
         f"{' or '.join(str(n) for n in sorted(noises))} noises a picture of {size} x {size} px, {steps} steps. An answer is the true one whose mean colour is nearest (CIEDE2000);"
         f" none: the picture before is nearer. Asked for: at least {LEAST_ANSWERS} answers, each in at least {100 * LEAST_SHARE:.0f} %"
-        " (`training/assess/spread.py`).", "",
+        " (`training/assess/spread.py`). The noise's mean draws the answer: over the whole picture, or over the mask where one is given. So"
+        " pictures that share noise tend to share the answer, the more so the more their masks overlap.", "",
         f"| instruction (world) | answers | none | answers with at least {100 * LEAST_SHARE:.0f} % | at least {LEAST_ANSWERS} |",
         "|---|---|---|---|---|",
     ]  # fmt: skip

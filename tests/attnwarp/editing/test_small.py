@@ -118,3 +118,50 @@ def test_half_precision_changes_an_edit_by_less_than_40_db(name, dtype):
     )
     assert np.abs(whole - picture).max() > 0.1
     assert -10 * np.log10(np.square(whole - half).mean()) > 40
+
+
+def test_noise_pooled_over_a_region_is_white_there_and_hears_nothing_outside():
+    """Oracle: the weighted sum in loops, and the variance of many white noises."""
+    unet = load_editor("small-plain").unet
+    region = torch.zeros(2, 8, 8)
+    region[0, 2:5, 3:6], region[0, 5, 3] = 1, 0.5
+    noises = torch.randn(4000, 48, 8, 8, generator=torch.Generator().manual_seed(0))
+    unet.region = region
+    pooled = unet._pooled(noises)
+    by_hand = (
+        sum(float(region[0, i, j]) * noises[0, :, i, j] for i in range(8) for j in range(8))
+        / float(region[0].square().sum()) ** 0.5
+    )
+    assert torch.allclose(pooled[0], by_hand, atol=1e-5)
+    assert abs(float(pooled[0::2].var()) - 1) < 0.02  # views take turns in a batch
+    changed = noises.clone()
+    changed[0, :, 6:] += 5
+    assert torch.equal(unet._pooled(changed)[0], pooled[0])
+    # Where nothing is edited the whole picture counts, as it does without a region.
+    unet.region = None
+    assert torch.allclose(unet._pooled(noises)[1], pooled[1], atol=1e-5)
+
+
+def test_an_open_instruction_hears_the_noise_inside_the_mask_alone():
+    """Oracle: the same edit of a network whose draw adds nothing."""
+    picture = np.full((32, 32, 3), 0.5, np.float32)
+    mask = np.zeros((32, 32), np.float32)
+    mask[8:24, 8:24] = 1
+    first = torch.randn(1, 48, 8, 8, generator=torch.Generator().manual_seed(1))
+    second = first.clone()
+    second[:, :, :2] = torch.randn(1, 48, 2, 8, generator=torch.Generator().manual_seed(2))
+
+    def drawn(noise, **more):
+        heard = []
+        editor = load_editor("small-plain")
+        editor.unet.draw.register_forward_hook(lambda net, args, out: heard.append(args[0][0, :48]))
+        edit(editor, [picture], "make it another color", steps=1, noise=noise, **more)
+        return heard[0]
+
+    assert torch.equal(drawn(first, regions=[mask]), drawn(second, regions=[mask]))
+    assert not torch.allclose(drawn(first), drawn(second), atol=0.1)
+
+
+def test_an_editor_without_its_draw_is_an_option():
+    assert load_editor("small-plain", draws=False).unet.draw is None
+    assert load_editor("small-plain").unet.draw is not None
