@@ -8,11 +8,18 @@ from typing import Annotated
 import typer
 
 from attnwarp.cli.edit_image import (
+    SEGMENTER,
+    AtOption,
+    BoxOption,
     ControlOption,
     EditorOption,
     InstructionOption,
+    MaskOption,
+    SegmenterOption,
     ThreadsOption,
     TurntableOption,
+    WhereOption,
+    check_segmenter,
 )
 from attnwarp.cli.files import (
     check_inputs_stay,
@@ -65,6 +72,17 @@ def baseline(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the method."),
     ] = None,
+    source: Annotated[
+        str | None, typer.Option(metavar="VIEW", help="View that is marked; the first if left out.")
+    ] = None,
+    masks: Annotated[
+        Path | None, typer.Option(help="Folder of PNG masks, NAME.png; white is edited.")
+    ] = None,
+    mask: MaskOption = None,
+    box: BoxOption = None,
+    at: AtOption = None,
+    words: WhereOption = None,
+    segmenter: SegmenterOption = None,
     kind: SplatKindOption = None,
     antialiased: AntialiasedOption = None,
     screen_filter: ScreenFilterOption = None,
@@ -81,11 +99,18 @@ def baseline(
     stopped = f"stopped; what {out} holds is whole, and the same command goes on from it"
     with clear_errors(stopped, out), reporter(title=out.name) as report:
         changes = assignments(change or [], {})
+        check_segmenter(segmenter, words)
         check_out(out)
-        check_inputs_stay([out / "edited.ply"], [ply])
+        check_inputs_stay([out / "edited.ply"], [ply, mask])
         check_words(instruction)
         guide_of(editor)  # refuses what is no editor
         from attnwarp import check, methods
+        from attnwarp.methods.marks import Marks, numbers
+
+        marks = Marks(
+            masks, mask, numbers(box, "X0,Y0,X1,Y1", "--box"), numbers(at, "X,Y", "--at"), words,
+            segmenter or SEGMENTER,
+        )  # fmt: skip
 
         others = [name for name in methods.METHODS if name != "attention_warping"]
         check.one_of(method, others, "METHOD")
@@ -100,7 +125,8 @@ def baseline(
         warn_of_misfit(ply, splats, dataset)
         result, page = run_baseline(
             method, dataset, splats, editor, instruction, settings, out,
-            budget=budget, max_size=max_size, device=device, dtype=dtype, threads=threads,
+            budget=budget, marks=marks, source=source, max_size=max_size, device=device,
+            dtype=dtype, threads=threads,
             control=control, turntable=turntable, report=report,
         )  # fmt: skip
         ended = f", cut short by its {result.cut.replace('_', ' ')}" if result.cut else ""

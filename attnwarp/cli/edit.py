@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,9 +14,12 @@ from attnwarp.cli.bundled_scene import SIZE, capture, exact_masks, is_scene
 from attnwarp.cli.edit_image import (
     MOST_PIXELS,
     SEGMENTER,
+    AtOption,
+    BoxOption,
     ControlOption,
     EditorOption,
     InstructionOption,
+    MaskOption,
     SegmenterOption,
     ThreadsOption,
     TurntableOption,
@@ -85,6 +89,9 @@ def edit(
     masks: Annotated[
         Path | None, typer.Option(help="Folder of PNG masks, NAME.png; white is edited.")
     ] = None,
+    mask: MaskOption = None,
+    box: BoxOption = None,
+    at: AtOption = None,
     words: WhereOption = None,
     segmenter: SegmenterOption = None,
     stages: Annotated[int | None, typer.Option(min=1, help="Of editing and tuning (3).")] = None,
@@ -164,17 +171,23 @@ def edit(
         check_segmenter(segmenter, words)
         check_out(out)
         results = ("edited.ply", "edited-3dgs.ply")
-        check_inputs_stay((out / name for name in results), (source_picture, ply))
+        check_inputs_stay((out / name for name in results), (source_picture, ply, mask))
         check_words(instruction)
         guide_of(editor)  # refuses what is no editor
         from attnwarp import methods
+        from attnwarp.methods.marks import Marks, numbers
+
+        marks = Marks(
+            masks, mask, numbers(box, "X0,Y0,X1,Y1", "--box"), numbers(at, "X,Y", "--at"), words,
+            segmenter or SEGMENTER,
+        )  # fmt: skip
 
         settings = methods.preset("attention_warping", preset, **changes)
         use_threads(threads)
         if bundled:
             data = capture(str(data), out / "scene", report)
-            if masks is None and words is None:
-                masks = exact_masks(data, instruction, report)
+            if masks is None and not marks.of_source:
+                marks = replace(marks, masks=exact_masks(data, instruction, report))
         dataset = read_views(data, reading)
         splats = None if ply is None else read_splats(ply, kind, antialiased, screen_filter)
         if ply is not None and splats is not None:
@@ -190,8 +203,7 @@ def edit(
                 max_splats or FIT_SPLATS,
             ),
             source=source,
-            source_picture=source_picture, masks=masks, words=words,
-            segmenter=segmenter or SEGMENTER, max_size=max_size, store=store.value,
+            source_picture=source_picture, marks=marks, max_size=max_size, store=store.value,
             device=device, dtype=dtype, threads=threads, control=control, turntable=turntable,
             report=report,
         )  # fmt: skip

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from attnwarp.cli.options import DeviceOption, DtypeOption
-from attnwarp.editing.small import check_words, guide_of
+from attnwarp.editing.small import bundled, check_words, guide_of
 from attnwarp.errors import InputWarning
 from attnwarp.reporting import reporter
 
@@ -49,6 +49,18 @@ WhereOption = Annotated[
     typer.Option(
         "--where", metavar="WORDS", help='What is edited, such as "bear"; the rest stays.'
     ),
+]
+MaskOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Mask of the source view, lifted into all; white is edited."),
+]
+BoxOption = Annotated[
+    str | None,
+    typer.Option(metavar="X0,Y0,X1,Y1", help="Box around it, px of the (source) picture."),
+]
+AtOption = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y", help="Point on it, px of the (source) picture."),
 ]
 SegmenterOption = Annotated[
     str | None,
@@ -97,18 +109,23 @@ def edit_image(
     sheet: Annotated[
         Path | None, typer.Option(help="PNG file for a sheet of the picture after every step.")
     ] = None,
+    mask: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Mask of the picture; white is edited.")
+    ] = None,
+    box: BoxOption = None,
+    at: AtOption = None,
     words: WhereOption = None,
     segmenter: SegmenterOption = None,
     mask_out: Annotated[
-        Path | None, typer.Option("--mask", help="PNG file for the mask that --where gives.")
+        Path | None, typer.Option(help="PNG file for the mask that --box, --at or --where gives.")
     ] = None,
     device: DeviceOption = "auto",
     dtype: DtypeOption = "auto",
     threads: ThreadsOption = None,
 ) -> None:
     """Edit a picture by an instruction."""
-    if mask_out is not None and words is None:
-        raise ValueError("--mask: needs --where, which makes the mask")
+    if mask_out is not None and words is None and box is None and at is None:
+        raise ValueError("--mask-out: needs --box, --at or --where, which make the mask")
     check_segmenter(segmenter, words)
     check_words(instruction)
     if guide_of(editor) != "picture":
@@ -122,15 +139,23 @@ def edit_image(
             raise IsADirectoryError(f"{path}: is a folder, expected a PNG file")
         if path is not None:
             check_other(path, picture, "the picture to edit")
-    outputs = [("--out", out), ("--sheet", sheet), ("--mask", mask_out)]
+    outputs = [("--out", out), ("--sheet", sheet), ("--mask-out", mask_out)]
     for (first, one), (second, other) in combinations(outputs, 2):
         if one is not None and other is not None and one.resolve() == other.resolve():
             raise ValueError(f"{first}, {second}: got {one} for both, expected a file for each")
+    from attnwarp.methods.marks import Marks, bright_of, numbers, picture_mask, say_unmarked
+
+    marks = Marks(
+        mask=mask, box=numbers(box, "X0,Y0,X1,Y1", "--box"), at=numbers(at, "X,Y", "--at"),
+        words=words,
+    )  # fmt: skip
     image = _read(picture)
 
+    import cv2
     import numpy as np
     import torch
 
+    from attnwarp import check
     from attnwarp.devices import choose, type_of
     from attnwarp.editing.editor import edit, own_size, side_multiple
     from attnwarp.editing.segment import load_segmenter
@@ -147,21 +172,34 @@ def edit_image(
     whole, image = image, _fit(image, longest, side_multiple(model))
     h, w = image.shape[:2]
     _tell_stretch(whole.shape, image.shape, side_multiple(model))
-    share = None
-    if words is not None:
-        mask = load_segmenter(segmenter or SEGMENTER, device=device).segment(image, words)
-        share = mask[..., None].astype(np.float32)
+    share: Any = None
+    if mask is not None:
+        bright = bright_of(mask, picture, "--mask")
+        check.same_aspect(bright.shape, whole.shape[:2], f"--mask: {mask}", "crop or pad it")
+        share = cv2.resize(bright.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA)
+    elif words is not None:
+        share = load_segmenter(segmenter or SEGMENTER, device=device).segment(image, words)
+    elif marks.of_source:
+        full = picture_mask(marks, whole).astype(np.float32)
+        share = cv2.resize(full, (w, h), interpolation=cv2.INTER_AREA)
+    if share is not None:
+        share = share[..., None].astype(np.float32)
         if mask_out is not None:
             _write(mask_out, np.repeat(share, 3, axis=2))
     tiles: list[Image] = [image]
     with reporter(title=out.name) as report:
+        if share is None and editor in bundled():
+            say_unmarked(editor, report)
 
         def on_step(step: int, count: int, latents: Any) -> None:
             report.step(step + 1, count, f"{w} x {h} px")
             if sheet is not None:
                 tiles.append(model.decode(latents)[0])
 
-        result = edit(model, [image], instruction, steps=steps, seed=seed, on_step=on_step)
+        regions = None if share is None else [share[..., 0]]
+        result = edit(
+            model, [image], instruction, steps=steps, seed=seed, on_step=on_step, regions=regions
+        )
     edited = result.images[0]
     masked = edited if share is None else share * edited + (1 - share) * image
     # The photograph's own detail stays, and gets the change, enlarged.

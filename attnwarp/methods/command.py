@@ -12,10 +12,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from attnwarp.camera import Camera
 from attnwarp.devices import choose, peak_memory, type_of
 from attnwarp.editing.editor import own_size
-from attnwarp.editing.segment import load_segmenter
 from attnwarp.editing.small import bundled, check_instruction, load_editor, thread_count
 from attnwarp.errors import InputError, suggest
 from attnwarp.fit import (
@@ -27,21 +25,28 @@ from attnwarp.fit import (
     load_views,
 )
 from attnwarp.gaussians import Gaussians
-from attnwarp.io import THIRD_SCALE, Dataset, read_upright, write_ply
+from attnwarp.io import THIRD_SCALE, Dataset, write_ply
 from attnwarp.io.find import FileFinder, name_key
 from attnwarp.io.names import file_stems
 from attnwarp.methods import METHODS, Budget, MethodSettings, Result
 from attnwarp.methods.attention_warping import attention_warping
 from attnwarp.methods.base import VIEWER_PLY, workdir_of
 from attnwarp.methods.features import Features
+from attnwarp.methods.marks import (
+    Marks,
+    lifted_segments,
+    read_mask,
+    read_over_black,
+    say_unmarked,
+    source_mask,
+)
 from attnwarp.methods.page import show_edit
 from attnwarp.methods.page.orbit import check_film
-from attnwarp.methods.pictures import check_view_aspect
+from attnwarp.methods.pictures import Segment, check_view_aspect
 from attnwarp.methods.scene import images_of
 from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.methods.tuning import perceptual_net
 from attnwarp.methods.view_edits import check_editor
-from attnwarp.methods.words import masks_by_words, words_folder
 from attnwarp.process import asked_to_stop
 from attnwarp.reporting import Reporter
 
@@ -49,10 +54,6 @@ FIT_FOLDER = "fit"
 
 MOST_NAMES = 5
 """Names of views in one line."""
-
-COLORED = 0.1
-"""Spread of a pixel's channels that no grey picture has: a photograph, or a mask of two colours,
-named as a mask by mistake."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +83,7 @@ def edit_dataset(
     fit_plan: FitPlan,
     source: str | None,
     source_picture: Path | None,
-    masks: Path | None,
-    words: str | None,
-    segmenter: str,
+    marks: Marks,
     max_size: int | None,
     store: Any,
     device: str,
@@ -106,9 +105,7 @@ def edit_dataset(
         fit_plan: of the fit.
         source: name or number of the source view; the first if None.
         source_picture: file of the source view edited elsewhere.
-        masks: folder with a mask picture for each view.
-        words: of what is edited, instead of masks.
-        segmenter: makes them; see :func:`attnwarp.editing.segment.load_segmenter`.
+        marks: what is edited.
         max_size: larger pictures are averaged down to it.
         store: see :func:`attnwarp.methods.attention_warping`.
         device: of the editor and the splats, "auto", "cpu" or "cuda".
@@ -122,13 +119,9 @@ def edit_dataset(
         The edit and the path of its page.
 
     Raises:
-        InputError: no such view, mask, editor or segmenter; masks and words; words without a
-            detection in a view; files of something else where results go.
+        InputError: no such view, mask, editor or segmenter; marks where nothing is found; files of
+            something else where results go.
     """
-    if masks is not None and words is not None:
-        raise InputError("--where: got --masks too, expected one of the two")
-    if words is not None and not words.strip():
-        raise InputError(f"--where: got {words!r}, expected words such as 'bear'")
     check_film(turntable)
     workdir_of(out).check_unclaimed()  # again in the edit, but here before a fit
     device = choose(device, report)
@@ -144,11 +137,9 @@ def edit_dataset(
         h, w, _ = by_hand.shape
         # Again in the edit, but here before an editor is loaded and a fit spends its minutes.
         check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
-    segments = None if masks is None else _masks(masks, views.cameras, pictures, report)
+    segments = _marked(marks, editor_name, dataset, views, images, index, out, device, report)
     editor = load_editor(editor_name, device=device, dtype=type_of(dtype, device))
     check_instruction(editor_name, editor, instruction)
-    if words is not None:
-        segments = _by_words(words, segmenter, device, views.cameras, images, out, report)
     if settings.size is None:
         settings = replace(settings, size=own_size(editor))
     if splats is None:
@@ -169,7 +160,7 @@ def edit_dataset(
         settings,
         source=index,
         source_picture=by_hand,
-        segments=segments,
+        segments=segments(splats),
         folder=out,
         store=store,
         report=report,
@@ -200,6 +191,8 @@ def run_baseline(
     out: Path,
     *,
     budget: Budget,
+    marks: Marks,
+    source: str | None,
     max_size: int | None,
     device: str,
     dtype: str = "auto",
@@ -219,12 +212,12 @@ def run_baseline(
         settings: of the method. Without a size, the editor's own is taken.
         out: folder of all results.
         budget: limits of the run.
+        marks: what is edited.
+        source: name or number of the view that is marked; the first if None.
         max_size: larger pictures are averaged down to it.
         device: of the editor and the splats, "auto", "cpu" or "cuda".
         dtype: of the editor; see :func:`attnwarp.devices.type_of`.
         threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
-        control: also edit the page's views each alone; None does so with a bundled editor.
-        turntable: file of the scene's turn, GIF or MP4.
         control: also edit the page's views each alone; None does so with a bundled editor.
         turntable: file of the scene's turn, GIF or MP4.
         report: receives how the work stands.
@@ -239,6 +232,8 @@ def run_baseline(
     device = choose(device, report)
     views = load_views(dataset, max_size=max_size)
     images = images_of(views)
+    index = _view_of(views.cameras, source, dataset)
+    segments = _marked(marks, editor_name, dataset, views, images, index, out, device, report)
     editor = load_editor(editor_name, device=device, dtype=type_of(dtype, device))
     check_instruction(editor_name, editor, instruction)
     torch.set_num_threads(thread_count(editor, threads))
@@ -254,6 +249,7 @@ def run_baseline(
         instruction,
         settings,
         folder=out,
+        segments=segments(splats),
         budget=budget,
         report=report,
     )
@@ -271,26 +267,32 @@ def _report_memory(device: str, report: Reporter) -> None:
         report.log(f"edited{peak}")
 
 
-def _by_words(
-    words: str,
-    name: str,
-    device: str,
-    cameras: Sequence[Camera],
+def _marked(
+    marks: Marks,
+    editor_name: str,
+    dataset: Dataset,
+    views: Views,
     images: Sequence[npt.NDArray[Any]],
+    index: int,
     out: Path,
+    device: str,
     report: Reporter,
-) -> list[npt.NDArray[np.bool_]]:
-    """Masks by a segmenter, whose networks do not stay beside the editor's."""
-    segmenter = load_segmenter(name, device=device)
-    folder = words_folder(out, segmenter, words)
-    report.log(f"masks of {words!r} by {name}: {folder}")
-    masks, kept = masks_by_words(segmenter, words, cameras, images, folder, report)
-    if kept:
-        report.log(f"{kept} of {len(masks)} masks are those of an earlier run")
-    report.log(_coverage(masks, cameras))
-    # Words may hold braces, so no template of them.
-    _say_empty(masks, cameras, lambda n: f"--where: no {words!r} was detected in {n} views", report)
-    return masks
+) -> Callable[[Gaussians], list[Segment] | None]:
+    """Segments of all views as a function of the splats; what is marked is read at once."""
+    pictures = [path for path in dataset.image_paths if path is not None]
+    full = [c for c, path in zip(dataset.cameras, dataset.image_paths, strict=True) if path]
+    if marks.masks is not None:
+        given = _masks(marks.masks, views.cameras, pictures, report)
+        return lambda splats: given
+    if not marks.of_source:
+        if editor_name in bundled():
+            say_unmarked(editor_name, report)
+        return lambda splats: None
+    mask = source_mask(
+        marks, views.cameras[index], images[index], pictures[index], full[index].width, out, device,
+        report,
+    )  # fmt: skip
+    return lambda splats: lifted_segments(mask, splats, views.cameras, index, report)
 
 
 def _fitted(
@@ -415,57 +417,3 @@ def mask_files(folder: Path, cameras: Any) -> list[Path]:
             )
         paths.append(found[0])
     return paths
-
-
-def _coverage(masks: list[npt.NDArray[np.bool_]], cameras: Any) -> str:
-    """One line: of which views masks cover the least and the most."""
-    shares = [float(mask.mean()) for mask in masks]
-    least, most = int(np.argmin(shares)), int(np.argmax(shares))
-    return (
-        f"masks cover {shares[least]:.1%} of {cameras[least].name} (least)"
-        f" to {shares[most]:.1%} of {cameras[most].name} (most)"
-    )
-
-
-def read_mask(path: Path, camera: Camera, beside: Path | None = None) -> npt.NDArray[np.bool_]:
-    """(H, W) bool of a picture: what is white and opaque.
-
-    Args:
-        path: of the mask.
-        camera: of its view.
-        beside: the view's picture; see :func:`attnwarp.io.read_upright`.
-
-    Raises:
-        InputError: it is coloured.
-        ValueError: another aspect ratio than the camera's.
-    """
-    import cv2
-
-    pixels, top = read_over_black(path, beside)
-    if np.ptp(pixels, axis=-1).max() > COLORED * top:
-        raise InputError(
-            f"--masks: {path} is coloured, expected a grey picture: white is edited, black is not"
-        )
-    if pixels.max() == 1:
-        raise InputError(
-            f"--masks: {path} has no value above 1 of {top}, so all of it is black; multiply its"
-            f" values by {top}"
-        )
-    bright = pixels.mean(axis=-1) / top
-    size = (camera.width, camera.height)
-    check_view_aspect(bright.shape, camera, f"--masks: {path}")
-    if bright.shape != size[::-1]:
-        bright = cv2.resize(bright, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(bright > 0.5)
-
-
-def read_over_black(path: Path, beside: Path | None = None) -> tuple[npt.NDArray[Any], int]:
-    """(H, W, 3) of a picture over black where it is transparent, and the value of white.
-
-    It is turned as its EXIF tag asks; see :func:`attnwarp.io.read_upright` for ``beside``.
-    """
-    pixels = read_upright(path, beside=beside)
-    top = int(np.iinfo(pixels.dtype).max)
-    if pixels.shape[2] == 3:
-        return pixels, top
-    return pixels[..., :3] * (pixels[..., 3:] / top), top

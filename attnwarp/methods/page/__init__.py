@@ -334,7 +334,16 @@ class _Page:
         said = "The scene did not change" if math.isnan(share) else (
             f"{share:.0%} of the edited scene's change lies outside the mask"
         )  # fmt: skip
-        return f"{title}<p>{said}; the mask covers {covered:.0%} of the pictures.</p>"
+        shown = "".join(
+            f'<figure><img alt="mask of {escape(name)}" src="{_data(mask, quality=80, exact=0)}">'
+            f"<figcaption>{escape(name)}</figcaption></figure>"
+            for name in self.shown[:2]
+            for mask in [self.folder.read_picture(f"segments/{name}.png")]
+        )
+        return (
+            f"{title}<p>{said}; the mask covers {covered:.0%} of the pictures.</p>"
+            f'<div class="pair">{shown}</div>'
+        )
 
     def orbit(self, turns: Sequence[Sequence[Bytes]]) -> str:
         """Both scenes from cameras around them."""

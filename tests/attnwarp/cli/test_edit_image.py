@@ -138,7 +138,7 @@ def test_words_edit_what_they_name_alone(folder, tmp_path):
     common = (
         tmp_path / "photo.png", "--instruction", "a bear", "--editor", folder, "--out", out, "--steps", 2, "--size", 64,
     )  # fmt: skip
-    result = run(*common, "--where", "bear", *segmenter, "--mask", mask_file)
+    result = run(*common, "--where", "bear", *segmenter, "--mask-out", mask_file)
     assert result.exit_code == 0, result.output
     masked, mask = cv2.imread(str(out)), cv2.imread(str(mask_file))[..., 0] > 127
     expected = GroundedSam.from_folders(*models).segment(pixels.astype(np.float32) / 255, "bear")
@@ -148,6 +148,29 @@ def test_words_edit_what_they_name_alone(folder, tmp_path):
     everywhere = cv2.imread(str(out))
     assert np.array_equal(masked[mask], everywhere[mask])
     assert np.array_equal(masked[~mask], pixels[..., ::-1][~mask])
+
+
+@pytest.mark.parametrize(
+    "option, value", [("--at", "32,20"), ("--box", "10,4,54,36"), ("--mask", "m.png")]
+)
+def test_a_marked_thing_alone_is_edited(folder, tmp_path, option, value):
+    """Oracle: the edit without a mask inside, the picture outside."""
+    pixels = np.full((40, 64, 3), 60, np.uint8)
+    pixels[10:30, 20:44] = (40, 60, 220)
+    cv2.imwrite(str(tmp_path / "photo.png"), pixels)
+    thing = np.zeros((40, 64), bool)
+    thing[10:30, 20:44] = True
+    cv2.imwrite(str(tmp_path / "m.png"), 255 * thing.astype(np.uint8))
+    common = (
+        tmp_path / "photo.png", "--instruction", "a bear", "--editor", folder, "--out", tmp_path / "o.png", "--steps", 2,
+        "--size", 64,
+    )  # fmt: skip
+    assert run(*common).exit_code == 0
+    everywhere = cv2.imread(str(tmp_path / "o.png"))
+    result = run(*common, option, tmp_path / value if option == "--mask" else value)
+    assert result.exit_code == 0, result.output
+    expected = np.where(thing[..., None], everywhere, pixels)
+    assert np.array_equal(cv2.imread(str(tmp_path / "o.png")), expected)
 
 
 def test_words_that_the_picture_does_not_show_are_one_clear_line(folder, tmp_path):

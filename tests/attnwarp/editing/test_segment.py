@@ -1,6 +1,7 @@
 """Masks by words; oracles are transformers' own processors, and exact masks of a ray-cast world."""
 
 import dataclasses
+import re
 import shutil
 
 import cv2
@@ -14,6 +15,7 @@ from attnwarp.editing.segment import (
     GroundedSam,
     NoDetectionError,
     Segmenter,
+    cut_out,
     load_segmenter,
     segments_of,
 )
@@ -216,3 +218,43 @@ def test_words_without_letters_are_refused(clip, words):
 def test_other_pictures_are_refused(clip, image, message):
     with pytest.raises(ValueError, match=message):
         clip.segment(image, "bear")
+
+
+def two_squares():
+    """A red square of 20 px and a blue one on grey, 60 x 80 px, with a little grain."""
+    picture = np.full((60, 80, 3), 0.4, np.float32)
+    picture[10:30, 10:30] = (0.8, 0.1, 0.1)
+    picture[30:50, 50:70] = (0.1, 0.2, 0.8)
+    grain = np.random.default_rng(0).normal(0, 0.02, picture.shape)
+    return np.clip(picture + grain, 0, 1).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "marks",
+    [{"box": (46, 26, 74, 54)}, {"at": (60, 40)}],
+    ids=["a box around it", "a click on it"],
+)
+def test_what_a_person_marks_is_cut_out_alone(marks):
+    expected = np.zeros((60, 80), dtype=bool)
+    expected[30:50, 50:70] = True
+    assert np.array_equal(cut_out(two_squares(), **marks), expected)
+
+
+@pytest.mark.parametrize(
+    "marks, message",
+    [
+        ({"at": (90, 4)}, "--at: got 90, 4, expected px inside the picture of 80 x 60"),
+        ({"box": (1, 2, 99, 40)}, "--box: got 1, 2, 99, 40, expected px inside"),
+        ({"box": (30, 9, 10, 40)}, "--box: got 30, 9, 10, 40, expected X0,Y0,X1,Y1 with X0 < X1"),
+        ({}, "expected either a box or a point"),
+        ({"at": (3, 4), "box": (1, 2, 9, 9)}, "expected either a box or a point"),
+    ],
+)
+def test_marks_that_say_nothing_are_refused(marks, message):
+    with pytest.raises(InputError, match=re.escape(message)):
+        cut_out(two_squares(), **marks)
+
+
+def test_a_box_around_the_whole_picture_still_cuts():
+    mask = cut_out(two_squares(), box=(0, 0, 80, 60))
+    assert mask.shape == (60, 80)

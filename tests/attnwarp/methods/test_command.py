@@ -24,17 +24,19 @@ from typer.testing import CliRunner
 
 from attnwarp import Camera
 from attnwarp.cli.main import app
-from attnwarp.editing.segment import GroundedSam, NoDetectionError, load_segmenter
+from attnwarp.editing.segment import GroundedSam, NoDetectionError, cut_out, load_segmenter
 from attnwarp.errors import InputError
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp.io.images import encode_png
 from attnwarp.io.lock import alone_in
 from attnwarp.methods import PRESETS, command
-from attnwarp.methods.command import _masks, mask_files, read_mask, read_over_black
-from attnwarp.methods.scene import to_float
+from attnwarp.methods.command import _masks, mask_files
+from attnwarp.methods.marks import read_mask, read_over_black
+from attnwarp.methods.scene import near_of, to_float
 from attnwarp.methods.words import masks_by_words, words_folder
 from attnwarp.render import render
 from attnwarp.reporting import SILENT
+from attnwarp.warp import lift_masks
 
 runner = CliRunner()
 QUICK = (
@@ -179,31 +181,61 @@ def test_a_mask_and_a_picture_by_hand_are_read_from_files(place, tmp_path):
     assert np.array_equal(source[:, 16:], original[:, 16:])
 
 
-def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
-    """Oracle: the same edit with ``--masks`` of the files that the words left."""
+def test_words_are_asked_of_the_source_alone_and_lifted_as_its_mask_is(place, tmp_path):
+    """Oracle: SAM and Grounding DINO called directly, and the same edit with ``--mask``."""
     save_dino(tmp_path / "dino")
     save_sam(tmp_path / "sam", seed=2)
     ply = ("--ply", place / "splats.ply")
     segmenter = ("--segmenter", f"{tmp_path / 'dino'},{tmp_path / 'sam'}")
     result = run(place, tmp_path / "words", *ply, "--where", "bear", *segmenter)
     assert result.exit_code == 0, result.output
-    assert "masks are those of an earlier run" not in result.stderr
-    again = run(place, tmp_path / "words", *ply, "--where", "bear", *segmenter)
-    assert again.exit_code == 0, again.output
-    assert f"{len(cameras())} of {len(cameras())} masks are those of an earlier run" in again.stderr
-    files = sorted((tmp_path / "words" / "segments").iterdir())
-    assert [path.name for path in files] == [camera.name for camera in cameras()]
-    shares = [(read_image(path) > 127).mean() for path in files]
-    assert min(shares) > 0 and max(shares) < 1
-    (line,) = [line for line in result.stderr.splitlines() if line.startswith("masks cover")]
-    percent = [float(number) for number in re.findall(r"([0-9.]+)%", line)]
-    assert percent == pytest.approx([100 * min(shares), 100 * max(shares)], abs=0.051)
-    names = re.findall(r"v\d\.png", line)
-    assert [shares[int(name[1])] for name in names] == [min(shares), max(shares)]
-    result = run(place, tmp_path / "files", *ply, "--masks", tmp_path / "words" / "segments")
+    (made,) = (tmp_path / "words" / "words").rglob("*.png")
+    source = read_image(place / "data" / "images" / "v0.png").astype(np.float32) / 255
+    direct = GroundedSam.from_folders(tmp_path / "dino", tmp_path / "sam")
+    assert np.array_equal(read_image(made)[..., 0] > 127, direct.segment(source, "bear"))
+    result = run(place, tmp_path / "file", *ply, "--mask", made)
     assert result.exit_code == 0, result.output
-    for name in ("views/v0.png", "edited.ply"):
-        assert (tmp_path / "words" / name).read_bytes() == (tmp_path / "files" / name).read_bytes()
+    assert "--mask marks" in result.stderr and "lifted through the splats" in result.stderr
+    for name in ("views/v0.png", "edited.ply", "segments/v1.png"):
+        assert (tmp_path / "words" / name).read_bytes() == (tmp_path / "file" / name).read_bytes()
+
+
+def test_a_mask_of_the_source_is_lifted_into_every_view(place, tmp_path):
+    """Oracle: the library's lifting, and the photographs where it marks nothing."""
+    half = np.zeros((32, 32), dtype=bool)
+    half[:, :16] = True
+    picture = 255 * np.repeat(half[..., None], 3, axis=2).astype(np.uint8)
+    (tmp_path / "mask.png").write_bytes(encode_png(picture))
+    out = tmp_path / "out"
+    result = run(place, out, "--ply", place / "splats.ply", "--mask", tmp_path / "mask.png")
+    assert result.exit_code == 0, result.output
+    model, views = read_ply(place / "splats.ply"), cameras()
+    lifted = lift_masks(model, views[:1], [half], near=near_of(views, model))
+    for k, view in enumerate(views):
+        share = read_image(out / "segments" / f"v{k}.png")[..., 0] / 255
+        raw = lifted.render(view)
+        assert not share[raw < 0.49].any() and (share[raw > 0.76] == 1).all()
+    original = read_image(place / "data" / "images" / "v0.png")
+    unmarked = read_image(out / "segments" / "v0.png")[..., 0] == 0
+    edited = read_image(out / "views" / "v0.png")
+    assert np.array_equal(edited[unmarked], original[unmarked])
+    assert (edited[~unmarked] != original[~unmarked]).any()
+
+
+@pytest.mark.parametrize("option, value", [("--box", "4,4,28,28")])
+def test_a_box_marks_what_opencv_cuts_out(place, tmp_path, option, value):
+    """Oracle: the cut of the source's picture, given as a file."""
+    source = read_image(place / "data" / "images" / "v0.png").astype(np.float32) / 255
+    marks = tuple(map(float, value.split(",")))
+    mask = cut_out(source, **{option[2:]: marks})
+    picture = 255 * np.repeat(mask[..., None], 3, axis=2).astype(np.uint8)
+    (tmp_path / "mask.png").write_bytes(encode_png(picture))
+    ply = ("--ply", place / "splats.ply")
+    assert run(place, tmp_path / "a", *ply, option, value).exit_code == 0
+    assert run(place, tmp_path / "b", *ply, "--mask", tmp_path / "mask.png").exit_code == 0
+    for k in range(len(cameras())):
+        one, two = ((tmp_path / f / "segments" / f"v{k}.png").read_bytes() for f in "ab")
+        assert one == two
 
 
 MASKS = {
@@ -337,6 +369,10 @@ def test_transparent_pixels_of_a_mask_or_a_picture_by_hand_are_black(tmp_path):
         ),
         (("--masks", ".", "--where", "bear"), "--where: got --masks too, expected one of the two"),
         (("--masks", "data/images"), "v0.png is coloured, expected a grey picture"),
+        (("--at", "3,4", "--box", "1,2,3,4"), "--at: got --box too, expected one of the two"),
+        (("--at", "3"), "--at: got '3', expected X,Y in px, such as 64,68"),
+        (("--at", "300,4"), "--at: got 300, 4, expected px inside the picture of 32 x 32"),
+        (("--box", "9,9,4,12"), "--box: got 9, 9, 4, 12, expected X0,Y0,X1,Y1 with X0 < X1"),
         (("--where", " "), "--where: got ' ', expected words such as 'bear'"),
         (("--where", "bear", "--segmenter", "dino"), "segmenter 'dino': unknown, expected"),
         (("--segmenter", "clip-parts"), "--segmenter: needs --where, the words that it looks for"),
@@ -576,7 +612,7 @@ def test_words_that_no_view_shows_are_one_clear_line(place, tmp_path):
     for _ in range(2):  # kept masks say no more
         result = run(place, tmp_path, "--ply", place / "splats.ply", "--where", "snowman")
         assert result.exit_code == 2
-        assert "no 'snowman' was detected in view images/v0.png or any other" in result.output
+        assert "no 'snowman' was detected in view images/v0.png" in result.output
     assert not (tmp_path / "edited.ply").exists()
 
 

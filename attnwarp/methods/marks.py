@@ -1,0 +1,244 @@
+"""Marks of what is edited: a person makes them in the source view, splats lift them into all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.camera import Camera
+from attnwarp.editing.segment import Mask, cut_out, load_segmenter
+from attnwarp.errors import InputError
+from attnwarp.gaussians import Gaussians
+from attnwarp.io import read_upright
+from attnwarp.methods.pictures import Segment, check_view_aspect
+from attnwarp.methods.scene import near_of, to_float
+from attnwarp.methods.words import masks_by_words, words_folder
+from attnwarp.reporting import Reporter
+from attnwarp.warp import lift_masks
+
+COLORED = 0.1
+"""Spread of a pixel's channels that no grey picture has: a photograph, or a mask of two colours,
+named as a mask by mistake."""
+
+HOW = "--at X,Y, --box X0,Y0,X1,Y1, --mask FILE or --where WORDS"
+"""Options that mark what is edited, for messages."""
+
+POOR = 0.8
+"""Overlap of a mask and of itself, lifted, below which the splats do not follow it."""
+
+
+@dataclass(frozen=True)
+class Marks:
+    """One way to say what is edited; none edits everything.
+
+    Args:
+        masks: folder with a mask picture for each view.
+        mask: file of a mask of the source view; white is edited.
+        box: x0, y0, x1, y1 in px of the source's picture, around the thing.
+        at: x, y in px of a point on the thing.
+        words: names of the thing.
+        segmenter: looks for them; see :func:`attnwarp.editing.segment.load_segmenter`.
+
+    Raises:
+        InputError: several of them, or words without a letter.
+
+    Example:
+        >>> from attnwarp.methods.marks import Marks
+        >>> Marks(at=(64, 68)).of_source, Marks().of_source
+        (True, False)
+    """
+
+    masks: Path | None = None
+    mask: Path | None = None
+    box: tuple[float, ...] | None = None
+    at: tuple[float, ...] | None = None
+    words: str | None = None
+    segmenter: str = "clip-parts"
+
+    def __post_init__(self) -> None:
+        options = {
+            "--masks": self.masks, "--mask": self.mask, "--box": self.box, "--at": self.at,
+            "--where": self.words,
+        }  # fmt: skip
+        given = [name for name, value in options.items() if value is not None]
+        if len(given) > 1:
+            raise InputError(f"{given[1]}: got {given[0]} too, expected one of the two")
+        if self.words is not None and not self.words.strip():
+            raise InputError(f"--where: got {self.words!r}, expected words such as 'bear'")
+
+    @property
+    def of_source(self) -> bool:
+        """True if the source view alone is marked, so that its mask is lifted."""
+        return any(value is not None for value in (self.mask, self.box, self.at, self.words))
+
+
+def numbers(text: str | None, names: str, option: str) -> tuple[float, ...] | None:
+    """Numbers of an option such as ``--at 64,68``.
+
+    Args:
+        text: as it was typed, or None.
+        names: of the numbers, "X,Y".
+        option: for the error.
+
+    Raises:
+        InputError: another count, or no numbers.
+
+    Example:
+        >>> from attnwarp.methods.marks import numbers
+        >>> numbers("64,68", "X,Y", "--at")
+        (64.0, 68.0)
+    """
+    if text is None:
+        return None
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != len(names.split(",")) or not np.isfinite(values).all():
+        raise InputError(f"{option}: got {text!r}, expected {names} in px, such as 64,68")
+    return values
+
+
+def say_unmarked(editor: str, report: Reporter) -> None:
+    """Say that an editor paints more than what the words name, and how to mark it."""
+    report.log(
+        f"{editor} does not tell things apart: it may paint what lies near, too; mark the thing"
+        f" with {HOW}"
+    )
+
+
+def picture_mask(marks: Marks, image: npt.NDArray[Any], scale: float = 1.0) -> Mask:
+    """(H, W) bool of a picture by box or point.
+
+    Args:
+        marks: with ``box`` or ``at``.
+        image: (H, W, 3) sRGB.
+        scale: px of the image for one of the marks'.
+    """
+    box = None if marks.box is None else tuple(scale * v for v in marks.box)
+    at = None if marks.at is None else tuple(scale * v for v in marks.at)
+    return cut_out(to_float(image), box=box, at=at)
+
+
+def source_mask(
+    marks: Marks,
+    camera: Camera,
+    image: npt.NDArray[Any],
+    picture: Path,
+    full_width: int,
+    out: Path,
+    device: str,
+    report: Reporter,
+) -> Mask:
+    """(H, W) bool of the source view, as it is marked.
+
+    Args:
+        marks: of the source.
+        camera: of the source view.
+        image: (H, W, 3) of it.
+        picture: its file.
+        full_width: px of the file that coordinates are of.
+        out: folder of the edit, which keeps masks by words.
+        device: of a segmenter.
+        report: hears what was found.
+
+    Raises:
+        InputError: nothing is marked, or nothing was found.
+    """
+    if marks.mask is not None:
+        mask, how = read_mask(marks.mask, camera, beside=picture, option="--mask"), "--mask"
+        if not mask.any():
+            raise InputError(f"--mask: {marks.mask} is black; white is edited")
+    elif marks.words is not None:
+        segmenter, how = load_segmenter(marks.segmenter, device=device), "--where"
+        folder = words_folder(out, segmenter, marks.words)
+        (mask,), _ = masks_by_words(segmenter, marks.words, [camera], [image], folder, report)
+    else:
+        how = "--box" if marks.at is None else "--at"
+        mask = picture_mask(marks, image, camera.width / full_width)
+    report.log(f"{how} marks {mask.mean():.1%} of the source view {camera.name}")
+    return mask
+
+
+def lifted_segments(
+    mask: Mask, splats: Gaussians, cameras: Sequence[Camera], source: int, report: Reporter
+) -> list[Segment]:
+    """(H, W) of each view in [0, 1]: the source's mask, lifted through splats.
+
+    Values are whole 255ths, as the pictures of masks have them.
+    """
+    near = near_of(cameras, splats)
+    lifted = lift_masks(splats, [cameras[source]], [mask], near=near)
+    (agreement,) = lifted.agreement
+    left_out = int((~lifted.reached).sum())
+    alone = f", {left_out} of them left out, as they have none" if left_out else ""
+    report.log(
+        f"lifted through the splats: the source sees {lifted.seen.mean():.0%} of them, the rest"
+        f" follow their neighbours{alone}; back in the source the mask"
+        f" overlaps itself by {agreement:.0%}"
+        + ("; the splats do not fit it well, look at segments/" if agreement < POOR else "")
+    )
+    # The soft edge lies inside, so that nothing changes where less than half of a pixel is marked.
+    soft = (np.clip(4 * lifted.render(camera) - 2, 0, 1) for camera in cameras)
+    return [np.rint(255 * share).astype(np.float32) / np.float32(255) for share in soft]
+
+
+def read_mask(
+    path: Path, camera: Camera, beside: Path | None = None, option: str = "--masks"
+) -> npt.NDArray[np.bool_]:
+    """(H, W) bool of a picture: what is white and opaque.
+
+    Args:
+        path: of the mask.
+        camera: of its view.
+        beside: the view's picture; see :func:`attnwarp.io.read_upright`.
+        option: that named it, for errors.
+
+    Raises:
+        InputError: it is coloured.
+        ValueError: another aspect ratio than the camera's.
+    """
+    import cv2
+
+    bright = bright_of(path, beside, option)
+    size = (camera.width, camera.height)
+    check_view_aspect(bright.shape, camera, f"{option}: {path}")
+    if bright.shape != size[::-1]:
+        bright = cv2.resize(bright, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(bright > 0.5)
+
+
+def bright_of(path: Path, beside: Path | None, option: str) -> npt.NDArray[Any]:
+    """(H, W) in [0, 1]: brightness of a grey picture, black where it is transparent.
+
+    Raises:
+        InputError: it is coloured, or its white is 1 of 255.
+    """
+    pixels, top = read_over_black(path, beside)
+    if np.ptp(pixels, axis=-1).max() > COLORED * top:
+        raise InputError(
+            f"{option}: {path} is coloured, expected a grey picture: white is edited, black is not"
+        )
+    if pixels.max() == 1:
+        raise InputError(
+            f"{option}: {path} has no value above 1 of {top}, so all of it is black; multiply its"
+            f" values by {top}"
+        )
+    return np.asarray(pixels.mean(axis=-1) / top)
+
+
+def read_over_black(path: Path, beside: Path | None = None) -> tuple[npt.NDArray[Any], int]:
+    """(H, W, 3) of a picture over black where it is transparent, and the value of white.
+
+    It is turned as its EXIF tag asks; see :func:`attnwarp.io.read_upright` for ``beside``.
+    """
+    pixels = read_upright(path, beside=beside)
+    top = int(np.iinfo(pixels.dtype).max)
+    if pixels.shape[2] == 3:
+        return pixels, top
+    return pixels[..., :3] * (pixels[..., 3:] / top), top
