@@ -63,7 +63,7 @@ class EditingProbe(MethodProbe[EditResult]):
     def check(self, study: Study) -> None:
         """Figures by yaw need their variants measured."""
         part = study.part(EditingPart).editing
-        for name in sorted(self.measured(study)):
+        for name in sorted(self.measured(study) & study.variants.keys()):
             if editor_of(study, study.variants[name]).ideal is not None:
                 raise ValueError(
                     f"probes.{self.name}: {name!r} has the ideal editor, whose answers are those of"
