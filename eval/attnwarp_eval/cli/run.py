@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -368,8 +369,9 @@ def run_study(
                         f" {len(store.done())} cells are kept, the same command goes on from here",
                         TOO_LITTLE,
                     ) from None
-                _write_report(store)
                 results = read_results(store)
+                _print_answer(results)
+                _write_report(store)
                 uncalibrated = problems(results)
     _print_failures(summary)
     if not summary.complete:
@@ -409,6 +411,24 @@ def _print_failures(summary: Summary) -> None:
     for failure in summary.failures:
         table.add_row(failure.scene, failure.variant, failure.probe, failure.error)
     Console(stderr=True).print(table)
+
+
+def _print_answer(results: Results) -> None:
+    """The report's answer on the terminal: sentences, and one table."""
+    from rich.console import Console
+
+    from attnwarp_eval.document.write import terminal
+    from attnwarp_eval.report.answer import answer
+
+    section = answer(results)
+    if section is None:
+        return
+    console = Console(highlight=False)
+    for line in section.text:
+        console.print(line.replace("**", "").replace("`", ""), markup=False)
+    for table in section.tables:
+        rows = [[cell.replace("**", "").replace("`", "") for cell in row] for row in table.rows]
+        console.print(terminal(replace(table, rows=rows)))
 
 
 def _write_report(store: Store, *, timings: bool = True, pictures: bool = True) -> None:

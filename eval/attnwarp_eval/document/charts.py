@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -177,13 +178,18 @@ def lines(
             if np.isfinite(value.mean):
                 hover(axes, place + shift, value.mean, f"{line.name}, {place:g}: {spread(value)}")
     axes.set(xlabel=_plain(x), ylabel=_plain(y))
-    axes.set_title(_plain(title), loc="left", fontsize=9.5)
+    axes.set_title(_wrapped(title, 62), loc="left", fontsize=9.5)
     if log:
         axes.set_yscale("log")
     if share:
         axes.set_ylim(-0.03, 1.03)
     if legend:
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+
+
+def _wrapped(text: str, width: int) -> str:
+    """Plain text on lines of at most ``width`` characters, so that none is cut at an edge."""
+    return _plain("\n".join(textwrap.wrap(text, width)))
 
 
 def _plain(text: str) -> str:
@@ -249,7 +255,7 @@ def heatmap(
     axes.tick_params(length=0)
     axes.spines[["left", "bottom"]].set_visible(False)
     axes.invert_yaxis()
-    axes.set_title(_plain(title), loc="left", fontsize=9.5)
+    axes.set_title(_wrapped(title, 62), loc="left", fontsize=9.5)
 
 
 MOST_NAMES = 12
@@ -336,8 +342,10 @@ def cost_front(
             linewidth=1,
             alpha=0.6,
         )
-    axes.set(xlabel=_plain(x), ylabel=_plain(y), xscale="log", yscale="log" if log else "linear")
-    axes.set_title(_plain(title), loc="left", fontsize=9.5)
+    axes.set(
+        xlabel=_plain(x), ylabel=_wrapped(y, 40), xscale="log", yscale="log" if log else "linear"
+    )
+    axes.set_title(_wrapped(title, 62), loc="left", fontsize=9.5)
     axes.margins(0.2)
     _move_apart(axes, notes)
     return [names[i] for i in on_front]

@@ -93,6 +93,8 @@ class Gallery:
 class Section:
     """A heading with text, tables, figures and galleries, in this order.
 
+    A ``folded`` section is closed until a reader opens it.
+
     Example:
         >>> section = Section("Depth", ["Against exact depth."], [Table(["AbsRel"], [["0.01"]])])
         >>> section.title, section.figures
@@ -104,6 +106,7 @@ class Section:
     tables: list[Table] = field(default_factory=list)
     figures: list[Picture] = field(default_factory=list)
     gallery: Gallery | None = None
+    folded: bool = False
 
 
 @dataclass
@@ -132,7 +135,8 @@ class Finding:
 
 @dataclass
 class Report:
-    """The whole report; its findings stand on a page alone.
+    """The whole report: its answer, if it has one, before everything else. Findings stand on a page
+    alone.
 
     Example:
         >>> from attnwarp_eval.document.write import markdown
@@ -144,3 +148,4 @@ class Report:
     lead: list[str]
     sections: list[Section]
     findings: list[Finding] = field(default_factory=list)
+    answer: Section | None = None

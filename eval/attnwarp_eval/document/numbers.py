@@ -6,6 +6,9 @@ import math
 
 from attnwarp_eval.statistics.intervals import Interval, Ratio
 
+FEWEST_SCENES = 6
+"""Scenes below which an answer shows their range, and speaks of no others."""
+
 
 def number(value: float | None, digits: int = 3) -> str:
     """A number to ``digits`` significant digits; a dash where it is undefined.

@@ -122,7 +122,10 @@
   mark();
 
   // A link into a folded table opens it; paper shows everything.
-  const open = () => document.getElementById(location.hash.slice(1))?.closest("details")?.setAttribute("open", "");
+  const open = () => {
+    const target = document.getElementById(location.hash.slice(1));
+    (target?.querySelector(":scope > details.fold") ?? target?.closest("details"))?.setAttribute("open", "");
+  };
   window.addEventListener("hashchange", () => {
     open();
     document.getElementById(location.hash.slice(1))?.scrollIntoView();

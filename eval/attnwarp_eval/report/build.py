@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
-from attnwarp_eval.document.model import Report, Section
+from attnwarp_eval.document.model import Picture, Report, Section
 from attnwarp_eval.report.ablations import ablations, compared_of
+from attnwarp_eval.report.answer import answer
 from attnwarp_eval.report.claims import claims, judge, load_claims
 from attnwarp_eval.report.commands import add_commands
 from attnwarp_eval.report.findings import findings
+from attnwarp_eval.report.fronts import TITLE as FRONTS
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.galleries import galleries
 from attnwarp_eval.report.measured import failures, measured
 from attnwarp_eval.report.settling import settling
 from attnwarp_eval.study.probe_report import Layout, Place, reports
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Study
 
 
 def build(results: Results, root: Path, *, timings: bool = True, pictures: bool = True) -> Report:
@@ -81,9 +85,28 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
     if not timings:
         for section in sections:
             section.tables = [table.without_timings() for table in section.tables]
+    answered = answer(results, timings)
+    if answered is not None:
+        for section in sections:
+            section.folded = True
+        answered.figures += _front(study, sections)
     first = findings(results, problems(results), judged, compared, pictures=pictures)
     add_commands(results, sections, first)
-    return Report(study.title or study.name, lead, sections, first)
+    return Report(study.title or study.name, lead, sections, first, answered)
+
+
+def _front(study: Study, sections: Sequence[Section]) -> list[Picture]:
+    """The figure of the front whose metric decides the answer; the first one where none does."""
+    figures = next((section.figures for section in sections if section.title == FRONTS), [])
+    asked = study.answer
+    column = None if asked is None else asked.columns[asked.decides]
+    titles = [
+        front.title
+        for front in study.fronts
+        if column is not None and (front.probe, front.metric) == (column.probe, column.metric)
+    ]
+    fitting = [f for f in figures if any(f.caption.startswith(title) for title in titles)]
+    return (fitting or figures)[:1]
 
 
 def problems(results: Results) -> list[str]:

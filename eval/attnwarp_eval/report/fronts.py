@@ -24,6 +24,8 @@ from attnwarp_eval.study.results import Results, Shared
 from attnwarp_eval.study.schema import Front
 from attnwarp_eval.study.turns import Timed, timed_in_turn
 
+TITLE = "What accuracy costs in time"
+
 DRAWS = 1000
 """Resamples of scenes and rounds."""
 
@@ -35,7 +37,7 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
         results: of the run.
         layout: of the report.
     """
-    section = Section("What accuracy costs in time")
+    section = Section(TITLE)
     section.text = _text(results)
     for index, front in enumerate(results.study.fronts):
         metric = front.metric.format(layer=results.layer)
@@ -50,14 +52,15 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
         section.text += shared.text(front.title)
         path = layout.figure(f"front-{index}.svg")
         own = report_of(front.probe)
-        label = f"{metric} ({own.probe.metric(metric).unit})"
+        specification = own.probe.metric(metric)
+        label = f"{metric} ({specification.unit})"
         once = "" if timed else ", one pass"
         with charts.drawing(path) as (axes,):
             on_front = charts.cost_front(
                 axes,
                 points,
                 x=f"seconds {own.cost_of}{once}",
-                y=label,
+                y=f"{specification.description}, {specification.unit}",
                 title=front.title,
                 # A difference of colours above a floor may be negative.
                 log=own.probe.metric(metric).unit != "dE00",

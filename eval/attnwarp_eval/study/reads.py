@@ -44,6 +44,7 @@ _ALWAYS = frozenset(
         "probes",
         "ablations",
         "fronts",
+        "answer",
         "pictures",
     }
 )

@@ -5,6 +5,7 @@ What only one probe reads stands in that probe's file; :mod:`attnwarp_eval.study
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -129,6 +130,36 @@ class Front(Part):
     variants: list[str]
 
 
+FIGURE = re.compile(r"\{([^{}|]+)\|([^{}|]+)\}")
+"""A figure within a sentence of :class:`Answer`: ``{column|variant}``."""
+
+
+class AnswerColumn(Part):
+    """A column of an answer's table: a metric, over targets within a range of yaws, in degrees.
+
+    ``probe`` is empty until the study fills in the main probe.
+    """
+
+    metric: str
+    probe: str = ""
+    yaw: tuple[float, float] | None = None
+
+
+class Answer(Part):
+    """First words of a report: a question, sentences, one table.
+
+    A sentence holds figures as ``{column|variant}``. ``variants`` are the table's rows, each with
+    what it is in words; ``columns`` are titles with their metrics. ``decides`` is the column by
+    which a variant is recommended.
+    """
+
+    question: str
+    sentences: list[str] = Field(default_factory=list)
+    variants: Annotated[dict[str, str], Field(min_length=2, max_length=5)]
+    columns: Annotated[dict[str, AnswerColumn], Field(min_length=1, max_length=4)]
+    decides: str
+
+
 class Pictures(Part):
     """Variants and views of which pictures are saved."""
 
@@ -172,6 +203,7 @@ class Study(Part):
     probes: Annotated[dict[str, list[str]], Field(min_length=1)]
     ablations: list[Ablation] = Field(default_factory=list)
     fronts: list[Front] = Field(default_factory=list)
+    answer: Answer | None = None
     pictures: Pictures = Pictures()
     _left_out: tuple[str, ...] = PrivateAttr(default=())
 

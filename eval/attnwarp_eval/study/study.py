@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field, ValidationError, create_model, model_vali
 
 from attnwarp.errors import InputError
 from attnwarp.io.text import read_text
+from attnwarp_eval.metrics.registry import Metric
 from attnwarp_eval.scene import explain
 from attnwarp_eval.scene.file import is_scene_file, scene_name
 from attnwarp_eval.scene.scene import Scene
@@ -21,6 +22,7 @@ from attnwarp_eval.study.populations import expanded, with_edits_of
 from attnwarp_eval.study.probe import Probe, probe, probes
 from attnwarp_eval.study.reads import unused
 from attnwarp_eval.study.schema import (
+    FIGURE,
     Front,
     Splats,
     Study,
@@ -67,6 +69,13 @@ class _Joined(Study):
                     {"probe": main, **entry} if isinstance(entry, dict) else entry
                     for entry in data[key]
                 ]
+        asked = data.get("answer")
+        if isinstance(asked, dict) and isinstance(asked.get("columns"), dict):
+            columns = {
+                title: {"probe": main, **column} if isinstance(column, dict) else column
+                for title, column in asked["columns"].items()
+            }
+            filled["answer"] = {**asked, "columns": columns}
         return filled
 
     @model_validator(mode="after")
@@ -98,10 +107,37 @@ class _Joined(Study):
             self.check_variants(front.variants, f"fronts[{i}]", front.probe)
             check_distinct(front.variants, f"fronts[{i}].variants")
             _check_metric(front, available[front.probe], f"fronts[{i}].metric")
+        self._check_answer(available)
         self.check_variants(self.pictures.variants, "pictures.variants")
         for p in available.values():
             p.check(self)
         return self
+
+    def _check_answer(self, available: dict[str, Probe[Any]]) -> None:
+        if self.answer is None:
+            return
+        for title, column in self.answer.columns.items():
+            key = f"answer.columns.{title}"
+            if column.probe not in available:
+                raise ValueError(
+                    f"{key}.probe: no probe {column.probe!r}{did_you_mean(column.probe, available)}"
+                )
+            self.check_variants(self.answer.variants, "answer.variants", column.probe)
+            _known_metric(column.metric, available[column.probe], f"{key}.metric")
+        if self.answer.decides not in self.answer.columns:
+            near = did_you_mean(self.answer.decides, self.answer.columns)
+            raise ValueError(f"answer.decides: no column {self.answer.decides!r}{near}")
+        for sentence in self.answer.sentences:
+            for title, variant in FIGURE.findall(sentence):
+                for name, known in (
+                    (title, self.answer.columns),
+                    (variant, self.answer.variants),
+                ):
+                    if name not in known:
+                        raise ValueError(
+                            f"answer.sentences: {{{title}|{variant}}} names"
+                            f" {name!r}{did_you_mean(name, known)}"
+                        )
 
     def _check_each_variant(self) -> None:
         for name, variant in self.variants.items():
@@ -126,15 +162,19 @@ def _check_probe(name: str, available: list[str], key: str) -> None:
         raise ValueError(f"{key}: no table can be made of {name!r}{did_you_mean(name, available)}")
 
 
-def _check_metric(front: Front, front_probe: Probe[Any], key: str) -> None:
+def _known_metric(metric: str, own: Probe[Any], key: str) -> Metric:
     try:
-        direction = front_probe.metric(front.metric).direction
+        known = own.metric(metric)
     except KeyError:
-        near = did_you_mean(front.metric, front_probe.metrics)
-        raise ValueError(f"{key}: no metric {front.metric!r}{near}") from None
-    if "{" in front.metric.replace("{layer}", ""):
-        raise ValueError(f"{key}: got {front.metric!r}; braces may hold 'layer' alone")
-    if direction != "lower":
+        near = did_you_mean(metric, own.metrics)
+        raise ValueError(f"{key}: no metric {metric!r}{near}") from None
+    if "{" in metric.replace("{layer}", ""):
+        raise ValueError(f"{key}: got {metric!r}; braces may hold 'layer' alone")
+    return known
+
+
+def _check_metric(front: Front, front_probe: Probe[Any], key: str) -> None:
+    if _known_metric(front.metric, front_probe, key).direction != "lower":
         raise ValueError(f"{key}: {front.metric!r} is not one of which less is better")
 
 

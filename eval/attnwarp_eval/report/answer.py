@@ -1,0 +1,182 @@
+"""Answer of a run, in words and one table: what a reader should know first."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from statistics import fmean
+
+from attnwarp_eval.document.model import Section, Table
+from attnwarp_eval.document.numbers import FEWEST_SCENES, number
+from attnwarp_eval.metrics.registry import Metric
+from attnwarp_eval.statistics.intervals import interval
+from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.probe_report import report_of
+from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import FIGURE, Answer, AnswerColumn
+from attnwarp_eval.study.turns import timed_in_turn
+
+TITLE = "Answer"
+
+_UNITS = {
+    "px": "px",
+    "dB": "dB",
+    "dE00": "dE00",
+    "deg": "degrees",
+    "pixels": "pixels",
+    "views": "views",
+}
+"""Unit of a metric -> the word behind its figure, where the figure is not changed."""
+
+
+def answer(results: Results, timings: bool = True) -> Section | None:
+    """The section that a report begins with; None where the study states no question.
+
+    Args:
+        results: of the run.
+        timings: whether seconds are shown.
+    """
+    asked = results.study.answer
+    if asked is None:
+        return None
+    section = Section(TITLE, [f"**{asked.question}**"])
+    section.text += [_filled(results, asked, sentence) for sentence in asked.sentences]
+    table, leaders = _table(results, asked, timings)
+    section.text.append(f"{_advice(results, asked, leaders)} {_how_sure(results)}")
+    meanings = (f"- `{name}`: {words}" for name, words in asked.variants.items())
+    section.text.append("\n".join(meanings))
+    section.tables.append(table)
+    return section
+
+
+def in_words(value: float, metric: Metric, key: str) -> str:
+    """A figure with its unit, as a person says it.
+
+    Args:
+        value: of the figure; NaN where undefined.
+        metric: its specification.
+        key: its name in a record, whose last part may be the size of a feature grid.
+
+    Example:
+        >>> from attnwarp_eval.metrics.registry import METRICS
+        >>> in_words(0.686, METRICS["occlusion.hidden_share"], "occlusion.hidden_share")
+        '69 %'
+        >>> key = "warp.epe_median_layer.64"
+        >>> in_words(0.4671, METRICS[key], key)
+        '0.47 px of a 64 grid'
+    """
+    if not math.isfinite(value):
+        return "undefined"
+    if metric.unit in ("share", "ratio"):
+        percent = 100 * value
+        return f"{percent:.0f} %" if abs(percent) >= 10 else f"{number(percent, 2)} %"
+    text = number(value, 2 if abs(value) < 10 else 3)
+    if metric.unit == "layer px":
+        grid = key.rpartition(".")[2]
+        return f"{text} px of a {grid} grid" if grid.isdigit() else f"{text} px of the grid"
+    return f"{text} {_UNITS.get(metric.unit, '')}".strip()
+
+
+def _figure(results: Results, column: AnswerColumn, variant: str) -> tuple[float, list[float], str]:
+    """Mean over scenes, each scene's mean, and the figure's full name."""
+    key = column.metric.format(layer=results.layer)
+    table = results.views(column.probe, variant, key, column.yaw)
+    by_scene = [interval({scene: list(views.values())}).mean for scene, views in table.items()]
+    defined = [value for value in by_scene if math.isfinite(value)]
+    return (fmean(defined) if defined else math.nan), defined, key
+
+
+def _filled(results: Results, asked: Answer, sentence: str) -> str:
+    """A sentence with the run's figures in the place of ``{column|variant}``."""
+
+    def figure(match: re.Match[str]) -> str:
+        column = asked.columns[match[1]]
+        value, _, key = _figure(results, column, match[2])
+        return in_words(value, probe(column.probe).metric(key), key)
+
+    return FIGURE.sub(figure, sentence)
+
+
+def _table(results: Results, asked: Answer, timings: bool) -> tuple[Table, list[str]]:
+    """The table, and the variants that are the best in the column that decides."""
+    rows = {name: [f"`{name}`"] for name in asked.variants}
+    columns, decided = ["variant"], list[str]()
+    for title, column in asked.columns.items():
+        figures = {name: _figure(results, column, name) for name in rows}
+        key = column.metric.format(layer=results.layer)
+        metric = probe(column.probe).metric(key)
+        leaders = _leaders({name: value for name, (value, _, _) in figures.items()}, metric)
+        if title == asked.decides:
+            decided = leaders
+        # What is said of all figures stands once, in the column's head.
+        _, _, unit = in_words(1.0, metric, key).partition(" ")
+        columns.append(title if unit in ("", "%") else f"{title}, {unit}")
+        for name, (value, scenes, _) in figures.items():
+            text = _cell(value, metric, key, unit)
+            text = f"**{text}**" if name in leaders else text
+            if 1 < len(scenes) < FEWEST_SCENES:
+                low, high = (_cell(end, metric, key, unit) for end in (min(scenes), max(scenes)))
+                text += f" ({low.removesuffix(' %')} to {high})"
+            rows[name].append(text)
+    timed: tuple[str, ...] = ()
+    if timings:
+        own = report_of(asked.columns[asked.decides].probe)
+        timed = (f"time {own.cost_of}, ms",)
+        for name, row in rows.items():
+            seconds = _seconds(results, own.name, own.stage, own.cost, name)
+            row.append(number(1000 * seconds))
+    return Table([*columns, *timed], list(rows.values()), timed=timed), decided
+
+
+def _cell(value: float, metric: Metric, key: str, unit: str) -> str:
+    text = in_words(value, metric, key)
+    return text if unit == "%" else text.removesuffix(f" {unit}")
+
+
+def _leaders(values: Mapping[str, float], metric: Metric) -> list[str]:
+    """Variants with the best value, equals together; none where no direction is better."""
+    size = {
+        name: abs(value) if metric.direction in ("lower", "zero") else -value
+        for name, value in values.items()
+        if math.isfinite(value)
+    }
+    if metric.direction == "none" or len(size) < 2:
+        return []
+    least = min(size.values())
+    slack = metric.atol + metric.rtol * abs(least)
+    leaders = [name for name, value in size.items() if value <= least + slack]
+    return leaders if len(leaders) < len(size) else []
+
+
+def _seconds(results: Results, own: str, stage: str, cost: str, variant: str) -> float:
+    """Seconds of a variant, taken in turn where they were."""
+    timed = timed_in_turn(results, stage) if stage else None
+    if timed is not None and variant in timed.names:
+        return timed.seconds(variant).mean
+    once = results.seconds(own, variant, cost).values()
+    return fmean(once) if once else math.nan
+
+
+def _advice(results: Results, asked: Answer, leaders: list[str]) -> str:
+    """The variant to use, by the column that decides."""
+    if not leaders:
+        return f"No variant is better than the others in {asked.decides}."
+    column = asked.columns[asked.decides]
+    value, _, key = _figure(results, column, leaders[0])
+    figure = in_words(value, probe(column.probe).metric(key), key)
+    several = " or ".join(f"`{name}`" for name in leaders)
+    return f"Use {several} because of these variants it has the best {asked.decides}: {figure}."
+
+
+def _how_sure(results: Results) -> str:
+    study = results.study
+    count = len(study.scenes)
+    if count == 1:
+        return f"This is one scene, {study.scene_names[0]}: other scenes may differ."
+    if count < FEWEST_SCENES:
+        return (
+            f"Figures are means over {count} scenes ({', '.join(study.scene_names)}), and brackets"
+            " hold the lowest and the highest scene. So few scenes say nothing in general."
+        )
+    return f"Figures are means over {count} scenes ({study.scenes_in_words})."

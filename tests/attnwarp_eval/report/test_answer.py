@@ -1,0 +1,112 @@
+"""Answer of a report. Oracle: hand-made records whose means follow by hand."""
+
+import pytest
+import written_runs
+from pydantic import ValidationError
+
+from attnwarp_eval.document.model import Report, Section, Table
+from attnwarp_eval.document.write import markdown
+from attnwarp_eval.report.answer import answer
+from attnwarp_eval.study.study import parse_study
+
+SCENES = ["one", "two", "three"]
+HIDDEN, ERROR = "occlusion.hidden_share", "warp.feature_all_accepted.64"
+# Scene -> (share hidden at 30 degrees, at 90 degrees, error of features at both).
+VALUES = {
+    "masked": [(0.0, 0.02, 0.2), (0.0, 0.01, 0.3), (0.0, 0.03, 0.1)],
+    "open": [(0.1, 0.60, 0.9), (0.1, 0.70, 0.8), (0.1, 0.80, 1.0)],
+}
+STUDY = {
+    "name": "hand-made",
+    "scenes": SCENES,
+    "variants": {"masked": {}, "open": {"set": {"depth_agreement": False}}},
+    "probes": {"warp": ["masked", "open"]},
+    "answer": {
+        "question": "What does the mask buy?",
+        "sentences": ["Without it {hidden|open} is hidden, with it {hidden|masked}."],
+        "variants": {"masked": "keeps what is seen", "open": "keeps all"},
+        "columns": {
+            "hidden": {"metric": HIDDEN, "yaw": [60, 180]},
+            "feature error": {"metric": ERROR},
+        },
+        "decides": "feature error",
+    },
+}
+
+
+def run(scenes=SCENES, asked=STUDY["answer"]):
+    cells = []
+    for name, values in VALUES.items():
+        for scene, (near, far, error) in zip(scenes, values * 2, strict=False):
+            views = [
+                ("yaw030", 30.0, {HIDDEN: near, ERROR: error}),
+                ("yaw090", 90.0, {HIDDEN: far, ERROR: error}),
+            ]
+            record = written_runs.record(views, cost={"seconds": {"steady": 0.05}})
+            cells.append(written_runs.outcome("warp", scene, [name], record))
+    return written_runs.results({**STUDY, "scenes": scenes, "answer": asked}, cells)
+
+
+def test_an_answer_has_the_means_over_scenes_of_views_in_range_as_words():
+    section = answer(run())
+    assert section.text[:2] == [
+        "**What does the mask buy?**",
+        "Without it 70 % is hidden, with it 2.0 %.",
+    ]
+    table = section.tables[0]
+    assert table.columns == ["variant", "hidden", "feature error", "time a view, ms"]
+    assert table.rows == [
+        ["`masked`", "**2.0 %** (1.0 to 3.0 %)", "**20 %** (10 to 30 %)", "50.0"],
+        ["`open`", "70 % (60 to 80 %)", "90 % (80 to 100 %)", "50.0"],
+    ]
+
+
+def test_the_variant_that_is_best_where_it_decides_is_recommended():
+    advice = answer(run()).text[2]
+    assert advice.startswith("Use `masked`") and "feature error: 20 %" in advice
+    assert "So few scenes say nothing in general." in advice
+
+
+def test_six_scenes_and_more_show_no_range():
+    section = answer(run([f"scene{k}" for k in range(6)]))
+    assert section.tables[0].rows[0][1:3] == ["**2.0 %**", "**20 %**"]
+    assert "nothing in general" not in section.text[2]
+
+
+def test_a_figure_that_no_record_has_is_undefined_and_recommends_nobody():
+    columns = {"lands": {"metric": "warp.epe_median"}}
+    asked = {**STUDY["answer"], "sentences": [], "columns": columns, "decides": "lands"}
+    section = answer(run(asked=asked))
+    assert section.tables[0].rows[0][1] == "undefined"
+    assert section.text[1].startswith("No variant is better than the others")
+
+
+def test_a_study_without_a_question_has_no_answer():
+    assert answer(run(asked=None)) is None
+
+
+def test_seconds_are_left_out_of_a_report_without_timings():
+    assert answer(run(), timings=False).tables[0].columns[-1] == "feature error"
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"sentences": ["{hiden|open} of it"]}, "did you mean 'hidden'"),
+        ({"sentences": ["{hidden|opn} of it"]}, "did you mean 'open'"),
+        ({"decides": "hiden"}, "answer.decides: no column 'hiden'"),
+        ({"columns": {"hidden": {"metric": "occlusion.hiden"}}}, "no metric 'occlusion.hiden'"),
+        ({"variants": {"masked": "a", "shut": "b"}}, "no variant 'shut'"),
+    ],
+)
+def test_a_name_that_an_answer_does_not_have_is_refused(change, message):
+    with pytest.raises(ValidationError, match=message):
+        parse_study({**STUDY, "answer": {**STUDY["answer"], **change}})
+
+
+def test_an_answer_stands_first_and_what_is_folded_is_closed_in_markdown():
+    first = Section("Answer", ["**Why?**"], [Table(["a"], [["1"]])])
+    text = markdown(Report("Title", ["Lead."], [Section("Rest", ["x"], folded=True)], [], first))
+    order = [text.index(part) for part in ("# Title", "**Why?**", "| 1 |", "Lead.", "<details>")]
+    assert order == sorted(order)
+    assert "<summary>Rest</summary>" in text and "## Rest" not in text
