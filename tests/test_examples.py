@@ -132,6 +132,12 @@ scene = load_scene("spheres")
 geometry = Geometry(scene)
 source, target = (camera.resize(32, 32) for camera in scene.cameras[:2])
 """,
+    "docs/measuring/consistency.md": """
+originals = list(np.random.default_rng(0).random((3, 64, 64, 3)))
+edited = [1 - picture for picture in originals]
+source, target = originals[:2]
+source_edited, target_edited = edited[:2]
+""",
     "docs/method/algorithm.md": """
 source_picture = target_picture = np.random.default_rng(0).random((64, 64, 3), np.float32)
 view = None

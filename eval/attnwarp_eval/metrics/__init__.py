@@ -22,8 +22,10 @@ from attnwarp_eval.metrics.depth import depth_error
 from attnwarp_eval.metrics.embedding import (
     Similarity,
     clip_similarity,
+    direction_consistency,
     directional_similarity,
     image_similarity,
+    match_similarity,
 )
 from attnwarp_eval.metrics.fidelity import fidelity, nearest_answer
 from attnwarp_eval.metrics.image import (
@@ -69,6 +71,7 @@ __all__ = [
     "confusion",
     "cross_view",
     "depth_error",
+    "direction_consistency",
     "directional_similarity",
     "edit_fidelity",
     "edit_psnr",
@@ -81,6 +84,7 @@ __all__ = [
     "image_similarity",
     "label_transport",
     "mask_error",
+    "match_similarity",
     "mean_by_yaw",
     "metric",
     "ms_ssim",

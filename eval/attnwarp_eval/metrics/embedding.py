@@ -113,16 +113,103 @@ def directional_similarity(
         1.0
     """
     after = _embeddings(images_after, "images_after")
-    before = _embeddings(images_before, "images_before")
-    if before.shape != after.shape:
-        raise ValueError(
-            f"images_before: got shape {before.shape}, expected {after.shape}, as images_after"
-        )
-    change = _unit(after) - _unit(before)
+    change = _change(images_before, after)
     wanted = _unit(_matching(text_after, after, "text_after")) - _unit(
         _matching(text_before, after, "text_before")
     )
     return Similarity(_cosine(_unit(change, TINY_DISPLACEMENT), _unit(wanted, TINY_DISPLACEMENT)))
+
+
+def direction_consistency(images_before: npt.ArrayLike, images_after: npt.ArrayLike) -> Similarity:
+    """Cosine of the changes of neighbouring views: 1 where the edit moves both the same way.
+
+    The changes are those of :func:`directional_similarity`. Higher is better; a cosine has no unit.
+
+    Args:
+        images_before, images_after: (N, D) embeddings of N views in the order of their path, before
+            and after the edit. Any encoder's ``images`` gives them.
+
+    Returns:
+        One value for each of the N - 1 pairs of neighbours; none for one view. Undefined where
+        either change is smaller than TINY_DISPLACEMENT, or an embedding shorter than TINY_NORM.
+
+    Raises:
+        ValueError: other shapes, or embeddings that are NaN or infinite.
+
+    Source: A. Haque et al., "Instruct-NeRF2NeRF: Editing 3D Scenes with Instructions", ICCV 2023
+        ("CLIP direction consistency").
+
+    Example:
+        >>> from attnwarp_eval import metrics
+        >>> before = [[1.0, 0.0, 0.0]] * 3
+        >>> after = [[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]  # the last goes elsewhere
+        >>> metrics.direction_consistency(before, after).values.round(9).tolist()
+        [1.0, 0.5]
+    """
+    change = _unit(_change(images_before, images_after), TINY_DISPLACEMENT)
+    return Similarity(_cosine(change[:-1], change[1:]))
+
+
+def match_similarity(
+    source_before: npt.ArrayLike,
+    target_before: npt.ArrayLike,
+    source_after: npt.ArrayLike,
+    target_after: npt.ArrayLike,
+) -> Similarity:
+    """Cosine, after the edit, of the patches of two views that matched before it.
+
+    Two patches match where each has the highest cosine with the other among all patches of its
+    view, before the edit. Of equally near patches the first counts. Higher is better; a cosine has
+    no unit.
+
+    Args:
+        source_before, source_after: (P, D) features of the source's patches before and after the
+            edit, in one order: an encoder's ``tokens`` of one picture, reshaped.
+        target_before, target_after: (Q, D) of the target's.
+
+    Returns:
+        One value a match, in the order of the source's patches; undefined where the edit left a
+        feature shorter than TINY_NORM. Without a match no value, and a mean that is NaN. A feature
+        shorter than TINY_NORM before the edit matches nothing. A black picture has features too
+        where an encoder adds the place of a patch: its matches are by place alone.
+
+    Raises:
+        ValueError: other shapes, or features that are NaN or infinite.
+
+    Example:
+        >>> from attnwarp_eval import metrics
+        >>> before = [[1.0, 0.0], [0.0, 1.0]]
+        >>> turned = [[1.0, 1.0], [0.0, 1.0]]  # the edit changed patch 0 in the source alone
+        >>> metrics.match_similarity(before, before, turned, before).values.round(3).tolist()
+        [0.707, 1.0]
+    """
+    source, target = (
+        _embeddings(value, name)
+        for value, name in ((source_before, "source_before"), (target_before, "target_before"))
+    )
+    if source.shape[1] != target.shape[1]:
+        raise ValueError(
+            f"target_before: got {target.shape[1]} features a patch, expected {source.shape[1]}, as"
+            " source_before; both must come from one encoder"
+        )
+    after = []
+    for value, name, before in (
+        (source_after, "source_after", source),
+        (target_after, "target_after", target),
+    ):
+        array = _embeddings(value, name)
+        if array.shape != before.shape:
+            raise ValueError(
+                f"{name}: got shape {array.shape}, expected {before.shape}, as before the edit"
+            )
+        after.append(_unit(array))
+    if not (len(source) and len(target)):
+        return Similarity(np.zeros(0))
+    cosines = np.nan_to_num(_unit(source) @ _unit(target).T, nan=-np.inf)
+    nearest = cosines.argmax(axis=1)
+    rows = np.arange(len(source))
+    mutual = (cosines.argmax(axis=0)[nearest] == rows) & np.isfinite(cosines[rows, nearest])
+    return Similarity(_cosine(after[0][mutual], after[1][nearest[mutual]]))
 
 
 def image_similarity(source_edit: npt.ArrayLike, renders: npt.ArrayLike) -> Similarity:
@@ -148,6 +235,16 @@ def image_similarity(source_edit: npt.ArrayLike, renders: npt.ArrayLike) -> Simi
     pictures = _embeddings(renders, "renders")
     source = _matching(source_edit, pictures, "source_edit")
     return Similarity(_cosine(_unit(pictures), _unit(source)))
+
+
+def _change(before: npt.ArrayLike, after: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """(N, D) difference of embeddings brought to unit length, pair by pair."""
+    second, first = _embeddings(after, "images_after"), _embeddings(before, "images_before")
+    if first.shape != second.shape:
+        raise ValueError(
+            f"images_before: got shape {first.shape}, expected {second.shape}, as images_after"
+        )
+    return _unit(second) - _unit(first)
 
 
 def _embeddings(value: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:

@@ -133,6 +133,8 @@ _SPECS = (
     Metric("embedding.clip_directional", "cosine", "higher", 2e-3, 0, "CLIP: change of the view against the prompt's"),
     Metric("embedding.clip_image", "cosine", "higher", 1e-3, 0, "CLIP: render against the edited source view"),
     Metric("embedding.dino_image", "cosine", "higher", 1e-3, 0, "DINO: render against the edited source view"),
+    Metric("embedding.direction_consistency", "cosine", "higher", 2e-3, 0, "changes of neighbouring views against each other"),
+    Metric("embedding.match_similarity", "cosine", "higher", 1e-3, 0, "patches after the edit that matched before it"),
     Metric("embedding.undefined", "views", "lower", 0, 0, "views whose embedding or change has no direction"),
     Metric("perceptual.distance", "ratio", "lower", 1e-4, 1e-2, "perceptual distance of edited picture and render"),
     # Image metrics, consistency and fidelity: attnwarp_eval.metrics, docs/measuring/metrics.md.

@@ -8,8 +8,10 @@ import pytest
 from attnwarp_eval.metrics import (
     Similarity,
     clip_similarity,
+    direction_consistency,
     directional_similarity,
     image_similarity,
+    match_similarity,
 )
 from attnwarp_eval.metrics.embedding import TINY_DISPLACEMENT, TINY_NORM
 from attnwarp_eval.metrics.registry import METRICS
@@ -201,3 +203,96 @@ def test_the_figures_are_specified():
         )
     assert METRICS["embedding.undefined"].direction == "lower"
     assert METRICS["perceptual.distance"].direction == "lower"
+
+
+def test_changes_of_neighbouring_views_by_brute_force_and_one_undefined():
+    random = np.random.default_rng(5)
+    before, after = random.normal(size=(2, 6, 24))
+    after[2] = 3 * before[2]  # unchanged but for its length: no direction
+    unit = lambda v: v / math.sqrt(math.fsum(x * x for x in v))  # noqa: E731
+    change = [unit(b) - unit(a) for a, b in zip(before, after, strict=True)]
+    expected = [by_hand(change[i], change[i + 1]) for i in range(5)]
+    expected[1] = expected[2] = math.nan
+    result = direction_consistency(before, after)
+    np.testing.assert_allclose(result.values, expected, atol=1e-13)
+    assert result.undefined == 2
+
+
+def test_one_edit_in_all_views_has_direction_consistency_1_and_an_opposed_pair_less():
+    before = np.tile(E[0], (3, 1))
+    assert direction_consistency(before, np.tile(E[1], (3, 1))).values == pytest.approx([1, 1])
+    # e1 - e0 and -e1 - e0: orthogonal.
+    assert direction_consistency(before[:2], np.array([E[1], -E[1]])).mean == pytest.approx(0)
+
+
+def test_one_view_or_none_has_no_neighbour():
+    for count in (0, 1):
+        result = direction_consistency(E[:count], E[1 : 1 + count])
+        assert len(result.values) == 0 and math.isnan(result.mean)
+
+
+def test_matched_patches_by_brute_force():
+    random = np.random.default_rng(6)
+    source, target = random.normal(size=(2, 40, 8))
+    source_after, target_after = random.normal(size=(2, 40, 8))
+    table = [[by_hand(a, b) for b in target] for a in source]
+    pairs = [
+        (i, j)
+        for i in range(40)
+        for j in range(40)
+        if table[i][j] == max(table[i]) == max(row[j] for row in table)
+    ]
+    assert 5 < len(pairs) < 40  # some patches have no partner
+    np.testing.assert_allclose(
+        match_similarity(source, target, source_after, target_after).values,
+        [by_hand(source_after[i], target_after[j]) for i, j in pairs],
+        atol=1e-14,
+    )
+
+
+def test_views_that_are_edited_alike_keep_their_matches_whatever_the_order_of_patches():
+    random = np.random.default_rng(7)
+    before, after = random.normal(size=(2, 30, 8))
+    order = random.permutation(30)
+    result = match_similarity(before, before[order], after, after[order])
+    np.testing.assert_allclose(result.values, np.ones(30), atol=1e-14)
+    assert match_similarity(before, before[order], after, random.normal(size=(30, 8))).mean < 0.5
+
+
+def test_patches_without_a_feature_match_nothing_and_those_that_lose_it_are_undefined():
+    nothing = match_similarity(np.zeros((3, 4)), E, E[:3], E)
+    assert len(nothing.values) == 0 and math.isnan(nothing.mean)
+    assert len(match_similarity(E[:0], E, E[:0], E).values) == 0
+    lost = match_similarity(E[:2], E[:2], np.array([E[0], 0 * E[0]]), E[:2])
+    assert lost.values[0] == 1 and lost.undefined == 1
+
+
+def test_features_of_other_shapes_are_refused():
+    with pytest.raises(ValueError, match=r"target_before: got 3 features a patch, expected 4"):
+        match_similarity(E, np.eye(3), E, np.eye(3))
+    with pytest.raises(ValueError, match=r"source_after: got shape \(2, 4\), expected \(4, 4\)"):
+        match_similarity(E, E, E[:2], E)
+    with pytest.raises(ValueError, match=r"images_before: got shape"):
+        direction_consistency(E[:2], E[:3])
+
+
+def test_one_edit_of_a_scene_is_more_consistent_than_an_edit_of_one_view():
+    from attnwarp.encoders import load_encoder
+
+    random = np.random.default_rng(8)
+    coarse = random.random((8, 10, 3))
+    wide = np.kron(coarse, np.ones((16, 16, 1)))  # two views of one wall, 16 px apart
+    views = [wide[:, :128], wide[:, 16:144]]
+    edited = [view[..., ::-1] ** 2 for view in views]  # its colours exchanged, and darker
+    encoder = load_encoder("dino-small", "dino")
+
+    def both(second):
+        tokens = encoder.tokens([*views, edited[0], second]).reshape(4, 64, -1)
+        embeddings = encoder.images([*views, edited[0], second])
+        return (
+            match_similarity(*tokens).mean,
+            direction_consistency(embeddings[:2], embeddings[2:]).mean,
+        )
+
+    (match, direction), (match_one, direction_one) = both(edited[1]), both(1 - views[1])
+    assert match > match_one and direction > direction_one
