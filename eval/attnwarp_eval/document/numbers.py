@@ -7,7 +7,7 @@ import math
 from attnwarp_eval.statistics.intervals import Interval, Ratio
 
 FEWEST_SCENES = 6
-"""Scenes below which an answer shows their range, and speaks of no others."""
+"""Scenes below which a document shows their range, and no interval."""
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -69,6 +69,9 @@ def decibels(error: float) -> str:
 def spread(value: Interval, scenes: int | None = None) -> str:
     """Mean ± half of the 95 % interval, with the number of undefined values.
 
+    Of few scenes it is the mean with the lowest and the highest scene: an interval would speak of
+    scenes in general.
+
     Args:
         value: the interval.
         scenes: of the study; where fewer were measured, the text says how many.
@@ -76,12 +79,17 @@ def spread(value: Interval, scenes: int | None = None) -> str:
     Example:
         >>> from attnwarp_eval.statistics.intervals import interval
         >>> spread(interval({"bear": [1.0], "fence": [1.1], "glass": [0.9]}))
-        '1.00 ± 0.25'
+        '1.00 (0.900 to 1.10)'
+        >>> spread(interval({f"drawn-{k}": [1.0 + 0.1 * k] for k in range(6)}))
+        '1.25 ± 0.20'
     """
     if not math.isfinite(value.mean):
         return "–"
     note = _note(value, scenes)
-    if not value.bounded:
+    few = value.scenes < FEWEST_SCENES and math.isfinite(value.least)  # NaN: of rounds, not scenes
+    if few and value.least < value.most:
+        return f"{number(value.mean)} ({number(value.least)} to {number(value.most)}){note}"
+    if few or not value.bounded:
         return number(value.mean) + note
     return f"{number(value.mean)} ± {number(value.high - value.mean, 2)}{note}"
 

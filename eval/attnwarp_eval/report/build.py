@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from attnwarp_eval.document.model import Picture, Report, Section
+from attnwarp_eval.document.numbers import FEWEST_SCENES
 from attnwarp_eval.report.ablations import ablations, compared_of
 from attnwarp_eval.report.answer import answer
 from attnwarp_eval.report.claims import claims, judge, load_claims
@@ -49,8 +50,12 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
             (
                 "Figures are means over the views of one scene, which has no interval."
                 if alone
-                else f"Figures are means over {len(study.scenes)} scenes of means over their views,"
-                " ± half of the 95 % interval (Student's t over scenes)."
+                else f"Figures are means over {len(study.scenes)} scenes of means over their views;"
+                + (
+                    " brackets hold the lowest and the highest scene."
+                    if len(study.scenes) < FEWEST_SCENES
+                    else " ± half of the 95 % interval (Student's t over scenes)."
+                )
             )
             + " Differences are paired on scene and view; verdicts are adjusted for the number of"
             " tests in their table, those of claims for the number of claims."

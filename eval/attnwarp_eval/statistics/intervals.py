@@ -33,6 +33,7 @@ class Interval:
             scenes.
         p: two-sided probability of a mean this far from 0 were the truth 0 (Student's t); NaN with
             under two scenes.
+        least, most: the lowest and the highest scene; NaN where nothing was defined.
 
     Example:
         >>> value = interval({"bear": [1.0, 3.0], "fence": [4.0]})
@@ -48,6 +49,8 @@ class Interval:
     undefined: int
     detectable: float
     p: float
+    least: float = np.nan
+    most: float = np.nan
 
     @property
     def bounded(self) -> bool:
@@ -92,15 +95,16 @@ def interval(values: Table, *, level: float = 0.95) -> Interval:
     means = np.array([v.mean() for v in groups])
     mean, count = float(means.mean()), len(groups)
     if count < 2:
-        return Interval(mean, np.nan, np.nan, count, views, undefined, np.nan, np.nan)
+        return Interval(mean, np.nan, np.nan, count, views, undefined, np.nan, np.nan, mean, mean)
     error = float(means.std(ddof=1) / np.sqrt(count))
     if error <= 1e-13 * abs(mean):
         error = 0.0  # the rounding of equal means, which is no spread
     half = error * float(stats.t.ppf(0.5 + level / 2, count - 1))
     p = float(2 * stats.t.sf(abs(mean) / error, count - 1)) if error > 0 else float(mean == 0)
     return Interval(
-        mean, mean - half, mean + half, count, views, undefined, _power_factor(count) * error, p
-    )
+        mean, mean - half, mean + half, count, views, undefined, _power_factor(count) * error, p,
+        float(means.min()), float(means.max()),
+    )  # fmt: skip
 
 
 def _power_factor(scenes: int) -> float:

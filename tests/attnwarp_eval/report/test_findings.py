@@ -64,7 +64,7 @@ def test_a_claim_comes_with_its_difference_and_the_view_in_which_it_is_largest()
     (finding,) = found(results(CLAIMED, VALUES), [])
     assert finding.text.startswith("Integer pixel centres")
     assert finding.text.endswith("seen here, holds in general.")
-    assert finding.value == "+0.500 ± 0.025 layer px"
+    assert finding.value == "+0.500 (0.490 to 0.510) layer px"
     assert finding.outcome == "holds"
     assert isinstance(finding.picture, Slider)
     # 0.7 - 0.1; view 1 of scene two has the same, and a later name.
@@ -82,7 +82,7 @@ def test_a_claim_that_some_scenes_lack_says_in_how_many_it_is_seen():
 def test_a_difference_that_no_claim_names_is_told_once_with_its_verdict():
     (finding,) = found(results(OTHER, VALUES), [])
     assert finding.text.startswith("Slip: `slipped` is worse than `good` (")
-    assert (finding.value, finding.outcome) == ("+0.500 ± 0.025 layer px", "fails")
+    assert (finding.value, finding.outcome) == ("+0.500 (0.490 to 0.510) layer px", "fails")
     (bare,) = found(results(OTHER, VALUES), [], pictures=False)
     assert bare.picture is None
 

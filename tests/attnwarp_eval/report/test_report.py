@@ -120,7 +120,7 @@ def test_numbers_have_three_significant_digits(value, text):
 def test_a_mean_says_what_was_undefined_and_which_scenes_are_missing():
     value = interval({"a": [1.0, float("nan")], "b": [3.0]})
     # Two scene means 1 and 3: half width is t(0.975, 1 degree of freedom) * 1 = 12.7.
-    assert spread(value, 3) == "2.00 ± 13 (1 undefined, 2 of 3 scenes)"
+    assert spread(value, 3) == "2.00 (1.00 to 3.00) (1 undefined, 2 of 3 scenes)"
     assert spread(interval({"a": []})) == "–"
 
 
@@ -128,14 +128,14 @@ def test_an_ablation_table_shows_means_differences_and_verdicts():
     (section,) = tabulated(results(CLEAR))
     main, _, contrasts = section.tables
     column = main.columns.index("EPE on 64, layer px")
-    assert [row[column] for row in main.rows] == ["0.100 ± 0", "0.600 ± 0.025"]
+    assert [row[column] for row in main.rows] == ["0.100", "0.600 (0.590 to 0.610)"]
     assert [row[main.columns.index("M splat-pixel pairs a view")] for row in main.rows] == [
         "1.00",
         "1.00",
     ]
     row = next(row for row in contrasts.rows if row[1] == SLIP)
     assert row[0] == "slipped"
-    assert row[2] == "0.500 ± 0.025"
+    assert row[2] == "0.500 (0.490 to 0.510)"
     assert row[3] == "worse"
     assert row[6] == "3, 6"
 
@@ -215,7 +215,7 @@ def test_a_variant_measured_on_fewer_scenes_says_so():
         results({"good": CLEAR["good"], "slipped": [[0.6, 0.6], None, [0.6, 0.6]]})
     )
     column = section.tables[0].columns.index("EPE on 64, layer px")
-    assert section.tables[0].rows[1][column] == "0.600 ± 0 (2 of 3 scenes)"
+    assert section.tables[0].rows[1][column] == "0.600 (2 of 3 scenes)"
 
 
 def test_differences_that_vanish_in_every_view_are_called_the_same_values_and_never_equal():
@@ -883,7 +883,7 @@ def test_a_front_holds_variants_against_each_other_over_the_views_that_all_of_th
     (section,) = fronts(run, Layout(tmp_path))
     rows = {row[0]: row for row in section.tables[0].rows}
     for name, mean in means.items():
-        assert rows[name][1].startswith(f"{number(mean)} ± ")
+        assert rows[name][1].startswith(f"{number(mean)} (")
     assert rows["rare"][1].endswith("own views")
     # Equally slow here, so only the better of the two is on the front.
     assert {name: row[-1] for name, row in rows.items()} == {

@@ -182,8 +182,13 @@ def test_the_reports_words_need_an_interval_on_one_side_of_their_limit(tmp_path)
     (table,) = section.tables
     assert {row[0]: row[-1] for row in table.rows} == {name: name for name in THREE}
     shown = next(row for row in table.rows if row[0] == "varies, and agrees within a seed")
-    # Student's t, by hand: 4.303 * sd / sqrt(3), with sd 1, 0.577, 0.577 and 0.764.
-    assert shown[1:5] == ["21.0 ± 2.5", "12.3 ± 1.4", "2.33 ± 1.4", "-3.83 ± 1.9"]
+    # The three scenes' own values: 1 is the floor within, and the excess is within - between / 2 - 1.
+    assert shown[1:5] == [
+        "21.0 (20.0 to 22.0)",
+        "12.3 (12.0 to 13.0)",
+        "2.33 (2.00 to 3.00)",
+        "-3.83 (-4.50 to -3.00)",
+    ]
 
 
 @pytest.mark.parametrize(
