@@ -27,6 +27,9 @@ well below it.
 EXACT_ROTATION = 1e-12
 """Up to here a rotation's error is float64 rounding, and it is kept bit for bit."""
 
+SAME_PLACE = 1e-12
+"""Share of two centres' coordinates below which their distance is rounding."""
+
 
 def nearest_orthonormal(R: Array) -> Array:
     """The orthonormal (3, 3) matrix nearest to ``R``, by SVD."""
@@ -320,3 +323,29 @@ class Camera:
     def from_dict(cls, data: dict[str, Any]) -> Camera:
         """The camera that :meth:`to_dict` wrote."""
         return cls(**data)
+
+
+def fundamental(view: Camera, key: Camera) -> Array | None:
+    """(3, 3) float64 F with y^T F x = 0 for pixels x of ``view`` and y of ``key`` that see one
+    point; None where the centres of projection coincide and there is none.
+
+    F = K_key^-T [t]_x R K_view^-1 with the motion (R, t) from ``view`` to ``key`` (Hartley and
+    Zisserman 2004, section 9.2). Its scale is that of t.
+
+    Example:
+        >>> from attnwarp.camera import Camera, fundamental
+        >>> view = dict(width=8, height=8, fov_y=60, up=(0, 1, 0))
+        >>> left = Camera.look_at((0, 0, 3), (0, 0, 0), **view)
+        >>> right = Camera.look_at((1, 0, 3), (1, 0, 0), **view)
+        >>> line = fundamental(left, right) @ [2.5, 3.5, 1.0]  # a row of pixels
+        >>> bool(abs(line[0]) < 1e-12), round(float(-line[2] / line[1]), 9)
+        (True, 3.5)
+    """
+    scale = np.linalg.norm(view.position) + np.linalg.norm(key.position)
+    if np.linalg.norm(view.position - key.position) <= SAME_PLACE * scale:
+        return None
+    pose = key.relative_to(view)
+    x, y, z = pose[:3, 3]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    essential = cross @ pose[:3, :3]
+    return np.asarray(np.linalg.inv(key.K).T @ essential @ np.linalg.inv(view.K))

@@ -27,6 +27,13 @@ from attnwarp_eval.metrics.embedding import (
     image_similarity,
     match_similarity,
 )
+from attnwarp_eval.metrics.epipolar import (
+    Tsed,
+    epipolar_distance,
+    sift_matches,
+    tsed,
+    tsed_of_views,
+)
 from attnwarp_eval.metrics.fidelity import fidelity, nearest_answer
 from attnwarp_eval.metrics.image import (
     EditPsnr,
@@ -59,6 +66,7 @@ __all__ = [
     "EditPsnr",
     "Flow",
     "Similarity",
+    "Tsed",
     "YawBin",
     "YawMean",
     "above_floor",
@@ -76,6 +84,7 @@ __all__ = [
     "edit_fidelity",
     "edit_psnr",
     "endpoint_error",
+    "epipolar_distance",
     "feature_error",
     "fidelity",
     "flow_consistency",
@@ -95,7 +104,10 @@ __all__ = [
     "psnr",
     "same_answer",
     "scores",
+    "sift_matches",
     "ssim",
     "ssim_map",
+    "tsed",
+    "tsed_of_views",
     "view_dependent",
 ]

@@ -190,6 +190,13 @@ _SPECS = (
     Metric(
         "consistency.flow_false", "share", "lower", 1e-3, 0, "of what flow's check passes, not visible in the source"
     ),
+    Metric("consistency.tsed_1px", "share", "higher", 1e-4, 0, "view pairs with 10 SIFT matches, the median within 1 px of epipolar lines"),
+    Metric("consistency.tsed_2px", "share", "higher", 1e-4, 0, "the same within 2 px"),
+    Metric("consistency.tsed_4px", "share", "higher", 1e-4, 0, "the same within 4 px"),
+    Metric("consistency.tsed_distance", "px", "lower", 1e-2, 1e-2, "median over view pairs of their median epipolar distance"),
+    Metric("consistency.tsed_pairs", "views", "none", 0, 0, "view pairs that were judged"),
+    Metric("consistency.tsed_few_matches", "views", "none", 0, 0, "of them, pairs with fewer than 10 matches, which count against"),
+    Metric("consistency.tsed_no_baseline", "views", "none", 0, 0, "of them, pairs with one centre of projection, left out"),
     Metric("multiview.delta_e", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 of two edited views at the same points"),
     Metric("multiview.delta_e_floor", "dE00", "none", 1e-3, 1e-2, "the same of the true edited views"),
     Metric("multiview.delta_e_above", "dE00", "lower", 1e-3, 1e-2, "disagreement above that floor; below 0, views are more alike than true ones"),

@@ -6,7 +6,8 @@ import pytest
 from drawn_lines import drawn_distances
 
 from attnwarp import Camera
-from attnwarp.methods.epipolar import fundamental, line_distances
+from attnwarp.camera import fundamental
+from attnwarp.methods.epipolar import line_distances
 
 
 def pair():
