@@ -778,8 +778,8 @@ def test_segments_leave_the_original_or_black_outside(scene, editor):
         assert np.array_equal(kept.edited[view][:, :16], whole.edited[view][:, :16])
         assert np.array_equal(kept.edited[view][:, 16:], to_bytes(images[view])[:, 16:])
         assert (black.edited[view][:, 16:] == 0).all()
-    with pytest.raises(ValueError, match=r"segments\[0\] \(v0.png\): got float64, expected bool"):
-        run(scene, editor, settings=settings, segments=[left * 1.0] * 5)
+    with pytest.raises(ValueError, match=r"segments\[0\] \(v0.png\): got int64, expected bool"):
+        run(scene, editor, settings=settings, segments=[left * 1] * 5)
     with pytest.raises(ValueError, match="segments: every one is empty"):
         run(scene, editor, settings=settings, segments=[left & False] * 5)
 
