@@ -228,8 +228,8 @@ def likely_bounces(spec: SceneSpec) -> int:
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
-        >>> likely_bounces(load_scene("bear").spec)
-        3
+        >>> likely_bounces(load_scene("spheres").spec), likely_bounces(load_scene("bear").spec)
+        (3, 4)
     """
     more = {"glossy": 1, "specular": 1, "refraction": 1, "medium": 2, "subsurface": 6}
     present = called_for(spec)
