@@ -6,6 +6,7 @@ The metrics are pure functions of :mod:`attnwarp_eval.metrics`; this module read
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 import re
 from collections import Counter
@@ -136,13 +137,19 @@ class _Figure:
     encoder: Kind | None = None
 
 
-_EDIT, _CLIP, _DIRECTION, _DINO, _CLIP_IMAGE, _PERCEPTUAL = FIGURES = (
+_EDIT, _CLIP, _DIRECTION, _NEIGHBOURS, _DINO, _CLIP_IMAGE, _PERCEPTUAL = FIGURES = (
     _Figure("edit.psnr_mean", "Edit PSNR", ("renders", "edited")),
     _Figure("embedding.clip_similarity", "CLIP similarity", ("renders", "prompt"), "clip"),
     _Figure(
         "embedding.clip_directional",
         "CLIP directional similarity",
         ("renders", "originals", "prompt", "source_prompt"),
+        "clip",
+    ),
+    _Figure(
+        "embedding.direction_consistency",
+        "CLIP direction consistency",
+        ("renders", "originals"),
         "clip",
     ),
     _Figure(
@@ -525,7 +532,7 @@ def _tasks(
         renders = read("renders", batch)
         encode("clip", renders, result.clip)
         encode("dino", renders, result.dino)
-        changed = [name for name in batch if name in members[_DIRECTION]]
+        changed = [name for name in batch if name in members[_DIRECTION] | members[_NEIGHBOURS]]
         encode("clip", partners("originals", changed, renders), result.before)
         paired = [name for name in batch if name in members[_EDIT] | members[_PERCEPTUAL]]
         masked = paired if "masks" in folders else []
@@ -610,6 +617,11 @@ def _rows(
             similarity = metrics.directional_similarity(
                 before, after, texts["source_prompt"], texts["prompt"]
             )
+        elif figure is _NEIGHBOURS:
+            similarity = metrics.direction_consistency(
+                _stack(gathered.before, names), _stack(gathered.clip, names)
+            )
+            names = [f"{one} to {two}" for one, two in itertools.pairwise(names)]
         else:
             kind: Kind = "dino" if figure is _DINO else "clip"
             assert source is not None  # the figure needs it, see _possible

@@ -135,10 +135,17 @@ def test_the_whole_row_is_what_the_encoders_and_pixels_give(data, models):
         list(edited.values()), list(renders.values())
     )
     assert result["perceptual.distance"]["value"] == pytest.approx(lpips.mean(), rel=1e-4)
+    change = [
+        unit(clip.images([renders[v]])[0]) - unit(clip.images([originals[v]])[0]) for v in VIEWS
+    ]
+    neighbours = result["embedding.direction_consistency"]["views"]
+    assert list(neighbours) == ["view1 to view2", "view2 to view10"]
+    assert list(neighbours.values()) == pytest.approx(
+        [cosine(change[0], change[1]), cosine(change[1], change[2])], abs=1e-4
+    )
     for key, row in result.items():
-        assert (row["unit"], row["direction"]) == (metric(key).unit, metric(key).direction) and row[
-            "n"
-        ] == 3
+        assert (row["unit"], row["direction"]) == (metric(key).unit, metric(key).direction)
+        assert row["n"] == (2 if key == "embedding.direction_consistency" else 3)
 
 
 def test_what_is_saved_says_what_was_measured_with_what(data, models):
@@ -179,7 +186,10 @@ def test_json_goes_to_stdout_alone(data, models):
     "left_out, reasons",
     [
         ("edited", {"Edit PSNR": "needs --edited", "Perceptual distance": "needs --edited"}),
-        ("originals", {"CLIP directional similarity": "needs --originals"}),
+        (
+            "originals",
+            {f"CLIP direction{n}": "needs --originals" for n in ("al similarity", " consistency")},
+        ),
         (
             "source-edit",
             {f"{n} single-image similarity": "needs --source-edit" for n in ("CLIP", "DINO")},
@@ -209,7 +219,7 @@ def test_what_is_left_out_costs_its_figures_and_the_reason_is_said(data, models,
     assert saved(folder)["not_computed"] == reasons
     for title, reason in reasons.items():
         assert f"not computed: {title}: {reason}" in done.stderr
-    assert len(saved(folder)["metrics"]) == 7 - len(reasons) - (
+    assert len(saved(folder)["metrics"]) == 8 - len(reasons) - (
         "Edit PSNR" in reasons
     )  # Edit PSNR has two rows
 
