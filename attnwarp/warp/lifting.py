@@ -52,6 +52,18 @@ class LiftedMask:
             says it does not.
         agreement: for each mask, the intersection over union of it and of this, rendered there; NaN
             where both are empty.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.warp import lift_masks
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.3), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = dict(width=8, height=8, fov_y=40, up=(0, 1, 0))
+        >>> front, back = (Camera.look_at((0, 0, z), (0, 0, 0), **view) for z in (3, -3))
+        >>> lifted = lift_masks(disc, [front], [np.ones((8, 8), dtype=bool)])
+        >>> lifted.seen.tolist(), bool(lifted.render(back)[4, 4] > 0.5)
+        ([True], True)
     """
 
     gaussians: Gaussians

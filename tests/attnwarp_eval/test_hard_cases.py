@@ -218,9 +218,9 @@ def test_a_scan_with_a_hole_doubled_faces_and_a_sliver_goes_through_the_whole_ch
     assert (rays[1].depth > rays[0].depth)[~same & rays[1].valid].all()
     pair = two_view(geometry, torn.source, torn.targets[0])
     assert pair.visible.mean() > 0.2
-    with pytest.warns(MeshNotice):
-        image = appearance(torn, torn.source)
-        splats = surface_splats(torn, "2d", 500)
+    # Its shapes are built once, and noticed once.
+    image = appearance(torn, torn.source)
+    splats = surface_splats(torn, "2d", 500)
     assert np.isfinite(image).all() and image.mean() > 0.05
     assert len(splats.means) > 300 and np.isfinite(np.asarray(splats.means)).all()
 

@@ -179,7 +179,7 @@ def test_splats_that_were_moved_since_are_refused_where_nothing_was_kept() -> No
         _ = view.distortion_l1
 
 
-def test_a_picture_of_nothing_has_none() -> None:
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_picture_of_nothing_has_none(backend: str) -> None:
     nothing = crossing_discs(2, seed=0).select(torch.tensor([], dtype=torch.long))
-    for backend in BACKENDS:
-        assert not render(nothing, front_camera(5, 4), backend=backend).distortion_l1.any()
+    assert not render(nothing, front_camera(5, 4), backend=backend).distortion_l1.any()
