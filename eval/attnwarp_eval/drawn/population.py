@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -25,7 +26,7 @@ OTHER_SEED = 1_000_003
 Count = Annotated[int, Field(ge=1, le=10_000)]
 
 
-class _Scenes(Spec):
+class _Scenes(Spec, ABC):
     """Keys of every population."""
 
     generator: Literal[1] = 1
@@ -39,21 +40,22 @@ class _Scenes(Spec):
         return self
 
     @property
+    @abstractmethod
     def count(self) -> int:
         """Number of scenes."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def word(self) -> str:
         """First word of the scenes' names."""
-        raise NotImplementedError
 
+    @abstractmethod
     def scene(self, number: int) -> Drawn:
         """Draw one of them."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _what(self) -> str:
-        raise NotImplementedError
+        """Number and kind of the scenes, in words."""
 
     def _decided_by(self) -> Any:
         """Whatever decides the scenes beside the population's own keys."""

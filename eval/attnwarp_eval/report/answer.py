@@ -10,7 +10,7 @@ from statistics import fmean
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
 from attnwarp_eval.metrics.registry import Metric
-from attnwarp_eval.statistics.intervals import interval
+from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.results import Results
@@ -78,13 +78,11 @@ def in_words(value: float, metric: Metric, key: str) -> str:
     return f"{text} {_UNITS.get(metric.unit, '')}".strip()
 
 
-def _figure(results: Results, column: AnswerColumn, variant: str) -> tuple[float, list[float], str]:
-    """Mean over scenes, each scene's mean, and the figure's full name."""
+def _figure(results: Results, column: AnswerColumn, variant: str) -> tuple[Interval, str]:
+    """Mean over scenes, and the figure's full name."""
     key = column.metric.format(layer=results.layer)
     table = results.views(column.probe, variant, key, column.yaw)
-    by_scene = [interval({scene: list(views.values())}).mean for scene, views in table.items()]
-    defined = [value for value in by_scene if math.isfinite(value)]
-    return (fmean(defined) if defined else math.nan), defined, key
+    return interval({scene: list(views.values()) for scene, views in table.items()}), key
 
 
 def _filled(results: Results, asked: Answer, sentence: str) -> str:
@@ -92,8 +90,8 @@ def _filled(results: Results, asked: Answer, sentence: str) -> str:
 
     def figure(match: re.Match[str]) -> str:
         column = asked.columns[match[1]]
-        value, _, key = _figure(results, column, match[2])
-        return in_words(value, probe(column.probe).metric(key), key)
+        value, key = _figure(results, column, match[2])
+        return in_words(value.mean, probe(column.probe).metric(key), key)
 
     return FIGURE.sub(figure, sentence)
 
@@ -106,18 +104,20 @@ def _table(results: Results, asked: Answer, timings: bool) -> tuple[Table, list[
         figures = {name: _figure(results, column, name) for name in rows}
         key = column.metric.format(layer=results.layer)
         metric = probe(column.probe).metric(key)
-        leaders = _leaders({name: value for name, (value, _, _) in figures.items()}, metric)
+        leaders = _leaders({name: value.mean for name, (value, _) in figures.items()}, metric)
         if title == asked.decides:
             decided = leaders
         # What is said of all figures stands once, in the column's head.
         _, _, unit = in_words(1.0, metric, key).partition(" ")
         columns.append(title if unit in ("", "%") else f"{title}, {unit}")
-        for name, (value, scenes, _) in figures.items():
-            text = _cell(value, metric, key, unit)
+        for name, (value, _) in figures.items():
+            text = _cell(value.mean, metric, key, unit)
             text = f"**{text}**" if name in leaders else text
-            if 1 < len(scenes) < FEWEST_SCENES:
-                low, high = (_cell(end, metric, key, unit) for end in (min(scenes), max(scenes)))
+            if 1 < value.scenes < FEWEST_SCENES:
+                low, high = (_cell(end, metric, key, unit) for end in (value.least, value.most))
                 text += f" ({low.removesuffix(' %')} to {high})"
+            if value.undefined and value.views:
+                text += f", {value.undefined} undefined"
             rows[name].append(text)
     timed: tuple[str, ...] = ()
     if timings:
@@ -163,8 +163,8 @@ def _advice(results: Results, asked: Answer, leaders: list[str]) -> str:
     if not leaders:
         return f"No variant is better than the others in {asked.decides}."
     column = asked.columns[asked.decides]
-    value, _, key = _figure(results, column, leaders[0])
-    figure = in_words(value, probe(column.probe).metric(key), key)
+    value, key = _figure(results, column, leaders[0])
+    figure = in_words(value.mean, probe(column.probe).metric(key), key)
     several = " or ".join(f"`{name}`" for name in leaders)
     return f"Use {several} because of these variants it has the best {asked.decides}: {figure}."
 

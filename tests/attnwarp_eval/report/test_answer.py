@@ -61,6 +61,12 @@ def test_an_answer_has_the_means_over_scenes_of_views_in_range_as_words():
     ]
 
 
+def test_views_without_a_value_are_counted_and_not_averaged_in():
+    made = run()
+    made.cells[0].record.views[0].metrics[ERROR] = float("nan")  # one of two views of one scene
+    assert answer(made).tables[0].rows[0][2] == "**20 %** (10 to 30 %), 1 undefined"
+
+
 def test_the_variant_that_is_best_where_it_decides_is_recommended():
     advice = answer(run()).text[2]
     assert advice.startswith("Use `masked`") and "feature error: 20 %" in advice
