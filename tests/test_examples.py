@@ -137,6 +137,8 @@ originals = list(np.random.default_rng(0).random((3, 64, 64, 3)))
 edited = [1 - picture for picture in originals]
 source, target = originals[:2]
 source_edited, target_edited = edited[:2]
+from few_splats import few_splats
+splats = few_splats()
 from attnwarp import Camera
 size = {"width": 64, "height": 64, "fov_y": 60}
 cameras = [Camera.look_at((x, -4, 0), (0, 0, 0), **size) for x in (0, 1, 2)]

@@ -57,6 +57,13 @@ class Preprocessing:
         """(height, width) of the output; None if it depends on the picture."""
         return self.crop or (self.resize if isinstance(self.resize, tuple) else None)
 
+    @property
+    def seen(self) -> float:
+        """Share of a picture's shorter side that is left by the crop, in (0, 1]."""
+        if self.crop is None or not isinstance(self.resize, int):
+            return 1.0
+        return min(1.0, min(self.crop) / self.resize)
+
     def __call__(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """(H, W, 3) in [0, 1] to (3, h, w), normalised."""
         if self.resize is not None:

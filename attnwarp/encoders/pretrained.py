@@ -59,7 +59,7 @@ class _Pictures:
         self, about: EncoderInfo, preprocessing: Preprocessing, device: torch.device
     ) -> None:
         self.about = about
-        self._preprocess = preprocessing
+        self.preprocess = preprocessing
         self._device = device
 
     def _run(
@@ -73,7 +73,7 @@ class _Pictures:
         results: list[npt.NDArray[np.float64]] = []
         for start in range(0, len(images), BATCH):
             batch = [
-                self._preprocess(checked_image(images[i], f"images[{i}]"))
+                self.preprocess(checked_image(images[i], f"images[{i}]"))
                 for i in range(start, min(start + BATCH, len(images)))
             ]
             for _, equal in groupby(batch, key=lambda picture: picture.shape):
@@ -174,7 +174,7 @@ class Dino(_Pictures):
             )
         if grids:
             return np.stack(grids)
-        height, width = self._preprocess.shape or (0, 0)
+        height, width = self.preprocess.shape or (0, 0)
         return np.zeros((0, height // self._patch, width // self._patch, self._dim))
 
     def _grid(self, x: torch.Tensor) -> torch.Tensor:

@@ -28,8 +28,11 @@ from attnwarp_eval.metrics.embedding import (
     match_similarity,
 )
 from attnwarp_eval.metrics.epipolar import (
+    Keypoints,
     Tsed,
     epipolar_distance,
+    match_features,
+    sift_features,
     sift_matches,
     tsed,
     tsed_of_views,
@@ -45,6 +48,12 @@ from attnwarp_eval.metrics.image import (
     psnr,
     ssim,
     ssim_map,
+)
+from attnwarp_eval.metrics.known_geometry import (
+    disagreement_at,
+    edit_agreement,
+    feature_consistency,
+    perceptual_consistency,
 )
 from attnwarp_eval.metrics.labels import carried_labels, label_transport
 from attnwarp_eval.metrics.multiview import (
@@ -65,6 +74,7 @@ __all__ = [
     "Disagreement",
     "EditPsnr",
     "Flow",
+    "Keypoints",
     "Similarity",
     "Tsed",
     "YawBin",
@@ -81,10 +91,13 @@ __all__ = [
     "depth_error",
     "direction_consistency",
     "directional_similarity",
+    "disagreement_at",
+    "edit_agreement",
     "edit_fidelity",
     "edit_psnr",
     "endpoint_error",
     "epipolar_distance",
+    "feature_consistency",
     "feature_error",
     "fidelity",
     "flow_consistency",
@@ -93,6 +106,7 @@ __all__ = [
     "image_similarity",
     "label_transport",
     "mask_error",
+    "match_features",
     "match_similarity",
     "mean_by_yaw",
     "metric",
@@ -101,9 +115,11 @@ __all__ = [
     "nearest_answer",
     "optical_flow",
     "perceptual",
+    "perceptual_consistency",
     "psnr",
     "same_answer",
     "scores",
+    "sift_features",
     "sift_matches",
     "ssim",
     "ssim_map",

@@ -138,7 +138,7 @@ def cross_view(
     counted = selected & ~pair.edge
     if exclude is not None:
         counted &= ~region(exclude, target.shape, "exclude")
-    return _disagreement(source, target, pair.xy, counted, int(selected.sum()))
+    return disagreement(source, target, pair.xy, counted, int(selected.sum()))
 
 
 def view_dependent(
@@ -180,7 +180,7 @@ def view_dependent(
             f"tolerance: got {tolerance}, expected a number of linear light that is not negative"
         )
     source, target = (to_linear(each) for each in _pictures(source_srgb, target_srgb, pair))
-    ask = pair.visible & ~pair.edge & _has_taps(pair.xy, source.shape)
+    ask = pair.visible & ~pair.edge & has_taps(pair.xy, source.shape)
     column, row = np.floor(pair.xy[ask] - 0.5).astype(np.int64).T
     # The last pixel's centre has its second tap at weight 0, outside.
     right, below = (
@@ -255,9 +255,9 @@ def optical_flow(source_srgb: Any, target_srgb: Any, method: FlowMethod = "dis")
     backward = _flow(_grey(source), _grey(target), method)
     centers = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
     xy = centers + forward
-    inside = _has_taps(xy, shape)
+    inside = has_taps(xy, shape)
     back = np.full((*shape, 2), np.nan)
-    back[inside] = _sample(backward, xy[inside])
+    back[inside] = sampled(backward, xy[inside])
     gap, length = (
         ((forward + back) ** 2).sum(axis=-1),
         (forward**2).sum(axis=-1) + (back**2).sum(axis=-1),
@@ -292,7 +292,7 @@ def flow_consistency(
     target = picture(target_srgb, "target_srgb", shape=shape)
     source = picture(source_srgb, "source_srgb", shape=shape)
     selected = region(mask, shape)
-    return _disagreement(source, target, flow.xy, selected & flow.accepted, int(selected.sum()))
+    return disagreement(source, target, flow.xy, selected & flow.accepted, int(selected.sum()))
 
 
 def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, float]:
@@ -380,7 +380,7 @@ def _pictures(source_srgb: Any, target_srgb: Any, pair: TwoView) -> tuple[Array,
     )
 
 
-def _has_taps(xy: Array, shape: tuple[int, ...]) -> Mask:
+def has_taps(xy: Array, shape: tuple[int, ...]) -> Mask:
     """Positions with all four bilinear taps in a picture of (H, W): not beyond the outermost pixel
     centres; not NaN.
     """
@@ -392,7 +392,7 @@ def _has_taps(xy: Array, shape: tuple[int, ...]) -> Mask:
     return inside
 
 
-def _sample(image: Array, xy: Array) -> Array:
+def sampled(image: Array, xy: Array) -> Array:
     """(N, C) bilinear samples of an (H, W, C) picture at (N, 2) positions that have taps."""
     from scipy.ndimage import map_coordinates
 
@@ -406,17 +406,17 @@ def _sample(image: Array, xy: Array) -> Array:
     )
 
 
-def _disagreement(
+def disagreement(
     source: Array, target: Array, xy: Array, pixels: Mask, candidates: int
 ) -> Disagreement:
     """Disagreement of sRGB pictures, at the pixels of ``pixels`` whose position has taps."""
     from skimage.color import deltaE_ciede2000, rgb2lab
 
-    counted = pixels & _has_taps(xy, source.shape)
+    counted = pixels & has_taps(xy, source.shape)
     shape = counted.shape
     linear, srgb, delta_e = (np.full((*shape, *rest), np.nan) for rest in ((3,), (3,), ()))
     if counted.any():
-        source_colors = _sample(to_linear(source), xy[counted])
+        source_colors = sampled(to_linear(source), xy[counted])
         target_colors = target[counted]
         source_srgb_colors = to_srgb(source_colors)
         linear[counted] = to_linear(target_colors) - source_colors

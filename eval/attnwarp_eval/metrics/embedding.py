@@ -78,7 +78,7 @@ def clip_similarity(images: npt.ArrayLike, text: npt.ArrayLike) -> Similarity:
         [1.0, 0.0]
     """
     pictures = _embeddings(images, "images")
-    return Similarity(_cosine(_unit(pictures), _unit(_matching(text, pictures, "text"))))
+    return Similarity(_cosine(unit_rows(pictures), unit_rows(_matching(text, pictures, "text"))))
 
 
 def directional_similarity(
@@ -114,10 +114,12 @@ def directional_similarity(
     """
     after = _embeddings(images_after, "images_after")
     change = _change(images_before, after)
-    wanted = _unit(_matching(text_after, after, "text_after")) - _unit(
+    wanted = unit_rows(_matching(text_after, after, "text_after")) - unit_rows(
         _matching(text_before, after, "text_before")
     )
-    return Similarity(_cosine(_unit(change, TINY_DISPLACEMENT), _unit(wanted, TINY_DISPLACEMENT)))
+    return Similarity(
+        _cosine(unit_rows(change, TINY_DISPLACEMENT), unit_rows(wanted, TINY_DISPLACEMENT))
+    )
 
 
 def direction_consistency(images_before: npt.ArrayLike, images_after: npt.ArrayLike) -> Similarity:
@@ -146,7 +148,7 @@ def direction_consistency(images_before: npt.ArrayLike, images_after: npt.ArrayL
         >>> metrics.direction_consistency(before, after).values.round(9).tolist()
         [1.0, 0.5]
     """
-    change = _unit(_change(images_before, images_after), TINY_DISPLACEMENT)
+    change = unit_rows(_change(images_before, images_after), TINY_DISPLACEMENT)
     return Similarity(_cosine(change[:-1], change[1:]))
 
 
@@ -202,10 +204,10 @@ def match_similarity(
             raise ValueError(
                 f"{name}: got shape {array.shape}, expected {before.shape}, as before the edit"
             )
-        after.append(_unit(array))
+        after.append(unit_rows(array))
     if not (len(source) and len(target)):
         return Similarity(np.zeros(0))
-    cosines = np.nan_to_num(_unit(source) @ _unit(target).T, nan=-np.inf)
+    cosines = np.nan_to_num(unit_rows(source) @ unit_rows(target).T, nan=-np.inf)
     nearest = cosines.argmax(axis=1)
     rows = np.arange(len(source))
     mutual = (cosines.argmax(axis=0)[nearest] == rows) & np.isfinite(cosines[rows, nearest])
@@ -234,7 +236,7 @@ def image_similarity(source_edit: npt.ArrayLike, renders: npt.ArrayLike) -> Simi
     """
     pictures = _embeddings(renders, "renders")
     source = _matching(source_edit, pictures, "source_edit")
-    return Similarity(_cosine(_unit(pictures), _unit(source)))
+    return Similarity(_cosine(unit_rows(pictures), unit_rows(source)))
 
 
 def _change(before: npt.ArrayLike, after: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -244,7 +246,7 @@ def _change(before: npt.ArrayLike, after: npt.ArrayLike) -> npt.NDArray[np.float
         raise ValueError(
             f"images_before: got shape {first.shape}, expected {second.shape}, as images_after"
         )
-    return _unit(second) - _unit(first)
+    return unit_rows(second) - unit_rows(first)
 
 
 def _embeddings(value: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
@@ -278,7 +280,7 @@ def _matching(
     return array
 
 
-def _unit(rows: npt.NDArray[np.float64], tiny: float = TINY_NORM) -> npt.NDArray[np.float64]:
+def unit_rows(rows: npt.NDArray[np.float64], tiny: float = TINY_NORM) -> npt.NDArray[np.float64]:
     """Rows of length 1, and NaN where a row is shorter than ``tiny``."""
     # Scaled first: the square of a float64 above 1e154 overflows.
     largest = np.abs(rows).max(axis=1, initial=0, keepdims=True)

@@ -169,30 +169,88 @@ def sift_matches(source_srgb: Any, target_srgb: Any) -> tuple[Array, Array]:
         >>> np.median(source - target, axis=0).round(1).tolist()
         [16.0, 0.0]
     """
+    return match_features(
+        sift_features(source_srgb, "source_srgb"), sift_features(target_srgb, "target_srgb")
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """Keypoints of a picture, from :func:`sift_features`.
+
+    Attributes:
+        xy: (N, 2) px, pixel centres at +0.5.
+        descriptors: (N, 128) float32; None without a keypoint.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval.metrics import Keypoints
+        >>> len(Keypoints(np.zeros((0, 2)), None).xy)
+        0
+    """
+
+    xy: Array
+    descriptors: npt.NDArray[np.float32] | None
+
+
+def sift_features(image_srgb: Any, name: str = "image_srgb") -> Keypoints:
+    """Find SIFT features of a picture, by OpenCV.
+
+    Args:
+        image_srgb: (H, W, 3) sRGB in [0, 1].
+        name: of the picture, for messages.
+
+    Raises:
+        ValueError: a picture that is not sRGB in [0, 1].
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> metrics.sift_features(np.zeros((64, 64, 3))).xy.shape
+        (0, 2)
+    """
     import cv2
 
     cv: Any = cv2  # its stubs lack the precise upscaling, without which positions are 0.25 px off
-    detector = cv.SIFT_create(enable_precise_upscale=True)
-    found = []
-    for value, name in ((source_srgb, "source_srgb"), (target_srgb, "target_srgb")):
-        eight_bit = np.round(255 * picture(value, name)).astype(np.uint8)
-        points, features = detector.detectAndCompute(
-            cv.cvtColor(eight_bit, cv.COLOR_RGB2GRAY), None
-        )
-        found.append((np.array([point.pt for point in points]).reshape(-1, 2) + 0.5, features))
-    (source, source_features), (target, target_features) = found
-    if len(source) < 2 or len(target) < 2:
+    eight_bit = np.round(255 * picture(image_srgb, name)).astype(np.uint8)
+    points, descriptors = cv.SIFT_create(enable_precise_upscale=True).detectAndCompute(
+        cv.cvtColor(eight_bit, cv.COLOR_RGB2GRAY), None
+    )
+    return Keypoints(np.array([point.pt for point in points]).reshape(-1, 2) + 0.5, descriptors)
+
+
+def match_features(source: Keypoints, target: Keypoints) -> tuple[Array, Array]:
+    """Match features of two pictures: both nearest to each other, and by a margin.
+
+    Args:
+        source, target: from :func:`sift_features`.
+
+    Returns:
+        (N, 2) and (N, 2) positions in px, as of :func:`sift_matches`.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> coarse = np.random.default_rng(0).random((16, 16, 3))
+        >>> features = metrics.sift_features(np.kron(coarse, np.ones((8, 8, 1))))
+        >>> source, target = metrics.match_features(features, features)
+        >>> np.abs(source - target).max().item()
+        0.0
+    """
+    import cv2
+
+    if len(source.xy) < 2 or len(target.xy) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    matcher = cv.BFMatcher(cv.NORM_L2)
-    there = matcher.knnMatch(source_features, target_features, k=2)
-    back = {m.queryIdx: m.trainIdx for m in matcher.match(target_features, source_features)}
+    matcher: Any = cv2.BFMatcher(cv2.NORM_L2)
+    there = matcher.knnMatch(source.descriptors, target.descriptors, k=2)
+    back = {m.queryIdx: m.trainIdx for m in matcher.match(target.descriptors, source.descriptors)}
     rows = [
         (best.queryIdx, best.trainIdx)
         for best, second in there
         if best.distance < RATIO * second.distance and back[best.trainIdx] == best.queryIdx
     ]
     index = np.array(rows, dtype=np.int64).reshape(-1, 2)
-    return source[index[:, 0]], target[index[:, 1]]
+    return source.xy[index[:, 0]], target.xy[index[:, 1]]
 
 
 def tsed_of_views(images: Sequence[Any], cameras: Sequence[Camera]) -> Tsed:
@@ -223,13 +281,13 @@ def tsed_of_views(images: Sequence[Any], cameras: Sequence[Camera]) -> Tsed:
 
     if len(images) != len(cameras):
         raise ValueError(f"images: got {len(images)}, expected {len(cameras)}, one for each camera")
-    views = [
-        (picture(image, f"images[{i}]", shape=(camera.height, camera.width)), camera)
+    features = [
+        sift_features(picture(image, f"images[{i}]", shape=(camera.height, camera.width)))
         for i, (image, camera) in enumerate(zip(images, cameras, strict=True))
     ]
     distances: list[Array | None] = []
-    for (source, view), (target, key) in itertools.pairwise(views):
+    for (source, view), (target, key) in itertools.pairwise(zip(features, cameras, strict=True)):
         F = fundamental(view, key)
-        matches = None if F is None else sift_matches(source, target)
+        matches = None if F is None else match_features(source, target)
         distances.append(None if matches is None else epipolar_distance(*matches, F))
     return tsed(distances)

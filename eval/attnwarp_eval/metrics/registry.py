@@ -158,6 +158,7 @@ _SPECS = (
             ("", "at exact correspondences"),
             ("flow_", "along optical flow"),
             ("flow_same_", "along optical flow at the pixels of the exact figure"),
+            ("rendered_", "at correspondences of rendered depth"),
         )
         for name, unit, direction, atol, rtol, what in _DISAGREEMENT
     ),
@@ -197,6 +198,11 @@ _SPECS = (
     Metric("consistency.tsed_pairs", "views", "none", 0, 0, "view pairs that were judged"),
     Metric("consistency.tsed_few_matches", "views", "none", 0, 0, "of them, pairs with fewer than 10 matches, which count against"),
     Metric("consistency.tsed_no_baseline", "views", "none", 0, 0, "of them, pairs with one centre of projection, left out"),
+    Metric("consistency.edit_delta_e", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 of two views at known correspondences that the edit adds, changed pixels"),
+    Metric("consistency.edit_delta_e_p90", "dE00", "lower", 1e-2, 1e-2, "90th percentile of it"),
+    Metric("consistency.edit_pixels", "pixels", "none", 0, 0, "changed pixels that were compared"),
+    Metric("consistency.features", "ratio", "lower", 1e-3, 0, "1 - cosine of the features of two views at known correspondences"),
+    Metric("consistency.perceptual", "ratio", "lower", 1e-4, 1e-2, "perceptual distance of a view and the other warped to it, known correspondences"),
     Metric("multiview.delta_e", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 of two edited views at the same points"),
     Metric("multiview.delta_e_floor", "dE00", "none", 1e-3, 1e-2, "the same of the true edited views"),
     Metric("multiview.delta_e_above", "dE00", "lower", 1e-3, 1e-2, "disagreement above that floor; below 0, views are more alike than true ones"),
