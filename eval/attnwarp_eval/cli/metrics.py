@@ -56,6 +56,18 @@ def metrics(
             )
         ),
     ] = None,
+    consistency: Annotated[
+        Path | None,
+        typer.Option(
+            help="transforms.json, its folder, or a COLMAP folder: do neighbouring views agree? Its"
+            " pictures are the edited ones, or with --renders those before the edit.",
+            metavar="DATA",
+        ),
+    ] = None,
+    ply: Annotated[
+        Path | None,
+        typer.Option(help="Splats before the edit, for --consistency at rendered depth."),
+    ] = None,
     background: Annotated[
         str, typer.Option(help="Behind transparent pixels: black, white, or r,g,b in [0, 1].")
     ] = "black",
@@ -67,7 +79,7 @@ def metrics(
         bool, typer.Option("--json", help="Print metrics.json instead of a table.")
     ] = False,
 ) -> None:
-    """Edit PSNR, CLIP, DINO and perceptual figures of your own pictures.
+    """Edit PSNR, CLIP, DINO and perceptual figures of your own pictures, or their consistency.
 
     A figure that cannot be computed is named with the reason.
     """
@@ -77,18 +89,33 @@ def metrics(
         from attnwarp.errors import InputError
         from attnwarp_eval.study.store import Store
         from attnwarp_eval.user_images import measure, write
+        from attnwarp_eval.user_images.consistency import measure_consistency
 
         inputs = measure.Inputs(
-            renders, edited, originals, source_edit, prompt, source_prompt, mask, _color(background)
-        )
+            renders, edited, originals, source_edit, prompt, source_prompt, mask, consistency, ply,
+            _color(background),
+        )  # fmt: skip
+        one_view = {
+            "--edited": edited, "--source-edit": source_edit, "--prompt": prompt,
+            "--source-prompt": source_prompt, "--mask": mask,
+        }  # fmt: skip
+        unread = [name for name, value in one_view.items() if value is not None]
+        if consistency is not None and unread:
+            raise InputError(
+                f"{unread[0]}: figures of single views do not go with --consistency; leave it out"
+                " here, or --consistency"
+            )
+        if consistency is None and ply is not None:
+            raise InputError("--ply: needs --consistency DATA, cameras with pictures")
         if (out / "study.json").exists():
             raise InputError(
                 f"--out: {out} is the run of a study, to which these figures would be strange;"
                 " name another folder"
             )
         kinds: dict[Any, str | None] = {"clip": clip, "dino": dino, "perceptual": perceptual}
+        work = measure.measure if consistency is None else measure_consistency
         with reporter() as report, resumable(lambda: "finished batches of views are kept"):
-            measured = measure.measure(inputs, kinds, Store(out), device=device, report=report)
+            measured = work(inputs, kinds, Store(out), device=device, report=report)
         paths = write.write(measured, out)
     if as_json:
         typer.echo(write.to_json(measured), nl=False)

@@ -61,6 +61,8 @@ class Inputs:
         source_prompt: what the scene showed before.
         masks: folder of masks, named as the renders: white counts for Edit PSNR and the perceptual
             distance, black and transparent do not.
+        poses, ply: cameras with pictures, and splats of the scene before the edit, for
+            :func:`attnwarp_eval.user_images.consistency.measure_consistency`.
         background: sRGB in [0, 1] behind transparent pixels of pictures.
     """
 
@@ -71,6 +73,8 @@ class Inputs:
     prompt: str | None = None
     source_prompt: str | None = None
     masks: Path | None = None
+    poses: Path | None = None
+    ply: Path | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
@@ -130,35 +134,43 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class _Figure:
+class Figure:
+    """A figure that pictures may give.
+
+    Attributes:
+        key, title: as of :class:`Row`.
+        needs: fields of :class:`Inputs`.
+        encoder: kind of the encoder behind it, if any.
+    """
+
     key: str
     title: str
-    needs: tuple[str, ...]  # fields of Inputs
+    needs: tuple[str, ...]
     encoder: Kind | None = None
 
 
 _EDIT, _CLIP, _DIRECTION, _NEIGHBOURS, _DINO, _CLIP_IMAGE, _PERCEPTUAL = FIGURES = (
-    _Figure("edit.psnr_mean", "Edit PSNR", ("renders", "edited")),
-    _Figure("embedding.clip_similarity", "CLIP similarity", ("renders", "prompt"), "clip"),
-    _Figure(
+    Figure("edit.psnr_mean", "Edit PSNR", ("renders", "edited")),
+    Figure("embedding.clip_similarity", "CLIP similarity", ("renders", "prompt"), "clip"),
+    Figure(
         "embedding.clip_directional",
         "CLIP directional similarity",
         ("renders", "originals", "prompt", "source_prompt"),
         "clip",
     ),
-    _Figure(
+    Figure(
         "embedding.direction_consistency",
         "CLIP direction consistency",
         ("renders", "originals"),
         "clip",
     ),
-    _Figure(
+    Figure(
         "embedding.dino_image", "DINO single-image similarity", ("renders", "source_edit"), "dino"
     ),
-    _Figure(
+    Figure(
         "embedding.clip_image", "CLIP single-image similarity", ("renders", "source_edit"), "clip"
     ),
-    _Figure("perceptual.distance", "Perceptual distance", ("renders", "edited"), "perceptual"),
+    Figure("perceptual.distance", "Perceptual distance", ("renders", "edited"), "perceptual"),
 )
 
 _MASKED = (_EDIT, _PERCEPTUAL)
@@ -221,7 +233,7 @@ def measure(
     wanted = _possible(inputs, folders, encoders, done)
     # Also where bundled encoders alone are needed, which would leave it unread.
     device_of(device)
-    loaded = _load(wanted, encoders, device, done)
+    loaded = load_encoders(wanted, encoders, device, done)
     wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
     if not wanted:
         raise InputError(
@@ -328,7 +340,7 @@ def _possible(
     folders: Mapping[str, Mapping[str, Path]],
     encoders: Mapping[Kind, str | None],
     done: Measured,
-) -> list[_Figure]:
+) -> list[Figure]:
     """The figures that the inputs allow; the others' reasons go to ``done``."""
     wanted = []
     for figure in FIGURES:
@@ -347,9 +359,14 @@ def _possible(
     return wanted
 
 
-def _load(
-    wanted: Sequence[_Figure], encoders: Mapping[Kind, str | None], device: str, done: Measured
+def load_encoders(
+    wanted: Sequence[Figure], encoders: Mapping[Kind, str | None], device: str, done: Measured
 ) -> dict[Kind, Any]:
+    """Load the encoders of figures; those that cannot be loaded cost their figures.
+
+    Raises:
+        InputError: one that is named cannot be loaded, or is of another kind.
+    """
     for kind, name in encoders.items():
         if name is None or name == "none":
             continue
@@ -379,12 +396,12 @@ def _load(
     return loaded
 
 
-def _views(figure: _Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[str]:
+def _views(figure: Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[str]:
     first, *others = _groups(figure, folders)
     return [name for name in folders[first] if all(name in folders[other] for other in others)]
 
 
-def _groups(figure: _Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[str]:
+def _groups(figure: Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[str]:
     """The folders that a figure is computed from."""
     used = [name for name in figure.needs if name in folders]
     return [*used, "masks"] if figure in _MASKED and "masks" in folders else used
@@ -392,7 +409,7 @@ def _groups(figure: _Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[
 
 def _compare_names(
     folders: Mapping[str, Mapping[str, Path]],
-    views: Mapping[_Figure, Sequence[str]],
+    views: Mapping[Figure, Sequence[str]],
     done: Measured,
 ) -> None:
     """Name the pictures without a partner."""
@@ -421,7 +438,7 @@ def _compare_names(
 
 
 def _check_sizes(
-    folders: Mapping[str, Mapping[str, Path]], views: Mapping[_Figure, Sequence[str]]
+    folders: Mapping[str, Mapping[str, Path]], views: Mapping[Figure, Sequence[str]]
 ) -> None:
     """Check before anything is computed that both pictures of a pair have one size."""
     from attnwarp.io.images import upright_size
@@ -495,7 +512,7 @@ class _Gathered:
 def _tasks(
     inputs: Inputs,
     folders: Mapping[str, Mapping[str, Path]],
-    views: Mapping[_Figure, Sequence[str]],
+    views: Mapping[Figure, Sequence[str]],
     needed: Sequence[str],
     loaded: Mapping[Kind, Any],
     device: str,
@@ -589,7 +606,7 @@ def _sha256(path: Path) -> str:
 def _rows(
     inputs: Inputs,
     source: Picture | None,
-    views: Mapping[_Figure, Sequence[str]],
+    views: Mapping[Figure, Sequence[str]],
     loaded: Mapping[Kind, Any],
     gathered: _Gathered,
     done: Measured,
@@ -654,7 +671,7 @@ def _edit_rows(errors: Mapping[str, tuple[float, float]], done: Measured) -> Non
         )
 
 
-def _texts_needed(views: Iterable[_Figure]) -> list[str]:
+def _texts_needed(views: Iterable[Figure]) -> list[str]:
     return [
         n
         for n in ("prompt", "source_prompt")

@@ -23,7 +23,17 @@ FORMAT = 1
 
 _TITLE = "Metrics of the edited scene"
 
-_INPUTS = ("renders", "edited", "originals", "source_edit", "masks", "prompt", "source_prompt")
+_INPUTS = (
+    "renders",
+    "edited",
+    "originals",
+    "source_edit",
+    "masks",
+    "prompt",
+    "source_prompt",
+    "poses",
+    "ply",
+)
 
 _READING = (
     "Pictures are read as sRGB in [0, 1]: 8 bits over 255, 16 bits over 65535, grey as three equal"

@@ -1,0 +1,408 @@
+"""Do neighbouring views of a person's own edit agree? Pictures with poses, and no truth.
+
+The metrics are pure functions of :mod:`attnwarp_eval.metrics`; this module reads the files, and
+compares each view with the next in the order of their names. Keypoints are found at full size; all
+else is computed on pictures whose longest side is :data:`LONGEST` px, the size of the study
+``audit``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp import check
+from attnwarp.camera import Camera, fundamental
+from attnwarp.encoders import Kind
+from attnwarp.errors import InputError
+from attnwarp.reporting import SILENT, Reporter
+from attnwarp_eval import metrics
+from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.metrics.epipolar import LEAST_MATCHES, LIMITS
+from attnwarp_eval.study.record import with_nan
+from attnwarp_eval.study.store import Store
+from attnwarp_eval.study.task import Task, results
+from attnwarp_eval.user_images.measure import (
+    OFF,
+    Figure,
+    Inputs,
+    Measured,
+    Picture,
+    Row,
+    load_encoders,
+    natural,
+    pictures_in,
+    read_picture,
+)
+
+LONGEST = 256
+"""Longest side in px of the pictures that all but keypoints are computed on; smaller ones stay."""
+
+PROTOCOL = 1
+"""Raised whenever the same pictures would give other figures."""
+
+_TSED = tuple(
+    Figure(f"consistency.tsed_{limit}px", f"TSED at {limit} px", ("poses",)) for limit in LIMITS
+)
+_DISTANCE = Figure("consistency.tsed_distance", "Epipolar distance", ("poses",))
+_FLOW = Figure("consistency.flow_delta_e", "Flow warp error", ("originals",))
+_DIRECTION = Figure(
+    "embedding.direction_consistency", "CLIP direction consistency", ("originals",), "clip"
+)
+_MATCHES = Figure("embedding.match_similarity", "DINO match similarity", ("originals",), "dino")
+_RENDERED = Figure("consistency.rendered_delta_e", "Colour at rendered depth", ("ply",))
+_EDIT = Figure(
+    "consistency.edit_delta_e", "Colour that the edit adds, rendered depth", ("ply", "originals")
+)
+_FEATURES = Figure("consistency.features", "Features at rendered depth", ("ply",), "dino")
+_PERCEPTUAL = Figure(
+    "consistency.perceptual", "Perceptual distance at rendered depth", ("ply",), "perceptual"
+)
+
+FIGURES = (
+    *_TSED, _DISTANCE, _FLOW, _DIRECTION, _MATCHES, _EDIT, _RENDERED, _FEATURES, _PERCEPTUAL,
+)  # fmt: skip
+
+_OPTIONS = {"poses": "--consistency", "ply": "--ply", "originals": "--originals and --renders"}
+
+_FOUND_BY: Mapping[Figure, str] = {**dict.fromkeys((*_TSED, _DISTANCE, _FLOW), "cv2")}
+"""Packages that figures need beside the encoders'."""
+
+
+@dataclass(frozen=True)
+class _View:
+    """A view on its way to a pair.
+
+    Attributes:
+        edited, original: (H, W, 3) at full size; the original None where there is none.
+        camera: of that size.
+    """
+
+    edited: Picture
+    original: Picture | None
+    camera: Camera
+
+
+def measure_consistency(
+    inputs: Inputs,
+    encoders: Mapping[Kind, str | None],
+    store: Store,
+    *,
+    device: str = "cpu",
+    report: Reporter = SILENT,
+) -> Measured:
+    """Compute what the pictures allow for each view and the next.
+
+    Args:
+        inputs: with ``poses``. Views that are judged are ``renders``, else the pictures of the
+            poses; with ``renders``, the pictures before the edit are ``originals``, else the
+            pictures of the poses.
+        encoders, store, device, report: see :func:`attnwarp_eval.user_images.measure.measure`.
+
+    Raises:
+        InputError: poses or pictures that cannot be read, fewer than two views, or a picture of
+            another shape than its camera.
+    """
+    done = Measured(inputs)
+    cameras, edited, originals = _files(inputs, done)
+    names = list(edited)
+    given = {"poses": True, "ply": inputs.ply is not None, "originals": bool(originals)}
+    wanted = []
+    for figure in FIGURES:
+        absent = [_OPTIONS[need] for need in figure.needs if not given[need]]
+        package = _FOUND_BY.get(figure)
+        if absent:
+            done.missing[figure.title] = f"needs {' and '.join(absent)}"
+        elif figure.encoder is not None and encoders.get(figure.encoder) == OFF:
+            done.missing[figure.title] = f"left out by --{figure.encoder} {OFF}"
+        elif package is not None and not _installed(package):
+            done.missing[figure.title] = f"needs the package {package}; install attnwarp[eval]"
+        else:
+            wanted.append(figure)
+    loaded = load_encoders(wanted, encoders, device, done)
+    wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
+    pairs = _Pairs(inputs, cameras, edited, originals, wanted, loaded)
+    tasks = (_task(pairs, inputs, one, two, device) for one, two in itertools.pairwise(names))
+    values: dict[Figure, dict[str, float]] = {figure: {} for figure in wanted}
+    for (one, two), found in zip(
+        itertools.pairwise(names), results(store, tasks, len(names) - 1, report), strict=True
+    ):
+        for figure in wanted:
+            values[figure][f"{one} to {two}"] = found[figure.key]
+    for figure in wanted:
+        row = values[figure]
+        value = _over(figure, row)
+        if figure in _TSED and np.isnan(list(values[_DISTANCE].values())).all():
+            value = float("nan")  # no pair has enough matches
+        done.rows.append(Row(figure.key, figure.title, value, row, figure.encoder))
+    few = sum(np.isnan(value) for value in values.get(_DISTANCE, {}).values())
+    if few:
+        done.notes.append(
+            f"{few} of {len(names) - 1} pairs have fewer than {LEAST_MATCHES} SIFT matches"
+            " or one centre of projection: they have no epipolar distance, and those with too few"
+            " matches count against TSED, whatever the edit did"
+        )
+    return done
+
+
+def _over(figure: Figure, values: Mapping[str, float]) -> float:
+    """The figure of all pairs: a median where its definition says so, else a mean."""
+    defined = [value for value in values.values() if not np.isnan(value)]
+    if not defined:
+        return float("nan")
+    return float(np.median(defined) if figure is _DISTANCE else np.mean(defined))
+
+
+def _installed(package: str) -> bool:
+    from importlib.util import find_spec
+
+    return find_spec(package) is not None
+
+
+def _files(
+    inputs: Inputs, done: Measured
+) -> tuple[dict[str, Camera], dict[str, Path], dict[str, Path]]:
+    """Cameras, pictures after the edit, and those before it, by name in natural order."""
+    from attnwarp.io import read_dataset
+    from attnwarp.io.names import file_stems
+
+    assert inputs.poses is not None
+    try:
+        dataset = read_dataset(
+            inputs.poses, points=False, missing_images="none", resize_cameras=True
+        )
+    except (FileNotFoundError, ValueError) as error:
+        raise InputError(f"--consistency: {error}") from None
+    stems = file_stems(dataset.cameras)
+    cameras = dict(zip(stems, dataset.cameras, strict=True))
+    posed = {
+        stem: path
+        for stem, path in zip(stems, dataset.image_paths, strict=True)
+        if path is not None
+    }
+    folders = {
+        name: pictures_in(getattr(inputs, name), f"--{name}")
+        for name in ("renders", "originals")
+        if getattr(inputs, name) is not None
+    }
+    edited = folders.get("renders", posed)
+    originals = folders.get("originals", posed if "renders" in folders else {})
+    names = sorted((name for name in edited if name in cameras), key=natural)
+    lone = [name for name in edited if name not in cameras]
+    if lone:
+        done.unpaired.append(
+            f"{len(lone)} pictures without a camera of their name in --consistency: {lone[0]} first"
+        )
+    if originals and (lacking := [name for name in names if name not in originals]):
+        done.unpaired.append(
+            f"{len(lacking)} views without a picture before the edit, left out: {lacking[0]} first"
+        )
+        names = [name for name in names if name in originals]
+    if len(names) < 2:
+        raise InputError(
+            f"--consistency: {len(names)} pictures have a camera of their name, expected at least"
+            f" 2; cameras are named {', '.join(list(cameras)[:3])}, pictures"
+            f" {', '.join(list(edited)[:3])}"
+        )
+    return cameras, {n: edited[n] for n in names}, {n: originals[n] for n in names if originals}
+
+
+class _Pairs:
+    """Figures of two neighbouring views; what a view has of its own is kept for its second pair."""
+
+    def __init__(
+        self,
+        inputs: Inputs,
+        cameras: Mapping[str, Camera],
+        edited: Mapping[str, Path],
+        originals: Mapping[str, Path],
+        wanted: Sequence[Figure],
+        loaded: Mapping[Kind, Any],
+    ) -> None:
+        self.inputs, self.cameras = inputs, cameras
+        self.edited, self.originals = edited, originals
+        self.wanted, self.loaded = tuple(wanted), loaded
+        self._view: Callable[[str], _View] = lru_cache(maxsize=2)(self._read)
+        self._small: Callable[[str], _View] = lru_cache(maxsize=2)(self._reduced)
+        self._keypoints = lru_cache(maxsize=2)(self._found)
+        self._surface = lru_cache(maxsize=2)(self._rendered)
+        self._encoded = lru_cache(maxsize=16)(self._features)
+        self._splats: Any = None
+
+    def figures(self, one: str, two: str) -> dict[str, float]:
+        """Figures of a view and the next, by key; NaN where undefined."""
+        values: dict[str, float] = {}
+        if _DISTANCE in self.wanted:
+            values |= self._epipolar(one, two)
+        a, b = self._small(one), self._small(two)
+        if _FLOW in self.wanted:
+            values[_FLOW.key] = _along_flow(a, b)
+        if _DIRECTION in self.wanted:
+            before, after = (
+                np.stack([self._encoded("clip", name, old) for name in (one, two)])
+                for old in (True, False)
+            )
+            values[_DIRECTION.key] = metrics.direction_consistency(before, after).mean
+        if _MATCHES in self.wanted:
+            tokens = [
+                self._encoded("dino", name, old).reshape(-1, self.loaded["dino"].about.dim)
+                for old in (True, False)
+                for name in (one, two)
+            ]
+            values[_MATCHES.key] = metrics.match_similarity(*tokens).mean
+        if self.inputs.ply is not None:
+            values |= self._at_depth(one, two)
+        return {figure.key: values[figure.key] for figure in self.wanted}
+
+    def _epipolar(self, one: str, two: str) -> dict[str, float]:
+        F = fundamental(self._view(one).camera, self._view(two).camera)
+        if F is None:
+            return dict.fromkeys((f.key for f in (*_TSED, _DISTANCE)), float("nan"))
+        matches = metrics.match_features(self._keypoints(one), self._keypoints(two))
+        result = metrics.tsed([metrics.epipolar_distance(*matches, F)])
+        median = float(result.medians[0])
+        # A pair with too few matches counts against.
+        return {_DISTANCE.key: median} | {
+            figure.key: float(median < limit) for figure, limit in zip(_TSED, LIMITS, strict=True)
+        }
+
+    def _at_depth(self, one: str, two: str) -> dict[str, float]:
+        from attnwarp.warp import warp_surfaces
+
+        a, b = self._small(one), self._small(two)
+        view = warp_surfaces(
+            a.camera, b.camera, self._surface(two), self._surface(one), warn_empty=False
+        )
+        where = view.correspondence.xy.numpy(), view.mask.numpy()
+        values = {
+            _RENDERED.key: metrics.disagreement_at(a.edited, b.edited, *where).figures("rendered_")[
+                _RENDERED.key
+            ]
+        }
+        if _EDIT in self.wanted:
+            assert a.original is not None and b.original is not None
+            before, after = (a.original, b.original), (a.edited, b.edited)
+            values[_EDIT.key] = metrics.edit_agreement(before, after, *where)[_EDIT.key]
+        if _FEATURES in self.wanted:
+            dino = self.loaded["dino"]
+            first, second = (self._encoded("dino", name, False) for name in (one, two))
+            size = a.edited.shape[:2]
+            values[_FEATURES.key] = 1 - (
+                metrics.feature_consistency(
+                    first, second, *where, size, seen=dino.preprocess.seen
+                ).mean
+            )
+        if _PERCEPTUAL in self.wanted:
+            network = self.loaded["perceptual"]
+            values[_PERCEPTUAL.key] = metrics.perceptual_consistency(
+                a.edited, b.edited, *where, lambda x, y: float(network.distance([x], [y])[0])
+            )
+        return values
+
+    def _read(self, name: str) -> _View:
+        edited = read_picture(self.edited[name], self.inputs.background)
+        original = None
+        if name in self.originals:
+            original = read_picture(self.originals[name], self.inputs.background)
+        camera, (height, width) = self.cameras[name], edited.shape[:2]
+        for path, image in ((self.edited[name], edited), (self.originals.get(name), original)):
+            if image is not None:
+                try:
+                    check.same_aspect(
+                        image.shape[:2], (camera.height, camera.width), str(path),
+                        "crop it as its camera sees it",
+                    )  # fmt: skip
+                except ValueError as error:
+                    raise InputError(str(error)) from None
+        return _View(edited, original, camera.resize(width, height))
+
+    def _reduced(self, name: str) -> _View:
+        view = self._view(name)
+        height, width = view.edited.shape[:2]
+        share = min(1.0, LONGEST / max(height, width))
+        size = (max(1, round(width * share)), max(1, round(height * share)))
+        edited, original = (
+            None if image is None else _shrunk(image, size)
+            for image in (view.edited, view.original)
+        )
+        assert edited is not None
+        return _View(edited, original, view.camera.resize(*size))
+
+    def _found(self, name: str) -> metrics.Keypoints:
+        return metrics.sift_features(self._view(name).edited, str(self.edited[name]))
+
+    def _rendered(self, name: str) -> Any:
+        from attnwarp.io import read_ply, read_splat
+        from attnwarp.warp import render_surface
+
+        if self._splats is None:
+            path = self.inputs.ply
+            assert path is not None
+            read = read_splat if path.suffix.lower() == ".splat" else read_ply
+            self._splats = read(path)
+        return render_surface(self._splats, self._small(name).camera)
+
+    def _features(self, kind: Kind, name: str, before: bool) -> npt.NDArray[np.float64]:
+        view = self._small(name)
+        image = view.original if before else view.edited
+        encoder = self.loaded[kind]
+        encode = encoder.images if kind == "clip" else encoder.tokens
+        return np.asarray(encode([image])[0])
+
+
+def _shrunk(image: Picture, size: tuple[int, int]) -> Picture:
+    import cv2
+
+    if image.shape[1::-1] == size:
+        return image
+    return np.clip(cv2.resize(image, size, interpolation=cv2.INTER_AREA), 0, 1).astype(np.float32)
+
+
+def _along_flow(one: _View, two: _View) -> float:
+    """dE00 along the flow of the originals; NaN for two views of different sizes."""
+    assert one.original is not None and two.original is not None
+    if len({image.shape for image in (one.original, two.original, one.edited, two.edited)}) > 1:
+        return float("nan")
+    flow = metrics.optical_flow(one.original, two.original)
+    return metrics.flow_consistency(one.edited, two.edited, flow).figures("flow_")[_FLOW.key]
+
+
+def _task(pairs: _Pairs, inputs: Inputs, one: str, two: str, device: str) -> Task[dict[str, float]]:
+    def hashed(files: Mapping[str, Path]) -> list[str]:
+        return [_sha256(files[name]) for name in (one, two) if name in files]
+
+    spec = {
+        "probe": "user consistency",
+        "protocol": PROTOCOL,
+        "edited": hashed(pairs.edited),
+        "originals": hashed(pairs.originals),
+        "cameras": [pairs.cameras[name].to_dict() for name in (one, two)],
+        "ply": None if inputs.ply is None else _sha256(inputs.ply),
+        "figures": [figure.key for figure in pairs.wanted],
+        "encoders": {kind: pairs.loaded[kind].about.to_dict() for kind in sorted(pairs.loaded)},
+        "background": list(inputs.background),
+        "device": device,
+    }
+    return Task(
+        f"{one} to {two}",
+        spec,
+        lambda tell: {"figures": without_nan(pairs.figures(one, two))},
+        lambda record: with_nan(record["figures"]),
+    )
+
+
+@lru_cache(maxsize=512)
+def _sha256(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None

@@ -1,0 +1,138 @@
+"""`attnwarp-eval metrics --consistency` on a small capture whose edit agrees by construction: the
+renders of repainted splats.
+"""
+
+import importlib.util
+import itertools
+import json
+
+import cv2
+import numpy as np
+import pytest
+import small_capture
+import torch
+from few_splats import few_splats
+from torch_threads import on_one_thread
+from typer.testing import CliRunner
+
+from attnwarp.io import read_dataset
+from attnwarp.render import render
+from attnwarp.warp import warp_view
+from attnwarp_eval import metrics
+from attnwarp_eval.cli.main import app
+from attnwarp_eval.user_images.measure import read_picture
+
+one_thread = pytest.fixture(on_one_thread, scope="module", autouse=True)
+
+DEPTH = (
+    "consistency.rendered_delta_e",
+    "consistency.edit_delta_e",
+    "consistency.features",
+    "consistency.perceptual",
+)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("capture")
+    small_capture.write(folder)
+    dataset = read_dataset(folder)
+    splats = few_splats()
+    splats.sh = splats.sh.flip(-1)  # red for blue, the same in all views
+    (folder / "renders").mkdir()
+    for camera, path in zip(dataset.cameras, dataset.image_paths, strict=True):
+        picture = render(splats, camera).color.clamp(0, 1).numpy()
+        cv2.imwrite(
+            str(folder / "renders" / path.name), np.round(255 * picture[..., ::-1]).astype(np.uint8)
+        )
+    return folder
+
+
+def call(*arguments):
+    return CliRunner().invoke(app, ["metrics", *map(str, arguments)])
+
+
+def measured(folder, out, *more):
+    done = call("--consistency", folder, "--renders", folder / "renders", "--out", out, *more)
+    assert done.exit_code == 0, done.output
+    return json.loads((out / "metrics.json").read_text()), done.output
+
+
+def test_every_figure_is_that_of_its_function(capture, tmp_path):
+    result, _ = measured(capture, tmp_path, "--ply", capture / "scene.ply")
+    rows = result["metrics"]
+    assert result["not_computed"] == {}
+    dataset = read_dataset(capture)
+    names = [path.stem for path in dataset.image_paths]
+    after = [read_picture(capture / "renders" / path.name) for path in dataset.image_paths]
+    before = [read_picture(path) for path in dataset.image_paths]
+    pairs = [f"{one} to {two}" for one, two in itertools.pairwise(names)]
+    assert all(list(row["views"]) == pairs for row in rows.values())
+    exact = metrics.tsed_of_views(after, dataset.cameras)
+    nan = lambda values: [np.nan if v is None else v for v in values]  # noqa: E731
+    np.testing.assert_allclose(
+        nan(rows["consistency.tsed_distance"]["views"].values()), exact.medians, rtol=1e-9
+    )
+    assert nan([rows["consistency.tsed_2px"]["value"]])[0] == pytest.approx(
+        exact.share(2), nan_ok=True
+    )
+    flow = metrics.optical_flow(before[0], before[1])
+    assert rows["consistency.flow_delta_e"]["views"][pairs[0]] == pytest.approx(
+        metrics.flow_consistency(after[0], after[1], flow).figures()["consistency.delta_e"],
+        nan_ok=True,
+    )
+    with torch.no_grad():
+        view = warp_view(few_splats(), *dataset.cameras[:2])
+    edit = metrics.edit_agreement(
+        before[:2], after[:2], view.correspondence.xy.numpy(), view.mask.numpy()
+    )
+    assert rows["consistency.edit_delta_e"]["views"][pairs[0]] == pytest.approx(
+        edit["consistency.edit_delta_e"], rel=1e-6
+    )
+
+
+def test_a_repainted_view_is_seen_and_a_second_call_computes_nothing(capture, tmp_path):
+    flawed = tmp_path / "flawed"
+    flawed.mkdir()
+    for path in sorted((capture / "renders").iterdir()):
+        image = cv2.imread(str(path))
+        cv2.imwrite(str(flawed / path.name), 255 - image if path.stem == "3" else image)
+    right, _ = measured(capture, tmp_path / "a", "--ply", capture / "scene.ply")
+    options = ["--consistency", capture, "--renders", flawed, "--ply", capture / "scene.ply"]
+    assert call(*options, "--out", tmp_path / "b").exit_code == 0
+    wrong = json.loads((tmp_path / "b/metrics.json").read_text())
+    for key in DEPTH:
+        row, other = (data["metrics"][key]["views"] for data in (right, wrong))
+        assert other["2 to 3"] > row["2 to 3"] + 0.01, key
+        assert other["0 to 1"] == pytest.approx(row["0 to 1"], abs=1e-6), key
+    cells = {path: path.stat().st_mtime_ns for path in (tmp_path / "b").rglob("*.json")}
+    assert call(*options, "--out", tmp_path / "b").exit_code == 0
+    changed = [path.name for path, time in cells.items() if path.stat().st_mtime_ns != time]
+    assert changed == ["metrics.json"]
+
+
+def test_what_is_missing_is_named_with_its_figures(capture, tmp_path, monkeypatch):
+    done = call("--consistency", capture, "--out", tmp_path)  # edited pictures alone
+    assert done.exit_code == 0, done.output
+    assert "not computed: Flow warp error: needs --originals and --renders" in done.output
+    assert "not computed: Colour at rendered depth: needs --ply" in done.output
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda n: None if n == "cv2" else find(n))
+    _, output = measured(capture, tmp_path / "out", "--perceptual", "none")
+    assert "Epipolar distance: needs the package cv2" in output
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--prompt", "a bear"], "--prompt: figures of single views do not go with --consistency"),
+        (["--renders", "nowhere"], "--renders: nowhere is no folder"),
+    ],
+)
+def test_what_does_not_fit_is_refused(capture, tmp_path, options, message):
+    done = call("--consistency", capture, *options, "--out", tmp_path)
+    assert done.exit_code == 2
+    assert message in " ".join(done.output.split())
+    done = call("--ply", capture / "scene.ply", "--renders", capture / "renders")
+    assert done.exit_code == 2
+    assert "--ply: needs --consistency" in " ".join(done.output.split())
