@@ -11,6 +11,7 @@ from attnwarp_eval.report.ablations import ablations, compared_of
 from attnwarp_eval.report.answer import answer
 from attnwarp_eval.report.claims import claims, judge, load_claims
 from attnwarp_eval.report.commands import add_commands
+from attnwarp_eval.report.controls import controls
 from attnwarp_eval.report.findings import findings
 from attnwarp_eval.report.fronts import TITLE as FRONTS
 from attnwarp_eval.report.fronts import fronts
@@ -80,6 +81,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
         *([claims(results, judged), *settling(results, judged, timings)] if study.scenes else []),
         *(galleries(results) if pictures else []),
         *of_probes[Place.INSTRUMENT],
+        *controls(results),
         *ablations(results, compared),
         *of_probes[Place.RESULT],
         *(fronts(results, layout) if timings else []),

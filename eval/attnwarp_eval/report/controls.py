@@ -1,22 +1,62 @@
-"""Blindness of a study: what its positive controls, wrong warps, do not move."""
+"""Controls of a study of edits: what its figures see of wrong features and of another seed."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
+from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.statistics.intervals import paired, verdict
+from attnwarp_eval.study.controls import OTHER_SEED
 from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Variant
-from attnwarp_eval.study.shared.edits import VariantPart, editor_of
+from attnwarp_eval.study.shared.edits import VariantPart
 
 BLIND: Literal["blind"] = "blind"
 """Word that stands for "can't tell" where the study's control failed."""
 
 
 def is_control(variant: Variant) -> bool:
-    """Return True if a variant takes features from the wrong place."""
+    """Return True if a variant takes features from the wrong place, or another seed."""
     return isinstance(variant, VariantPart) and variant.control is not None
+
+
+def controls_of(results: Results, name: str, baseline: str) -> dict[str, str]:
+    """Measured controls of a variant: what each does, by its label.
+
+    A control differs from its variant in ``control`` alone.
+
+    Args:
+        results: of the run.
+        name: of the probe.
+        baseline: the variant.
+    """
+    study, own = results.study, probe(name)
+    meaning = own.meaning(study, study.variants[baseline])
+    return {
+        label: str(variant.part(VariantPart).control)
+        for label, variant in study.variants.items()
+        if is_control(variant)
+        and own.meaning(study, variant.model_copy(update={"control": None})) == meaning
+        and results.records(name, label)
+    }
+
+
+def seen(results: Results, name: str, metric: str, baseline: str, label: str) -> bool:
+    """Return True if a figure tells a control from its variant: worse, or other for a seed.
+
+    Args:
+        results, name, baseline: see :func:`controls_of`.
+        metric: a figure for which one direction is better.
+        label: of the control.
+    """
+    direction = probe(name).metric(metric).direction
+    difference = paired(results.views(name, baseline, metric), results.views(name, label, metric))
+    judged = verdict(difference, direction)  # type: ignore[arg-type]
+    other_seed = results.study.variants[label].part(VariantPart).control == OTHER_SEED
+    return judged in (("better", "worse") if other_seed else ("worse",))
 
 
 def blind(results: Results, name: str, metric: str, baseline: str) -> bool:
@@ -29,19 +69,54 @@ def blind(results: Results, name: str, metric: str, baseline: str) -> bool:
         results: of the run.
         name: of the probe.
         metric: a figure for which one direction is better.
-        baseline: of the comparison; its controls have its editor.
+        baseline: of the comparison.
     """
-    study = results.study
-    direction = probe(name).metric(metric).direction
-    editor = editor_of(study, study.variants[baseline])
-    controls = [
-        label
-        for label, variant in study.variants.items()
-        if is_control(variant) and editor_of(study, variant) == editor and label != baseline
-        if results.records(name, label)
+    found = controls_of(results, name, baseline)
+    wrong = [label for label, control in found.items() if control != OTHER_SEED]
+    return bool(wrong) and not any(seen(results, name, metric, baseline, label) for label in wrong)
+
+
+def controls(results: Results) -> list[Section]:
+    """The section on controls, one table for each baseline that has some.
+
+    Args:
+        results: of the run.
+    """
+    pairs = {(one.probe, one.baseline): None for one in results.study.ablations}
+    tables = [
+        table
+        for name, baseline in pairs
+        if probe(name).edits
+        for table in _tables(results, name, baseline)
     ]
-    right = results.views(name, baseline, metric)
-    return bool(controls) and not any(
-        verdict(paired(right, results.views(name, label, metric)), direction) == "worse"  # type: ignore[arg-type]
-        for label in controls
+    if not tables:
+        return []
+    text = (
+        "A control takes features from the wrong place, so it has to do worse: then a figure has"
+        " seen it. A figure that sees none of them is blind to where features come from. The same"
+        " variant with another seed must not be seen."
     )
+    return [Section("Controls", [text], tables)]
+
+
+def _tables(results: Results, name: str, baseline: str) -> Iterator[Table]:
+    found = controls_of(results, name, baseline)
+    if not found:
+        return
+    metrics = [metric.format(layer=results.layer) for metric in report_of(name).contrasts]
+    metrics = [m for m in metrics if probe(name).metric(m).direction in ("higher", "lower")]
+    rows = [
+        [
+            label,
+            "not seen" if control == OTHER_SEED else "seen",
+            *(
+                "seen" if seen(results, name, metric, baseline, label) else "not seen"
+                for metric in metrics
+            ),
+        ]
+        for label, control in found.items()
+    ]
+    if set(found.values()) != {OTHER_SEED}:
+        answers = [BLIND if blind(results, name, m, baseline) else "sees" for m in metrics]
+        rows.append(["this figure is", "", *answers])
+    yield Table(["control", "expected", *metrics], rows, f"Controls of {baseline!r}")

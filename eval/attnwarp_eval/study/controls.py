@@ -1,7 +1,7 @@
-"""Positive controls of studies of edits: features that a method cannot be right with.
+"""Controls of studies of edits: features that a method cannot be right with, and other noise.
 
-A study that does not tell the method from these is blind to where features come from, whatever it
-says of two methods.
+A study that does not tell the method from wrong features is blind to where features come from,
+whatever it says of two methods. One that tells it from itself with another seed tells too much.
 """
 
 from __future__ import annotations
@@ -14,7 +14,16 @@ from torch import Tensor
 
 from attnwarp.warp import FeatureWarp, WarpedView
 
-Control = Literal["mirrored", "displaced"]
+Control = Literal["mirrored", "displaced", "another scene", "another seed"]
+
+OTHER_SCENE: Control = "another scene"
+"""Control whose features are those of the next scene's source, edited under the same words."""
+
+OTHER_SEED: Control = "another seed"
+"""Negative control: the same variant with other noise and other stages."""
+
+SEED_STEP = 1_000_003
+"""Difference of the seed of :data:`OTHER_SEED` from the study's."""
 
 DISPLACEMENT = 1 / 8
 """Share of the source's width by which ``displaced`` moves what is taken."""

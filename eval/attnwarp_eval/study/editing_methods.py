@@ -20,6 +20,7 @@ from attnwarp_eval.study.reads import MASK_RULES, warp_reads
 if TYPE_CHECKING:
     from attnwarp.camera import Camera
     from attnwarp.editing.editor import Editor
+    from attnwarp.editing.recording import Recording
     from attnwarp.gaussians import Gaussians
     from attnwarp.methods import Budget
     from attnwarp.warp import WarpedView
@@ -54,6 +55,19 @@ def with_source_words(settings: dict[str, Any], words: str) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
+class Donor:
+    """Another scene, whose source's features a control injects.
+
+    Attributes:
+        editor: of its source, with the same layers as the job's.
+        picture: (H, W, 3) sRGB in [0, 1], its source before the edit.
+    """
+
+    editor: Editor
+    picture: Image
+
+
+@dataclass(frozen=True, eq=False)
 class Job:
     """A scene to edit.
 
@@ -71,6 +85,7 @@ class Job:
         budget: limits of the method; None for none. Only methods with ``takes_budget`` get one.
         source_picture: (H, W, 3) sRGB in [0, 1], the source view edited by hand; None where the
             editor edits it. Only methods with ``takes_picture`` get one.
+        donor: of the features that targets get in place of the source's; None for the source's.
     """
 
     gaussians: Gaussians
@@ -84,6 +99,7 @@ class Job:
     truth: Mapping[str, Sequence[Image]]
     budget: Budget | None = None
     source_picture: Image | None = None
+    donor: Donor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +229,8 @@ def _attention_warping(job: Job) -> EditedScene:
     """:func:`attnwarp.methods.attention_warping`."""
     from attnwarp.methods import AttentionWarpingSettings, attention_warping
 
+    if job.donor is not None:
+        return _with_features_of(job, job.donor)
     return _edited(
         attention_warping(
             job.gaussians,
@@ -227,6 +245,43 @@ def _attention_warping(job: Job) -> EditedScene:
             budget=job.budget,
         )
     )
+
+
+def _with_features_of(job: Job, donor: Donor) -> EditedScene:
+    """Attention warping whose targets take the features of the donor's source, edited under the
+    same words, settings and noise.
+    """
+    from attnwarp.methods import AttentionWarpingSettings
+    from attnwarp.methods.attention_warping import AttentionWarping
+    from attnwarp.methods.base import ViewEdit, run
+
+    recordings: list[Recording] = []
+
+    class Swapping(AttentionWarping):
+        """Record in a first run, and take that recording in a second one."""
+
+        def edit_source(self, number: int, *rest: Any) -> list[ViewEdit]:
+            edits = super().edit_source(number, *rest)
+            own = self.views.recorded(number + 1)[number]
+            assert own.recording is not None  # what records nothing reads no control
+            recordings.append(own.recording)
+            self.views.keep(number, replace(own, recording=recordings[0]))
+            return edits
+
+    settings = AttentionWarpingSettings.from_dict(job.settings)
+    run(
+        "attention_warping", lambda work, s: Swapping(work, s, 0, None, None, "cpu"),
+        AttentionWarpingSettings, job.gaussians, job.cameras[:1], [donor.picture], donor.editor,
+        job.instruction, replace(settings, iterations=0),
+    )  # fmt: skip
+    return _edited(
+        run(
+            "attention_warping",
+            lambda work, s: Swapping(work, s, 0, job.source_picture, job.warps, "cpu"),
+            AttentionWarpingSettings, job.gaussians, job.cameras, job.images, job.editor,
+            job.instruction, settings, folder=job.folder, budget=job.budget,
+        )
+    )  # fmt: skip
 
 
 def _edited(result: Any) -> EditedScene:

@@ -13,7 +13,7 @@ from pydantic import Field
 from attnwarp.errors import InputError
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.budgets import BudgetPart
-from attnwarp_eval.study.controls import Control
+from attnwarp_eval.study.controls import OTHER_SCENE, OTHER_SEED, SEED_STEP, Control
 from attnwarp_eval.study.edit_truth import answers_of
 from attnwarp_eval.study.editing_methods import EDITING_METHODS
 from attnwarp_eval.study.hand_made import Kind
@@ -86,7 +86,7 @@ class VariantPart(Part):
     surface, ``geometry: truth`` warps by exact depth. ``budget`` cuts the method short.
     ``by_hand`` gives the method a source view that was edited by hand
     (:mod:`attnwarp_eval.study.hand_made`) instead of letting the editor edit it. ``control`` takes
-    features from the wrong place (:mod:`attnwarp_eval.study.controls`).
+    features from the wrong place or scene, or another seed (:mod:`attnwarp_eval.study.controls`).
     """
 
     method: str = "attention_warping"
@@ -111,6 +111,8 @@ class MethodProbe(Probe[E]):
     """Base of probes that run a variant's method of editing."""
 
     edits = True
+    other_scenes = False
+    """True where a cell can take features of another scene."""
     shared: ClassVar[Mapping[tuple[str, ...], str]] = {
         ("editing", "options"): "options",
         ("editing", "editor"): "editor",
@@ -121,7 +123,10 @@ class MethodProbe(Probe[E]):
         own = variant.part(VariantPart)
         settings = settings_of(study, variant, 0)
         read = {"method", "budget", "by_hand", *splats_reads(variant)}
-        if EDITING_METHODS[own.method].takes_picture and settings["method"] == "warp":
+        warps = EDITING_METHODS[own.method].takes_picture and settings["method"] == "warp"
+        if own.control == OTHER_SEED or (
+            warps and (own.control != OTHER_SCENE or self.other_scenes)
+        ):
             read.add("control")
         read |= EDITING_METHODS[own.method].reads(settings)
         one_mask = settings.get("sources", 1) == 1 and not settings.get("confidence")
@@ -141,7 +146,7 @@ class MethodProbe(Probe[E]):
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """The method with all its settings, the editor, and where splats and warps come from."""
         own = variant.part(VariantPart)
-        settings = settings_of(study, variant, seed)
+        settings = settings_of(study, variant, seed + SEED_STEP * (own.control == OTHER_SEED))
         return {
             "spp": study.spp,
             "method": own.method,
@@ -152,8 +157,33 @@ class MethodProbe(Probe[E]):
             **splats_spec(study, variant, seed),
             **self._budget_spec(study, variant, seed),
             **({"by_hand": own.by_hand} if own.by_hand is not None else {}),
-            **({"control": own.control} if own.control is not None else {}),
+            **({"control": own.control} if own.control not in (None, OTHER_SEED) else {}),
         }
+
+    def other_scene(
+        self, study: Study, variant: Variant, scene: str, scenes: Mapping[str, Scene]
+    ) -> tuple[Json, dict[str, str]]:
+        """Entries of a cell's spec and of its sources for features of another scene: the next one.
+
+        Raises:
+            StudyError: there is no other scene.
+        """
+        if variant.part(VariantPart).control != OTHER_SCENE:
+            return {}, {}
+        names = list(scenes)
+        other = names[(names.index(scene) + 1) % len(names)]
+        if other == scene:
+            raise StudyError(
+                f"control: {OTHER_SCENE!r} takes features of the next scene, and the run has"
+                f" {scene!r} alone; name a second scene, or leave the variant out"
+            )
+        files = dict(zip(study.scene_names, study.scenes, strict=True))
+        entry = {"scene": scenes[other].content_hash, **self.of_other_scene(study, scenes[other])}
+        return {"other": entry}, {"other scene": str(files[other])}
+
+    def of_other_scene(self, study: Study, scene: Scene) -> Json:
+        """Further entries of a cell's spec on the other scene."""
+        return {}
 
     def _budget_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """Limits of the method; for the seconds of another variant, all that decides its run."""

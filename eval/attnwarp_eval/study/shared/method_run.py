@@ -15,15 +15,23 @@ import torch
 
 from attnwarp import Gaussians
 from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
-from attnwarp_eval.study.controls import MovedView
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.study.controls import OTHER_SCENE, MovedView
 from attnwarp_eval.study.edit_truth import EditTruth
-from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Job, with_source_words
+from attnwarp_eval.study.editing_methods import (
+    EDITING_METHODS,
+    Donor,
+    EditedScene,
+    Job,
+    with_source_words,
+)
 from attnwarp_eval.study.hand_made import hand_made
 from attnwarp_eval.study.probe import Work
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.schema import StudyError
 from attnwarp_eval.study.shared.edits import files_digest
 from attnwarp_eval.study.warping import warp_truth
+from attnwarp_eval.world import World, changed
 
 if TYPE_CHECKING:
     from attnwarp.editing.controlnet import DepthControlNet
@@ -56,6 +64,7 @@ def run_method(
     before: Gaussians,
     budget: Budget | None = None,
     editor: Editor | None = None,
+    donor: Donor | None = None,
 ) -> EditedScene:
     """Edit a scene by the method of a cell.
 
@@ -66,11 +75,15 @@ def run_method(
         before: the splats to edit.
         budget: limits of the method.
         editor: in place of the one that the spec names.
+        donor: of the control's features; the other scene's source with the same editor if left out.
     """
     spec, world = work.spec, work.world
     with work.meter.stage("setup"):
         if editor is None:
             editor = load(work.cell.sources["editor"], spec["editor"])
+        other = other_world(work) if donor is None else None
+        if other is not None:
+            donor = Donor(editor, other.image(other.source.name, spec["spp"]))
     with tempfile.TemporaryDirectory() as folder:
         job = Job(
             before,
@@ -84,6 +97,7 @@ def run_method(
             {a: [views[n] for n in names] for a, views in truth.answers.items()},
             budget,
             source_by_hand(work, truth, names[0]),
+            donor,
         )
         return EDITING_METHODS[spec["method"]].run(job)
 
@@ -101,6 +115,26 @@ def source_by_hand(work: Work, truth: EditTruth, source: str) -> Image | None:
         truth.masks[answer][source],
         work.spec["seed"],
     )
+
+
+def other_world(work: Work) -> World | None:
+    """World of the scene whose features a cell's control takes; None for another control.
+
+    Raises:
+        InputError: its file has changed since the cell was planned.
+    """
+    other = work.spec.get("other")
+    if other is None:
+        return None
+    made = _other_world(work.cell.sources["other scene"], work.spec["size"], other["scene"])
+    if made.content_hash != other["scene"]:
+        raise changed(f"scene {made.scene.name!r}")
+    return made
+
+
+@lru_cache(maxsize=1)
+def _other_world(scene: str, size: int, content: str) -> World:
+    return World(load_scene(scene), size)
 
 
 def own_seconds(result: EditedScene) -> float:
@@ -141,6 +175,8 @@ def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
     """Warps by exact depth, with the exact mask, or wrong ones; None for the method's own."""
     spec, world = work.spec, work.world
     control = spec.get("control")
+    if control == OTHER_SCENE:  # the right warp of wrong features
+        control = None
     if spec["geometry"] == "splats" and spec["mask"] == "rules" and control is None:
         return None
     warp = spec["settings"].get("warp")

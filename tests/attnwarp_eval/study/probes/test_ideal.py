@@ -186,6 +186,40 @@ def test_what_the_ideal_editor_cannot_do_is_refused(tmp_path, changes, message):
         load(tmp_path, **changes)
 
 
+def test_another_scene_is_the_next_and_another_seed_is_the_methods(tmp_path):
+    controls = {"other": {"control": "another scene"}, "again": {"control": "another seed"}}
+    study = load(
+        tmp_path, scenes=["spheres", "bear"], views=["yaw030"], variants={"full": {}, **controls},
+        probes={"ideal": ["full", *controls]},
+    )  # fmt: skip
+    scenes = {name: load_scene(name) for name in ("spheres", "bear")}
+    of = {(c.scene, c.variant): c for c in cells_of(study, scenes) if c.probe == "ideal"}
+    for scene, other in (("spheres", "bear"), ("bear", "spheres")):
+        entry = of[scene, "other"].spec["other"]
+        assert (
+            entry["scene"] == scenes[other].content_hash and "other" not in of[scene, "full"].spec
+        )
+        full, again = of[scene, "full"].spec, of[scene, "again"].spec
+        assert (
+            full["settings"]["seed"] == full["seed"] == again["seed"] != again["settings"]["seed"]
+        )
+        assert {**again, "settings": full["settings"]} == full
+    record = compute(probe("ideal"), of["spheres", "other"], tmp_path)
+    right = compute(probe("ideal"), of["spheres", "full"], tmp_path)
+    # The source is edited as ever; its features do not reach the targets.
+    assert record.extra.answers == right.extra.answers
+    seen = [r.views[0].metrics["parts.seen.edit"] for r in (record, right)]
+    assert seen[0] < seen[1] - 0.1
+
+
+def test_another_scene_needs_two(tmp_path):
+    study = load(
+        tmp_path, variants={"full": {"control": "another scene"}}, probes={"ideal": ["full"]}
+    )
+    with pytest.raises(StudyError, match="'spheres' alone"):
+        cells(study)
+
+
 def test_an_unreachable_settling_names_the_range(records):
     of = world("spheres", 64)
     cameras = [of.camera(name) for name in ("source", "yaw010")]

@@ -21,6 +21,7 @@ from attnwarp_eval.cost import Meter
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.budgets import Spent, Stopwatch, timed
 from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.controls import OTHER_SCENE
 from attnwarp_eval.study.edit_truth import EditTruth, planned_truth
 from attnwarp_eval.study.editing_methods import EDITING_METHODS
 from attnwarp_eval.study.probe import Work, metrics_of, probe, register
@@ -53,6 +54,7 @@ class EditingProbe(MethodProbe[EditResult]):
 
     name = "editing"
     protocol = 2
+    other_scenes = True
     study_part = EditingPart
     variant_part = VariantPart
     metrics = metrics_of("multiview.", "fidelity.", "embedding.", "depth.", "image.")
@@ -112,8 +114,25 @@ class EditingProbe(MethodProbe[EditResult]):
                 f"by_hand: method {own.method!r} edits its source itself; methods that take a"
                 f" picture are {able}"
             )
+        if own.control == OTHER_SCENE:
+            self._check_other_scene(study, variant)
         if own.options or any(probe(name).edits for name in study.probes):
             settings_of(study, variant, 0)
+
+    def _check_other_scene(self, study: Study, variant: Variant) -> None:
+        from attnwarp.editing.small import guide_of
+
+        editor, settings = editor_of(study, variant), settings_of(study, variant, 0)
+        if editor.ideal is None and guide_of(editor.name) == "depth":
+            raise ValueError(
+                f"control: {OTHER_SCENE!r} needs an editor that takes pictures, and"
+                f" {editor.name!r} takes depth; choose another editor or control"
+            )
+        if settings.get("sources", 1) > 1 or settings.get("estimate", 0) > 0:
+            raise ValueError(
+                f"control: {OTHER_SCENE!r} replaces the features of one source and nothing else;"
+                " set options.sources to 1 and options.estimate to 0, or choose another control"
+            )
 
     def measured(self, study: Study) -> Set[str]:
         """Variants whose seconds limit others are run too."""
@@ -143,13 +162,15 @@ class EditingProbe(MethodProbe[EditResult]):
                         **self.common_spec(study, scene, seed),
                         **self.variant_spec(study, variant, seed),
                     }
+                    donor, files = self.other_scene(study, variant, name, scenes)
+                    decided |= donor
                     views = study.pictures_of(decided["views"], label)
                     for edit in edits:
                         yield Cell(
                             {**decided, "edit": edit, "encoders": encoders},
                             name, label, self.name, seed, (label,),
                             tuple(f"{edit['name']}/{view}" for view in views),
-                            {**sources, **names_of},
+                            {**sources, **names_of, **files},
                         )  # fmt: skip
 
     # From a cell to its record

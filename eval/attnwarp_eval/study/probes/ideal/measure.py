@@ -22,6 +22,7 @@ from attnwarp_eval.metrics.parts import part_answers, part_figures
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import EditTruth
+from attnwarp_eval.study.editing_methods import Donor
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.schema import Study, Variant
@@ -30,7 +31,7 @@ from attnwarp_eval.study.shared.edits import (
     VariantPart,
     editor_of,
 )
-from attnwarp_eval.study.shared.method_run import own_seconds, run_method
+from attnwarp_eval.study.shared.method_run import other_world, own_seconds, run_method
 from attnwarp_eval.study.shared.splats import splats_of
 from attnwarp_eval.study.shared.things import ThingsPart, check_things, thing_of
 from attnwarp_eval.two_view import HIDDEN
@@ -85,6 +86,7 @@ class IdealProbe(MethodProbe[IdealResult]):
     metrics = metrics_of("parts.")
     study_keys = frozenset({"size", "views", "seeds", "spp", "editing", "things"})
     draws = False
+    other_scenes = True
 
     def check(self, study: Study) -> None:
         """Every variant needs the ideal editor, and a method that it can serve."""
@@ -122,13 +124,19 @@ class IdealProbe(MethodProbe[IdealResult]):
         for name, scene in scenes.items():
             thing = thing_of(study, scene)
             for label in names:
+                other, files = self.other_scene(study, study.variants[label], name, scenes)
                 for seed in study.seeds:
                     spec = {
                         **self.common_spec(study, scene, seed),
                         **self.variant_spec(study, study.variants[label], seed),
+                        **other,
                         "thing": thing,
                     }
-                    yield Cell(spec, name, label, self.name, seed, (label,))
+                    yield Cell(spec, name, label, self.name, seed, (label,), sources=files)
+
+    def of_other_scene(self, study: Study, scene: Scene) -> Json:
+        """The other scene's thing."""
+        return {"thing": thing_of(study, scene)}
 
     def compute(self, work: Work) -> IdealResult:
         """Solve the share, edit the scene, and measure every target."""
@@ -144,11 +152,12 @@ class IdealProbe(MethodProbe[IdealResult]):
             share = solve_share(thing.grams, ideal["settled"], steps)
             checked = alone(thing.grams, share, steps)
             editor = thing.editor(share, ideal["cross"])
+            donor = self._donor(work, share)
         with meter.stage("splats"):
             before = splats_of(work)
         # The words decide nothing; the method asks for some.
         spec["edit"] = {"instruction": EDIT, "target": EDIT, "source": world.scene.title}
-        result = run_method(work, _truth(thing), names, before, editor=editor)
+        result = run_method(work, _truth(thing), names, before, editor=editor, donor=donor)
         del spec["edit"]
         for part, seconds in result.seconds.items():
             meter.add(f"method: {part}", seconds)
@@ -178,6 +187,19 @@ class IdealProbe(MethodProbe[IdealResult]):
             len(edited),
         )
 
+    def _donor(self, work: Work, share: float) -> Donor | None:
+        """The other scene's source with an editor that knows its answers; None without one."""
+        other = other_world(work)
+        if other is None:
+            return None
+        spec, name = work.spec, other.source.name
+        ideal = spec["editor"]["ideal"]
+        thing = _thing(
+            other, (name,), tuple(spec["other"]["thing"]), ideal["parts"], ideal["colors"],
+            spec["spp"],
+        )  # fmt: skip
+        return Donor(thing.editor(share, ideal["cross"]), thing.before[name])
+
     def _figures(
         self,
         world: World,
@@ -203,7 +225,7 @@ class IdealProbe(MethodProbe[IdealResult]):
         return IdealResult.from_json(data["ideal"])
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=3)
 def _thing(
     world: World,
     names: tuple[str, ...],
