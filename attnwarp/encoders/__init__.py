@@ -65,12 +65,23 @@ REAL: dict[str, tuple[Kind, str]] = {
         "dino",
         "DINOv2 in the transformers format, such as facebook/dinov2-with-registers-small",
     ),
+    "clip-whole:FOLDER": (
+        "clip",
+        "the same, of whole pictures resized without antialiasing: the paper's figures",
+    ),
+    "dinov2-518:FOLDER": (
+        "dino",
+        "DINOv2 that sees whole pictures at 518 px: the paper's figures",
+    ),
     "lpips:FILE_OR_FOLDER": (
         "perceptual",
         "LPIPS: a torchvision backbone (alex, vgg, squeeze) and its linear layers",
     ),
 }
 """Encoders read from the user's files: pattern -> (kind, description)."""
+
+AUTHORS_SIDE = 518
+"""Side in px of the pictures that DINOv2 sees in the paper's figures."""
 
 _SCHEMES = {pattern.partition(":")[0]: kind for pattern, (kind, _) in REAL.items()}
 
@@ -142,7 +153,9 @@ def load_encoder(name: str, kind: Kind | None = None, *, device: str = "cpu") ->
 
     Args:
         name: a bundled one (``clip-small``, ``clip-parts``, ``dino-small``,
-            ``perceptual-small``), or ``clip:FOLDER``, ``dinov2:FOLDER``, ``lpips:FILE_OR_FOLDER``.
+            ``perceptual-small``), or ``clip:FOLDER``, ``dinov2:FOLDER``, ``lpips:FILE_OR_FOLDER``;
+            ``clip-whole:FOLDER`` and ``dinov2-518:FOLDER`` see pictures as the paper's authors
+            show them.
         kind: the expected kind; an encoder of another kind is refused before it is loaded.
         device: "cpu" or "cuda", for real ones. The bundled ones are small and stay on the CPU; the
             loss of ``perceptual-small`` is computed where its pictures lie.
@@ -181,8 +194,11 @@ def load_encoder(name: str, kind: Kind | None = None, *, device: str = "cpu") ->
         return load_lpips(path, name=name, device=device)
     from attnwarp.encoders import pretrained
 
-    load = pretrained.load_clip if scheme == "clip" else pretrained.load_dinov2
-    return load(path, name=name, device=device)
+    if scheme in ("clip", "clip-whole"):
+        whole = scheme == "clip-whole"
+        return pretrained.load_clip(path, name=name, device=device, whole=whole)
+    side = AUTHORS_SIDE if scheme == "dinov2-518" else None
+    return pretrained.load_dinov2(path, name=name, device=device, side=side)
 
 
 def _pattern(name: str) -> str:

@@ -26,6 +26,8 @@ _FAMILIES = ("CLIPImageProcessor", "CLIPFeatureExtractor", "BitImageProcessor")
 _FILTERS = {0: "nearest", 1: "Lanczos", 2: "bilinear", 3: "bicubic", 4: "box", 5: "Hamming"}
 """Pillow's numbers of its filters, as the file stores them."""
 
+_SAMPLED = "bicubic, not antialiased"
+
 LEAST, MOST = 1e-4, 1e4
 """Limits of deviations, and of any number here: those of published encoders are 0.2 to 1, or 255
 times so much. Beyond, all pictures look alike in float32.
@@ -43,6 +45,8 @@ class Preprocessing:
         crop: (height, width) in px, cut from the centre; a smaller picture is padded with black.
         scale: factor applied to [0, 1]; 1 for networks that expect [0, 1].
         mean, std: per channel, after the scaling.
+        antialias: False resizes as torch does by default: a cubic of the nearest 16 pixels, however
+            much a picture shrinks.
     """
 
     resize: int | tuple[int, int] | None
@@ -51,6 +55,7 @@ class Preprocessing:
     scale: float = 1.0
     mean: tuple[float, ...] = (0.0, 0.0, 0.0)
     std: tuple[float, ...] = (1.0, 1.0, 1.0)
+    antialias: bool = True
 
     @property
     def shape(self) -> tuple[int, int] | None:
@@ -67,7 +72,8 @@ class Preprocessing:
     def __call__(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """(H, W, 3) in [0, 1] to (3, h, w), normalised."""
         if self.resize is not None:
-            image = resize(image, _target(image, self.resize), self.resample)
+            size = _target(image, self.resize)
+            image = resize(image, size, self.resample) if self.antialias else sampled(image, size)
         if self.crop is not None:
             image = center_crop(image, self.crop)
         mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
@@ -79,7 +85,8 @@ class Preprocessing:
         if self.resize is not None:
             to = self.resize
             what = f"the shorter edge to {to}" if isinstance(to, int) else f"to {to[1]} x {to[0]}"
-            steps.append(f"resized {what} px ({_FILTERS[self.resample]}, antialiased, floating)")
+            how = f"{_FILTERS[self.resample]}, antialiased" if self.antialias else _SAMPLED
+            steps.append(f"resized {what} px ({how}, floating)")
         if self.crop is not None:
             steps.append(f"the central {self.crop[1]} x {self.crop[0]} px cut out")
         if self.scale != 1:
@@ -114,6 +121,25 @@ def resize(
             channel = np.asarray(Image.fromarray(channel).resize(shape, resample)).clip(0, 1)
         channels.append(channel)
     return np.stack(channels, axis=2)
+
+
+def sampled(image: npt.NDArray[np.float32], size: tuple[int, int]) -> npt.NDArray[np.float32]:
+    """(H, W, 3) in [0, 1] to (h, w, 3), bicubic without antialiasing, clipped to [0, 1].
+
+    Args:
+        image: the picture.
+        size: (h, w) in px.
+
+    Example:
+        >>> half = sampled(np.eye(4, dtype=np.float32)[..., None].repeat(3, axis=2), (2, 2))
+        >>> half[..., 0].round(3).tolist()  # (-3, 19, 19, -3) / 32 of four
+        [[0.611, 0.0], [0.0, 0.611]]
+    """
+    import torch
+
+    planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None]
+    small = torch.nn.functional.interpolate(planes, size, mode="bicubic", align_corners=False)
+    return np.ascontiguousarray(small[0].numpy().transpose(1, 2, 0).clip(0, 1))
 
 
 def center_crop(image: npt.NDArray[np.float32], size: tuple[int, int]) -> npt.NDArray[np.float32]:

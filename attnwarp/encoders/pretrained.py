@@ -13,6 +13,7 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -188,7 +189,7 @@ class Dino(_Pictures):
         return int(self._model.config.hidden_size)
 
 
-def load_clip(folder: Path, *, name: str, device: str = "cpu") -> Clip:
+def load_clip(folder: Path, *, name: str, device: str = "cpu", whole: bool = False) -> Clip:
     """CLIP from a folder in the transformers format.
 
     Args:
@@ -196,6 +197,7 @@ def load_clip(folder: Path, *, name: str, device: str = "cpu") -> Clip:
             its index), preprocessor_config.json, and tokenizer.json or vocab.json with merges.txt.
         name: the name in errors and results.
         device: "cpu" or "cuda".
+        whole: resize the whole picture, without antialiasing and without a crop.
 
     Raises:
         InputError: a file is missing or invalid; the message says which, and how to get it.
@@ -216,6 +218,8 @@ def load_clip(folder: Path, *, name: str, device: str = "cpu") -> Clip:
             f" {preprocessing.shape or 'pictures of any size'}, the network in config.json takes"
             f" ({side}, {side}); the two files are not of one model"
         )
+    if whole:
+        preprocessing = replace(preprocessing, resize=(side, side), crop=None, antialias=False)
     _fitting_tokenizer(tokenizer, model.config.text_config, folder, name)
     about = EncoderInfo(
         name,
@@ -229,7 +233,7 @@ def load_clip(folder: Path, *, name: str, device: str = "cpu") -> Clip:
     return Clip(model, tokenizer, about, preprocessing, torch_device)
 
 
-def load_dinov2(folder: Path, *, name: str, device: str = "cpu") -> Dino:
+def load_dinov2(folder: Path, *, name: str, device: str = "cpu", side: int | None = None) -> Dino:
     """DINOv2 from a folder in the transformers format, with registers or without.
 
     Args:
@@ -237,6 +241,8 @@ def load_dinov2(folder: Path, *, name: str, device: str = "cpu") -> Dino:
             its index) and preprocessor_config.json.
         name: the name in errors and results.
         device: "cpu" or "cuda".
+        side: px to which the whole picture is resized, without antialiasing and without a crop;
+            None for the published preprocessing.
 
     Raises:
         InputError: a file is missing or invalid; the message says which, and how to get it.
@@ -245,6 +251,8 @@ def load_dinov2(folder: Path, *, name: str, device: str = "cpu") -> Dino:
     torch_device = device_of(device)
     config = _config(folder, name, "dino", ("dinov2", "dinov2_with_registers"))
     preprocessing = read_preprocessing(folder)
+    if side is not None:
+        preprocessing = replace(preprocessing, resize=(side, side), crop=None, antialias=False)
     with optional_imports():
         from transformers import Dinov2Model, Dinov2WithRegistersModel
 

@@ -126,7 +126,7 @@ def edit_dataset(
     workdir_of(out).check_unclaimed()  # again in the edit, but here before a fit
     device = choose(device, report)
     views = load_views(dataset, max_size=max_size)
-    index = _view_of(views.cameras, source, dataset)
+    index = view_of(views.cameras, source, dataset)
     images = images_of(views)
     # Views are the cameras with a picture.
     pictures = [path for path in dataset.image_paths if path is not None]
@@ -137,7 +137,7 @@ def edit_dataset(
         h, w, _ = by_hand.shape
         # Again in the edit, but here before an editor is loaded and a fit spends its minutes.
         check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
-    segments = _marked(marks, editor_name, dataset, views, images, index, out, device, report)
+    segments = marked(marks, editor_name, dataset, views, images, index, out, device, report)
     editor = load_editor(editor_name, device=device, dtype=type_of(dtype, device))
     check_instruction(editor_name, editor, instruction)
     if settings.size is None:
@@ -232,8 +232,8 @@ def run_baseline(
     device = choose(device, report)
     views = load_views(dataset, max_size=max_size)
     images = images_of(views)
-    index = _view_of(views.cameras, source, dataset)
-    segments = _marked(marks, editor_name, dataset, views, images, index, out, device, report)
+    index = view_of(views.cameras, source, dataset)
+    segments = marked(marks, editor_name, dataset, views, images, index, out, device, report)
     editor = load_editor(editor_name, device=device, dtype=type_of(dtype, device))
     check_instruction(editor_name, editor, instruction)
     torch.set_num_threads(thread_count(editor, threads))
@@ -267,7 +267,7 @@ def _report_memory(device: str, report: Reporter) -> None:
         report.log(f"edited{peak}")
 
 
-def _marked(
+def marked(
     marks: Marks,
     editor_name: str,
     dataset: Dataset,
@@ -323,7 +323,7 @@ def _fitted(
     return result.gaussians
 
 
-def _view_of(cameras: Any, name: str | None, dataset: Dataset) -> int:
+def view_of(cameras: Any, name: str | None, dataset: Dataset) -> int:
     """The number of a view by its name, its file's name with or without suffix, or its number."""
     if name is None:
         return 0

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from attnwarp.editing.editor import Guide
     from attnwarp.fit import Views
     from attnwarp.gaussians import Gaussians
+    from attnwarp.methods import Result
 
 WITHOUT_TRUTH = ("image.", "embedding.")
 """Beginnings of the names of figures that need no true pictures."""
@@ -196,7 +197,7 @@ def compare(
         for title, metric in report_of("editing").columns.items()
         if not metric.startswith(WITHOUT_TRUTH)
     }
-    originals = _originals(views, out / "originals")
+    originals = write_originals(views, out / "originals")
     seconds: dict[str, float] = {}
     for place, name in enumerate(usable):
         report.step(place, len(usable), name)
@@ -206,7 +207,7 @@ def compare(
         )
         edited = _edit(study, name, editor, views, splats, words, folder / "run", seconds)
         seconds[name] = sum(edited.seconds.get(part, 0.0) for part in method_run.PARTS)
-        _write_pictures(views.cameras, splats, edited, originals, folder)
+        write_pictures(views.cameras, splats, edited, originals, folder)
         page = _page(folder / "run", splats, views.cameras, originals, editor, parts[name].name)
         result.rows[name] = _measured(study, edited, words, folder, out / "originals", result)
         result.rows[name] |= {
@@ -228,7 +229,7 @@ def _reference(variant: Variant) -> str | None:
     return None if budget is None else budget.seconds_of
 
 
-def _originals(views: Views, folder: Path) -> list[npt.NDArray[np.float32]]:
+def write_originals(views: Views, folder: Path) -> list[npt.NDArray[np.float32]]:
     """(H, W, 3) pictures over black, also written as files."""
     import torch
 
@@ -289,10 +290,10 @@ def _edit(
     return EDITING_METHODS[own.method].run(job)
 
 
-def _write_pictures(
+def write_pictures(
     cameras: Sequence[Camera],
     before: Gaussians,
-    edited: EditedScene,
+    edited: EditedScene | Result,
     originals: Sequence[npt.NDArray[np.float32]],
     folder: Path,
 ) -> None:

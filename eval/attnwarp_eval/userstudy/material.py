@@ -180,7 +180,8 @@ def _captured(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]
     views = sorted({k * count // MOST_VIEWS for k in range(MOST_VIEWS)} if count > MOST_VIEWS
                    else range(count))  # fmt: skip
     files = [f"view-{view:04d}.png" for view in views]
-    before = {Path(name).stem: run / "originals" / name for name in files}
+    originals = run / data.get("originals", "originals")
+    before = {Path(name).stem: originals / name for name in files}
     key = (run.resolve().name, "edit", 0)
     for method, folder in folders.items():
         own = {Path(name).stem: folder / "renders" / name for name in files}

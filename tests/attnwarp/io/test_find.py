@@ -20,7 +20,7 @@ from attnwarp.io import (
     read_transforms,
 )
 from attnwarp.io.names import file_stems
-from attnwarp.methods.command import _view_of, mask_files
+from attnwarp.methods.command import mask_files, view_of
 
 NAMES = ["images/left/é one.png", "images/right/B.png", "images/c.png"]
 """Names on the disk."""
@@ -193,4 +193,4 @@ def test_image_of_another_form_is_not_read_twice_from_the_disk(tmp_path, monkeyp
 @pytest.mark.parametrize("name", ["RIGHT\\B.png", "right/b.PNG", "b", "RIGHT%2FB.png"])
 def test_a_source_view_is_found_by_another_spelling_of_its_name(name):
     cameras = views("left/a.png", "right/B.png", "c.png")
-    assert _view_of(cameras, name, Dataset(cameras, [None] * 3)) == 1
+    assert view_of(cameras, name, Dataset(cameras, [None] * 3)) == 1

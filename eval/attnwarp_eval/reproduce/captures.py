@@ -1,0 +1,158 @@
+"""The captures of a manifest as methods take them: pictures, cameras, splats, segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.camera import Camera
+from attnwarp.digest import digest
+from attnwarp.errors import InputError
+from attnwarp.fit import Views, load_views
+from attnwarp.gaussians import Gaussians
+from attnwarp.io import Dataset, read_dataset, read_ply
+from attnwarp.methods.command import marked, view_of
+from attnwarp.methods.marks import Marks
+from attnwarp.methods.pictures import Segment
+from attnwarp.methods.scene import images_of, near_of, render_picture, to_float
+from attnwarp.reporting import Reporter
+from attnwarp_eval.reproduce.manifest import Loaded
+
+LOOKS, LOOK_SIZE = 6, 256
+"""Views whose renders are held against their pictures, and their longest side in px."""
+
+LEAST_PSNR = 15.0
+"""dB below which renders of splats are of something else than the pictures."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ready:
+    """A capture that was read.
+
+    Attributes:
+        dataset: its views.
+        views: pictures and cameras at the size of the manifest.
+        images: (H, W, 3) of each view, over black.
+        source: number of the source view.
+        content: SHA-256 of the pictures, the cameras and their names, and the source's number.
+    """
+
+    dataset: Dataset
+    views: Views
+    images: list[npt.NDArray[Any]]
+    source: int
+    content: str
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Cameras of the views."""
+        return list(self.views.cameras)
+
+    def pictures(self) -> list[Path]:
+        """Files of the views."""
+        return [path for path in self.dataset.image_paths if path is not None]
+
+
+def ready(loaded: Loaded, name: str) -> Ready:
+    """Read a capture; the last one that a process read is kept.
+
+    Raises:
+        InputError: it cannot be used; the message begins with its key in the manifest.
+    """
+    c = loaded.manifest.captures[name]
+    images = None if c.images is None else loaded.path(c.images)
+    try:
+        return _read(loaded.path(c.data), images, c.scale, loaded.manifest.max_size, c.source)
+    except (InputError, FileNotFoundError, ValueError) as error:
+        text = str(error).replace("--source", "source")
+        raise InputError(f"captures.{name}: {text}") from None
+
+
+@lru_cache(maxsize=1)
+def _read(
+    data: Path, images: Path | None, scale: int, max_size: int | None, source: str | None
+) -> Ready:
+    dataset = read_dataset(data, images=images, scale=scale)
+    views = load_views(dataset, max_size=max_size, damaged="error")
+    index = view_of(views.cameras, source, dataset)
+    content = digest([views.digest, [camera.name for camera in views.cameras], index])
+    return Ready(dataset, views, images_of(views), index, content)
+
+
+def likeness(capture: Ready, splats: Gaussians) -> float:
+    """PSNR in dB of renders of splats against the pictures of some views, pooled over them."""
+    count = len(capture.cameras)
+    chosen = dict.fromkeys(np.linspace(0, count - 1, min(LOOKS, count)).round().astype(int))
+    near, error, size = near_of(capture.cameras, splats), 0.0, 0
+    for k in chosen:
+        camera, picture = capture.cameras[k], to_float(capture.images[k])
+        factor = min(1.0, LOOK_SIZE / max(camera.width, camera.height))
+        if factor < 1:
+            import cv2
+
+            w, h = (max(1, round(factor * side)) for side in (camera.width, camera.height))
+            camera = camera.resize(w, h)
+            small = cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA)
+            picture = np.asarray(small, np.float32)
+        render = render_picture(splats, camera, near, "auto")
+        error += float(np.square(render.astype(np.float64) - picture).sum())
+        size += picture.size
+    return float(-10 * np.log10(max(error / size, 1e-12)))
+
+
+def check_likeness(place: str, capture: Ready, splats: Gaussians) -> None:
+    """Refuse splats whose renders are unlike the pictures.
+
+    Raises:
+        InputError: they are under :data:`LEAST_PSNR`; the message begins with ``place``.
+    """
+    psnr = likeness(capture, splats)
+    if psnr < LEAST_PSNR:
+        raise InputError(
+            f"{place}: renders of its splats are {psnr:.1f} dB from the pictures, expected at least"
+            f" {LEAST_PSNR:g}; give splats that were fitted to these cameras, in the same"
+            " coordinates and units (nerfstudio and gsplat turn, move and scale a scene first), or"
+            " leave them out, so that they are fitted"
+        )
+
+
+def splats_file(loaded: Loaded, run: Path, name: str, kind: Any) -> Path:
+    """File of a capture's splats: the manifest's, or that of their fit in the run's folder."""
+    given = loaded.manifest.captures[name].splats.get(kind)
+    return loaded.path(given) if given else run / "fits" / f"{name}-{kind}" / "splats.ply"
+
+
+def read_splats(path: Path, kind: str) -> Gaussians:
+    """Splats of a file.
+
+    Raises:
+        InputError: no such file, or splats of another kind.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; fit it with attnwarp fit, or leave the key out")
+    splats = read_ply(path)
+    if splats.kind != kind:
+        raise InputError(f"{path}: holds {splats.kind}gs, expected {kind}gs; name another file")
+    return splats
+
+
+def segments(
+    loaded: Loaded, name: str, splats: Gaussians, out: Path, device: str, report: Reporter
+) -> list[Segment] | None:
+    """(H, W) shares of each view that are edited; None where a capture marks nothing."""
+    part = loaded.manifest.captures[name].mask
+    if part is None:
+        return None
+    capture = ready(loaded, name)
+    folder, source = (p and loaded.path(p) for p in (part.folder, part.source))
+    marks = Marks(folder or None, source or None, words=part.words, segmenter=part.segmenter)
+    lift = marked(
+        marks, "", capture.dataset, capture.views, capture.images, capture.source, out, device,
+        report,
+    )  # fmt: skip
+    return lift(splats)

@@ -1,0 +1,502 @@
+"""Cells of a reproduction: fits, edits with their figures, and warps of the source.
+
+A cell is one capture x edit x method x seed. Its id is the hash of what decides its figures; its
+files lie in the run's folder, so that workers have to see that folder and the manifest's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from attnwarp.encoders import Kind
+from attnwarp.gaussians import Gaussians
+from attnwarp.methods import Budget, Result
+from attnwarp.reporting import SILENT, Reporter
+from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.experiments.captured import write_originals, write_pictures
+from attnwarp_eval.files import write_picture
+from attnwarp_eval.reproduce.captures import (
+    Ready,
+    check_likeness,
+    read_splats,
+    ready,
+    segments,
+    splats_file,
+)
+from attnwarp_eval.reproduce.check import Checked
+from attnwarp_eval.reproduce.manifest import Loaded, Manifest, Row
+from attnwarp_eval.study.cell import Cell, merged
+from attnwarp_eval.study.editing_methods import with_source_words
+from attnwarp_eval.study.probe import Probe, Work, register, unregister
+from attnwarp_eval.study.record import Failure, Json, with_nan
+from attnwarp_eval.study.store import Store
+from attnwarp_eval.study.work import compute_and_write
+from attnwarp_eval.user_images import measure
+
+PROTOCOL = 1
+"""Raised whenever the same inputs would give other figures."""
+
+AUTHORS = {"clip": "clip-whole", "dinov2": "dinov2-518"}
+"""Encoders that see pictures as the paper's authors show them, by the published one."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """The result of a cell beside its record's usual entries.
+
+    Attributes:
+        figures: by their title, with the encoders' published preprocessing.
+        authors: the same with that of the paper's authors.
+        counts: of views, edited views, network rows, iterations and splats.
+        seconds: of the method, by part.
+        gpu: GiB of a GPU at most; NaN without one.
+        files: path in the run's folder, and SHA-256.
+    """
+
+    figures: Mapping[str, float] = field(default_factory=dict)
+    authors: Mapping[str, float] = field(default_factory=dict)
+    counts: Mapping[str, float] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    gpu: float = np.nan
+    files: Sequence[Mapping[str, str]] = ()
+
+    def to_json(self) -> Json:
+        """Entries of a record; what was measured in seconds and bytes is of its cost."""
+        data = asdict(self)
+        cost = {"method": data.pop("seconds"), "gpu_gib": data.pop("gpu")}
+        return {**without_nan(data), "cost": without_nan(cost)}
+
+    @classmethod
+    def from_json(cls, data: Json) -> Made:
+        """Rebuild from :meth:`to_json`."""
+        cost = with_nan({"gpu": data["cost"]["gpu_gib"]})
+        return cls(
+            with_nan(data["figures"]), with_nan(data["authors"]), with_nan(data["counts"]),
+            data["cost"]["method"], cost["gpu"], data["files"],
+        )  # fmt: skip
+
+
+class Reproduction(Probe[Made]):
+    """Probe whose cells are of captures; no study names it, so it is registered while it runs."""
+
+    name: ClassVar[str] = "reproduction"
+    protocol: ClassVar[int] = PROTOCOL
+    needs_scenes: ClassVar[bool] = False
+    judges_variants: ClassVar[bool] = False
+    draws: ClassVar[bool] = False
+
+    def compute(self, work: Work) -> Made:
+        """Fit, edit or warp, as the cell's spec says."""
+        s = work.cell.sources
+        loaded = Loaded(Manifest.model_validate_json(s["manifest"]), Path(s["folder"]))
+        job = Job(loaded, Path(s["run"]), _own_device(s["devices"].split(",")), work.cell)
+        return {"fit": job.fit, "edit": job.edit, "warp": job.warp}[work.spec["kind"]]()
+
+    def read_extra(self, data: Json) -> Made:
+        """The extra of a record."""
+        return Made.from_json(data)
+
+
+def _own_device(devices: Sequence[str]) -> str:
+    """The device of this process: the one with the number of its worker, in turn."""
+    from distributed import get_worker
+
+    try:
+        number = str(get_worker().name)
+    except ValueError:  # no worker
+        number = "0"
+    return devices[int(number) % len(devices) if number.isdecimal() else 0]
+
+
+@lru_cache(maxsize=1)
+def editor_of(name: str, device: str) -> Any:
+    from attnwarp.devices import type_of
+    from attnwarp.editing.small import load_editor
+
+    return load_editor(name, device=device, dtype=type_of("auto", device))
+
+
+@dataclass(frozen=True)
+class Job:
+    """A cell at work.
+
+    Attributes:
+        loaded, cell: the manifest and the cell.
+        run: the run's folder.
+        device: "cpu" or "cuda", with a number or without.
+        report: receives how far it is.
+        budget: limits of the method; None for a whole cell.
+        first_splats: take those that a fit begins with, where it has not ended.
+    """
+
+    loaded: Loaded
+    run: Path
+    device: str
+    cell: Cell
+    report: Reporter = SILENT
+    budget: Budget | None = None
+    first_splats: bool = False
+
+    @property
+    def capture(self) -> Ready:
+        """Capture of the cell."""
+        return ready(self.loaded, self.cell.scene)
+
+    def folder(self) -> Path:
+        """Folder of the cell's files."""
+        return cell_folder(self.run, self.cell.id)
+
+    def _files(
+        self, *folders: Path, ends: Sequence[str] = (".png", ".ply")
+    ) -> list[dict[str, str]]:
+        paths = sorted(p for f in folders for p in ([f] if f.is_file() else f.rglob("*")))
+        return [Store(self.run).keep_picture(p) for p in paths if p.suffix in ends]
+
+    def fit(self) -> Made:
+        """Fit splats to all views; a fit that was killed goes on."""
+        from attnwarp.fit import FitSettings, first_splats, fit
+
+        capture, kind = self.capture, self.cell.spec["settings"]["kind"]
+        settings = FitSettings.from_dict(self.cell.spec["settings"])
+        path = splats_file(self.loaded, self.run, self.cell.scene, kind)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        start = first_splats(capture.dataset, capture.cameras, settings, self.report)
+        done = fit(start.to(device=self.device), capture.views, settings, folder=path.parent)
+        check_likeness(f"captures.{self.cell.scene}: fit of {kind}gs", capture, done.gaussians)
+        counts = {"splats": len(done.gaussians), "iterations": done.iteration}
+        return Made({}, {}, counts, {"fit": done.seconds}, _gpu(self.device), self._files(path))
+
+    def edit(self) -> Made:
+        """Edit a capture by a method, and measure what came out."""
+        capture, folder = self.capture, self.folder()
+        row = self.loaded.manifest.methods[self.cell.variant]
+        _reset_gpu(self.device)
+        result, splats = self.run_method(editor_of(self.loaded.editor(row.editor), self.device))
+        originals = self.run / "originals" / self.cell.scene
+        images = write_originals(capture.views, originals)
+        write_pictures(capture.cameras, splats, result, images, folder)
+        counts = {
+            "views": len(capture.cameras), "edited": len(result.edited),
+            **{k: result.counters[k] for k in ("network_rows", "iterations", "splats")},
+        }  # fmt: skip
+        files = self._files(folder / "renders", folder / "edited", folder / "run" / "edited.ply")
+        return Made(
+            self.figures(result, originals), self.figures(result, originals, authors=True),
+            counts, result.seconds, _gpu(self.device), files,
+        )  # fmt: skip
+
+    def run_method(self, editor: Any) -> tuple[Result, Gaussians]:
+        """The result of the cell's method, and the splats before it."""
+        from attnwarp.editing.small import thread_count
+        from attnwarp.fit import compile_kernels
+        from attnwarp.methods import METHODS, preset
+
+        spec, capture, folder = self.cell.spec, self.capture, self.folder()
+        torch.set_num_threads(thread_count(editor))
+        splats = self.splats(self.loaded.manifest.methods[self.cell.variant].splats)
+        compile_kernels(splats.kind, self.report, self.device)
+        options: dict[str, Any] = {"budget": self.budget} if self.budget else {}
+        if spec["method"] == "attention_warping":
+            options["source"] = capture.source
+        marked = segments(self.loaded, self.cell.scene, splats, folder, self.device, self.report)
+        result = METHODS[spec["method"]](
+            splats, capture.cameras, capture.images, editor, spec["text"],
+            preset(spec["method"], **spec["settings"]), folder=folder / "run",
+            segments=marked, report=self.report, **options,
+        )  # fmt: skip
+        return result, splats
+
+    def splats(self, kind: str) -> Gaussians:
+        """Splats of the capture, on the device."""
+        path = splats_file(self.loaded, self.run, self.cell.scene, kind)
+        if self.first_splats and not path.is_file():
+            from attnwarp.fit import FitSettings, first_splats
+
+            settings = FitSettings.from_dict({**self.loaded.manifest.fit, "kind": kind})
+            start = first_splats(self.capture.dataset, self.capture.cameras, settings)
+            return start.to(device=self.device)
+        return read_splats(path, kind).to(device=self.device)
+
+    def figures(self, result: Result, originals: Path, authors: bool = False) -> dict[str, float]:
+        """Figures by their title; those of bundled encoders have no version of the authors."""
+        folder, words = self.folder(), self.cell.spec["words"]
+        source = folder / "edited" / f"view-{self.capture.source:04d}.png"
+        names: dict[Kind, str | None] = {
+            "clip": self.loaded.encoder("clip"), "dino": self.loaded.encoder("dino"),
+        }  # fmt: skip
+        if authors:
+            names = {k: authors_version(str(name)) or measure.OFF for k, name in names.items()}
+            if set(names.values()) == {measure.OFF}:
+                return {}
+        inputs = measure.Inputs(
+            folder / "renders", folder / "edited" if result.edited else None, originals,
+            source if self.capture.source in result.edited else None,
+            words["target"], words["source"],
+        )  # fmt: skip
+        done = measure.measure(
+            inputs, {**names, "perceptual": measure.OFF}, Store(folder / "measured"),
+            device=self.device,
+        )  # fmt: skip
+        return {row.title: row.value for row in done.rows if row.encoder or not authors}
+
+    def warp(self) -> Made:
+        """The source's picture warped into a target by both kinds of splats, with its mask."""
+        from attnwarp.methods.scene import near_of, to_float
+        from attnwarp.warp import PRESETS, sample, warp_view
+
+        capture, folder, target = self.capture, self.folder(), self.cell.spec["target"]
+        source = to_float(capture.images[capture.source])
+        truth = to_float(capture.images[target])
+        figures: dict[str, float] = {}
+        for kind in ("2d", "3d"):
+            splats = self.splats(kind)
+            view = warp_view(
+                splats, capture.cameras[capture.source], capture.cameras[target],
+                PRESETS["paper"], near=near_of(capture.cameras, splats), warn_empty=False,
+            )  # fmt: skip
+            planes = torch.from_numpy(np.ascontiguousarray(source.transpose(2, 0, 1)))
+            warped = sample(planes, view.correspondence)[0].numpy().transpose(1, 2, 0)
+            mask = view.mask.cpu().numpy()
+            figures[f"valid, {kind}gs"] = float(mask.mean())
+            apart = np.abs(warped - truth)[mask]
+            figures[f"apart, {kind}gs"] = float(apart.mean()) if apart.size else np.nan
+            shown = np.where(mask[..., None], warped, 0.0)
+            for what, picture in (("warped", warped), ("valid", shown)):
+                pixels = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
+                write_picture(folder / f"{what}-{kind}.png", pixels)
+        for what, picture in (("source", source), ("target", truth)):
+            write_picture(folder / f"{what}.png", np.rint(255 * picture).astype(np.uint8))
+        return Made(figures, files=self._files(folder))
+
+
+def cell_folder(run: Path, cell_id: str) -> Path:
+    """Folder of a cell's files."""
+    return run / "made" / cell_id[:16]
+
+
+def _reset_gpu(device: str) -> None:
+    if device != "cpu":
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def _gpu(device: str) -> float:
+    return np.nan if device == "cpu" else torch.cuda.max_memory_allocated(device) / 2**30
+
+
+def authors_version(name: str) -> str | None:
+    """The encoder that sees pictures as the authors show them; None for one that has none.
+
+    Example:
+        >>> authors_version("clip:/models/clip"), authors_version("clip-small")
+        ('clip-whole:/models/clip', None)
+    """
+    scheme, colon, place = name.partition(":")
+    return f"{AUTHORS[scheme]}:{place}" if colon and scheme in AUTHORS else None
+
+
+@dataclass(frozen=True)
+class Planned:
+    """Cells of a manifest in the order of their running: all of a wave may run at once."""
+
+    loaded: Loaded
+    checked: Checked
+    fits: list[Cell]
+    edits: list[Cell]
+    warps: list[Cell]
+
+    @property
+    def waves(self) -> tuple[list[Cell], list[Cell]]:
+        """Fits, then what needs them."""
+        return self.fits, [*self.edits, *self.warps]
+
+    @property
+    def cells(self) -> list[Cell]:
+        """All of them."""
+        return [*self.fits, *self.edits, *self.warps]
+
+
+def plan(loaded: Loaded, checked: Checked, run: Path, devices: Sequence[str]) -> Planned:
+    """The cells of a manifest whose inputs were checked."""
+    m = loaded.manifest
+    sources = {
+        "manifest": m.model_dump_json(), "folder": str(loaded.folder.resolve()),
+        "run": str(run.resolve()), "devices": ",".join(devices),
+    }  # fmt: skip
+
+    def cell(kind: str, scene: str, variant: str, seed: int, **spec: Any) -> Cell:
+        common = {
+            "probe": Reproduction.name, "protocol": PROTOCOL, "kind": kind,
+            "capture": checked.captures[scene], "seed": seed,
+        }  # fmt: skip
+        return Cell({**common, **spec}, scene, variant, Reproduction.name, seed, (variant,), (),
+                    sources)  # fmt: skip
+
+    kinds = {row.splats for row in m.methods.values()} | ({"2d", "3d"} if m.geometry else set())
+    fits = [
+        cell("fit", name, f"fit of {kind}gs", 0, settings=_fit_settings(m, kind))
+        for name, capture in m.captures.items()
+        for kind in sorted(kinds - capture.splats.keys())
+    ]
+
+    def splats_of(name: str, kind: str) -> Any:
+        return checked.splats[name].get(kind) or {"fit": _fit_settings(m, kind)}
+
+    def edit(name: str, edit_name: str, method: str, row: Row, seed: int) -> Cell:
+        words = m.captures[name].edits[edit_name]
+        guided = editor_guide(loaded.editor(row.editor)) == "depth"
+        return cell(
+            "edit", name, method, seed,
+            edit=edit_name,
+            splats=splats_of(name, row.splats),
+            mask=checked.masks.get(name),
+            method=row.method,
+            settings=settings_of(loaded, row, seed, words.source),
+            text=words.controlnet if guided else words.instruction,
+            words={"source": words.source, "target": words.target},
+            editor=checked.weights[f"editors.{row.editor}"][0],
+            encoders={k: v for k, (v, _) in checked.weights.items() if k.startswith("encoders.")},
+        )  # fmt: skip
+
+    edits = [
+        edit(name, edit_name, method, row, seed)
+        for name, edit_name in loaded.edits()
+        for method, row in m.methods.items()
+        for seed in loaded.seeds(row)
+    ]
+    warps = [
+        cell("warp", name, f"view {target}", 0, target=target,
+             splats=[splats_of(name, kind) for kind in ("2d", "3d")])
+        for name in m.captures
+        for target in _targets(checked.views[name], ready(loaded, name).source, m.geometry)
+    ]  # fmt: skip
+    return Planned(loaded, checked, fits, merged(edits), warps)
+
+
+def _fit_settings(manifest: Manifest, kind: str) -> Json:
+    from attnwarp.fit import FitSettings
+
+    return FitSettings.from_dict({**manifest.fit, "kind": kind}).to_dict()
+
+
+def editor_guide(name: str) -> str:
+    """Guide of an editor, "picture" or "depth"."""
+    from attnwarp.editing.small import guide_of
+
+    return guide_of(name)
+
+
+def settings_of(loaded: Loaded, row: Row, seed: int, source_words: str) -> Json:
+    """All settings of a row's method."""
+    from attnwarp.methods import preset
+
+    own = {**row.options, "seed": seed, "size": loaded.manifest.size,
+           "perceptual_encoder": loaded.encoder("perceptual")}  # fmt: skip
+    settings = preset(row.method, row.preset, **own).to_dict()
+    return with_source_words(settings, source_words)
+
+
+def _targets(views: int, source: int, count: int) -> list[int]:
+    """Views evenly spread after the source, without it."""
+    return sorted(
+        {(source + (k + 1) * views // (count + 1)) % views for k in range(count)} - {source}
+    )
+
+
+def todo(cells: Sequence[Cell], store: Store) -> list[Cell]:
+    """Cells without a whole record and whole files."""
+    done = store.done()
+
+    def whole(cell: Cell) -> bool:
+        read = Reproduction().read
+        record = store.whole(cell.id, read) if cell.id in done else None
+        return record is not None and not store.damaged_pictures(record.extra.files)
+
+    return [cell for cell in cells if not whole(cell)]
+
+
+def execute(
+    planned: Planned, store: Store, *, jobs: int, scheduler: str | None, report: Reporter
+) -> list[Failure]:
+    """Compute what is still to do, fits first, and return what failed.
+
+    Args:
+        planned: the cells.
+        store: the run's folder.
+        jobs: worker processes; 1 stays in this process.
+        scheduler: a dask scheduler whose workers see the run's folder and the manifest's.
+        report: receives each cell.
+    """
+    from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
+    from attnwarp_eval.study.reporting import CellReporter
+
+    failures: list[Failure] = []
+    register(Reproduction)
+    try:
+        for wave in planned.waves:
+            left = todo(wave, store)
+            cells = CellReporter(left, len(wave) - len(left), report)
+            if not left:
+                continue
+            if scheduler is not None:
+                work = run_on_scheduler(left, store, {}, scheduler, cells)
+            elif jobs > 1 and len(left) > 1:
+                work = run_on_workers(left, store.root, min(jobs, len(left)), cells)
+            else:
+                work = _here(left, store, cells)
+            for cell, failure in work:
+                if failure is not None:
+                    store.write_failure(cell.id, asdict(failure))
+                    failures.append(failure)
+                cells.end(cell, failure)
+            if failures:
+                break
+    finally:
+        unregister(Reproduction.name)
+    return failures
+
+
+def _here(left: Sequence[Cell], store: Store, cells: Any) -> Generator[tuple[Cell, Failure | None]]:
+    for cell in left:
+        cells.start(cell)
+        yield cell, compute_and_write(Reproduction(), cell, str(store.root))
+
+
+def made_of(planned: Planned, store: Store) -> Iterator[tuple[Cell, Any]]:
+    """Cells with their records, those that are there."""
+    for cell in planned.cells:
+        record = store.whole(cell.id, Reproduction().read)
+        if record is not None:
+            yield cell, record
+
+
+def expected(planned: Planned) -> Json:
+    """Content of the run's ``study.json``: the manifest, its inputs and its cells."""
+    c = planned.checked
+    return {
+        "manifest": planned.loaded.manifest.model_dump(mode="json"),
+        "inputs": {
+            "captures": c.captures, "splats": c.splats, "masks": c.masks,
+            "weights": {k: {"sha256": sha, "probe": p} for k, (sha, p) in c.weights.items()},
+        },
+        "cells": [
+            {"id": cell.id, "title": title(cell), "scene": cell.scene, "kind": cell.spec["kind"],
+             "edit": cell.spec.get("edit"), "methods": list(cell.labels), "seed": cell.seed}
+            for cell in planned.cells
+        ],
+    }  # fmt: skip
+
+
+def title(cell: Cell) -> str:
+    """A cell in words."""
+    edit = f" / {cell.spec['edit']}" if "edit" in cell.spec else ""
+    return f"{cell.scene}{edit} / {cell.variant}" + (f" / seed {cell.seed}" if cell.seed else "")
+
+
+__all__ = ["Made", "Planned", "Reproduction", "execute", "expected", "made_of", "plan", "todo"]
