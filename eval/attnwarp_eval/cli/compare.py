@@ -57,7 +57,11 @@ def compare(
     from attnwarp_eval.compare.write import as_json, document
     from attnwarp_eval.document import write
     from attnwarp_eval.files import write_atomic
+    from attnwarp_eval.reproduce.seal import is_reproduction
 
+    if is_reproduction(baseline) and is_reproduction(run):
+        _side_by_side(baseline, run)
+        return
     with clear_errors():
         outputs = {"--markdown": markdown, "--json": json, "--html": html}
         _check_outputs(baseline, run, outputs, update)
@@ -99,6 +103,20 @@ def compare(
         raise fail(f"{run}: {result.too_little}", TOO_LITTLE)
     if result.left_out:
         raise fail(f"{run}: only what {baseline} has too was compared", TOO_LITTLE)
+
+
+def _side_by_side(one: Path, two: Path) -> None:
+    """Two people's reproductions: what differs of their inputs, and their figures."""
+    from rich.console import Console
+
+    from attnwarp_eval.document.write import terminal
+    from attnwarp_eval.reproduce.seal import side_by_side
+
+    with clear_errors():
+        lines, table = side_by_side(one, two)
+    for line in lines or ["same inputs, code and versions"]:
+        typer.echo(line)
+    Console(width=250).print(terminal(table))
 
 
 def _check_outputs(

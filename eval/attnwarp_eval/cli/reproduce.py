@@ -82,8 +82,9 @@ def reproduce(
                 planned, store, jobs=jobs or len(devices), scheduler=scheduler, report=report
             )
             from attnwarp_eval.reproduce.report import write_report
+            from attnwarp_eval.reproduce.seal import write_seal
 
-            paths = write_report(planned, store)
+            paths = [*write_report(planned, store), write_seal(store)]
         for path in paths:
             typer.echo(path)
     if failures:

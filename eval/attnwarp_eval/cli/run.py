@@ -478,12 +478,16 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
     results.jsonl is held against its checksum.
     """
     from attnwarp_eval.report import wrong_results
+    from attnwarp_eval.reproduce import seal
     from attnwarp_eval.study.run import verify
     from attnwarp_eval.study.store import Store
 
     with clear_errors():
-        problems = verify(Store(run))
-        problems.damaged += wrong_results(Store(run))
+        if seal.is_reproduction(run):
+            problems = seal.verify(Store(run))
+        else:
+            problems = verify(Store(run))
+            problems.damaged += wrong_results(Store(run))
     for what, items in (
         ("damaged", problems.damaged),
         ("failed", problems.failed),

@@ -18,7 +18,7 @@ from attnwarp.methods import Budget
 from attnwarp.reporting import Reporter
 from attnwarp_eval.cost import peak_memory_mb, reset_peak_memory
 from attnwarp_eval.reproduce.captures import ready
-from attnwarp_eval.reproduce.cells import Job, Planned, cell_folder, editor_of
+from attnwarp_eval.reproduce.cells import Job, Planned, editor_of
 from attnwarp_eval.study.cell import Cell
 
 STEPS = (1, 3)

@@ -416,3 +416,48 @@ def test_one_picture_or_text_instead_of_a_list_is_refused(clip, dino):
 def test_a_device_that_is_not_there_is_named(clip_folder):
     with pytest.raises(InputError, match="device 'tpu-ish': unknown, expected cpu or cuda"):
         load_encoder(f"clip:{clip_folder[0]}", device="tpu-ish")
+
+
+def _cubic(image, size):
+    """Bicubic without antialiasing by its definition, in float64: Keys' kernel with a = -3/4, four pixels a side."""
+
+    def kernel(x, a=-0.75):
+        x = abs(x)
+        if x <= 1:
+            return (a + 2) * x**3 - (a + 3) * x**2 + 1
+        return a * (x**3 - 5 * x**2 + 8 * x - 4) if x < 2 else 0.0
+
+    def weights(old, new):
+        rows = np.zeros((new, old))
+        for k in range(new):
+            at = (k + 0.5) * old / new - 0.5
+            for n in range(int(np.floor(at)) - 1, int(np.floor(at)) + 3):
+                rows[k, np.clip(n, 0, old - 1)] += kernel(at - n)
+        return rows
+
+    high, wide = (weights(o, n) for o, n in zip(image.shape, size, strict=False))
+    return np.einsum("ih,hwc,jw->ijc", high, image.astype(np.float64), wide).clip(0, 1)
+
+
+def test_the_authors_versions_see_whole_pictures_without_antialiasing(clip_folder, tmp_path):
+    """Oracle: the kernel's definition before transformers' own network."""
+    folder, model, processor, _ = clip_folder
+    picture = np.random.default_rng(0).random((90, 130, 3)).astype(np.float32)
+    encoder = load_encoder(f"clip-whole:{folder}", "clip")
+    mean, std = (np.array(v) for v in (processor.image_mean, processor.image_std))
+    seen = ((_cubic(picture, (32, 32)) - mean) / std).transpose(2, 0, 1)[None]
+    with torch.no_grad():
+        out = model.get_image_features(pixel_values=torch.from_numpy(seen).float())
+    expected = getattr(out, "pooler_output", out).numpy()
+    assert np.abs(encoder.images([picture]) - expected).max() < 1e-4
+    assert np.abs(load_encoder(f"clip:{folder}").images([picture]) - expected).max() > 1e-3
+    assert "not antialiased" in encoder.about.preprocessing
+
+    network, config = tiny_models.save_dino(tmp_path, registers=True)
+    encoder = load_encoder(f"dinov2-518:{tmp_path}", "dino")
+    mean, std = (np.array(config[key]) for key in ("image_mean", "image_std"))
+    seen = ((_cubic(picture, (518, 518)) - mean) / std).transpose(2, 0, 1)[None]
+    with torch.no_grad():
+        expected = network(pixel_values=torch.from_numpy(seen).float()).last_hidden_state[:, 0]
+    assert encoder.tokens([picture]).shape[1:3] == (37, 37) and encoder.about.size == 518
+    assert np.abs(encoder.images([picture]) - expected.numpy()).max() < 1e-4

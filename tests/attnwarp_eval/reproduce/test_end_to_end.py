@@ -1,7 +1,9 @@
 """The whole command on two exported scenes, killed half-way and begun again."""
 
+import hashlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,9 +16,11 @@ from edit_folders import files
 from PIL import Image
 from reproduction import EDIT, SIZE, VIEWS, write
 from skimage.metrics import peak_signal_noise_ratio
+from typer.testing import CliRunner
 
 from attnwarp.editing.small import load_editor
 from attnwarp.io import read_ply
+from attnwarp_eval.cli.main import app
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.reproduce.cells import settings_of
 from attnwarp_eval.reproduce.manifest import load_manifest
@@ -129,6 +133,32 @@ def test_an_exported_scene_gives_the_studys_edited_pictures(folder, run):
     for view, pixels in study.edited.items():
         path = run / "made" / cell["id"][:16] / "edited" / f"view-{view:04d}.png"
         assert np.abs(np.asarray(Image.open(path)).astype(int) - pixels).max() <= 1
+
+
+def test_a_sealed_run_is_verified_and_held_beside_another(folder, run):
+    """Oracle: hashlib's SHA-256 of a file, and a byte that is changed."""
+
+    def call(*arguments):
+        return CliRunner().invoke(app, [*map(str, arguments)])
+
+    seal = json.loads((run / "seal.json").read_text())
+    (picture, *_) = (name for name in seal["files"] if "/renders/" in name)
+    data = (run / picture).read_bytes()
+    assert seal["files"][picture] == hashlib.sha256(data).hexdigest()
+    done = call("verify", run)
+    assert done.exit_code == 0 and "every hash fits" in done.stdout
+    other = folder / "other"
+    shutil.copytree(run, other)
+    both = call("compare", run, other)
+    assert both.exit_code == 0 and "same inputs, code and versions" in both.stdout
+    for name in ("made/" + picture.split("/", 1)[1], "results.json", "seal.json"):
+        path = other / name
+        whole_file = path.read_bytes()
+        path.write_bytes(whole_file[:-3] + bytes([whole_file[-3] ^ 1]) + whole_file[-2:])
+        bad = call("verify", other)
+        assert bad.exit_code == 3 and name.split("/")[-1] in bad.stdout
+        assert call("compare", run, other).exit_code == 2
+        path.write_bytes(whole_file)
 
 
 def test_quick_runs_two_methods_on_one_scene(folder, run):

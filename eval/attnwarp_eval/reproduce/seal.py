@@ -1,0 +1,138 @@
+"""A reproduction's seal, its verification, and two of them side by side."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from attnwarp.errors import InputError
+from attnwarp_eval.canonical_json import digest, write_json
+from attnwarp_eval.cost import environment
+from attnwarp_eval.document.model import Table
+from attnwarp_eval.document.numbers import number
+from attnwarp_eval.reproduce.manifest import FIGURES
+from attnwarp_eval.reproduce.report import RESULTS
+from attnwarp_eval.study.store import Problems, Store
+
+SEAL = "seal.json"
+"""File of hashes: of the code and its packages, of what went in, and of every other file."""
+
+
+def is_reproduction(run: Path) -> bool:
+    """Return True for the folder of a reproduction that has ended."""
+    return (run / SEAL).is_file()
+
+
+def write_seal(store: Store) -> Path:
+    """Write the hashes of everything in a run's folder, with one of all of them."""
+    here = environment()
+    content = {
+        "code": here["source"],
+        "versions": here["versions"],
+        "inputs": store.read_study()["inputs"],
+        "files": {
+            path.relative_to(store.root).as_posix(): _sha256(path)
+            for path in sorted(store.root.rglob("*"))
+            if path.is_file() and path.name not in (SEAL, ".lock")
+        },
+    }
+    path = store.root / SEAL
+    write_json(path, {**content, "sha256": digest(content)})
+    return path
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def verify(store: Store) -> Problems:
+    """Compute the hashes of a sealed run again.
+
+    Raises:
+        StoreError: the folder is no run.
+    """
+    found = store.verify()
+    path = store.root / SEAL
+    try:
+        seal = json.loads(path.read_bytes())
+        sealed = seal.pop("sha256")
+        files: Mapping[str, str] = seal["files"]
+    except (ValueError, KeyError, AttributeError):
+        found.damaged.append(f"{path}: is no seal; run the command again, which writes it")
+        return found
+    if digest(seal) != sealed:
+        found.damaged.append(f"{path}: its checksum does not fit its content")
+    if store.read_study()["inputs"] != seal["inputs"]:
+        found.damaged.append(f"{path}: has other inputs than study.json")
+    for name, sha256 in files.items():
+        file = store.root / name
+        if not file.is_file():
+            found.damaged.append(f"{file}: is sealed, and missing")
+        elif _sha256(file) != sha256:
+            found.damaged.append(f"{file}: changed since it was sealed")
+    return found
+
+
+def side_by_side(one: Path, two: Path) -> tuple[list[str], Table]:
+    """Differences of what went into two reproductions, and their figures by row.
+
+    Raises:
+        InputError: one of the folders is no reproduction, or is damaged.
+    """
+    (study, first), (other, second) = map(_read, (one, two))
+    lines = [
+        f"other {name}: {', '.join(sorted(differing))}"
+        for name in ("captures", "splats", "masks", "weights")
+        if (differing := _differing(study["inputs"][name], other["inputs"][name]))
+    ]
+    seals = [json.loads((run / SEAL).read_bytes()) for run in (one, two)]
+    if seals[0]["code"] != seals[1]["code"]:
+        lines.append(f"other code: {seals[0]['code'][:12]} and {seals[1]['code'][:12]}")
+    lines += [
+        f"other {name}: {a} and {b}"
+        for name, a in seals[0]["versions"].items()
+        if (b := seals[1]["versions"].get(name)) != a
+    ]
+    rows = []
+    methods = dict.fromkeys(m for cells in (first, second) for key in cells for m in key[:1])
+    for method in methods:
+        shared = [key for key in first if key in second and key[0] == method]
+        row = [method, str(len(shared))]
+        for title in FIGURES.values():
+            a, b = (_mean([cells[key].get(title) for key in shared]) for cells in (first, second))
+            row += [number(a), number(b), number(b - a)]
+        rows.append(row)
+    columns = ["method", "cells of both"]
+    columns += [f"{head}, {which}" for head in FIGURES for which in ("first", "second", "apart")]
+    return lines, Table(columns, rows)
+
+
+def _read(run: Path) -> tuple[dict[str, Any], dict[tuple[str, str, str, int], dict[str, Any]]]:
+    """Content of ``study.json``, and figures by row, capture, edit and seed."""
+    if not is_reproduction(run):
+        raise InputError(f"{run}: has no {SEAL}; name the folder of a finished reproduction")
+    bad = verify(Store(run))
+    if not bad.ok:
+        raise InputError(f"{run}: is damaged; attnwarp-eval verify {run} names what")
+    cells = json.loads((run / RESULTS).read_bytes())["cells"]
+    figures = {
+        (method, cell["scene"], cell["edit"], cell["seed"]): cell["figures"] | cell["authors"]
+        for cell in cells
+        if cell["kind"] == "edit"
+        for method in cell["methods"]
+    }
+    return Store(run).read_study(), figures
+
+
+def _differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
+    return [name for name in {**a, **b} if a.get(name) != b.get(name)]
+
+
+def _mean(values: list[float | None]) -> float:
+    defined = [value for value in values if value is not None]
+    return sum(defined) / len(defined) if defined else math.nan
