@@ -23,7 +23,10 @@ MOST_NAMED = 5
 
 def compare(
     baseline: Annotated[
-        Path, typer.Argument(help="A baseline's file (.jsonl), or the folder of another run.")
+        Path,
+        typer.Argument(
+            help="A baseline's file (.jsonl), raw results (.jsonl.xz), or another run's folder."
+        ),
     ],
     run: Annotated[Path, typer.Argument(help="The run's folder.")],
     markdown: Annotated[
@@ -196,9 +199,18 @@ def _baseline(path: Path, run: Snapshot, common: bool) -> tuple[Snapshot, Pictur
     from attnwarp.errors import InputError
     from attnwarp_eval.compare import read_baseline
     from attnwarp_eval.compare.pictures import pictures_of_baseline
+    from attnwarp_eval.compare.snapshot import snapshot
+    from attnwarp_eval.report.raw import read_raw
 
-    if path.is_dir():
-        trusted, pictures, _ = _run(path)
+    if path.name == "results.jsonl" and (path.parent / "study.json").is_file():
+        path = path.parent  # a run's table of figures: the run itself has every one of them
+    pictures: Pictures = {}
+    raw = path.suffix == ".xz" and path.is_file()
+    if raw or path.is_dir():
+        if raw:
+            trusted = snapshot(read_raw(path))
+        else:
+            trusted, pictures, _ = _run(path)
         if trusted.missing and not common:
             raise InputError(
                 f"{path}: {len(trusted.missing)} cells are missing, so it is no baseline; run its"

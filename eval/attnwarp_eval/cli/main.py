@@ -37,6 +37,7 @@ app.callback()(program_options)
 for command in (
     run.run,
     run.report,
+    run.verdicts,
     run.verify,
     run.studies,
     reproduce.reproduce,

@@ -442,15 +442,25 @@ def report(
     run: Annotated[Path, typer.Argument(help="The run's folder.")],
     timings: Annotated[bool, typer.Option(help="Without: no seconds, to compare runs.")] = True,
     pictures: Annotated[bool, typer.Option(help="Without: tables and figures alone.")] = True,
+    raw: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER|FILE",
+            help="Write the raw results here too, compressed, for attnwarp-eval verdicts.",
+        ),
+    ] = None,
 ) -> None:
     """Make report.md, report.html and results.jsonl again from the cells of a run."""
     from attnwarp_eval.report import read_results
+    from attnwarp_eval.report.raw import write_raw
     from attnwarp_eval.study.store import Store
 
     with clear_errors():
         store = Store(run)
         _write_report(store, timings=timings, pictures=pictures)
         results = read_results(store)
+        if raw is not None:
+            typer.echo(write_raw(store, raw))
     missing = len(results.cells) - results.measured
     if results.failures:
         raise fail(
@@ -468,6 +478,51 @@ def report(
         log(
             f"{run}: {missing} of {len(results.cells)} cells are missing, as the run"
             f" is unfinished; attnwarp-eval verify {run} names them"
+        )
+
+
+def verdicts(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder of reports, with results*.jsonl.xz beside each.")
+    ] = Path("reports"),
+    write: Annotated[
+        list[Path] | None,
+        typer.Option(help="Document whose marked table and lines are made anew; may be repeated."),
+    ] = None,
+) -> None:
+    """Judge every claim by the raw results of its study, all adjusted together.
+
+    The table replaces what stands between <!-- verdicts --> and <!-- /verdicts --> in a document,
+    the lines of the headline claims what stands between <!-- headlines --> and
+    <!-- /headlines -->.
+    """
+    from attnwarp.errors import InputError
+    from attnwarp.io.text import read_text
+    from attnwarp_eval.document.write import markdown_table
+    from attnwarp_eval.files import write_atomic
+    from attnwarp_eval.report import verdicts as all_studies
+
+    with clear_errors():
+        if not folder.is_dir():
+            raise InputError(f"{folder}: no such folder; name that of the reports")
+        judged = all_studies.verdicts(folder)
+        for path in write or []:
+            text = read_text(path)
+            made = all_studies.filled(text, judged, path.parent)
+            if not all_studies.marked(text):
+                raise InputError(
+                    f"{path}: has no place for verdicts; put <!-- verdicts --> and"
+                    " <!-- /verdicts --> where the table belongs"
+                )
+            write_atomic(path, made.encode())
+            typer.echo(path)
+    if not write:
+        typer.echo(markdown_table(all_studies.table(judged, folder)))
+    if not any(each.judged for each in judged):
+        raise fail(
+            f"{folder}: holds no raw results of a study that judges a claim; write them with"
+            " attnwarp-eval report RUN --raw FOLDER",
+            TOO_LITTLE,
         )
 
 

@@ -85,8 +85,11 @@ class _Scenes(Spec, ABC):
 
     def pilot(self, count: int) -> Self:
         """A few scenes of another seed, drawn in the same way."""
-        other = (self.seed + OTHER_SEED) % 2**32
-        return self.model_copy(update={self._number: count, "seed": other})
+        return self.sized(count).model_copy(update={"seed": (self.seed + OTHER_SEED) % 2**32})
+
+    def sized(self, count: int) -> Self:
+        """The population of another number of scenes."""
+        return self.model_copy(update={self._number: count})
 
     _number: ClassVar[str]
 

@@ -8,16 +8,13 @@ from dataclasses import dataclass
 from functools import partial
 
 from attnwarp_eval.document.model import Section, Table
-from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.report.claims import Comparison, JudgedClaim, of_comparisons
+from attnwarp_eval.document.numbers import FEWEST_SCENES, number
+from attnwarp_eval.metrics.registry import Metric
+from attnwarp_eval.report.compared import between, detectable_text, difference_text
 from attnwarp_eval.report.controls import BLIND, blind
-from attnwarp_eval.statistics.intervals import (
-    Interval,
-    Verdict,
-    benjamini_hochberg,
-    paired,
-    verdict,
-)
+from attnwarp_eval.report.judging import Comparison, JudgedClaim, of_comparisons
+from attnwarp_eval.statistics.contrasts import EQUAL_LEVEL, Contrast
+from attnwarp_eval.statistics.intervals import benjamini_hochberg
 from attnwarp_eval.study.probe_report import is_mse, mean_values, report_of
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Ablation
@@ -33,26 +30,46 @@ CLAIMED = "†"
 
 
 @dataclass(frozen=True)
-class Contrast:
+class Row:
     """A variant against the baseline of its table, in one metric.
 
     Attributes:
         variant, metric: names.
-        difference: the variant's minus the baseline's.
+        specification: of the metric.
+        difference: the variant's against the baseline's.
         p: adjusted over the table, or over the claims where one makes this comparison.
-        claimed: whether one does.
-        verdict: None where no direction of the metric is better.
+        claim: the one that does.
+        verdict: empty where no direction of the metric is better.
     """
 
     variant: str
     metric: str
-    difference: Interval
+    specification: Metric
+    difference: Contrast
     p: float
-    claimed: bool
-    verdict: Verdict | None
+    claim: JudgedClaim | None
+    verdict: str
+
+    @property
+    def text(self) -> str:
+        """The difference, with the interval that agrees with the verdict."""
+        level = EQUAL_LEVEL if self.verdict == "equal" else self.difference.level(self.p)
+        return difference_text(self.difference, self.specification.unit, level)
+
+    @property
+    def outcome(self) -> str:
+        """The verdict; of fewer than six scenes, what all of them say: better, worse or mixed."""
+        if not 1 < self.difference.scenes < FEWEST_SCENES or not self.verdict:
+            return self.verdict
+        rounding = self.difference.flips.rounding
+        values = self.difference.by_scene.values()
+        for word, sign in (("higher", 1), ("lower", -1)):
+            if all(sign * value > rounding for value in values):
+                return "better" if word == self.specification.direction else "worse"
+        return "mixed"
 
 
-def ablations(results: Results, compared: Sequence[Sequence[Contrast]]) -> list[Section]:
+def ablations(results: Results, compared: Sequence[Sequence[Row]]) -> list[Section]:
     """A section for each ablation that the study names.
 
     Args:
@@ -67,7 +84,7 @@ def ablations(results: Results, compared: Sequence[Sequence[Contrast]]) -> list[
     return sections
 
 
-def _section(results: Results, ablation: Ablation, compared: Sequence[Contrast]) -> Section:
+def _section(results: Results, ablation: Ablation, compared: Sequence[Row]) -> Section:
     own, baseline = report_of(ablation.probe), ablation.baseline
     names = [baseline, *[v for v in ablation.variants if v != baseline]]
     section = Section(ablation.title, [ablation.note] if ablation.note else [])
@@ -95,13 +112,8 @@ def _section(results: Results, ablation: Ablation, compared: Sequence[Contrast])
     section.tables.append(Table(["variant", *columns, *pairs, time], rows, timed=(time,)))
     section.tables += own.details(results, names)
     if len(names) > 1:
-        unseen = {
-            metric
-            for metric in {
-                c.metric for c in compared if c.verdict == "can't tell" and c.difference.views
-            }
-            if own.probe.edits and blind(results, own.name, metric, baseline)
-        }
+        untold = {r.metric for r in compared if r.verdict == "can't tell" and r.difference.views}
+        unseen = {m for m in untold if own.probe.edits and blind(results, own.name, m, baseline)}
         section.tables.append(_table(compared, ablation.baseline, unseen))
         if unseen:
             section.text.append(
@@ -109,7 +121,7 @@ def _section(results: Results, ablation: Ablation, compared: Sequence[Contrast])
                 " place did not do worse here, so this study cannot see where features come from"
                 f' by these figures; {BLIND!r} stands for "can\'t tell".'
             )
-        if any(contrast.claimed for contrast in compared):
+        if any(row.claim is not None for row in compared):
             section.text.append(
                 f"{CLAIMED} in the table of differences: a claim makes this comparison. p-value and"
                 " verdict are the claim's, adjusted over the claims and not over the table."
@@ -117,29 +129,29 @@ def _section(results: Results, ablation: Ablation, compared: Sequence[Contrast])
     return section
 
 
-def compared_of(results: Results, judged: Sequence[JudgedClaim]) -> list[list[Contrast]]:
-    """The :func:`contrasts` of each table of variants of the study.
+def compared_of(results: Results, judged: Sequence[JudgedClaim]) -> list[list[Row]]:
+    """The :func:`rows_of` each table of variants of the study.
 
     Args:
         results: of the run.
         judged: the claims that it has measurements for.
     """
     claimed = of_comparisons(judged)
-    return [contrasts(results, ablation, claimed) for ablation in results.study.ablations]
+    return [rows_of(results, ablation, claimed) for ablation in results.study.ablations]
 
 
-def contrasts(
-    results: Results, ablation: Ablation, claimed: Mapping[Comparison, float]
-) -> list[Contrast]:
+def rows_of(
+    results: Results, ablation: Ablation, claimed: Mapping[Comparison, JudgedClaim]
+) -> list[Row]:
     """Each variant against the baseline, in each metric that its probe tests.
 
-    A comparison has one verdict in a report. So one that a claim makes has the claim's, and is no
+    A comparison has one verdict in a report. So one that a claim judges has the claim's, and is no
     test of this table.
 
     Args:
         results: of the run.
         ablation: of the study.
-        claimed: from :func:`attnwarp_eval.report.claims.of_comparisons`.
+        claimed: from :func:`attnwarp_eval.report.judging.of_comparisons`.
     """
     own, baseline = report_of(ablation.probe), ablation.baseline
     pairs = [
@@ -148,51 +160,48 @@ def contrasts(
         if name != baseline
         for metric in own.contrasts
     ]
-    differences = [
-        paired(results.views(own.name, baseline, metric), results.views(own.name, name, metric))
-        for name, metric in pairs
-    ]
+    differences = [between(results, own.name, baseline, *pair) for pair in pairs]
     of_claims = [claimed.get((own.name, m, frozenset({baseline, n}))) for n, m in pairs]
     adjusted = benjamini_hochberg(
         [
-            difference.p if of_claim is None else math.nan
-            for difference, of_claim in zip(differences, of_claims, strict=True)
+            difference.flips.p if claim is None else math.nan
+            for difference, claim in zip(differences, of_claims, strict=True)
         ]
     )
     rows = []
-    for pair, difference, of_table, of_claim in zip(
+    for pair, difference, of_table, claim in zip(
         pairs, differences, adjusted, of_claims, strict=True
     ):
-        specification, judged = own.probe.metric(pair[1]), of_claim is not None
-        p = of_table if of_claim is None else of_claim
-        outcome: Verdict | None = None
-        if specification.direction in ("higher", "lower"):
-            # Claims know no tolerance, so a comparison that one makes has none here.
-            atol = 0.0 if judged else specification.atol
-            outcome = verdict(difference, specification.direction, atol=atol, adjusted_p=p)
-        rows.append(Contrast(*pair, difference, p, judged, outcome))
+        specification = own.probe.metric(pair[1])
+        p = of_table if claim is None else claim.p
+        outcome = ""
+        if claim is not None and claim.verdict in ("blind", "equal"):
+            outcome = claim.verdict
+        elif specification.direction in ("higher", "lower"):
+            outcome = difference.verdict(specification.direction, adjusted_p=p)
+        rows.append(Row(*pair, specification, difference, p, claim, outcome))
     return rows
 
 
-def _table(compared: Sequence[Contrast], baseline: str, unseen: Set[str]) -> Table:
+def _table(compared: Sequence[Row], baseline: str, unseen: Set[str]) -> Table:
     rows = []
-    for contrast in compared:
-        difference = contrast.difference
-        judged: str = contrast.verdict or "–"
-        if judged == "can't tell" and contrast.metric in unseen:
+    for row in compared:
+        difference = row.difference
+        judged = row.outcome or "–"
+        if judged == "can't tell" and row.metric in unseen:
             judged = BLIND
         if difference.views == 0:
             judged = "not measured"
-        elif difference.mean == difference.low == difference.high == 0:
+        elif not any(difference.by_scene.values()):
             judged = "same values"
         rows.append(
             [
-                contrast.variant,
-                contrast.metric,
-                spread(difference),
+                row.variant,
+                row.metric,
+                row.text,
                 judged,
-                number(difference.detectable),
-                number(contrast.p) + (f" {CLAIMED}" if contrast.claimed else ""),
+                detectable_text(difference),
+                number(row.p) + (f" {CLAIMED}" if row.claim is not None else ""),
                 f"{difference.scenes}, {difference.views}",
             ]
         )

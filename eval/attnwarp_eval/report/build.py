@@ -9,13 +9,14 @@ from attnwarp_eval.document.model import Picture, Report, Section
 from attnwarp_eval.document.numbers import FEWEST_SCENES
 from attnwarp_eval.report.ablations import ablations, compared_of
 from attnwarp_eval.report.answer import answer
-from attnwarp_eval.report.claims import claims, judge, load_claims
+from attnwarp_eval.report.claims import load_claims
 from attnwarp_eval.report.commands import add_commands
 from attnwarp_eval.report.controls import controls
 from attnwarp_eval.report.findings import findings
 from attnwarp_eval.report.fronts import TITLE as FRONTS
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.galleries import galleries
+from attnwarp_eval.report.judging import claims_section, judge
 from attnwarp_eval.report.measured import failures, measured
 from attnwarp_eval.report.settling import settling
 from attnwarp_eval.study.probe_report import Layout, Place, reports
@@ -58,9 +59,9 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
                     else " ± half of the 95 % interval (Student's t over scenes)."
                 )
             )
-            + " Differences are paired on scene and view; verdicts are adjusted for the number of"
-            " tests in their table, those of claims for the number of claims."
-            ' "can\'t tell" is not "equal".'
+            + " Differences are paired on scene and view. Flipped signs of the scenes' differences"
+            " decide, from six scenes on; verdicts are adjusted for the number of tests in their"
+            ' table, those of claims for the number of claims. "can\'t tell" is not "equal".'
         )
         if alone and study.variants:
             lead.append(
@@ -78,7 +79,11 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
         for place, section in own.sections(results, layout):
             of_probes[place].append(section)
     sections = [
-        *([claims(results, judged), *settling(results, judged, timings)] if study.scenes else []),
+        *(
+            [claims_section(results, judged), *settling(results, judged, timings)]
+            if study.scenes
+            else []
+        ),
         *(galleries(results) if pictures else []),
         *of_probes[Place.INSTRUMENT],
         *controls(results),

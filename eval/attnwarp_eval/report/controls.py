@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Literal
 
 from attnwarp_eval.document.model import Section, Table
-from attnwarp_eval.statistics.intervals import paired, verdict
+from attnwarp_eval.report.compared import between
 from attnwarp_eval.study.controls import OTHER_SEED
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
@@ -53,8 +53,7 @@ def seen(results: Results, name: str, metric: str, baseline: str, label: str) ->
         label: of the control.
     """
     direction = probe(name).metric(metric).direction
-    difference = paired(results.views(name, baseline, metric), results.views(name, label, metric))
-    judged = verdict(difference, direction)  # type: ignore[arg-type]
+    judged = between(results, name, baseline, label, metric).verdict(direction)  # type: ignore[arg-type]
     other_seed = results.study.variants[label].part(VariantPart).control == OTHER_SEED
     return judged in (("better", "worse") if other_seed else ("worse",))
 

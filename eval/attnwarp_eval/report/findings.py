@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from attnwarp_eval.document.model import Finding, Picture, Slider
-from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.report.ablations import Contrast
-from attnwarp_eval.report.claims import JudgedClaim
-from attnwarp_eval.statistics.intervals import Interval
+from attnwarp_eval.document.numbers import number
+from attnwarp_eval.report.ablations import Row
+from attnwarp_eval.report.judging import JudgedClaim
 from attnwarp_eval.study.probe import probe, probes
 from attnwarp_eval.study.probe_report import reports
 from attnwarp_eval.study.record import PictureFile
@@ -45,7 +44,7 @@ def findings(
     results: Results,
     problems: list[str],
     judged: Sequence[JudgedClaim],
-    compared: Sequence[Sequence[Contrast]],
+    compared: Sequence[Sequence[Row]],
     *,
     pictures: bool = True,
 ) -> list[Finding]:
@@ -96,9 +95,9 @@ def _calibration(results: Results, problems: list[str]) -> Finding:
 
 
 def _clearest(judged_claims: Sequence[JudgedClaim]) -> list[JudgedClaim]:
-    """The claims with a clear outcome, those that hold in general or do not before the others."""
+    """The claims with a clear outcome, those that are told in general before the others."""
     clear = [j for j in judged_claims if len(j.sides) > 1 and j.here != "mixed"]
-    return sorted(clear, key=lambda j: (j.verdict == "can't tell", j.contrast.p))[:CLAIMS]
+    return sorted(clear, key=lambda j: (not j.told, j.contrast.flips.p))[:CLAIMS]
 
 
 def _claim(results: Results, judged: JudgedClaim) -> Finding:
@@ -106,11 +105,11 @@ def _claim(results: Results, judged: JudgedClaim) -> Finding:
     scenes = f"{judged.contrast.scenes} of {len(results.study.scenes)} scenes"
     seen = {"seen": "seen here", "seen where defined": f"seen here in {scenes}"}
     outcome = seen.get(judged.here, "not seen here")
-    if judged.verdict != "can't tell":
-        outcome += f", {judged.verdict} in general"
+    if judged.told:
+        outcome += f", {judged.in_words} in general"
     return Finding(
         f"{judged.claim.text}: {outcome}.",
-        _value(results, judged.claim.probe, judged.metric, judged.contrast),
+        judged.difference,
         f"`{judged.metric}`: {second} against {first}",
         "holds" if judged.here in seen else "fails",
         _pair(results, judged.claim.probe, first, second, judged.metric),
@@ -118,7 +117,7 @@ def _claim(results: Results, judged: JudgedClaim) -> Finding:
 
 
 def _effects(
-    results: Results, told: list[set[str]], compared: Sequence[Sequence[Contrast]]
+    results: Results, told: list[set[str]], compared: Sequence[Sequence[Row]]
 ) -> list[Finding]:
     """The clearest difference of each table of variants, then the next ones; pairs of variants of
     which a claim has told are left out.
@@ -135,12 +134,12 @@ def _of_table(
     results: Results,
     ablation: Ablation,
     told: list[set[str]],
-    compared: Sequence[Contrast],
+    compared: Sequence[Row],
 ) -> list[Finding]:
     """The clearest difference of each variant from the baseline, those with pictures first."""
     own, clearest = probe(ablation.probe), dict[str, tuple[bool, float, Finding]]()
-    for contrast in compared:
-        name, metric, p, outcome = contrast.variant, contrast.metric, contrast.p, contrast.verdict
+    for row in compared:
+        name, metric, p, outcome = row.variant, row.metric, row.p, row.outcome
         if outcome not in ("better", "worse") or {name, ablation.baseline} in told:
             continue
         if name in clearest and clearest[name][1] <= p:
@@ -148,20 +147,13 @@ def _of_table(
         finding = Finding(
             f"{ablation.title}: `{name}` is {outcome} than `{ablation.baseline}`"
             f" ({own.metric(metric).description}).",
-            _value(results, ablation.probe, metric, contrast.difference),
+            row.text,
             f"`{metric}`: {name} against {ablation.baseline}",
             "holds" if outcome == "better" else "fails",
             _pair(results, ablation.probe, ablation.baseline, name, metric),
         )
         clearest[name] = (finding.picture is None, p, finding)
     return [finding for *_, finding in sorted(clearest.values(), key=lambda item: item[:2])]
-
-
-def _value(results: Results, name: str, metric: str, difference: Interval) -> str:
-    plain = replace(difference, undefined=0)
-    sign = "+" if difference.mean > 0 else ""
-    unit = probe(name).metric(metric).unit
-    return f"{sign}{spread(plain)} {unit}"
 
 
 def _warped_and_true(results: Results) -> Slider | None:

@@ -8,15 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
-import numpy as np
-
 from attnwarp_eval.document.model import Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.metrics.registry import Metric
-from attnwarp_eval.report.claims import load_claims, of_scale
+from attnwarp_eval.report.claims import load_claims
+from attnwarp_eval.report.compared import between
+from attnwarp_eval.report.judging import count_of, found
 from attnwarp_eval.report.settling import seconds_of
-from attnwarp_eval.statistics.contrasts import Contrast, contrast
-from attnwarp_eval.statistics.planning import MOST_SCENES, scenes_needed
+from attnwarp_eval.statistics.contrasts import Contrast
+from attnwarp_eval.statistics.planning import scenes_needed
+from attnwarp_eval.statistics.scales import Scale
 from attnwarp_eval.statistics.signflips import FEWEST
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
@@ -24,7 +25,14 @@ from attnwarp_eval.study.results import Results
 
 PILOT_SCENES = 8
 
-INTEREST = {"ratio": math.log(1.1), "share": 0.05, "dB": 0.5, "dE00": 1.0, "cosine": 0.02}
+INTEREST = {
+    "ratio": math.log(1.1),
+    "odds": math.log(1.5),
+    "share": 0.05,
+    "dB": 0.5,
+    "dE00": 1.0,
+    "cosine": 0.02,
+}
 """Smallest difference of interest: by the scale, or by the unit of what is compared plainly."""
 
 COLUMNS = (
@@ -33,15 +41,15 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def interest(metric: Metric) -> float | None:
-    """Smallest difference of a metric that matters, on its scale; None where nobody has said.
+def interest(metric: Metric, scale: Scale) -> float | None:
+    """Smallest difference of a metric that matters, on a scale; None where nobody has said.
 
     Example:
         >>> from attnwarp_eval.metrics.registry import METRICS
-        >>> round(interest(METRICS["warp.epe_median"]), 4)  # a tenth more or less
+        >>> round(interest(METRICS["warp.epe_median"], "ratio"), 4)  # a tenth more or less
         0.0953
     """
-    return INTEREST.get(metric.scale, INTEREST.get(metric.unit))
+    return INTEREST.get(scale, INTEREST.get(metric.unit))
 
 
 def needed(value: Contrast, difference: float) -> int:
@@ -51,8 +59,7 @@ def needed(value: Contrast, difference: float) -> int:
         value: of the pilot, whose spread between scenes counts.
         difference: on the contrast's scale.
     """
-    spread = float(np.std(list(value.by_scene.values()), ddof=1))
-    return max(FEWEST, scenes_needed(difference, spread))
+    return max(FEWEST, scenes_needed(difference, value.deviation))
 
 
 def plan_table(results: Results) -> Table:
@@ -65,37 +72,32 @@ def plan_table(results: Results) -> Table:
     for title, name, metric, value in _contrasts(results):
         if len(value.by_scene) < 3:
             continue
-        aim, spread = interest(metric), float(np.std(list(value.by_scene.values()), ddof=1))
+        aim, spread = interest(metric, value.scale), value.deviation
         shown = "–" if aim is None else _difference(aim, value.scale)
-        count = "–" if aim is None else _count(needed(value, aim))
-        own = _count(needed(value, value.flips.mean)) if value.flips.mean else "–"
+        count = "–" if aim is None else count_of(needed(value, aim))
+        own = count_of(needed(value, value.flips.mean)) if value.flips.mean else "–"
         rows.append([title, name, shown, number(spread), count, own])
     return Table(list(COLUMNS), rows)
 
 
 def _contrasts(results: Results) -> Iterator[tuple[str, str, Metric, Contrast]]:
-    for claim in (one for entry in load_claims() for one in entry.of_each_editor()):
-        found = claim.measure(results)
-        if found is not None:
-            metric = probe(claim.probe).metric(found.metric)
-            yield claim.text, found.metric, metric, of_scale(claim, found)
+    for one in found(results, load_claims()):
+        metric = probe(one.claim.probe).metric(one.metric)
+        yield one.claim.text, one.metric, metric, one.contrast
     for table in results.study.ablations:
         own = report_of(table.probe)
         for name in table.variants:
             for key in (one.format(layer=results.layer) for one in own.contrasts):
                 metric = own.probe.metric(key)
-                a, b = (results.views(own.name, who, key) for who in (table.baseline, name))
-                value = contrast(a, b, metric.scale, floor=metric.atol)
                 if name != table.baseline and metric.direction in ("higher", "lower"):
+                    value = between(results, own.name, table.baseline, name, key)
                     yield f"{name} against {table.baseline}", key, metric, value
 
 
-def _difference(value: float, scale: str) -> str:
+def _difference(value: float, scale: Scale) -> str:
+    if scale == "odds":
+        return f"odds × {number(math.exp(value))}"
     return f"{100 * math.expm1(value):.0f} %" if scale == "ratio" else number(value)
-
-
-def _count(scenes: int) -> str:
-    return f"over {MOST_SCENES}" if scenes > MOST_SCENES else str(scenes)
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from statistics import fmean
 from typing import Any
 
 from attnwarp_eval.document.model import Section, Table
-from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.report.claims import JudgedClaim
+from attnwarp_eval.document.numbers import number
+from attnwarp_eval.report.judging import JudgedClaim, count_of
 from attnwarp_eval.statistics.planning import MOST_SCENES, effect_interval, scenes_needed
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.record import Record
@@ -34,23 +34,20 @@ def settling(
     findings = [
         finding
         for finding in judged
-        if finding.verdict == "can't tell"
-        and finding.contrast.bounded
-        and finding.parts
-        and finding.parts.scenes > 0
+        if finding.verdict == "can't tell" and finding.contrast.deviation > 0
     ]
     if not findings:
         return []
     hours = _hours_a_scene(results) if timings else math.nan
-    seeds = any(not math.isnan(finding.parts.share) for finding in findings if finding.parts)
+    seeds = any(not math.isnan(finding.parts.share) for finding in findings)
     columns = ["claim", "difference", "scenes", "scenes needed"]
     columns += [HOURS] if math.isfinite(hours) else []
-    columns += ["share of seeds", "± with as many seeds again"] if seeds else []
+    columns += ["share of seeds"] if seeds else []
     notes = [
-        "**Scenes needed**: with so many, the claim would be told in 80 % of studies, were the true"
-        " difference and its spread between scenes those seen here. Its test is at the level that"
-        " the adjustment for all claims leaves it here. Difference and spread are estimates from"
-        " few scenes; the brackets have 80 % of what is compatible with them."
+        "**Scenes needed**: with so many, a difference would be told in 80 % of studies, were the"
+        " true difference and its spread between scenes those seen here. Its test is at the level"
+        " that the adjustment for all claims leaves it here. Difference and spread are estimates"
+        " from few scenes; the brackets have 80 % of what is compatible with them."
     ]
     if math.isfinite(hours):
         notes.append(
@@ -58,13 +55,11 @@ def settling(
             f" {number(hours)} a scene, as here."
         )
     if seeds:
-        notes += [
+        notes.append(
             "**Share of seeds** in the squared spread between scenes: what few seeds add to it,"
             " estimated from how the seeds of one scene differ. The rest is how scenes differ, and"
-            " no seed takes that away.",
-            "**± with as many seeds again**: what half of the interval would then be, on the same"
-            " scenes.",
-        ]
+            " no seed takes that away."
+        )
     text = [
         "For each claim that cannot be told in general: what a study of its own would need.",
         "\n".join(f"- {note}" for note in notes),
@@ -74,34 +69,26 @@ def settling(
 
 
 def _row(finding: JudgedClaim, columns: list[str], hours: float) -> list[str]:
-    parts, contrast = finding.parts, finding.contrast
-    assert parts is not None
-    level = 1 - 0.05 * (contrast.p / finding.p if finding.p > 0 else 1.0)
-    low, high = effect_interval(contrast.mean, parts.scenes, contrast.scenes)
+    contrast = finding.contrast
+    mean, level = contrast.flips.mean, contrast.level(finding.p)
+    low, high = effect_interval(mean, contrast.deviation, contrast.scenes)
     # In units of the spread. Where their signs differ, the truth may be 0.
     smallest = 0.0 if low <= 0 <= high else min(abs(low), abs(high))
     likely, fewest, most = (
         scenes_needed(effect, 1.0, level=level)
-        for effect in (contrast.mean / parts.scenes, max(abs(low), abs(high)), smallest)
+        for effect in (mean / contrast.deviation, max(abs(low), abs(high)), smallest)
     )
     cells = {
         "claim": finding.claim.text,
-        "difference": spread(contrast),
+        "difference": finding.difference,
         "scenes": str(contrast.scenes),
-        "scenes needed": f"{_count(likely)} ({_count(fewest)} to {_count(most)})",
+        "scenes needed": f"{count_of(likely)} ({count_of(fewest)} to {count_of(most)})",
     }
     if likely <= MOST_SCENES:
         cells[HOURS] = number(likely * hours, 2)
-    if not math.isnan(parts.share):
-        half = contrast.high - contrast.mean
-        narrower = parts.with_seeds(2 * parts.seeds) / parts.scenes
-        cells["share of seeds"] = f"{100 * parts.share:.0f} %"
-        cells["± with as many seeds again"] = number(half * narrower, 2)
+    if not math.isnan(finding.parts.share):
+        cells["share of seeds"] = f"{100 * finding.parts.share:.0f} %"
     return [cells.get(column, "–") for column in columns]
-
-
-def _count(scenes: int) -> str:
-    return f"over {MOST_SCENES}" if scenes > MOST_SCENES else str(scenes)
 
 
 def _hours_a_scene(results: Results) -> float:

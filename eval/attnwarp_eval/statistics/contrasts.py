@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from attnwarp_eval.statistics.intervals import ROUNDING, ByView, Interval, interval
-from attnwarp_eval.statistics.scales import Scale, compared
+from attnwarp_eval.statistics.planning import scenes_needed
+from attnwarp_eval.statistics.scales import FACTORS, Scale, compared
 from attnwarp_eval.statistics.signflips import FEWEST, SignFlips
 
 Verdict = Literal["better", "worse", "equal", "can't tell"]
+
+EQUAL_LEVEL = 0.9
+"""Level of the interval that lies within a bound of equality: two one-sided tests at 5 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,11 +25,13 @@ class Contrast:
     """Difference of two arms, scene by scene, on one scale.
 
     Attributes:
-        by_scene: mean over a scene's views; scenes without a pair are left out.
-        scale: of the differences; those of ``ratio`` are logarithms.
+        scale: of the differences; those of ``ratio`` and ``odds`` are logarithms.
+        views: pairs of views in it.
         undefined: views that one side alone has, or where it is undefined.
+        by_scene: mean over a scene's views; scenes without a pair are left out.
         flips: the sign-flip test of ``by_scene``.
         student: Student's t beside it, on the same scale.
+        plain: the sign-flip test of plain differences, in which a bound of shares is.
 
     Example:
         >>> ours = {f"s{k}": {"v": 1.0 + k} for k in range(6)}
@@ -37,19 +43,39 @@ class Contrast:
         ('better', 'worse')
     """
 
-    by_scene: Mapping[str, float]
     scale: Scale
+    views: int
     undefined: int
+    by_scene: dict[str, float]
     flips: SignFlips
     student: Interval
+    plain: SignFlips
+
+    @property
+    def scenes(self) -> int:
+        """Number of scenes that have a pair of views."""
+        return len(self.by_scene)
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the scenes' differences, on the scale; NaN below two scenes."""
+        values = list(self.by_scene.values())
+        return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
 
     def shown(self, level: float = 0.95) -> tuple[float, float, float]:
-        """Mean and bounds as a reader is shown them: of ``ratio`` b / a, else b - a.
+        """Mean and bounds as a reader is shown them: b / a of ``ratio`` and ``odds``, else b - a.
 
-        0 (or a ratio of 1) lies inside exactly if the test at that level cannot tell.
+        0 (or a factor of 1) lies inside exactly if the test at that level cannot tell.
         """
-        values = (self.flips.mean, *self.flips.interval(level))
-        if self.scale == "ratio":
+        return self._read((self.flips.mean, *self.flips.interval(level)))
+
+    def range(self) -> tuple[float, float, float]:
+        """Mean, lowest and highest scene, as :meth:`shown` has them."""
+        values = list(self.by_scene.values())
+        return self._read((self.flips.mean, min(values), max(values)))
+
+    def _read(self, values: tuple[float, float, float]) -> tuple[float, float, float]:
+        if self.scale in FACTORS:
             return tuple(math.exp(value) for value in values)  # type: ignore[return-value]
         return values
 
@@ -71,16 +97,36 @@ class Contrast:
         Args:
             direction: which values are better.
             adjusted_p: the p-value adjusted for other tests; that of this one if left out.
-            bound: differences up to which arms are equal, on the scale; none are if left out.
+            bound: differences up to which arms are equal, on the scale, of ``odds`` as a share;
+                none are if left out.
         """
         p = self.flips.p if adjusted_p is None else adjusted_p
-        if len(self.by_scene) < FEWEST:
+        if self.scenes < FEWEST:
             return "can't tell"
-        if bound is not None and self.flips.equal(bound):
+        if bound is not None and self._bounded.equal(bound, EQUAL_LEVEL):
             return "equal"
         if not p <= 0.05:
             return "can't tell"
         return "better" if (self.flips.mean > 0) == (direction == "higher") else "worse"
+
+    @property
+    def _bounded(self) -> SignFlips:
+        """Differences that a bound of equality speaks of."""
+        return self.plain if self.scale == "odds" else self.flips
+
+    def needed(self, adjusted_p: float, bound: float | None = None) -> int:
+        """Scenes that would settle what these cannot tell, in 80 % of studies, were the difference
+        and its spread those seen here: by a difference, or by a bound that holds it.
+
+        Args:
+            adjusted_p, bound: as for :meth:`verdict`.
+        """
+        by = [scenes_needed(self.flips.mean, self.deviation, level=self.level(adjusted_p))]
+        own = self._bounded
+        if bound is not None and abs(own.mean) < bound:
+            spread = float(np.std(own.differences, ddof=1))
+            by.append(scenes_needed(bound - abs(own.mean), spread, level=EQUAL_LEVEL))
+        return max(FEWEST, min(by))
 
 
 def contrast(
@@ -89,30 +135,51 @@ def contrast(
     scale: Scale,
     *,
     floor: float = 0.0,
-    counts: Mapping[str, Mapping[str, int]] | None = None,
+    counts: tuple[ByView, ByView] | None = None,
 ) -> Contrast:
     """Compare b with a, paired on scene and view.
 
     Args:
         a, b: scene -> view (and seed) -> value, NaN where undefined.
         scale, floor: see :func:`~attnwarp_eval.statistics.scales.compared`.
-        counts: things that each share is of, for empirical logits.
+        counts: things that each share of a and of b is of; shares are then compared by their odds.
     """
+    if scale == "share" and counts is not None:
+        scale = "odds"
     by_scene: dict[str, float] = {}
+    plain: list[float] = []
     undefined, largest, each = 0, 0.0, {}
     for scene in sorted(set(a) | set(b)):
-        left, right = a.get(scene, {}), b.get(scene, {})
-        found = []
-        for view in sorted({*left, *right}):
-            pair = left.get(view, math.nan), right.get(view, math.nan)
-            count = None if counts is None else counts.get(scene, {}).get(view)
-            found.append(compared(*pair, scale, floor=floor, count=count))
-            if math.isfinite(found[-1]):
+        found, differences = [], []
+        for pair, number in _pairs(scene, a, b, counts):
+            value = compared(*pair, scale, floor=floor, counts=number)
+            if math.isfinite(value):
+                found.append(value)
+                differences.append(pair[1] - pair[0])
                 largest = max(largest, *map(abs, pair))
-        defined = [value for value in found if math.isfinite(value)]
-        undefined += len(found) - len(defined)
-        if defined:
-            by_scene[scene], each[scene] = float(np.mean(defined)), defined
-    rounding = ROUNDING * (1.0 if scale == "ratio" else largest)
-    flips = SignFlips(np.array(list(by_scene.values())), rounding)
-    return Contrast(by_scene, scale, undefined, flips, interval(each))
+            else:
+                undefined += 1
+        if found:
+            by_scene[scene], each[scene] = float(np.mean(found)), found
+            plain.append(float(np.mean(differences)))
+    rounding = ROUNDING * (1.0 if scale in FACTORS else largest)
+    return Contrast(
+        scale,
+        sum(map(len, each.values())),
+        undefined,
+        by_scene,
+        SignFlips(np.array(list(by_scene.values())), rounding),
+        interval(each),
+        SignFlips(np.array(plain), ROUNDING * largest),
+    )
+
+
+def _pairs(
+    scene: str, a: ByView, b: ByView, counts: tuple[ByView, ByView] | None
+) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
+    """Figures of each view of a scene, and the counts that they are of."""
+    sides = (a, b, *(counts or ({}, {})))
+    left, right, *of = (side.get(scene, {}) for side in sides)
+    for view in sorted({*left, *right}):
+        first, second, *number = (side.get(view, math.nan) for side in (left, right, *of))
+        yield (first, second), (number[0], number[1])

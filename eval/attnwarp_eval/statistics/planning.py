@@ -113,19 +113,11 @@ class Parts:
         seeds: how many seeds a scene has, in the mean.
         share: of that deviation's square, what seeds add by being few, in [0, 1]. NaN with one
             seed.
-
-    Example:
-        >>> round(Parts(2.0, 2, 0.5).with_seeds(4) ** 2, 9)  # of 4, seeds had 2 and now have 1
-        3.0
     """
 
     scenes: float
     seeds: float
     share: float
-
-    def with_seeds(self, seeds: float) -> float:
-        """The standard deviation of the scenes' means, had they ``seeds`` seeds each."""
-        return self.scenes * math.sqrt(1 - self.share + self.share * self.seeds / seeds)
 
 
 def parts(a: ByView, b: ByView) -> Parts:

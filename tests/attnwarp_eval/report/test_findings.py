@@ -8,8 +8,9 @@ import written_runs
 
 from attnwarp_eval.document.model import Slider
 from attnwarp_eval.report.ablations import compared_of
-from attnwarp_eval.report.claims import judge, load_claims
+from attnwarp_eval.report.claims import load_claims
 from attnwarp_eval.report.findings import findings
+from attnwarp_eval.report.judging import judge
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.edit_truth import Judgement
 from attnwarp_eval.study.probes.editing.result import EditResult, Measurement
@@ -53,7 +54,7 @@ def results(variants, values, *, pictures=True, calibration=None):
 
 CLAIMED = {"good": {}, "slipped": {"set": {"pixel_centers": "integer"}}}
 OTHER = {"good": {}, "slipped": {"set": {"depth_agreement": False}}}
-# Differences of 0.50, 0.49 and 0.51 px: an interval of 4.303 * 0.01 / sqrt(3) to either side.
+# Geometric means of the ratios: 6, sqrt(4.8 * 7) and sqrt(7 * 5.2).
 VALUES = {
     "good": [[0.1, 0.1], [0.1, 0.1], [0.1, 0.1]],
     "slipped": [[0.6, 0.6], [0.48, 0.7], [0.7, 0.52]],
@@ -63,8 +64,8 @@ VALUES = {
 def test_a_claim_comes_with_its_difference_and_the_view_in_which_it_is_largest():
     (finding,) = found(results(CLAIMED, VALUES), [])
     assert finding.text.startswith("Integer pixel centres")
-    assert finding.text.endswith("seen here, holds in general.")
-    assert finding.value == "+0.500 (0.490 to 0.510) layer px"
+    assert finding.text.endswith("seen here.")
+    assert finding.value == "× 5.94 (5.80 to 6.03)"
     assert finding.outcome == "holds"
     assert isinstance(finding.picture, Slider)
     # 0.7 - 0.1; view 1 of scene two has the same, and a later name.
@@ -75,14 +76,14 @@ def test_a_claim_comes_with_its_difference_and_the_view_in_which_it_is_largest()
 def test_a_claim_that_some_scenes_lack_says_in_how_many_it_is_seen():
     values = {**VALUES, "slipped": [*VALUES["slipped"][:2], [None, None]]}
     (finding,) = found(results(CLAIMED, values), [])
-    assert finding.text.endswith("seen here in 2 of 3 scenes, holds in general.")
+    assert finding.text.endswith("seen here in 2 of 3 scenes.")
     assert finding.outcome == "holds"
 
 
 def test_a_difference_that_no_claim_names_is_told_once_with_its_verdict():
     (finding,) = found(results(OTHER, VALUES), [])
     assert finding.text.startswith("Slip: `slipped` is worse than `good` (")
-    assert (finding.value, finding.outcome) == ("+0.500 (0.490 to 0.510) layer px", "fails")
+    assert (finding.value, finding.outcome) == ("× 5.94 (5.80 to 6.03)", "fails")
     (bare,) = found(results(OTHER, VALUES), [], pictures=False)
     assert bare.picture is None
 

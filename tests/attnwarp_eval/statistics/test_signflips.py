@@ -129,8 +129,8 @@ def test_scales_are_those_of_their_closed_forms():
     assert compared(1e-3, 0.0, "ratio", floor=1e-6) == pytest.approx(math.log(1e-3))
     assert math.isnan(compared(0.0, 1.0, "ratio"))
     # SciPy's logit of (k + 1/2) / (n + 1).
-    logit = [float(np.log(p / (1 - p))) for p in (3.5 / 11, 10.5 / 11)]
-    assert compared(0.3, 1.0, "share", count=10) == pytest.approx(logit[1] - logit[0])
+    logit = [float(np.log(p / (1 - p))) for p in (3.5 / 11, 20.5 / 21)]
+    assert compared(0.3, 1.0, "odds", counts=(10, 20)) == pytest.approx(logit[1] - logit[0])
     assert compared(0.3, 1.0, "share") == pytest.approx(0.7)
     assert compared(31.0, 30.0, "plain") == -1.0
     assert math.isnan(compared(math.nan, 1.0, "plain"))

@@ -11,7 +11,6 @@ from skimage.color import deltaE_ciede2000, rgb2lab
 
 from attnwarp_eval.metrics.gates import gated
 from attnwarp_eval.report import write_report
-from attnwarp_eval.report.claims import judge, load_claims
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.edit_truth import edit_truth
@@ -189,31 +188,6 @@ def test_the_reports_words_need_an_interval_on_one_side_of_their_limit(tmp_path)
         "2.33 (2.00 to 3.00)",
         "-3.83 (-4.50 to -3.00)",
     ]
-
-
-@pytest.mark.parametrize(
-    ("rows", "styles", "agrees"),
-    [
-        ([(20, 12, 3), (21, 13, 3), (22, 12, 4)], "holds", "holds"),
-        ([(20, 12, 13), (21, 13, 15), (22, 12, 14)], "holds", "does not hold"),
-        # Varies, but by less than is noticed: more than 0 is not enough.
-        ([(20, 0.50, 3), (21, 0.51, 3.1), (22, 0.52, 3)], "does not hold", "does not hold"),
-        ([(20, 0.5, 0.1), (21, 9, 0.1), (22, 14, 0.1)], "can't tell", "can't tell"),
-    ],
-)
-def test_claims_about_seeds_compare_variety_with_its_limit_and_with_the_seeds_own(
-    rows, styles, agrees
-):
-    judged = {one.claim.id: one for one in judge(written({"warping": rows}), load_claims())}
-    assert {id: one.verdict for id, one in judged.items()} == {
-        "seeds-give-styles": styles, "a-seed-agrees": agrees,
-    }  # fmt: skip
-    assert judged["seeds-give-styles"].contrast.mean == pytest.approx(
-        np.mean([row[1] for row in rows]) - 1
-    )
-    assert judged["a-seed-agrees"].contrast.mean == pytest.approx(
-        np.mean([row[1] - row[2] for row in rows])
-    )
 
 
 def test_every_seed_has_its_own_settings_and_all_share_the_splats(folder, monkeypatch):

@@ -1,0 +1,166 @@
+"""Two variants of a run in one figure, on the figure's own scale; the one way in which a report
+compares them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+
+import numpy as np
+
+from attnwarp_eval.document.numbers import FEWEST_SCENES, number
+from attnwarp_eval.metrics.counted import COUNTED
+from attnwarp_eval.metrics.registry import Metric
+from attnwarp_eval.statistics.contrasts import Contrast, contrast
+from attnwarp_eval.statistics.intervals import ByView
+from attnwarp_eval.study.probe import probe, probes
+from attnwarp_eval.study.results import Results
+
+Yaw = tuple[float, float]
+
+
+def between(
+    results: Results, name: str, first: str, second: str, metric: str, yaw: Yaw | None = None
+) -> Contrast:
+    """The second variant against the first.
+
+    Args:
+        results: of the run.
+        name: of the probe.
+        first, second: variants.
+        metric: the figure's name.
+        yaw: closed range of degrees that a view's yaw from the source must lie in; any if None.
+    """
+    a, b = (results.views(name, who, metric, yaw) for who in (first, second))
+    sides = [_counts(results, name, who, metric, yaw) for who in (first, second)]
+    return on_scale(results, name, metric, a, b, sides)
+
+
+def on_scale(
+    results: Results,
+    name: str,
+    metric: str,
+    a: ByView,
+    b: ByView,
+    counts: list[ByView | None],
+) -> Contrast:
+    """One table of a figure against another, on the figure's scale.
+
+    Args:
+        results: of the run.
+        name: of the probe.
+        metric: the figure's name.
+        a, b: scene -> view (and seed) -> value.
+        counts: things that each share is of; None where they are not known.
+    """
+    specification = probe(name).metric(metric)
+    first, second = counts
+    of = None if first is None or second is None else (first, second)
+    return contrast(
+        a, b, specification.scale, floor=floor_of(results, metric, specification), counts=of
+    )
+
+
+def floor_of(results: Results, metric: str, specification: Metric) -> float:
+    """The error below which a figure means nothing: that of the calibration, where it is a distance
+    that the calibration has too, and at least the metric's tolerance.
+
+    Args:
+        results: of the run.
+        metric: the figure's name.
+        specification: of it.
+    """
+    if specification.unit not in ("px", "layer px"):
+        return specification.atol
+    values = [
+        view.metrics.get(metric, math.nan)
+        for own in probes()
+        if own.always
+        for _, record in results.finished(own.name)
+        for view in record.views
+    ]
+    finite = [value for value in values if math.isfinite(value)]
+    return max(specification.atol, float(np.median(finite)) if finite else 0.0)
+
+
+def _counts(
+    results: Results, name: str, variant: str, metric: str, yaw: Yaw | None
+) -> ByView | None:
+    """Things that each share is of; None where the run has not counted them."""
+    specification = probe(name).metric(metric)
+    behind = metric.removeprefix(specification.name)
+    tables = [
+        results.views(name, variant, f"{count}{behind}", yaw)
+        for count in COUNTED.get(specification.name, ())
+    ]
+    total: dict[str, dict[str, float]] = defaultdict(dict)
+    for table in tables:
+        for scene, views in table.items():
+            for view, value in views.items():
+                total[scene][view] = total[scene].get(view, 0.0) + value
+    shares = results.views(name, variant, metric, yaw)
+    known = all(
+        math.isfinite(total[scene].get(view, math.nan))
+        for scene, views in shares.items()
+        for view, share in views.items()
+        if math.isfinite(share)
+    )
+    return dict(total) if tables and known else None
+
+
+def difference_text(value: Contrast, unit: str, level: float = 0.95) -> str:
+    """A difference for a reader, with the interval that agrees with its verdict; below six scenes
+    with the lowest and the highest scene.
+
+    Factors up to 2 are shown in percent, larger ones and those of odds as factors.
+
+    Args:
+        value: the difference.
+        unit: of the metric.
+        level: of the interval.
+
+    Example:
+        >>> tables = [{f"s{k}": {"v": v + 0.01 * v * k} for k in range(6)} for v in (1.0, 0.6)]
+        >>> difference_text(contrast(*tables, "ratio"), "px")
+        '-40 % (-40 to -40 %)'
+    """
+    if not value.by_scene:
+        return "–"
+    few = value.scenes < FEWEST_SCENES
+    mean, low, high = value.range() if few else value.shown(level)
+    if value.scale == "ratio" and max(mean, high) <= 2:
+        texts, behind = [_percent(x - 1) for x in (mean, low, high)], " %"
+    elif value.scale == "share" or (value.scale == "plain" and unit == "share"):
+        texts, behind = [_percent(x) for x in (mean, low, high)], " points"
+    elif value.scale == "plain":
+        texts = [f"{'+' if x > 0 else ''}{number(x)}" for x in (mean, low, high)]
+        behind = f" {unit}" if unit not in ("ratio", "cosine", "own") else ""
+    else:
+        word = "odds × " if value.scale == "odds" else "× "
+        texts, behind = [number(x) for x in (mean, low, high)], ""
+        texts[0] = f"{word}{texts[0]}"
+    lone = value.scenes < 2 or not math.isfinite(low)
+    brackets = "" if lone else f" ({texts[1]} to {texts[2]}{behind})"
+    note = f" ({value.undefined} undefined)" if value.undefined else ""
+    return f"{texts[0]}{behind}{brackets}{note}"
+
+
+def detectable_text(value: Contrast) -> str:
+    """The smallest difference that one test at 5 % would tell in 80 % of studies.
+
+    Args:
+        value: whose spread between scenes counts.
+    """
+    least = value.student.detectable
+    if value.scenes < FEWEST_SCENES or not math.isfinite(least):
+        return "–"
+    if value.scale == "ratio":
+        return f"{number(100 * math.expm1(least), 2)} %"
+    if value.scale == "odds":
+        return f"odds × {number(math.exp(least))}"
+    return f"{number(100 * least, 2)} points" if value.scale == "share" else number(least)
+
+
+def _percent(share: float) -> str:
+    return f"{'+' if share > 0 else ''}{number(100 * share, 2)}"

@@ -1,0 +1,341 @@
+"""Verdicts on claims: of the one study that judges each, adjusted together; and their section."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from statistics import fmean
+from typing import Literal
+
+from attnwarp_eval.document.model import Section, Table
+from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.metrics.multiview import ABOVE_FLOOR, BELOW_FLOOR
+from attnwarp_eval.report.claims import Claim, Measured, load_claims
+from attnwarp_eval.report.compared import difference_text
+from attnwarp_eval.statistics.contrasts import EQUAL_LEVEL, Contrast
+from attnwarp_eval.statistics.intervals import (
+    ROUNDING,
+    Interval,
+    agreement,
+    benjamini_hochberg,
+    common,
+    paired,
+)
+from attnwarp_eval.statistics.planning import MOST_SCENES, Parts, parts
+from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.results import Results
+
+Verdict = Literal[
+    "holds", "the opposite holds", "equal", "can't tell", "blind", "depends on the editor"
+]
+
+Here = Literal["seen", "seen where defined", "mixed", "not seen", "depends on the editor"]
+
+
+@dataclass(frozen=True)
+class JudgedClaim:
+    """A claim, what a run has of it, and the verdict.
+
+    Attributes:
+        claim: for one editor, where it has several.
+        measured: of the run.
+        agreement: views with the expected sign, and all of them.
+        here: what is seen on the run's scenes.
+        below_floor: scenes in which both sides disagree less than true views do.
+        parts: of the plain difference's spread between scenes.
+        judges: whether the run is of the study that judges the claim, on a sample.
+        p: adjusted p-value; that of its own test before :func:`decided`.
+        verdict: None where another study judges.
+    """
+
+    claim: Claim
+    measured: Measured
+    agreement: tuple[int, int]
+    here: Here
+    below_floor: tuple[str, ...]
+    parts: Parts
+    judges: bool
+    p: float
+    verdict: Verdict | None = None
+
+    @property
+    def contrast(self) -> Contrast:
+        """The difference, on the scale of its figure."""
+        return self.measured.contrast
+
+    @property
+    def metric(self) -> str:
+        """Name of the figure."""
+        return self.measured.metric
+
+    @property
+    def sides(self) -> dict[str, Interval]:
+        """Mean of each side."""
+        return self.measured.sides
+
+    @property
+    def difference(self) -> str:
+        """The difference in words, with the interval that agrees with the verdict."""
+        level = EQUAL_LEVEL if self.verdict == "equal" else 0.95
+        if self.verdict not in (None, "equal"):
+            level = self.contrast.level(self.p)
+        return difference_text(
+            self.contrast, probe(self.claim.probe).metric(self.metric).unit, level
+        )
+
+    @property
+    def told(self) -> bool:
+        """True if there is a verdict that says something."""
+        return self.verdict in ("holds", "the opposite holds", "equal")
+
+    @property
+    def in_words(self) -> str:
+        """The verdict; of what cannot be told also how many scenes would tell it, and of what
+        another study judges its name.
+        """
+        if self.verdict is None:
+            return f"judged by `{self.claim.study}`"
+        if self.verdict == "equal":
+            return f"equal within {_bound(self.claim)}"
+        if self.verdict != "can't tell":
+            return self.verdict
+        if self.measured.control == "not measured":
+            return "can't tell: its control was not measured"
+        if self.contrast.scenes < 2:
+            return self.verdict
+        needed = self.contrast.needed(self.p, self.claim.bound)
+        return f"can't tell: {count_of(needed)} scenes would"
+
+
+def count_of(scenes: int) -> str:
+    """A number of scenes in words.
+
+    Example:
+        >>> count_of(40), count_of(5000)
+        ('40', 'over 1000')
+    """
+    return f"over {MOST_SCENES}" if scenes > MOST_SCENES else str(scenes)
+
+
+def _bound(claim: Claim) -> str:
+    metric = probe(claim.probe).metric(claim.metric)
+    if isinstance(claim.equal_within, str):
+        return (
+            claim.equal_within.replace("%", "points")
+            if metric.scale == "share"
+            else (claim.equal_within)
+        )
+    return f"{claim.equal_within} {metric.unit}"
+
+
+def judge(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
+    """Every claim that the run has measurements for; those that its study judges with a verdict,
+    adjusted over them.
+
+    A claim about the editor's working is judged for each of its editors; :func:`together` makes
+    one verdict of them.
+    """
+    return decided(found(results, claims))
+
+
+def found(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
+    """Every claim that the run has measurements for, before a verdict.
+
+    Args:
+        results: of the run.
+        claims: to look for.
+    """
+    judged = []
+    for claim in (one for entry in claims for one in entry.of_each_editor()):
+        measured = claim.measure(results)
+        if measured is None or not measured.contrast.by_scene:
+            continue
+        judged.append(
+            JudgedClaim(
+                claim,
+                measured,
+                agreement(measured.a, measured.b, claim.sign),
+                _here(claim, measured, len(results.study.scenes)),
+                _below_floor(measured),
+                parts(measured.a, measured.b),
+                bool(results.study.sampled) and results.study.name == claim.study,
+                measured.contrast.flips.p,
+            )
+        )
+    return judged
+
+
+def decided(claims: Iterable[JudgedClaim]) -> list[JudgedClaim]:
+    """Claims with their verdicts, p-values adjusted over all that are judged
+    (Benjamini-Hochberg).
+
+    Args:
+        claims: of one run, or of the runs of all studies that judge.
+    """
+    every = list(claims)
+    adjusted = benjamini_hochberg([c.p if c.judges else float("nan") for c in every])
+    return [
+        replace(c, p=p, verdict=_verdict(c, p) if c.judges else None)
+        for c, p in zip(every, adjusted, strict=True)
+    ]
+
+
+def _verdict(judged: JudgedClaim, p: float) -> Verdict:
+    control = judged.measured.control
+    if control == "not seen":
+        return "blind"
+    if control == "not measured":
+        return "can't tell"
+    told = judged.contrast.verdict(judged.claim.expect, adjusted_p=p, bound=judged.claim.bound)
+    words: dict[str, Verdict] = {"better": "holds", "worse": "the opposite holds", "equal": "equal"}
+    return words.get(told, "can't tell")
+
+
+Comparison = tuple[str, str, frozenset[str]]
+"""A probe, a metric and two variants."""
+
+
+def of_comparisons(judged: Iterable[JudgedClaim]) -> dict[Comparison, JudgedClaim]:
+    """The claim that judges each comparison of two variants, over all views: a table that shows
+    such a comparison has the claim's verdict.
+    """
+    return {
+        (one.claim.probe, one.metric, frozenset(one.sides)): one
+        for one in judged
+        if one.claim.yaw is None and one.verdict is not None
+    }
+
+
+def together(
+    findings: Sequence[JudgedClaim], editors: Sequence[str]
+) -> tuple[Here, Verdict | None]:
+    """One verdict of the findings of a claim about the editor's working.
+
+    It has one only where all editors were measured and agree; else it depends on the editor, or
+    cannot be told from the editors that were measured.
+    """
+    here, verdicts = {f.here for f in findings}, {f.verdict for f in findings}
+    seen: Here = next(iter(here)) if len(here) == 1 else "depends on the editor"
+    if here == {"seen", "seen where defined"}:
+        seen = "seen where defined"
+    if verdicts == {None}:
+        return seen, None
+    if len(findings) < len(editors):
+        return seen, "can't tell"
+    return seen, next(iter(verdicts)) if len(verdicts) == 1 else "depends on the editor"
+
+
+def _here(claim: Claim, measured: Measured, scenes: int) -> Here:
+    """Tell whether the mean difference has the expected sign in every scene.
+
+    ``scenes``: how many the study has. One without values cannot show what is expected.
+    """
+    shared = common([measured.a, measured.b])
+    values = [abs(x) for table in shared for views in table.values() for x in views.values()]
+    rounding = ROUNDING * max(values, default=0.0)
+    differences = [paired({s: shared[0][s]}, {s: shared[1][s]}) for s in shared[0]]
+    signs = [one.mean * claim.sign > rounding for one in differences]
+    if not all(signs):
+        return "mixed" if any(signs) else "not seen"
+    return "seen" if len(signs) == scenes else "seen where defined"
+
+
+def _below_floor(measured: Measured) -> tuple[str, ...]:
+    if not measured.metric.startswith(ABOVE_FLOOR):
+        return ()
+    a, b = common([measured.a, measured.b])
+    return tuple(s for s in a if max(fmean(a[s].values()), fmean(b[s].values())) < 0)
+
+
+def _scenes(finding: JudgedClaim, scenes: int) -> str:
+    below = ", ".join(finding.below_floor)
+    text = f"{finding.contrast.scenes} of {scenes}"
+    return f"{text}; below the floor: {below}" if below else text
+
+
+HEAD = (
+    "- **Here** speaks of these scenes alone. `seen`: the difference has the expected sign in every"
+    " scene of the study. `seen where defined`: in every scene that has values, and some have none."
+    " `not seen`: in no scene.\n"
+    "- **In general**: one study judges each claim, on scenes that were drawn. Other reports show"
+    " the same difference without a verdict.\n"
+    "- **Difference**: errors as ratios, in percent (or as factors, ×); shares by their odds; the"
+    " rest as they are. Below six scenes the brackets hold the lowest and the highest scene.\n"
+    "- **Scenes**: those in which the difference is defined. **Views that agree** have the"
+    " expected sign.\n"
+    "- **Measured** are means. Those of two variants are over the views that both have, so that the"
+    " difference is theirs."
+)
+
+SAMPLED = (
+    "**In general** is said of {scenes}, and scenes like these. Flipped signs of the scenes'"
+    " differences decide, with p-values adjusted over the claims that this study judges. The"
+    " interval is the test's, at the level that the adjustment leaves, so it agrees with the"
+    " verdict; that of `equal` is at 90 %. `blind`: the control, features from a wrong place or"
+    " true pictures, was not told apart. **p by t** is Student's on the same scale, not adjusted."
+    " Below six scenes there is no verdict."
+)
+"""Paragraph on a report whose study judges claims."""
+
+
+def claims_section(results: Results, findings: Sequence[JudgedClaim]) -> Section:
+    """The section of the report.
+
+    Args:
+        results: of the run.
+        findings: the claims that it has measurements for.
+    """
+    declared = {claim.id: claim for claim in load_claims()}
+    judges = any(finding.judges for finding in findings)
+    rows, scenes = [], len(results.study.scenes)
+    for finding in findings:
+        claim = finding.claim
+        sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
+        agree, views = finding.agreement
+        ps = [
+            number(finding.p),
+            number(finding.contrast.student.p),
+            finding.measured.control or "–",
+        ]
+        rows.append(
+            [
+                claim.text,
+                finding.here,
+                finding.in_words,
+                _scenes(finding, scenes),
+                f"{agree} of {views}",
+                finding.difference,
+                *(ps if judges else []),
+                sides,
+                finding.metric,
+            ]
+        )
+        editors = declared[claim.id].editors if claim.id in declared else ()
+        own = [other for other in findings if other.claim.id == claim.id]
+        if editors and finding is own[-1]:
+            here, verdict = together(own, editors)
+            text = f"**{declared[claim.id].text}: both editors together**"
+            dashes = ["–"] * (4 + 3 * judges)
+            rows.append([text, here, verdict or finding.in_words, *dashes, finding.metric])
+    made = Section("What was expected, and what was seen")
+    if not rows:
+        made.text = ["Nothing that a claim speaks of was measured."]
+        return made
+    made.text = ["A claim that does not hold on these scenes is a result, not an error.", HEAD]
+    if judges:
+        made.text.append(SAMPLED.format(scenes=results.study.sampled))
+    if any(finding.metric.startswith(ABOVE_FLOOR) for finding in findings):
+        made.text.append(f"{BELOW_FLOOR} The column of scenes names those in which both sides are.")
+    columns = [
+        "claim",
+        "here",
+        "in general",
+        "scenes",
+        "views that agree",
+        "difference",
+        *(["adjusted p", "p by t", "control"] if judges else []),
+        "measured",
+        "metric",
+    ]
+    made.tables = [Table(columns, rows)]
+    return made

@@ -1,0 +1,154 @@
+"""Raw results of a run in one compressed file, from which every figure of its report is computed
+again: ``results.jsonl.xz``, the study and then one line a cell.
+"""
+
+from __future__ import annotations
+
+import json
+import lzma
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from attnwarp.errors import InputError
+from attnwarp_eval.canonical_json import canonical_json
+from attnwarp_eval.files import write_atomic
+from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.results import Outcome, Results
+from attnwarp_eval.study.schema import Study
+from attnwarp_eval.study.store import Store
+from attnwarp_eval.study.study import parse_study
+
+FORMAT = 1
+"""Version of the file's layout; a reader refuses others."""
+
+NAME = "results.jsonl.xz"
+
+DIGITS = 9
+"""Significant digits of a figure: more than any tolerance asks for."""
+
+
+def write_raw(store: Store, path: Path) -> Path:
+    """Write the raw results of a run, without its pictures and without paths of this machine.
+
+    Args:
+        store: the run.
+        path: of the file; in a folder, the file is called :data:`NAME`.
+
+    Returns:
+        Path of the file.
+
+    Raises:
+        StoreError: the folder is no run, or a record is damaged.
+    """
+    if path.is_dir() or not path.suffix:
+        path = path / NAME
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = "".join(f"{line}\n" for line in _lines(store))
+    write_atomic(path, lzma.compress(text.encode(), preset=9))
+    return path
+
+
+def _lines(store: Store) -> Iterator[str]:
+    stored, done = store.read_study(), store.done()
+    study = dict(stored["study"])
+    if study.get("population"):
+        study["scenes"] = [Path(name).name for name in study["scenes"]]
+    notices = {name: entry.get("notices", []) for name, entry in stored["scenes"].items()}
+    yield canonical_json({"raw": FORMAT, "study": study, "notices": notices})
+    for cell in stored["cells"]:
+        record: dict[str, Any] | None = None
+        if cell["id"] in done:
+            record = _shortened(store.read(cell["id"]))
+            record |= {"pictures": []}
+            for name in ("format", "sha256"):
+                del record[name]
+        yield canonical_json({"cell": cell, "record": record})
+
+
+def _shortened(value: Any) -> Any:
+    if isinstance(value, float) and math.isfinite(value):
+        return float(f"{value:.{DIGITS}g}")
+    if isinstance(value, dict):
+        return {key: _shortened(item) for key, item in value.items()}
+    return [_shortened(item) for item in value] if isinstance(value, list) else value
+
+
+def read_raw(path: Path) -> Results:
+    """The results that a file of raw results holds.
+
+    Raises:
+        InputError: the file is damaged, of another version, or its study cannot be read.
+    """
+    remedy = "take it from version control again, or write it with attnwarp-eval report RUN --raw"
+    try:
+        head, *cells = map(json.loads, lzma.decompress(path.read_bytes()).decode().splitlines())
+        if head["raw"] != FORMAT:
+            raise InputError(f"{path}: {head['raw']!r} is another version's; {remedy}")
+        study = parse_study(head["study"])
+        outcomes = [_outcome(**line) for line in cells]
+    except (lzma.LZMAError, ValueError, LookupError, TypeError, AttributeError) as error:
+        why = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        raise InputError(f"{path}: no raw results ({why}); {remedy}") from None
+    return Results(study, outcomes, [], {k: v for k, v in head["notices"].items() if v})
+
+
+def _outcome(cell: dict[str, Any], record: dict[str, Any] | None) -> Outcome:
+    return Outcome(
+        cell["id"],
+        cell["title"],
+        cell["scene"],
+        tuple(cell["variants"]),
+        cell["probe"],
+        cell["seed"],
+        None if record is None else probe(cell["probe"]).read(record),
+    )
+
+
+def together(parts: Sequence[Results]) -> Results:
+    """Parts of one study, run on some of its scenes each, as one run.
+
+    Raises:
+        InputError: they are of studies that differ in more than their scenes.
+    """
+    whole = max((part.study for part in parts), key=_count)
+    keys = [_but_scenes(part) for part in parts]
+    for part, key in zip(parts, keys, strict=True):
+        different = [name for name, value in keys[0].items() if key.get(name) != value]
+        if different:
+            raise InputError(
+                f"study {part.study.name}: parts differ in {', '.join(different)}, so they are no"
+                " parts of one study; keep one of them"
+            )
+    scenes = dict(
+        pair
+        for part in parts
+        for pair in zip(part.study.scene_names, part.study.scenes, strict=True)
+    )
+    if whole.population is not None:
+        scenes = {name: scenes[name] for name in whole.population.names if name in scenes}
+    cells = {cell.id: cell for part in parts for cell in part.cells}
+    cells |= {c.id: c for part in parts for c in part.cells if c.record is not None}
+    study = whole.model_copy(update={"scenes": list(scenes.values())})
+    notices = {name: lines for part in parts for name, lines in part.notices.items()}
+    return replace(parts[0], study=study, cells=list(cells.values()), notices=notices)
+
+
+def _count(study: Study) -> int:
+    return 0 if study.population is None else study.population.count
+
+
+def _but_scenes(part: Results) -> dict[str, Any]:
+    """All that decides the cells of a study but for its scenes."""
+    data = part.study.model_dump(mode="json")
+    for name in ("scenes", "title", "description"):
+        data.pop(name)
+    if part.study.population is not None:
+        data["population"] = part.study.population.sized(1).model_dump(mode="json")
+    if isinstance(data.get("editing"), dict):
+        data["editing"] = {**data["editing"], "edits": None}
+    return data

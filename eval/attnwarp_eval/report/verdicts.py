@@ -1,0 +1,204 @@
+"""One table of verdicts from the raw results of all studies, and the lines that README.md takes
+from it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from attnwarp.errors import InputError
+from attnwarp_eval.document.model import Table
+from attnwarp_eval.document.numbers import ratio_text
+from attnwarp_eval.document.write import markdown_table
+from attnwarp_eval.report.answer import in_words
+from attnwarp_eval.report.claims import Claim, load_claims
+from attnwarp_eval.report.judging import JudgedClaim, decided, found
+from attnwarp_eval.report.raw import read_raw, together
+from attnwarp_eval.statistics.intervals import time_ratio
+from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.probe_report import report_of
+from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.turns import Timed, timed_in_turn
+
+FILES = "results*.jsonl.xz"
+"""Files of raw results, at any depth below a folder of reports; several of one study are parts."""
+
+TABLE, LINES = "verdicts", "headlines"
+"""Marks of the blocks that :func:`filled` fills: ``<!-- verdicts -->`` and its end."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A claim with its verdict over all studies.
+
+    Attributes:
+        claim: for one editor, where it has several.
+        judged: None where its study has no raw results, or lacks a side.
+        time: ratio of the last side's seconds to the first one's, taken in turn; a dash without.
+        report: folder of the report.
+        population: of its scenes, in words.
+    """
+
+    claim: Claim
+    judged: JudgedClaim | None = None
+    time: str = "–"
+    report: Path | None = None
+    population: str = ""
+
+    @property
+    def measured(self) -> str:
+        """Mean of each side in words, the one that the claim speaks of first."""
+        if self.judged is None:
+            return "–"
+        metric = probe(self.claim.probe).metric(self.judged.metric)
+        means = [in_words(s.mean, metric, self.judged.metric) for s in self.judged.sides.values()]
+        return " against ".join(reversed(means))
+
+
+def verdicts(folder: Path) -> list[Judged]:
+    """Every claim with its verdict, p-values adjusted over all studies together.
+
+    Args:
+        folder: of reports, with raw results beside each.
+
+    Raises:
+        InputError: raw results that cannot be read, or are of no one study.
+    """
+    parts: dict[str, list[tuple[Path, Results]]] = defaultdict(list)
+    for path in sorted(folder.rglob(FILES)):
+        results = read_raw(path)
+        parts[results.study.name].append((path, results))
+    studies: dict[str, tuple[Path, Results]] = {}
+    for name, own in parts.items():
+        folders = {path.parent for path, _ in own}
+        if len(folders) > 1:
+            raise InputError(
+                f"study {name}: raw results lie in {', '.join(map(str, sorted(folders)))}; keep"
+                " those of one run"
+            )
+        studies[name] = (*folders, together([results for _, results in own]))  # type: ignore[assignment]
+    judged = decided(
+        one
+        for _, results in studies.values()
+        for one in found(results, load_claims())
+        if one.judges
+    )
+    by_text = {one.claim.text: one for one in judged}
+    every = [one for claim in load_claims() for one in claim.of_each_editor()]
+    return [_judged(claim, by_text.get(claim.text), studies) for claim in every]
+
+
+def _judged(
+    claim: Claim, one: JudgedClaim | None, studies: Mapping[str, tuple[Path, Results]]
+) -> Judged:
+    if one is None:
+        return Judged(claim)
+    folder, results = studies[claim.study]
+    return Judged(claim, one, _time(results, one), folder, results.study.sampled)
+
+
+def _time(results: Results, one: JudgedClaim) -> str:
+    timed = timed_in_turn(results, report_of(one.claim.probe).stage)
+    names = list(one.sides)
+    if timed is None or len(names) < 2:
+        return "–"
+    both = [turn for turn in timed.turns if set(names) <= set(turn.names)]
+    if not both:
+        return "–"
+    first, second = (Timed(both, timed.stage).rounds(name) for name in names)
+    return ratio_text(time_ratio(second, first))
+
+
+COLUMNS = ("claim", "verdict", "difference", "measured", "scenes", "control", "time", "report")
+
+
+def table(judged: list[Judged], beside: Path) -> Table:
+    """The table of all claims.
+
+    Args:
+        judged: of :func:`verdicts`.
+        beside: folder that links start from.
+    """
+    rows = []
+    for each in judged:
+        one = each.judged
+        if one is None or each.report is None:
+            absent = f"not measured: `{each.claim.study}` judges it"
+            rows.append([each.claim.text, absent, *["–"] * (len(COLUMNS) - 2)])
+            continue
+        link = Path(os.path.relpath(each.report / "report.md", beside)).as_posix()
+        rows.append(
+            [
+                each.claim.text,
+                one.in_words,
+                one.difference,
+                each.measured,
+                str(one.contrast.scenes),
+                one.measured.control or "–",
+                each.time,
+                f"[{each.claim.study}]({link})",
+            ]
+        )
+    return Table(list(COLUMNS), rows)
+
+
+def headlines(judged: list[Judged]) -> list[str]:
+    """Lines of the claims that README.md names, in their order; none where none was judged.
+
+    Args:
+        judged: of :func:`verdicts`.
+    """
+    chosen = sorted(
+        (each for each in judged if each.claim.headline), key=lambda each: each.claim.headline
+    )
+    lines = []
+    for number, each in enumerate((e for e in chosen if e.judged is not None), 1):
+        assert each.judged is not None
+        verdict = each.judged.in_words
+        lines.append(
+            f"{number}. **{each.claim.text}.** {verdict[0].upper()}{verdict[1:]}: {each.measured},"
+            f" over {each.population}."
+        )
+    return lines
+
+
+def filled(text: str, judged: list[Judged], beside: Path) -> str:
+    """A document with the table and the lines in their marked places; lines stay as they are while
+    no claim among them has raw results.
+
+    Args:
+        text: of the document.
+        judged: of :func:`verdicts`.
+        beside: folder of the document.
+
+    Example:
+        >>> filled("<!-- headlines -->\\nas before\\n<!-- /headlines -->\\n", [], Path())
+        '<!-- headlines -->\\nas before\\n<!-- /headlines -->\\n'
+    """
+    blocks = {
+        TABLE: markdown_table(table(judged, beside)).strip("\n"),
+        LINES: "\n".join(headlines(judged)),
+    }
+    for mark, content in blocks.items():
+        before, begun, rest = text.partition(_begin(mark))
+        _, ended, after = rest.partition(_end(mark))
+        if content and begun and ended:
+            text = f"{before}{begun}{content}\n{ended}{after}"
+    return text
+
+
+def marked(text: str) -> bool:
+    """Return True if a document has a place for the table or the lines."""
+    return any(_begin(mark) in text and _end(mark) in text for mark in (TABLE, LINES))
+
+
+def _begin(mark: str) -> str:
+    return f"<!-- {mark} -->\n"
+
+
+def _end(mark: str) -> str:
+    return f"<!-- /{mark} -->"

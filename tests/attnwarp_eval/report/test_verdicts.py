@@ -1,0 +1,180 @@
+"""Oracles: the stored run itself, SciPy's binomial, ratios by hand, and the documents that are
+committed.
+"""
+
+import json
+import lzma
+import pathlib
+import tarfile
+
+import numpy as np
+import pytest
+import written_runs
+from scipy import stats
+from typer.testing import CliRunner
+
+from attnwarp.errors import InputError
+from attnwarp_eval.canonical_json import digest
+from attnwarp_eval.cli.main import app
+from attnwarp_eval.report import read_results
+from attnwarp_eval.report.raw import read_raw, together
+from attnwarp_eval.report.results import lines
+from attnwarp_eval.report.verdicts import filled, headlines, table, verdicts
+from attnwarp_eval.study import Store
+from attnwarp_eval.study.study import parse_study
+
+ROOT = pathlib.Path(__file__).parents[3]
+DATA = pathlib.Path(__file__).parents[1] / "data" / "runs.tar.xz"
+SLIP = "warp.epe_median_layer.64"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stored")
+    with tarfile.open(DATA) as archive:
+        archive.extraction_filter = getattr(tarfile, "data_filter", None)
+        archive.extractall(folder)
+    return folder
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(app, list(map(str, arguments)))
+
+
+def written(folder, scenes, factors, *, name="suite", rounds=None):
+    """A run of 8 drawn scenes, or a part of it, in a folder of its own."""
+    content = {
+        "name": name,
+        "scenes": {"drawn": 8, "seed": 7},
+        "variants": {"good": {}, "slipped": {"set": {"pixel_centers": "integer"}}},
+        "probes": {
+            "warp": ["good", "slipped"],
+            **({"timing": ["good", "slipped"]} if rounds else {}),
+        },
+    }
+    study = parse_study(content)
+    chosen = [s for s in study.scenes if pathlib.Path(s).stem in scenes]
+    store, cells = Store(folder), []
+
+    def add(probe, scene, variants, data):
+        spec = {**data["spec"], "probe": probe, "scene": scene, "who": variants}
+        store.write({**data, "id": digest(spec), "spec": spec})
+        cells.append(
+            {"id": digest(spec), "title": "t", "scene": scene, "variants": variants,
+             "probe": probe, "seed": 0}
+        )  # fmt: skip
+
+    for scene, factor in zip(scenes, factors, strict=True):
+        for who, value in (("good", 0.1), ("slipped", 0.1 * factor)):
+            add("warp", scene, [who], written_runs.record([("v0", 30.0, {SLIP: value})]))
+    if rounds:
+        # The baseline's second run comes last.
+        each = [[1.0] * rounds, [2.0] * rounds, [1.0] * rounds]
+        spec = {"rounds": rounds, "views": ["v0"]}
+        cost = {"rounds": {"render": each, "pair": each}}
+        add("timing", scenes[0], ["good", "slipped"], written_runs.record([], spec=spec, cost=cost))
+    store.write_study(
+        {"study": study.model_copy(update={"scenes": chosen}).model_dump(mode="json"),
+         "scenes": {scene: {"hash": "", "title": ""} for scene in scenes}, "cells": cells}
+    )  # fmt: skip
+    return store
+
+
+SCENES = [f"drawn-{k}" for k in range(8)]
+
+
+@pytest.mark.parametrize("name", ["variants", "edits"])
+def test_raw_results_hold_every_figure_of_the_run_and_no_path_of_this_machine(
+    folder, name, tmp_path
+):
+    store = Store(folder / name)
+    done = invoke("report", store.root, "--no-pictures", "--raw", tmp_path / "reports")
+    path = tmp_path / "reports" / "results.jsonl.xz"
+    assert done.exit_code == 0 and str(path) in done.output
+    assert lines(read_raw(path), False) == lines(read_results(store), False)
+    assert str(pathlib.Path.home()) not in lzma.decompress(path.read_bytes()).decode()
+    # The same run twice, and its own table of figures in the place of the folder.
+    for baseline in (path, store.root / "results.jsonl"):
+        same = invoke("compare", baseline, store.root)
+        assert same.exit_code in (0, 3), same.output
+        assert "0 worse, 0 can't tell, 0 better" in same.output
+
+
+def test_damaged_raw_results_are_refused_with_what_to_do(tmp_path):
+    path = tmp_path / "results.jsonl.xz"
+    for content in (b"nothing", lzma.compress(b"[]"), lzma.compress(b'{"raw": 0}')):
+        path.write_bytes(content)
+        done = invoke("compare", path, tmp_path)
+        assert done.exit_code == 2
+        with pytest.raises(InputError, match="report RUN --raw"):
+            read_raw(path)
+
+
+def test_the_table_has_verdict_difference_and_time_and_parts_of_a_study_are_read_together(tmp_path):
+    factors = np.exp(np.linspace(0.5, 1.2, 8))
+    reports = tmp_path / "reports"
+    for k, half in enumerate((slice(0, 3), slice(3, 8))):
+        store = written(tmp_path / f"run{k}", SCENES[half], factors[half], rounds=7)
+        target = reports / "suite" / f"results-{k}.jsonl.xz"
+        assert invoke("report", store.root, "--raw", target, "--no-pictures").exit_code == 0
+    judged = verdicts(reports)
+    (slip,) = [one for one in judged if one.judged is not None]
+    assert slip.claim.id == "half-pixel-slip"
+    assert slip.judged.p == pytest.approx(stats.binomtest(8, 8).pvalue)
+    made = table(judged, tmp_path)
+    (cells,) = [row for row in made.rows if row[-1] != "–"]
+    row = dict(zip(made.columns, cells, strict=True))
+    assert row["verdict"] == "holds" and row["scenes"] == "8"
+    assert row["difference"].startswith(f"× {np.exp(np.log(factors).mean()):.2f} (")
+    assert row["time"] == "2.00 [2.00, 2.00]"
+    assert row["report"] == "[suite](reports/suite/report.md)"
+    mean = 0.1 * factors.mean()
+    assert row["measured"] == f"{mean:.2f} px of a 64 grid against 0.10 px of a 64 grid"
+    (line,) = headlines(judged)
+    assert "Holds: " in line and "over 8 scenes drawn by generator 1, seed 7." in line
+    document = tmp_path / "README.md"
+    document.write_text("a\n<!-- verdicts -->\nold\n<!-- /verdicts -->\nb\n")
+    assert invoke("verdicts", reports, "--write", document).exit_code == 0
+    text = document.read_text()
+    assert text.startswith("a\n<!-- verdicts -->\n") and text.endswith("<!-- /verdicts -->\nb\n")
+    assert "| holds |" in text and "\nold\n" not in text
+    assert text == filled(text, judged, tmp_path)
+
+
+def test_parts_of_other_studies_and_two_runs_of_one_are_refused(tmp_path):
+    runs = [
+        written(tmp_path / name, SCENES, [2.0] * 8, name=name) for name in ("suite", "variability")
+    ]
+    parts = [read_results(store) for store in runs]
+    with pytest.raises(InputError, match="parts differ in name"):
+        together(parts)
+    for place in ("one", "two"):
+        invoke("report", runs[0].root, "--no-pictures", "--raw", tmp_path / "reports" / place)
+    done = invoke("verdicts", tmp_path / "reports")
+    assert done.exit_code == 2 and "keep those of one run" in done.stderr
+
+
+def test_a_folder_without_raw_results_says_how_to_write_them(tmp_path):
+    done = invoke("verdicts", tmp_path)
+    assert done.exit_code == 3 and "--raw" in done.stderr
+    assert done.stdout.count("not measured") == len(verdicts(tmp_path))
+    document = tmp_path / "other.md"
+    document.write_text("nothing here\n")
+    done = invoke("verdicts", tmp_path, "--write", document)
+    assert done.exit_code == 2 and "has no place for verdicts" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["README.md", "reports/README.md"])
+def test_the_documents_say_what_the_committed_raw_results_give(name):
+    path = ROOT / name
+    text = path.read_text()
+    assert "<!-- /" in text
+    assert filled(text, verdicts(ROOT / "reports"), path.parent) == text
+
+
+def test_raw_results_are_lines_of_json(folder, tmp_path):
+    invoke("report", folder / "edits", "--no-pictures", "--raw", tmp_path / "own.jsonl.xz")
+    text = lzma.decompress((tmp_path / "own.jsonl.xz").read_bytes()).decode()
+    head, *cells = map(json.loads, text.splitlines())
+    assert head["study"]["name"] == "stored-edits" and len(cells) == 2
+    assert {cell["record"]["spec"]["probe"] for cell in cells} == {"calibration", "sensitivity"}
