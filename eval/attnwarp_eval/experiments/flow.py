@@ -27,6 +27,7 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.task import Task, results
+from attnwarp_eval.world import turned
 
 Method = Literal["dis", "farneback"]
 
@@ -66,27 +67,6 @@ class Row:
     method: str
     figures: dict[str, dict[str, float]]
     flow: dict[str, float]
-
-
-def turned(scene: Scene, yaw: float) -> Camera:
-    """The scene's source camera, taken around the point that it looks at by ``yaw`` degrees, at the
-    same height.
-    """
-    spec = scene.spec.cameras
-    angle = np.radians(spec.source.yaw + yaw)
-    position = (
-        spec.look_at[0] + spec.radius * float(np.cos(angle)),
-        spec.look_at[1] + spec.radius * float(np.sin(angle)),
-        float(scene.source.position[2]),
-    )
-    return Camera.look_at(
-        position,
-        spec.look_at,
-        width=spec.size[0],
-        height=spec.size[1],
-        fov_y=spec.fov,
-        name=f"turned{yaw:g}",
-    )
 
 
 @dataclass(frozen=True)

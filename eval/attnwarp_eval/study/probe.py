@@ -4,8 +4,8 @@ probes by name.
 How a report shows one is in :mod:`attnwarp_eval.study.probe_report`.
 
 >>> [probe.name for probe in probes()]
-['calibration', 'depth', 'editing', 'editing-timing', 'fit', 'ideal', 'labels', 'sensitivity',
- 'stability', 'timing', 'variability', 'warp']
+['audit', 'calibration', 'depth', 'editing', 'editing-timing', 'fit', 'ideal', 'labels',
+ 'sensitivity', 'stability', 'timing', 'variability', 'warp']
 >>> probe("depth").metric("depth.abs_rel").direction
 'lower'
 """

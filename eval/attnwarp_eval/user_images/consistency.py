@@ -2,8 +2,8 @@
 
 The metrics are pure functions of :mod:`attnwarp_eval.metrics`; this module reads the files, and
 compares each view with the next in the order of their names. Keypoints are found at full size; all
-else is computed on pictures whose longest side is :data:`LONGEST` px, the size of the study
-``audit``.
+else is computed on pictures whose longest side is :data:`LONGEST` px, and colours at every second
+row and column of them, as in the study ``audit``.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.metrics.epipolar import LEAST_MATCHES, LIMITS
+from attnwarp_eval.metrics.known_geometry import GRID
 from attnwarp_eval.study.record import with_nan
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.task import Task, results
@@ -282,15 +283,16 @@ class _Pairs:
             a.camera, b.camera, self._surface(two), self._surface(one), warn_empty=False
         )
         where = view.correspondence.xy.numpy(), view.mask.numpy()
+        thinned = where[0][GRID], where[1][GRID]
         values = {
-            _RENDERED.key: metrics.disagreement_at(a.edited, b.edited, *where).figures("rendered_")[
-                _RENDERED.key
-            ]
+            _RENDERED.key: metrics.disagreement_at(a.edited, b.edited[GRID], *thinned).figures(
+                "rendered_"
+            )[_RENDERED.key]
         }
         if _EDIT in self.wanted:
             assert a.original is not None and b.original is not None
-            before, after = (a.original, b.original), (a.edited, b.edited)
-            values[_EDIT.key] = metrics.edit_agreement(before, after, *where)[_EDIT.key]
+            before, after = (a.original, b.original[GRID]), (a.edited, b.edited[GRID])
+            values[_EDIT.key] = metrics.edit_agreement(before, after, *thinned)[_EDIT.key]
         if _FEATURES in self.wanted:
             dino = self.loaded["dino"]
             first, second = (self._encoded("dino", name, False) for name in (one, two))
@@ -372,7 +374,10 @@ def _along_flow(one: _View, two: _View) -> float:
     if len({image.shape for image in (one.original, two.original, one.edited, two.edited)}) > 1:
         return float("nan")
     flow = metrics.optical_flow(one.original, two.original)
-    return metrics.flow_consistency(one.edited, two.edited, flow).figures("flow_")[_FLOW.key]
+    result = metrics.disagreement_at(
+        one.edited, two.edited[GRID], flow.xy[GRID], flow.accepted[GRID]
+    )
+    return result.figures("flow_")[_FLOW.key]
 
 
 def _task(pairs: _Pairs, inputs: Inputs, one: str, two: str, device: str) -> Task[dict[str, float]]:

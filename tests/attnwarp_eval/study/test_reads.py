@@ -118,7 +118,7 @@ def test_a_variant_has_the_preset_of_its_method_that_it_names(method, name, expe
         ("edits: [snow]\nvariants:\n  v: {}\nprobes: {editing: [v]}\n",
          ":4: edits: nothing that this study measures reads it; add sensitivity to probes"),
         ("encoders: {clip: clip-small}\nvariants:\n  v: {}\nprobes: {variability: [v]}\nseeds: [0, 1]\n",
-         ":4: encoders: nothing that this study measures reads it; add editing or sensitivity"),
+         ":4: encoders: nothing that this study measures reads it; add audit, editing or"),
         ("splats: {count: 9}\nvariants:\n  v: {fitted: true}\nprobes: {warp: [v]}\n",
          ":4: splats: nothing that this study measures reads it"),
         ("splats: {count: 9}\nvariants:\n  v: {splats: {count: 8}}\nprobes: {warp: [v]}\n",

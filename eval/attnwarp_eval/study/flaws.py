@@ -1,0 +1,206 @@
+"""Flaws of known size in one view of a true edit, whose other view is right.
+
+Sizes are of the picture that is flawed: pixels, shares, degrees. A flaw is drawn on the true
+picture, by exact geometry, so its size is known and nothing else differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
+
+from attnwarp_eval.colors import to_linear, to_srgb
+from attnwarp_eval.metrics.arrays import Array, Mask
+from attnwarp_eval.metrics.consistency import has_taps, sampled
+from attnwarp_eval.two_view import HIDDEN, TwoView
+
+STEP = 1e-4
+"""Length in scene units by which a point is moved to see where its surface runs in the picture."""
+
+
+@dataclass(frozen=True, eq=False)
+class Edited:
+    """A true edit as the target of a pair shows it, and what flaws are made of.
+
+    Attributes:
+        pair: of source and target.
+        source: (h, w, 3) sRGB in [0, 1], the true source after the edit.
+        before, after, other: (H, W, 3) the target before the edit, after it, and with another right
+            answer.
+        mask: (H, W) bool, the edited object in the target.
+        elsewhere: (H, W, 3) a view of another scene; None where there is none.
+        seed: of what flaws draw.
+    """
+
+    pair: TwoView
+    source: Array
+    before: Array
+    after: Array
+    other: Array
+    mask: Mask
+    elsewhere: Array | None = None
+    seed: int = 0
+    _kept: dict[str, Array] = field(default_factory=dict)
+
+    def grown(self) -> Array:
+        """(H, W, 3) linear light: the object's paint, outside it that of its nearest pixel."""
+        if "grown" not in self._kept:
+            self._kept["grown"] = to_linear(self.after)
+            if self.mask.any():
+                nearest = distance_transform_edt(
+                    ~self.mask, return_distances=False, return_indices=True
+                )
+                self._kept["grown"] = self._kept["grown"][tuple(nearest)]
+        return self._kept["grown"]
+
+    def along(self) -> Array:
+        """(H, W, 2) unit direction in which the surface runs in the picture, that of one direction
+        of the world for all pixels; 0 where it runs along the ray.
+        """
+        if "along" not in self._kept:
+            hits, camera = self.pair.hits, self.pair.target
+            direction = np.random.default_rng([self.seed, 1]).normal(size=3)
+            tangent = direction - (hits.normal @ direction)[..., None] * hits.normal
+            with np.errstate(invalid="ignore"):
+                here, there = (
+                    camera.project(point.reshape(-1, 3))[0].reshape(*self.mask.shape, 2)
+                    for point in (hits.point, hits.point + STEP * tangent)
+                )
+                moved = there - here
+                length = np.linalg.norm(moved, axis=-1, keepdims=True)
+                self._kept["along"] = np.nan_to_num(
+                    np.divide(moved, length, out=np.zeros_like(moved), where=length > 1e-9)
+                )
+        return self._kept["along"]
+
+
+Make = Callable[[Edited, float], Array | None]
+
+
+@dataclass(frozen=True)
+class Flaw:
+    """A kind of flaw.
+
+    Attributes:
+        name: the first part of a condition's key.
+        title: for people, short.
+        unit: of its sizes.
+        sizes: rising.
+        reference: the size that tables of all flaws show.
+        make: (H, W, 3) sRGB of the flawed target at a size; None where it cannot be made.
+        counts: whether it is one of the flaws that matter most.
+    """
+
+    name: str
+    title: str
+    unit: str
+    sizes: tuple[float, ...]
+    reference: float
+    make: Make
+    counts: bool = False
+
+    def key(self, size: float) -> str:
+        """Condition's name at a size.
+
+        Example:
+            >>> FLAWS[0].key(0.3)
+            'answer=0.3'
+        """
+        return f"{self.name}={size:g}"
+
+    def at(self, size: float) -> str:
+        """Title with a size, for people."""
+        return f"{self.title} {size:g} {self.unit}" if self.unit else self.title
+
+
+def _answer(edited: Edited, size: float) -> Array:
+    """Another answer in a spot of the object's surface, ``size`` of its pixels."""
+    if size >= 1:
+        return edited.other
+    inside = np.argwhere(edited.mask)
+    if not len(inside):
+        return edited.after
+    points = edited.pair.hits.point[edited.mask]
+    center = points[np.random.default_rng([edited.seed, 2]).integers(len(points))]
+    near = np.argsort(((points - center) ** 2).sum(axis=1), kind="stable")
+    rows, columns = inside[near[: max(1, round(size * len(points)))]].T
+    result = edited.after.copy()
+    result[rows, columns] = edited.other[rows, columns]
+    return result
+
+
+def _hue(edited: Edited, size: float) -> Array:
+    """The object's hue turned by ``size`` degrees in CIELAB, its lightness and chroma kept."""
+    from skimage.color import lab2rgb, rgb2lab
+
+    lab = rgb2lab(edited.after)
+    turn = np.radians(size)
+    a, b = lab[..., 1], lab[..., 2]
+    turned = np.stack(
+        [lab[..., 0], a * np.cos(turn) - b * np.sin(turn), a * np.sin(turn) + b * np.cos(turn)], -1
+    )
+    return np.where(edited.mask[..., None], np.clip(lab2rgb(turned), 0, 1), edited.after)
+
+
+def _slid(edited: Edited, size: float) -> Array:
+    """Texture of the object that lies ``size`` px further on its surface."""
+    row, column = np.indices(edited.mask.shape)
+    at = [row + size * edited.along()[..., 1], column + size * edited.along()[..., 0]]
+    moved = np.stack(
+        [map_coordinates(edited.grown()[..., c], at, order=1, mode="nearest") for c in range(3)], -1
+    )
+    return np.where(edited.mask[..., None], to_srgb(np.clip(moved, 0, 1)), edited.after)
+
+
+def _doubled(edited: Edited, size: float) -> Array:
+    """Hidden pixels show what hides them from the source, as a mask of bounds alone has it."""
+    pair = edited.pair
+    hidden = (pair.label == HIDDEN) & has_taps(pair.xy, edited.source.shape)
+    result = edited.after.copy()
+    result[hidden] = to_srgb(np.clip(sampled(to_linear(edited.source), pair.xy[hidden]), 0, 1))
+    return result
+
+
+def _blurred(edited: Edited, size: float) -> Array:
+    blurred = gaussian_filter(to_linear(edited.after), (size, size, 0), mode="nearest")
+    return to_srgb(np.clip(blurred, 0, 1))
+
+
+def _ghost(edited: Edited, size: float) -> Array:
+    """Two answers at once, the other with a weight of ``size`` in linear light."""
+    mixed = (1 - size) * to_linear(edited.after) + size * to_linear(edited.other)
+    return to_srgb(np.clip(mixed, 0, 1))
+
+
+def _bled(edited: Edited, size: float) -> Array:
+    """The object's paint ``size`` px beyond its outline."""
+    around = ~edited.mask & (distance_transform_edt(~edited.mask) <= size)
+    if not edited.mask.any():
+        return edited.after
+    return np.where(around[..., None], to_srgb(np.clip(edited.grown(), 0, 1)), edited.after)
+
+
+def _noisy(edited: Edited, size: float) -> Array:
+    noise = np.random.default_rng([edited.seed, 3]).normal(0, size, edited.after.shape)
+    return np.clip(edited.after + noise, 0, 1)
+
+
+FLAWS = (
+    Flaw("answer", "another answer", "of the object", (0.1, 0.3, 1.0), 1.0, _answer, counts=True),
+    Flaw("unedited", "view left unedited", "", (1.0,), 1.0, lambda e, _: e.before, counts=True),
+    Flaw("ghost", "two answers at once", "weight", (0.1, 0.25, 0.5), 0.5, _ghost, counts=True),
+    Flaw("hue", "hue shift", "degrees", (5.0, 15.0, 45.0), 45.0, _hue, counts=True),
+    Flaw("slid", "texture slid", "px", (0.5, 1.0, 2.0, 4.0, 8.0, 16.0), 4.0, _slid, counts=True),
+    Flaw("doubled", "doubled behind an edge", "", (1.0,), 1.0, _doubled),
+    Flaw("bled", "paint bled outside", "px", (2.0, 4.0, 8.0), 4.0, _bled),
+    Flaw("blur", "blur", "px", (1.0, 2.0, 4.0), 2.0, _blurred),
+    Flaw("noise", "noise", "of 1", (0.01, 0.03, 0.1), 0.03, _noisy),
+    Flaw("elsewhere", "another scene", "", (1.0,), 1.0, lambda e, _: e.elsewhere),
+)
+"""Every flaw; those that count first."""
+
+CONDITIONS = {flaw.key(size): (flaw, size) for flaw in FLAWS for size in flaw.sizes}
+"""Flaws with their sizes by name."""

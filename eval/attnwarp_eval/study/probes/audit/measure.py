@@ -1,0 +1,514 @@
+"""Consistency metrics of view pairs whose edit is right, and of pairs with one flaw of known size.
+
+A pair is the source and a target turned by some yaw. Figures are named ``metric.condition``: the
+conditions are :data:`~attnwarp_eval.study.flaws.CONDITIONS`, in the target alone, and the right
+pairs of :data:`RIGHT`. A metric that needs the truth stands beside those that a person has.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from attnwarp.camera import Camera, fundamental
+from attnwarp.gaussians import Gaussians
+from attnwarp.warp import Surface, WarpedView, render_surface, warp_view
+from attnwarp_eval import metrics
+from attnwarp_eval.colors import to_srgb
+from attnwarp_eval.cost import in_turn
+from attnwarp_eval.metrics.arrays import Array, Mask, mean
+from attnwarp_eval.metrics.consistency import FlowMethod
+from attnwarp_eval.metrics.known_geometry import GRID
+from attnwarp_eval.scene.edits import changed as changed_object
+from attnwarp_eval.scene.edits import pick
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.scene.materials import MetalMaterial
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.scene.spec import ObjectChange
+from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.edit_truth import answers_of
+from attnwarp_eval.study.flaws import CONDITIONS, Edited
+from attnwarp_eval.study.probe import Probe, Work, metrics_of, register
+from attnwarp_eval.study.record import Json
+from attnwarp_eval.study.schema import Part, Splats, Study, StudyError, check_distinct
+from attnwarp_eval.study.shared.encoders import EncodersPart, encoder_identities, loaded
+from attnwarp_eval.truth import appearance
+from attnwarp_eval.truth.edits import edit_mask, touched
+from attnwarp_eval.two_view import TwoView
+from attnwarp_eval.world import World, changed, splats, turned
+
+RIGHT = ("right", "right_other")
+"""Right pairs without highlights: one answer in both views, and another one in both."""
+
+SHINY = "right_shiny"
+"""Right pair whose object is made of rough metal, so that its true views differ by highlights."""
+
+PAIRS = (*RIGHT, SHINY)
+
+GLOSS = MetalMaterial(type="metal", metal="Al", roughness=0.3)
+"""Surface of the object in that pair: broad highlights, and no texture."""
+
+Where = tuple[Array, Mask]
+"""(H, W, 2) px of the source for each target pixel, and (H, W) bool where they are trusted."""
+
+
+class Audit(Part):
+    """Edit and view pairs.
+
+    ``edit``: one with at least two answers. ``yaws``: degrees between the views of a pair.
+    ``splats``: the scene before the edit, whose depth is rendered.
+    """
+
+    edit: str = "parts"
+    yaws: Annotated[list[Annotated[float, Field(gt=0, le=180)]], Field(min_length=1)] = Field(
+        default_factory=lambda: [2.0, 10.0, 30.0, 60.0, 120.0]
+    )
+    splats: Splats = Splats(kind="2d", count=16_000, position_noise=0.1, normal_noise=3.0)
+
+    @model_validator(mode="after")
+    def _check_yaws(self) -> Audit:
+        check_distinct(self.yaws, "audit.yaws")
+        return self
+
+
+class StudyPart(EncodersPart):
+    """Keys of a study that this probe reads."""
+
+    audit: Audit = Audit()
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Seconds of one pair by metric and round, taken in turn."""
+
+    seconds: Mapping[str, list[float]]
+
+    def to_json(self) -> Json:
+        """The entry ``rounds`` of the record's cost."""
+        return {"cost": {"rounds": dict(self.seconds)}} if self.seconds else {}
+
+
+@register
+class AuditProbe(Probe[Seconds]):
+    """One cell a scene and seed: all metrics judge the same pictures."""
+
+    name = "audit"
+    study_part = StudyPart
+    metrics = metrics_of("consistency.", "embedding.", "multiview.")
+    judges_variants = False
+    draws = False
+    study_keys = frozenset({"size", "seeds", "spp", "timing_rounds", "encoders", "audit"})
+
+    def check(self, study: Study) -> None:
+        """Variants change no metric."""
+        if study.probes.get(self.name):
+            raise ValueError(
+                "probes.audit: got variants, expected []; it judges metrics, which no variant"
+                " changes"
+            )
+
+    def cells(
+        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
+    ) -> Iterator[Cell]:
+        """One for each scene and seed. The next scene gives the pictures of another scene."""
+        part = study.part(StudyPart)
+        identities = encoder_identities(part)
+        files = dict(zip(study.scene_names, study.scenes, strict=True))
+        order = list(scenes)
+        for place, (name, scene) in enumerate(scenes.items()):
+            answers = _answers(scene, part.audit.edit)
+            other = order[(place + 1) % len(order)]
+            for seed in study.seeds:
+                spec = {
+                    "probe": self.name,
+                    "protocol": self.protocol,
+                    "scene": scene.content_hash,
+                    "other": scenes[other].content_hash if other != name else None,
+                    "size": study.size,
+                    "seed": seed,
+                    "spp": study.spp,
+                    "rounds": study.timing_rounds,
+                    "splats": part.audit.splats.model_dump(),
+                    "encoders": identities,
+                    "edit": part.audit.edit,
+                    "answers": answers,
+                    "yaws": part.audit.yaws,
+                }
+                sources = {str(kind): part.encoders[kind] for kind in sorted(part.encoders)}
+                yield Cell(
+                    spec, name, "metrics", self.name, seed, ("metrics",),
+                    sources={**sources, "other": files[other]},
+                )  # fmt: skip
+
+    def compute(self, work: Work) -> Seconds:
+        """Every metric on every condition at every yaw."""
+        spec, world, meter = work.spec, work.world, work.meter
+        with meter.stage("setup"):
+            encoders = loaded(
+                {k: v for k, v in work.cell.sources.items() if k in spec["encoders"]},
+                spec["encoders"],
+            )
+        with meter.stage("truth"):
+            cameras = {yaw: turned(world.scene, yaw) for yaw in spec["yaws"]}
+            for camera in cameras.values():
+                world.add(camera)
+            pictures = _true_pictures(work, cameras)
+        with meter.stage("splats"):
+            model = splats(work.cell.scene_file, spec["size"], spec["seed"], **spec["splats"])
+            surface = render_surface(model, world.source)
+        edit = world.scene.edit(spec["edit"])
+        answer = pick(edit, spec["answers"][0][0])
+        texts = (edit.source, edit.target if answer is None else answer.target)
+        shown = {
+            state: {name: _Shown(picture, encoders) for name, picture in views.items()}
+            for state, views in pictures.items()
+        }
+        seconds: dict[str, list[float]] = {}
+        for place, camera in enumerate(cameras.values()):
+            with meter.stage("truth"):
+                truth = world.pair(camera.name, spec["size"])
+                edited = _edited(world, spec, pictures, camera, truth)
+                flawed = {
+                    name: flaw.make(edited, size) for name, (flaw, size) in CONDITIONS.items()
+                }
+
+            warp = partial(_warp, model, world.source, camera, surface)
+
+            def views(state: str, camera: Camera = camera) -> tuple[_Shown, _Shown]:
+                return shown[state][world.source.name], shown[state][camera.name]
+
+            pair = _Pair(truth, warp, views("before"), views("right"), encoders, texts)
+            figures: dict[str, float] = {}
+            with meter.stage("checks"):
+                for name in PAIRS:
+                    figures |= _named(pair.figures(*views(name)), name)
+                for name, picture in flawed.items():
+                    values = (
+                        dict.fromkeys(pair.contestants, math.nan)
+                        if picture is None
+                        else pair.figures(views("right")[0], _Shown(picture, encoders))
+                    )
+                    figures |= _named(values, name)
+            meter.count(pictures=len(PAIRS) + len(flawed))
+            if place == len(cameras) // 2:
+                with meter.stage("rounds"):
+                    whole = partial(_warp, model, world.source, camera)
+                    seconds = _rounds(pair, whole, spec)
+            work.add(camera.name, figures)
+        return Seconds(seconds)
+
+    def read_extra(self, data: Json) -> Seconds:
+        """Read from the record's cost."""
+        rounds = data["cost"].get("rounds", {})
+        return Seconds({key: [float(v) for v in values] for key, values in rounds.items()})
+
+
+def _answers(scene: Scene, edit: str) -> list[list[str]]:
+    """Names and contents of an edit's first two answers."""
+    names = {one.name for one in scene.edits}
+    answers = answers_of(scene, edit) if edit in names else []
+    if len(answers) < 2:
+        raise StudyError(
+            f"audit.edit: scene {scene.name!r} has no edit {edit!r} with two answers; there are"
+            f" {', '.join(one.name for one in scene.edits if one.answers) or 'none'}"
+        )
+    return [[name, scene.edited(edit, answer).content_hash] for name, answer in answers[:2]]
+
+
+def _true_pictures(work: Work, cameras: Mapping[float, Camera]) -> dict[str, dict[str, Array]]:
+    """(H, W, 3) sRGB by state of the scene and view; "elsewhere" is another scene, where there is
+    one.
+    """
+    spec, world = work.spec, work.world
+    views = [world.source, *cameras.values()]
+    edit = spec["edit"]
+    for name, content in spec["answers"]:
+        if world.edited_hash(edit, name) != content:
+            raise changed(f"edit {edit!r} of scene {world.scene.name!r}")
+    first, second = (world.scene.edited(edit, name) for name, _ in spec["answers"])
+    states = {"before": world.scene, "right": first, "right_other": second}
+    states[SHINY] = _glossy(first, touched(world.scene, edit, spec["answers"][0][0]))
+    if spec["other"] is not None:
+        other = load_scene(work.cell.sources["other"])
+        if other.content_hash != spec["other"]:
+            raise changed(f"scene {other.name!r}")
+        states["elsewhere"] = other.with_size(spec["size"], spec["size"])
+    # Scene by scene: Mitsuba caches the last one, and loading costs more than rendering.
+    return {
+        state: {
+            camera.name: to_srgb(
+                np.clip(
+                    appearance(
+                        scene,
+                        turned(scene, yaw) if state == "elsewhere" else camera,
+                        spp=spec["spp"],
+                        seed=0,
+                    ),
+                    0,
+                    1,
+                )
+            )
+            for yaw, camera in zip((0.0, *cameras), views, strict=True)
+        }
+        for state, scene in states.items()
+    }
+
+
+def _glossy(scene: Scene, objects: Sequence[int]) -> Scene:
+    """The scene whose objects are of rough metal."""
+    items = [
+        changed_object(item, ObjectChange(object=item.name, material=GLOSS))
+        if place in objects and not item.emission
+        else item
+        for place, item in enumerate(scene.spec.objects)
+    ]
+    return Scene(scene.spec.model_copy(update={"objects": tuple(items)}), scene.path)
+
+
+def _edited(
+    world: World,
+    spec: Json,
+    pictures: Mapping[str, Mapping[str, Array]],
+    camera: Camera,
+    truth: TwoView,
+) -> Edited:
+    return Edited(
+        truth,
+        pictures["right"][world.source.name],
+        pictures["before"][camera.name],
+        pictures["right"][camera.name],
+        pictures["right_other"][camera.name],
+        edit_mask(world.scene, spec["edit"], truth.hits, spec["answers"][0][0]),
+        pictures["elsewhere"][camera.name] if "elsewhere" in pictures else None,
+        spec["seed"],
+    )
+
+
+def _named(values: Mapping[str, float], condition: str) -> dict[str, float]:
+    return {f"{key}.{condition}": value for key, value in values.items()}
+
+
+def _warp(
+    model: Gaussians, source: Camera, target: Camera, surface: Surface | None = None
+) -> WarpedView:
+    """The warp by rendered depth; ``surface`` is the source's, rendered if left out."""
+    return warp_view(model, source, target, source_surface=surface, warn_empty=False)
+
+
+def _rounds(pair: _Pair, warp: Callable[[], WarpedView], spec: Json) -> dict[str, list[float]]:
+    """Seconds that one pair costs each metric, in turn in an order drawn anew each round.
+
+    Everything that a metric needs of the four pictures is made anew: keypoints, embeddings, flow,
+    the depth of both views. Truth costs nothing.
+    """
+
+    def work(name: str) -> Callable[[int], float]:
+        def run(turn: int) -> float:
+            new = pair.again(warp)
+            return new.contestants[name](*new.floor)
+
+        return run
+
+    turns = in_turn([work(name) for name in pair.contestants], spec["rounds"], seed=spec["seed"])
+    return dict(zip(pair.contestants, turns.seconds, strict=True))
+
+
+class _Shown:
+    """A picture, and what several metrics need of it or of its pair, made once.
+
+    A target belongs to one pair and one source.
+
+    Attributes:
+        picture: (H, W, 3) sRGB in [0, 1].
+    """
+
+    def __init__(self, picture: Array, encoders: Mapping[str, Any]) -> None:
+        self.picture, self._encoders = picture, encoders
+        self._kept: dict[str, Any] = {}
+
+    def once(self, name: str, make: Callable[[], Any]) -> Any:
+        """Result of ``make``, of the first call with that name."""
+        if name not in self._kept:
+            self._kept[name] = make()
+        return self._kept[name]
+
+    def part(self, kind: str) -> Any:
+        """Keypoints ("sift"), (1, D) embedding ("clip", "dino") or (h, w, D) "tokens"."""
+        if kind == "sift":
+            return self.once(kind, lambda: metrics.sift_features(self.picture))
+        if kind == "tokens":
+            return self.once(kind, lambda: self._encoders["dino"].tokens([self.picture])[0])
+        return self.once(kind, lambda: self._encoders[kind].images([self.picture]))
+
+    def again(self) -> _Shown:
+        """Copy of the picture with nothing made yet."""
+        return _Shown(self.picture, self._encoders)
+
+
+Measure = Callable[[_Shown, _Shown], float]
+
+
+class _Pair:
+    """All metrics of a pair of views.
+
+    Args:
+        truth: exact relation of the two.
+        warp: makes the warp by rendered depth.
+        before: source and target before the edit.
+        floor: source and target of the right edit.
+        encoders: by kind.
+        texts: what the source and the edit show, in words.
+
+    Attributes:
+        contestants: metric -> what computes it of source and target after the edit.
+    """
+
+    def __init__(
+        self,
+        truth: TwoView,
+        warp: Callable[[], WarpedView],
+        before: tuple[_Shown, _Shown],
+        floor: tuple[_Shown, _Shown],
+        encoders: Mapping[str, Any],
+        texts: Sequence[str],
+    ) -> None:
+        self.truth, self.before, self.floor = truth, before, floor
+        self.encoders, self.texts = encoders, texts
+        self._warp = warp
+        self.exact = truth.xy, truth.visible & ~truth.edge
+        self.contestants = self._contestants()
+
+    def again(self, warp: Callable[[], WarpedView]) -> _Pair:
+        """Copy of the pair with nothing made yet."""
+        before, floor = (
+            (first.again(), second.again()) for first, second in (self.before, self.floor)
+        )
+        return _Pair(self.truth, warp, before, floor, self.encoders, self.texts)
+
+    def figures(self, source: _Shown, target: _Shown) -> dict[str, float]:
+        """Every metric of two pictures."""
+        return {key: measure(source, target) for key, measure in self.contestants.items()}
+
+    def _contestants(self) -> dict[str, Measure]:
+        found: dict[str, Measure] = {
+            # A pair with too few matches counts against.
+            "consistency.tsed_2px": lambda s, t: float(self._distance(s, t) < 2),
+            "consistency.tsed_distance": self._distance,
+            "consistency.flow_delta_e.dis": lambda s, t: _colors(self._dis, s, t),
+            "consistency.flow_delta_e.farneback": lambda s, t: _colors(self._farneback, s, t),
+            "consistency.rendered_delta_e": lambda s, t: _colors(self._rendered, s, t),
+            "consistency.edit_delta_e": lambda s, t: self._added("", s, t),
+            "consistency.edit_delta_e_p90": lambda s, t: self._added("_p90", s, t),
+            "consistency.delta_e": self._exactly,
+            "multiview.delta_e_above": lambda s, t: (
+                self._exactly(s, t) - self._exactly(*self.floor)
+            ),
+        }
+        if "clip" in self.encoders:
+            found |= {
+                "embedding.direction_consistency": self._direction,
+                "embedding.clip_image": lambda s, t: _similar("clip", s, t),
+                "embedding.clip_similarity": lambda _, t: float(
+                    metrics.clip_similarity(t.part("clip"), self._words[1]).mean
+                ),
+                "embedding.clip_directional": lambda _, t: float(
+                    metrics.directional_similarity(
+                        self.before[1].part("clip"), t.part("clip"), *self._words
+                    ).mean
+                ),
+            }
+        if "dino" in self.encoders:
+            found |= {
+                "embedding.dino_image": lambda s, t: _similar("dino", s, t),
+                "embedding.match_similarity": self._matched,
+                "consistency.features.rendered": lambda s, t: self._features(self._rendered, s, t),
+                "consistency.features.exact": lambda s, t: self._features(self.exact, s, t),
+            }
+        if "perceptual" in self.encoders:
+            network = self.encoders["perceptual"]
+            found["consistency.perceptual"] = lambda s, t: metrics.perceptual_consistency(
+                s.picture, t.picture, *self._rendered,
+                lambda a, b: float(network.distance([a], [b])[0]),
+            )  # fmt: skip
+        return found
+
+    @cached_property
+    def _rendered(self) -> Where:
+        view = self._warp()
+        return view.correspondence.xy.numpy(), view.mask.numpy()
+
+    @cached_property
+    def _dis(self) -> Where:
+        return self._flow("dis")
+
+    @cached_property
+    def _farneback(self) -> Where:
+        return self._flow("farneback")
+
+    def _flow(self, method: FlowMethod) -> Where:
+        flow = metrics.optical_flow(self.before[0].picture, self.before[1].picture, method)
+        return flow.xy, flow.accepted
+
+    def _distance(self, source: _Shown, target: _Shown) -> float:
+        F = fundamental(self.truth.source, self.truth.target)
+        if F is None:
+            return math.nan
+
+        def median() -> float:
+            matches = metrics.match_features(source.part("sift"), target.part("sift"))
+            return float(metrics.tsed([metrics.epipolar_distance(*matches, F)]).medians[0])
+
+        return float(target.once("median", median))
+
+    def _exactly(self, source: _Shown, target: _Shown) -> float:
+        return float(target.once("exact", lambda: _colors(self.exact, source, target)))
+
+    def _added(self, suffix: str, source: _Shown, target: _Shown) -> float:
+        figures = target.once(
+            "edit",
+            lambda: metrics.edit_agreement(
+                (self.before[0].picture, self.before[1].picture[GRID]),
+                (source.picture, target.picture[GRID]),
+                *(part[GRID] for part in self._rendered),
+            ),
+        )
+        return float(figures[f"consistency.edit_delta_e{suffix}"])
+
+    def _direction(self, source: _Shown, target: _Shown) -> float:
+        before, after = (
+            np.concatenate([one.part("clip") for one in views])
+            for views in (self.before, (source, target))
+        )
+        return metrics.direction_consistency(before, after).mean
+
+    def _matched(self, source: _Shown, target: _Shown) -> float:
+        tokens = [one.part("tokens") for one in (*self.before, source, target)]
+        return metrics.match_similarity(*(rows.reshape(-1, rows.shape[-1]) for rows in tokens)).mean
+
+    def _features(self, where: Where, source: _Shown, target: _Shown) -> float:
+        similarity = metrics.feature_consistency(
+            source.part("tokens"), target.part("tokens"), *where, source.picture.shape[:2],
+            seen=self.encoders["dino"].preprocess.seen,
+        )  # fmt: skip
+        return 1 - similarity.mean
+
+    @cached_property
+    def _words(self) -> Array:
+        return np.asarray(self.encoders["clip"].texts(list(self.texts)))
+
+
+def _colors(where: Where, source: _Shown, target: _Shown) -> float:
+    result = metrics.disagreement_at(
+        source.picture, target.picture[GRID], *(part[GRID] for part in where)
+    )
+    return mean(result.delta_e[result.counted])
+
+
+def _similar(kind: str, source: _Shown, target: _Shown) -> float:
+    return metrics.image_similarity(source.part(kind), target.part(kind)).mean
