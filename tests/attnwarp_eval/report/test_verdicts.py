@@ -2,6 +2,7 @@
 committed.
 """
 
+import dataclasses
 import json
 import lzma
 import pathlib
@@ -17,9 +18,12 @@ from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import read_results
+from attnwarp_eval.report.claims import load_claims
+from attnwarp_eval.report.judging import decided, found
 from attnwarp_eval.report.raw import read_raw, together
 from attnwarp_eval.report.results import lines
 from attnwarp_eval.report.verdicts import filled, headlines, table, verdicts
+from attnwarp_eval.statistics.contrasts import contrast
 from attnwarp_eval.study import Store
 from attnwarp_eval.study.study import parse_study
 
@@ -178,3 +182,26 @@ def test_raw_results_are_lines_of_json(folder, tmp_path):
     head, *cells = map(json.loads, text.splitlines())
     assert head["study"]["name"] == "stored-edits" and len(cells) == 2
     assert {cell["record"]["spec"]["probe"] for cell in cells} == {"calibration", "sensitivity"}
+
+
+def test_of_200_simulated_runs_of_equal_arms_few_judge_and_no_interval_disagrees(tmp_path):
+    """Five claims a run, on the odds of shares: adjusted together, one in twenty runs may tell."""
+    store = written(tmp_path / "run", SCENES, [1.0] * 8)
+    (one,) = [c for c in found(read_results(store), load_claims()) if c.judges]
+    rng, told = np.random.default_rng(4), 0
+    for _ in range(200):
+        judged = []
+        for _ in range(5):
+            k = rng.binomial(40, np.clip(rng.normal(0.5, 0.2, 12), 0.05, 0.95), (2, 12))
+            a, b = ({f"s{i}": {"v": x / 40} for i, x in enumerate(side)} for side in k)
+            of = {f"s{i}": {"v": 40} for i in range(12)}
+            value = contrast(a, b, "share", counts=(of, of))
+            measured = dataclasses.replace(one.measured, contrast=value)
+            claim = dataclasses.replace(one.claim, equal_within=None)
+            judged.append(dataclasses.replace(one, claim=claim, measured=measured, p=value.flips.p))
+        every = decided(judged)
+        for each in every:
+            _, low, high = each.contrast.shown(each.contrast.level(each.p))
+            assert each.told == (not low <= 1 <= high)
+        told += any(each.told for each in every)
+    assert told <= stats.binom.ppf(0.999, 200, 0.05)
