@@ -245,7 +245,7 @@ def test_the_study_that_extends_another_on_its_page_says_what_it_keeps(tmp_path)
     """Oracle: the comments of the page."""
     _, extending = blocks("docs/measuring/studies.md", ("yaml",))
     (tmp_path / "mine.yaml").write_text(extending)
-    mine, base = load_study(str(tmp_path / "mine.yaml")), load_study("ablation-quick")
+    mine, base = load_study(str(tmp_path / "mine.yaml")), load_study("ablation")
     assert mine.editing.options == base.editing.options | {"steps": 4}
     assert (mine.size, mine.seeds, mine.fronts) == (96, [1, 2], [])
     assert mine.variants == base.variants

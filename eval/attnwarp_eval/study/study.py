@@ -273,15 +273,10 @@ def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:
     return merged(sorted(cells, key=lambda cell: place.get(cell.scene, len(place))))
 
 
-def shipped_studies(parts: bool = False) -> dict[str, Path]:
-    """Studies that come with the package, by name.
-
-    Args:
-        parts: add what several of them extend and what is no study by itself.
-    """
+def shipped_studies() -> dict[str, Path]:
+    """Studies that come with the package, by name."""
     folder = Path(str(resources.files("attnwarp_eval.study") / "shipped"))
-    files = folder.rglob("*.yaml") if parts else folder.glob("*.yaml")
-    return {p.stem: p for p in sorted(files)}
+    return {p.stem: p for p in sorted(folder.glob("*.yaml"))}
 
 
 def load_study(name_or_path: str, **overrides: Any) -> Study:
@@ -383,7 +378,7 @@ def _read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], _Li
     name, at = data.pop("extends"), f"{path}:{read['extends',]}: extends"
     if not isinstance(name, str):
         raise StudyError(f"{at}: got {name!r}, expected the name of a study or a YAML file's path")
-    shipped = shipped_studies(parts=True)
+    shipped = shipped_studies()
     base = shipped.get(name, path.parent / Path(name).expanduser())
     if not base.is_file():
         raise StudyError(

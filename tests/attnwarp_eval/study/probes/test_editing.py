@@ -395,7 +395,7 @@ def test_a_variant_is_the_same_cell_with_or_without_another_ones_budget(folder):
     assert len({cell.id for cell in cells.values()}) == 3
 
 
-@pytest.mark.parametrize("name", ["comparison-quick", "comparison-six", "comparison", "beyond"])
+@pytest.mark.parametrize("name", ["comparison", "beyond"])
 def test_studies_that_compare_methods_tune_attention_warping_alike(name):
     """Further sources leave fewer views, so fewer stages. Oracle: stages counted by hand."""
     study = load_study(name)
