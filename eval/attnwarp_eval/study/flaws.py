@@ -112,8 +112,15 @@ class Flaw:
         return f"{self.name}={size:g}"
 
     def at(self, size: float) -> str:
-        """Title with a size, for people."""
-        return f"{self.title} {size:g} {self.unit}" if self.unit else self.title
+        """Title with a size, for people.
+
+        Example:
+            >>> FLAWS[0].at(0.3), FLAWS[3].at(45)
+            ('another answer, 30 % of the object', 'hue shift, 45 degrees')
+        """
+        if self.unit.startswith("of the"):
+            return f"{self.title}, {100 * size:g} % {self.unit}"
+        return f"{self.title}, {size:g} {self.unit}" if self.unit else self.title
 
 
 def _answer(edited: Edited, size: float) -> Array:
@@ -191,13 +198,15 @@ def _noisy(edited: Edited, size: float) -> Array:
 FLAWS = (
     Flaw("answer", "another answer", "of the object", (0.1, 0.3, 1.0), 1.0, _answer, counts=True),
     Flaw("unedited", "view left unedited", "", (1.0,), 1.0, lambda e, _: e.before, counts=True),
-    Flaw("ghost", "two answers at once", "weight", (0.1, 0.25, 0.5), 0.5, _ghost, counts=True),
+    Flaw(
+        "ghost", "two answers at once", "of the light", (0.1, 0.25, 0.5), 0.5, _ghost, counts=True
+    ),
     Flaw("hue", "hue shift", "degrees", (5.0, 15.0, 45.0), 45.0, _hue, counts=True),
     Flaw("slid", "texture slid", "px", (0.5, 1.0, 2.0, 4.0, 8.0, 16.0), 4.0, _slid, counts=True),
     Flaw("doubled", "doubled behind an edge", "", (1.0,), 1.0, _doubled),
     Flaw("bled", "paint bled outside", "px", (2.0, 4.0, 8.0), 4.0, _bled),
     Flaw("blur", "blur", "px", (1.0, 2.0, 4.0), 2.0, _blurred),
-    Flaw("noise", "noise", "of 1", (0.01, 0.03, 0.1), 0.03, _noisy),
+    Flaw("noise", "noise", "of white", (0.01, 0.03, 0.1), 0.03, _noisy),
     Flaw("elsewhere", "another scene", "", (1.0,), 1.0, lambda e, _: e.elsewhere),
 )
 """Every flaw; those that count first."""

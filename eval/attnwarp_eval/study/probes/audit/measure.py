@@ -183,7 +183,7 @@ class AuditProbe(Probe[Seconds]):
             def views(state: str, camera: Camera = camera) -> tuple[_Shown, _Shown]:
                 return shown[state][world.source.name], shown[state][camera.name]
 
-            pair = _Pair(truth, warp, views("before"), views("right"), encoders, texts)
+            pair = _Pair(truth, warp, views("before"), dict(map(views, PAIRS)), encoders, texts)
             figures: dict[str, float] = {}
             with meter.stage("checks"):
                 for name in PAIRS:
@@ -311,7 +311,7 @@ def _rounds(pair: _Pair, warp: Callable[[], WarpedView], spec: Json) -> dict[str
     def work(name: str) -> Callable[[int], float]:
         def run(turn: int) -> float:
             new = pair.again(warp)
-            return new.contestants[name](*new.floor)
+            return new.contestants[name](*next(iter(new.partners.items())))
 
         return run
 
@@ -361,7 +361,7 @@ class _Pair:
         truth: exact relation of the two.
         warp: makes the warp by rendered depth.
         before: source and target before the edit.
-        floor: source and target of the right edit.
+        partners: the true target of each true source after the edit, the right edit's first.
         encoders: by kind.
         texts: what the source and the edit show, in words.
 
@@ -374,11 +374,11 @@ class _Pair:
         truth: TwoView,
         warp: Callable[[], WarpedView],
         before: tuple[_Shown, _Shown],
-        floor: tuple[_Shown, _Shown],
+        partners: Mapping[_Shown, _Shown],
         encoders: Mapping[str, Any],
         texts: Sequence[str],
     ) -> None:
-        self.truth, self.before, self.floor = truth, before, floor
+        self.truth, self.before, self.partners = truth, before, partners
         self.encoders, self.texts = encoders, texts
         self._warp = warp
         self.exact = truth.xy, truth.visible & ~truth.edge
@@ -386,10 +386,9 @@ class _Pair:
 
     def again(self, warp: Callable[[], WarpedView]) -> _Pair:
         """Copy of the pair with nothing made yet."""
-        before, floor = (
-            (first.again(), second.again()) for first, second in (self.before, self.floor)
-        )
-        return _Pair(self.truth, warp, before, floor, self.encoders, self.texts)
+        before = self.before[0].again(), self.before[1].again()
+        partners = {source.again(): target.again() for source, target in self.partners.items()}
+        return _Pair(self.truth, warp, before, partners, self.encoders, self.texts)
 
     def figures(self, source: _Shown, target: _Shown) -> dict[str, float]:
         """Every metric of two pictures."""
@@ -406,8 +405,9 @@ class _Pair:
             "consistency.edit_delta_e": lambda s, t: self._added("", s, t),
             "consistency.edit_delta_e_p90": lambda s, t: self._added("_p90", s, t),
             "consistency.delta_e": self._exactly,
+            # The floor is of the true views of what the source shows.
             "multiview.delta_e_above": lambda s, t: (
-                self._exactly(s, t) - self._exactly(*self.floor)
+                self._exactly(s, t) - self._exactly(s, self.partners[s])
             ),
         }
         if "clip" in self.encoders:

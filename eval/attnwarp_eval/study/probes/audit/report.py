@@ -32,6 +32,9 @@ SEES, BLIND = 0.9, 0.6
 ALARM = 0.05
 """Share of right pairs without highlights that lie above the threshold for false alarms."""
 
+MANY_ALARMS = 0.2
+"""Share of glossy pairs that a metric may take for flawed before the recommendation warns of it."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -135,7 +138,7 @@ class Pairs:
         return self.area(row, [flaw.key(flaw.reference) for flaw in COUNTED], yaws)
 
     def lowest(self, row: Row) -> float:
-        """Lowest AUROC among the flaws that matter most."""
+        """Lowest AUROC among the flaws that matter most; NaN where one is undefined."""
         return float(np.min([self.shown(row, flaw).value for flaw in COUNTED]))
 
     def alarms(self, row: Row) -> float:
@@ -176,11 +179,14 @@ class Pairs:
                 taken.setdefault(scene, []).append(float(np.median(rounds)))
         return interval(taken) if taken else None
 
+    def known(self) -> list[Row]:
+        """Metrics without truth that have a value."""
+        own = [row for row in self.rows if not row.truth]
+        return [row for row in own if math.isfinite(self.counted(row, self.near).value)]
+
     def best(self) -> Row | None:
         """Metric without truth with the largest mean AUROC of the flaws that matter most."""
-        own = [row for row in self.rows if not row.truth]
-        known = [row for row in own if math.isfinite(self.counted(row, self.near).value)]
-        return max(known, key=lambda row: self.counted(row, self.near).value, default=None)
+        return max(self.known(), key=lambda row: self.counted(row, self.near).value, default=None)
 
 
 @register_report
@@ -239,6 +245,10 @@ def area_text(value: Auroc, intervals: bool = True) -> str:
     return f"{value.value:.2f} [{value.low:.2f}, {value.high:.2f}]"
 
 
+def _two(value: float) -> str:
+    return f"{value:.2f}" if math.isfinite(value) else "–"
+
+
 def percent(share: float) -> str:
     """A share in percent; a dash where it is undefined.
 
@@ -272,7 +282,7 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
                 row.title,
                 row.needs,
                 area_text(counted),
-                f"{pairs.lowest(row):.2f}",
+                _two(pairs.lowest(row)),
                 area_text(pairs.shown(row, elsewhere), intervals=False),
                 percent(pairs.alarms(row)),
                 percent(float(np.mean([pairs.undefined(row, yaw) for yaw in pairs.near]))),
@@ -335,6 +345,20 @@ def _advice(pairs: Pairs) -> list[str]:
         f"**Without truth, report {best.title!r}** (needs {best.needs}): AUROC {area_text(value)}"
         f" over the five flaws; its mean over them reaches {SEES:g} {where}. {goal}"
     ]
+    alarms = pairs.alarms(best)
+    if alarms > MANY_ALARMS:
+        careful = [row for row in pairs.known() if pairs.alarms(row) <= MANY_ALARMS]
+        other = max(careful, key=lambda row: pairs.counted(row, pairs.near).value, default=None)
+        text.append(
+            f"**It is for matt edits**: it takes highlights of a truly glossy object for a flaw in"
+            f" {percent(alarms)} of pairs."
+            + (
+                f" Of the metrics that do so in at most {percent(MANY_ALARMS)},"
+                f" {other.title!r} sees most: AUROC {area_text(pairs.counted(other, pairs.near))}."
+                if other
+                else f" None without truth does so in at most {percent(MANY_ALARMS)}."
+            )
+        )
     unable = [
         row.title
         for row in pairs.rows
@@ -475,12 +499,7 @@ def _everything(pairs: Pairs) -> Section:
     paired = [
         [
             row.title,
-            *(
-                f"{pairs.shown(row, flaw).paired:.2f}"
-                if math.isfinite(pairs.shown(row, flaw).paired)
-                else "–"
-                for flaw in FLAWS
-            ),
+            *(_two(pairs.shown(row, flaw).paired) for flaw in FLAWS),
         ]
         for row in pairs.rows
     ]
@@ -507,7 +526,7 @@ def _everything(pairs: Pairs) -> Section:
         Table(
             ["metric", *(row.title for row in pairs.rows)],
             [
-                [row.title, *(f"{v:.2f}" if math.isfinite(v) else "–" for v in line)]
+                [row.title, *map(_two, line)]
                 for row, line in zip(pairs.rows, correlations, strict=True)
             ],
             "Rank correlation of metrics over the flaws of a pair, mean over pairs up to"
