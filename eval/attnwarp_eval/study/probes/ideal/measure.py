@@ -167,10 +167,9 @@ class IdealProbe(MethodProbe[IdealResult]):
                 names[k]: picture.astype(np.float32) / np.float32(255)
                 for k, picture in result.edited.items()
             }
-            pictures = {
-                "edit": edited,
-                "render": _renders(world, names, before, result.gaussians),
-            }
+            pictures = {"edit": edited}
+            if spec["settings"]["iterations"]:  # else the scene is as it was
+                pictures["render"] = _renders(world, names, before, result.gaussians)
             answers = part_answers(edited[names[0]], thing.truth(names[0]), thing.parts)
             for name in names[1:]:
                 work.add(f"parts/{name}", self._figures(world, thing, name, pictures, answers))
