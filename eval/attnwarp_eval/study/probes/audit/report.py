@@ -293,7 +293,7 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
         "metric", "needs", "AUROC, five flaws", "lowest of five", "another scene",
         "false alarms on highlights", "undefined", "ms a pair",
     ]  # fmt: skip
-    what = ", ".join(flaw.at(flaw.reference) for flaw in COUNTED)
+    what = "; ".join(flaw.at(flaw.reference) for flaw in COUNTED)
     text = [
         *_advice(pairs),
         (
@@ -359,10 +359,12 @@ def _advice(pairs: Pairs) -> list[str]:
                 else f" None without truth does so in at most {percent(MANY_ALARMS)}."
             )
         )
+    # One scene alone has no view of another one.
+    measured = any(math.isfinite(pairs.shown(row, FLAWS[-1]).value) for row in pairs.rows)
     unable = [
         row.title
         for row in pairs.rows
-        if pairs.shown(row, FLAWS[-1]).value < SEES and not row.truth
+        if measured and not pairs.shown(row, FLAWS[-1]).value >= SEES and not row.truth
     ]
     if unable:
         text.append(
