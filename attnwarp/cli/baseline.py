@@ -17,6 +17,7 @@ from attnwarp.cli.edit_image import (
     MaskOption,
     SegmenterOption,
     ThreadsOption,
+    TuneOutsideOption,
     TurntableOption,
     WhereOption,
     check_segmenter,
@@ -83,6 +84,7 @@ def baseline(
     at: AtOption = None,
     words: WhereOption = None,
     segmenter: SegmenterOption = None,
+    tune_outside: TuneOutsideOption = False,
     kind: SplatKindOption = None,
     antialiased: AntialiasedOption = None,
     screen_filter: ScreenFilterOption = None,
@@ -125,7 +127,8 @@ def baseline(
         warn_of_misfit(ply, splats, dataset)
         result, page = run_baseline(
             method, dataset, splats, editor, instruction, settings, out,
-            budget=budget, marks=marks, source=source, max_size=max_size, device=device,
+            budget=budget, marks=marks, tune_outside=tune_outside,
+            source=source, max_size=max_size, device=device,
             dtype=dtype, threads=threads,
             control=control, turntable=turntable, report=report,
         )  # fmt: skip

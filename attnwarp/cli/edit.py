@@ -22,6 +22,7 @@ from attnwarp.cli.edit_image import (
     MaskOption,
     SegmenterOption,
     ThreadsOption,
+    TuneOutsideOption,
     TurntableOption,
     WhereOption,
     check_segmenter,
@@ -94,6 +95,7 @@ def edit(
     at: AtOption = None,
     words: WhereOption = None,
     segmenter: SegmenterOption = None,
+    tune_outside: TuneOutsideOption = False,
     stages: Annotated[int | None, typer.Option(min=1, help="Of editing and tuning (3).")] = None,
     views_per_stage: Annotated[
         int | None, typer.Option(min=1, help="New views a stage edits.")
@@ -203,7 +205,9 @@ def edit(
                 max_splats or FIT_SPLATS,
             ),
             source=source,
-            source_picture=source_picture, marks=marks, max_size=max_size, store=store.value,
+            source_picture=source_picture, marks=marks,
+            tune_outside=tune_outside, max_size=max_size,
+            store=store.value,
             device=device, dtype=dtype, threads=threads, control=control, turntable=turntable,
             report=report,
         )  # fmt: skip

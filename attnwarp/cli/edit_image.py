@@ -62,6 +62,10 @@ AtOption = Annotated[
     str | None,
     typer.Option(metavar="X,Y", help="Point on it, px of the (source) picture."),
 ]
+TuneOutsideOption = Annotated[
+    bool,
+    typer.Option("--tune-outside", help="Tune splats that no mask marks, too; else they stay."),
+]
 SegmenterOption = Annotated[
     str | None,
     typer.Option(

@@ -80,6 +80,8 @@ class Options(TypedDict, total=False):
         budget: limits of the run, :class:`Budget`; None for a whole run.
         segments: what is edited: (H, W) masks of the views, bool or soft in [0, 1], or a function
             of a view's number and picture. The original stays outside.
+        tune_outside: tune all splats alike (False). Else each takes the share of a step that it
+            belongs to what the segments mark, so that the rest stays.
         checkpoint_seconds: between two checkpoints of tuning (30); more where one takes long.
         backend: of :func:`attnwarp.render.render` ("auto").
         report: receives how the run stands, :class:`attnwarp.reporting.Reporter`.
@@ -93,6 +95,7 @@ class Options(TypedDict, total=False):
     folder: Path | str | None
     budget: Budget | None
     segments: Segments | None
+    tune_outside: bool
     checkpoint_seconds: float
     backend: str
     report: Reporter
@@ -322,9 +325,12 @@ class _Run:
         self.names = file_stems(work.scene.cameras)
         self.seconds = self.folder.seconds
         self.rounds = tuple(Plan(method).rounds)
+        bound = work.scene.segments is not None and work.settings.composite == "original"
+        self.bound = bound and not options.get("tune_outside", False)
         self.tuning = Tuning(
             work.frozen, work.scene.cameras, work.settings,
             sum(part.iterations for part in self.rounds), work.backend,
+            work.membership() if self.bound else None,
         )  # fmt: skip
         tuned = sorted({view for part in self.rounds for view in part.training})
         self.tuning.check_sizes(
@@ -346,6 +352,7 @@ class _Run:
                 "instruction": work.instruction,
                 "settings": work.settings.to_dict(),
                 "budget": self.budget.to_dict(),
+                **({"tuned": "what is marked"} if self.bound else {}),
                 **method.about,
                 "rounds": [
                     {

@@ -84,6 +84,7 @@ def edit_dataset(
     source: str | None,
     source_picture: Path | None,
     marks: Marks,
+    tune_outside: bool = False,
     max_size: int | None,
     store: Any,
     device: str,
@@ -106,6 +107,7 @@ def edit_dataset(
         source: name or number of the source view; the first if None.
         source_picture: file of the source view edited elsewhere.
         marks: what is edited.
+        tune_outside: tune splats that are not marked, too.
         max_size: larger pictures are averaged down to it.
         store: see :func:`attnwarp.methods.attention_warping`.
         device: of the editor and the splats, "auto", "cpu" or "cuda".
@@ -161,6 +163,7 @@ def edit_dataset(
         source=index,
         source_picture=by_hand,
         segments=segments(splats),
+        tune_outside=tune_outside,
         folder=out,
         store=store,
         report=report,
@@ -192,6 +195,7 @@ def run_baseline(
     *,
     budget: Budget,
     marks: Marks,
+    tune_outside: bool = False,
     source: str | None,
     max_size: int | None,
     device: str,
@@ -213,6 +217,7 @@ def run_baseline(
         out: folder of all results.
         budget: limits of the run.
         marks: what is edited.
+        tune_outside: tune splats that are not marked, too.
         source: name or number of the view that is marked; the first if None.
         max_size: larger pictures are averaged down to it.
         device: of the editor and the splats, "auto", "cpu" or "cuda".
@@ -250,6 +255,7 @@ def run_baseline(
         settings,
         folder=out,
         segments=segments(splats),
+        tune_outside=tune_outside,
         budget=budget,
         report=report,
     )

@@ -9,6 +9,8 @@ from functools import cached_property
 from typing import Any, Protocol, cast
 from weakref import WeakKeyDictionary
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -166,6 +168,8 @@ class Tuning:
         settings: losses, rates, background, seed.
         iterations: in all, over which the centres' learning rate falls.
         backend: of the renderer.
+        membership: (N,) in [0, 1], factor of each splat's steps; None for 1. A splat of 0 keeps its
+            bytes.
 
     Attributes:
         iteration: iterations done, over all rounds.
@@ -184,6 +188,7 @@ class Tuning:
         settings: MethodSettings,
         iterations: int,
         backend: str = "auto",
+        membership: npt.NDArray[np.floating[Any]] | None = None,
     ) -> None:
         self.settings, self.iterations, self.backend = settings, iterations, backend
         rates = FitSettings(kind=start.kind)
@@ -201,6 +206,11 @@ class Tuning:
             lr_quats=g * rates.lr_quats,
         )
         self.model = Model(start, self.fit, extent_of(cameras, start.world_means()))
+        self.membership = (
+            None
+            if membership is None
+            else torch.from_numpy(membership).to(self.model.tensors["means"])
+        )
         self.random = torch.Generator().manual_seed(settings.seed)
         self.queue: list[int] = []
         self.iteration = 0
@@ -318,9 +328,22 @@ class Tuning:
             )
         loss.backward()
         self.iteration += 1
-        self.model.step(self.iteration / max(1, self.iterations))
+        self._step(self.iteration / max(1, self.iterations))
         self.loss = value
         self.visits[view.number] = self.visits.get(view.number, 0) + 1
+
+    def _step(self, progress: float) -> None:
+        """One step of the model, of which each splat takes its membership's share."""
+        if self.membership is None:
+            self.model.step(progress)
+            return
+        tensors = self.model.tensors
+        before = {name: tensor.detach().clone() for name, tensor in tensors.items()}
+        self.model.step(progress)
+        with torch.no_grad():
+            for name, tensor in tensors.items():
+                share = self.membership.reshape(-1, *[1] * (tensor.dim() - 1))
+                tensor.copy_(torch.lerp(before[name], tensor, share))
 
     def loss_of(self, picture: Render, view: TrainingView) -> Tensor:
         """The weighted sum of the losses.

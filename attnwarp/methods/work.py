@@ -19,7 +19,7 @@ from attnwarp.methods.pictures import Image, Segment, Size, composite, edit_size
 from attnwarp.methods.scene import Scene, near_of, render_picture
 from attnwarp.methods.settings import MethodSettings
 from attnwarp.reporting import Reporter
-from attnwarp.warp import WarpSettings, render_surface
+from attnwarp.warp import WarpSettings, lift_masks, render_surface
 from attnwarp.workdir import Workdir
 
 Guide = npt.NDArray[Any]
@@ -99,6 +99,18 @@ class Work:
             return picture
         s, segment = self.settings, self.scene.segments[view]
         return composite(picture, self.picture(view), segment, s.composite, s.composite_blur)
+
+    def membership(self) -> npt.NDArray[np.float64]:
+        """(N,) in [0, 1]: how far each splat before the edit belongs to the segments.
+
+        0 up to a half, where its pixels are not marked, and 1 from three quarters on.
+        """
+        segments = self.scene.segments
+        assert segments is not None
+        lifted = lift_masks(
+            self.frozen, self.scene.cameras, segments, near=self.near, backend=self.backend
+        )
+        return np.asarray(np.clip(4 * lifted.membership - 2, 0, 1))
 
     def regions(self, views: Sequence[int]) -> list[Segment] | None:
         """Masks of views, for the noise of a bundled editor; None where everything is edited."""

@@ -331,6 +331,21 @@ def test_segments_leave_the_original_outside(run, scene):
         assert np.array_equal(half.edited[view][:, 16:], to_bytes(scene[2][view])[:, 16:])
 
 
+def test_splats_that_no_segment_marks_keep_their_bytes(run, scene, tmp_path):
+    left = np.zeros((32, 32), dtype=bool)
+    left[:, :16] = True
+    before = scene[0]
+    settings = ByViewSettings(steps=1, iterations=6, geometry_rate=1.0)
+    x = before.world_means()[:, 0]  # the cameras look at -0.2 to 0.2
+    for folder, outside in (("kept", {}), ("tuned", {"tune_outside": True})):
+        result = run("by_view", settings, segments=[left] * 3, folder=tmp_path / folder, **outside)
+        moved = (result.gaussians.sh != before.sh).flatten(1).any(dim=1).numpy()
+        assert moved[x < -0.6].all()
+        assert moved[x > 0.6].all() if outside else not moved[x > 0.6].any()
+        marked = json.loads((tmp_path / folder / "manifest.json").read_text())
+        assert ("tuned" in marked) == (not outside)
+
+
 def test_splats_are_tuned_on_pictures_that_a_small_edit_changes_in_the_segments_alone(
     run, scene, monkeypatch
 ):

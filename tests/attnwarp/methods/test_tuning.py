@@ -70,6 +70,30 @@ def test_tuning_recolours_the_scene_to_its_pictures():
     assert sum(tuning.visits.values()) == 250
 
 
+def test_a_splat_takes_the_share_of_a_step_that_it_belongs():
+    start, views = splats(), cameras()
+    target = [
+        TrainingView(k, c, np.ones((c.height, c.width, 3), np.float32)) for k, c in enumerate(views)
+    ]
+    share = np.tile([0.0, 0.25, 1.0], len(start))[: len(start)]
+
+    def moved(steps, membership=None):
+        settings = replace(SETTINGS, perceptual=0.0)
+        tuning = Tuning(start, views, settings, steps, membership=membership)
+        origin = {name: tensor.detach().clone() for name, tensor in tuning.model.tensors.items()}
+        tuning.advance(0, steps, target, lambda number: number % len(target))
+        return {n: t.detach() - origin[n] for n, t in tuning.model.tensors.items()}
+
+    whole, parts = moved(1), moved(1, share)
+    for name, step in parts.items():
+        expected = whole[name] * torch.from_numpy(share).float().reshape(
+            -1, *[1] * (step.dim() - 1)
+        )
+        assert torch.allclose(step, expected, atol=1e-6), name
+    assert all(not step[share == 0].any() for step in moved(20, share).values())
+    assert parts["dc"][share == 1].abs().max() > 1e-4
+
+
 def test_without_a_geometry_rate_only_colours_move():
     start, views = splats(), cameras()
     settings = replace(SETTINGS, geometry_rate=0.0)
