@@ -43,6 +43,9 @@ from attnwarp_eval.user_images import measure
 PROTOCOL = 1
 """Raised whenever the same inputs would give other figures."""
 
+COUNTED = ("network_rows", "edits", "iterations", "splats", "feature_bytes")
+"""Counters of a method that a record keeps."""
+
 AUTHORS = {"clip": "clip-whole", "dinov2": "dinov2-518"}
 """Encoders that see pictures as the paper's authors show them, by the published one."""
 
@@ -176,21 +179,25 @@ class Job:
     def edit(self) -> Made:
         """Edit a capture by a method, and measure what came out."""
         capture, folder = self.capture, self.folder()
-        row = self.loaded.manifest.methods[self.cell.variant]
         _reset_gpu(self.device)
-        result, splats = self.run_method(editor_of(self.loaded.editor(row.editor), self.device))
+        result, splats = self.run_method(self.editor())
         originals = self.run / "originals" / self.cell.scene
         images = write_originals(capture.views, originals)
         write_pictures(capture.cameras, splats, result, images, folder)
         counts = {
             "views": len(capture.cameras), "edited": len(result.edited),
-            **{k: result.counters[k] for k in ("network_rows", "iterations", "splats")},
+            **{k: result.counters[k] for k in COUNTED if k in result.counters},
         }  # fmt: skip
         files = self._files(folder / "renders", folder / "edited", folder / "run" / "edited.ply")
         return Made(
             self.figures(result, originals), self.figures(result, originals, authors=True),
             counts, result.seconds, _gpu(self.device), files,
         )  # fmt: skip
+
+    def editor(self) -> Any:
+        """Editor of the cell's row; the last one that a process loaded is kept."""
+        row = self.loaded.manifest.methods[self.cell.variant]
+        return editor_of(self.loaded.editor(row.editor), self.device)
 
     def run_method(self, editor: Any) -> tuple[Result, Gaussians]:
         """The result of the cell's method, and the splats before it."""

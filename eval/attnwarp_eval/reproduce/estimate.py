@@ -10,24 +10,21 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import torch
 
 from attnwarp.methods import Budget
 from attnwarp.reporting import Reporter
 from attnwarp_eval.cost import peak_memory_mb, reset_peak_memory
 from attnwarp_eval.reproduce.captures import ready
-from attnwarp_eval.reproduce.cells import Job, Planned, editor_of
+from attnwarp_eval.reproduce.cells import Job, Made, Planned
 from attnwarp_eval.study.cell import Cell
 
 STEPS = (1, 3)
 """Steps of denoising of the two pilots of a method: their difference is what a step takes."""
 
-EDITS, ITERATIONS = 4, 8
-"""Edits of a pilot, as far as its budget goes, and iterations of its tuning."""
+EDITS, BRANCHES, ITERATIONS = 8, 3, 8
+"""Edits of a pilot, as far as a budget for so many branches goes, and iterations of its tuning."""
 
-EDITING = ("source", "warp", "edit")
+EDITING = ("source", "warp", "edit", "write")
 """Parts of a method's seconds that grow with its edits."""
 
 
@@ -36,12 +33,12 @@ class Unit:
     """Measured costs of a method on one capture.
 
     Attributes:
-        whole: seconds of a cell that edits nothing: renders, files, figures.
+        whole: seconds of a cell beside edits and tuning: renders, files, figures.
         edit: seconds of an edit with all its steps.
         iteration: seconds of one of tuning.
         edits, iterations, rounds: of a whole run on this capture.
         views: of the capture.
-        files, state, picture: bytes of a cell that edits nothing, of a round's end, of an edit.
+        files, state, picture: bytes of a cell's other files, of a round's end, of an edit.
         memory: GiB of the process, with the features of all steps.
         gpu: GiB of a GPU; NaN without one.
     """
@@ -91,7 +88,7 @@ def estimate(
             report.log(f"measuring a few edits of {name}")
             folder = Path(place) / str(len(units))
             if warm:  # kernels, networks and caches that a first call waits for
-                _pilot(planned, cell, folder / "warm", devices[0], steps=1)
+                _pilot(planned, cell, folder / "warm", devices[0], STEPS[0])
                 warm = False
             units[name] = _measured(planned, cell, folder, devices[0])
         fits = [
@@ -121,66 +118,62 @@ def estimate(
 
 
 def _measured(planned: Planned, cell: Cell, folder: Path, device: str) -> Unit:
-    """Costs of a cell's method from a run without edits and two short ones."""
-    began = time.perf_counter()
-    made, _ = _pilot(planned, cell, folder / "none", device, steps=STEPS[0], rows=0)
-    whole = time.perf_counter() - began
-    rounds = json.loads((made / "run" / "manifest.json").read_text())["rounds"]
+    """Costs of a cell's method from its plan and two short cells."""
+    plan = _job(planned, cell, folder / "plan", device, 0)
+    plan.run_method(plan.editor())
+    rounds = json.loads((plan.folder() / "run" / "manifest.json").read_text())["rounds"]
     gc.collect()
     reset_peak_memory()
-    if device != "cpu":
-        torch.cuda.reset_peak_memory_stats(device)
-    (_, short), (last, long) = (
-        _pilot(planned, cell, folder / str(steps), device, steps=steps) for steps in STEPS
+    (short, _, whole), (long, last, _) = (
+        _pilot(planned, cell, folder / str(steps), device, steps) for steps in STEPS
     )
-    memory = peak_memory_mb() / 1024
-    settings = cell.spec["settings"]
-
-    def edit_seconds(result: Any) -> float:
-        spent = sum(result.seconds.get(part, 0.0) for part in EDITING)
-        return float(spent / max(1, result.counters["edits"]))
-
-    one, three = map(edit_seconds, (short, long))
+    one, three = (_spent(made, EDITING) / made.counts["edits"] for made in (short, long))
     step = max(0.0, three - one) / (STEPS[1] - STEPS[0])
-    tuned = [result.seconds.get("tune", 0.0) for result in (short, long)]
-    iterations = sum(r.counters["iterations"] for r in (short, long))
-    state = _bytes(last, (".pt", ".ply"))
-    files = _bytes(made)
-    features = long.counters.get("feature_bytes", 0) / STEPS[1] * settings["steps"] / 2**30
+    tuned = sum(_spent(made, ("tune",)) for made in (short, long))
+    steps, edits = cell.spec["settings"]["steps"], long.counts["edits"]
+    state, pictures = _bytes(last, (".pt", ".ply")), _bytes(last / "run" / "rounds", (".png",))
+    features = long.counts.get("feature_bytes", 0) / STEPS[1] * steps / 2**30
     return Unit(
         whole,
-        one + step * (settings["steps"] - STEPS[0]),
-        sum(tuned) / max(1, iterations),
+        one + step * (steps - STEPS[0]),
+        tuned / max(1, sum(made.counts["iterations"] for made in (short, long))),
         sum(len(part["views"]) for part in rounds),
         sum(part["iterations"] for part in rounds),
         len(rounds),
         planned.checked.views[cell.scene],
-        files,
+        _bytes(last) - state - 3 * pictures,
         state,
-        max(0.0, _bytes(last) - state - files) / max(1, long.counters["edits"]),
-        memory + features,
-        math.nan if device == "cpu" else torch.cuda.max_memory_allocated(device) / 2**30,
+        3 * pictures / edits,
+        peak_memory_mb() / 1024 + features,
+        math.nan if device == "cpu" else max(short.gpu, long.gpu),
     )
 
 
+def _job(planned: Planned, cell: Cell, run: Path, device: str, rows: int) -> Job:
+    budget = Budget(network_rows=rows)
+    return Job(planned.loaded, run, device, cell, budget=budget, first_splats=True)
+
+
 def _pilot(
-    planned: Planned, cell: Cell, run: Path, device: str, *, steps: int, rows: int | None = None
-) -> tuple[Path, Any]:
-    """Folder and result of a short run of a method; of a whole cell where ``rows`` is 0."""
-    settings = {**cell.spec["settings"], "steps": steps, "iterations": 0}
-    if rows is None and cell.spec["settings"]["iterations"]:
-        settings["iterations"] = ITERATIONS
+    planned: Planned, cell: Cell, run: Path, device: str, steps: int
+) -> tuple[Made, Path, float]:
+    """Result and folder of a short cell, and its seconds but for edits and tuning."""
+    settings = {**cell.spec["settings"], "steps": steps}
+    settings["iterations"] = min(ITERATIONS, settings["iterations"])
     pilot = replace(cell, spec={**cell.spec, "settings": settings})
-    loaded = planned.loaded
-    row = loaded.manifest.methods[cell.variant]
-    editor = editor_of(loaded.editor(row.editor), device)
-    branches = 3  # at most; a budget that is too large by one edit is no harm
-    limit = EDITS * branches * steps if rows is None else rows
-    job = Job(loaded, run, device, pilot, budget=Budget(network_rows=limit), first_splats=True)
-    if rows is None:
-        return job.folder(), job.run_method(editor)[0]
-    job.edit()
-    return job.folder(), None
+    rows = EDITS * BRANCHES * steps
+    while True:  # a method whose first batch is larger than the budget edits nothing
+        job = _job(planned, pilot, run / str(rows), device, rows)
+        began = time.perf_counter()
+        made = job.edit()
+        if made.counts["edits"]:
+            seconds = time.perf_counter() - began - _spent(made, (*EDITING, "tune"))
+            return made, job.folder(), seconds
+        rows *= 2
+
+
+def _spent(made: Made, parts: Sequence[str]) -> float:
+    return sum(made.seconds.get(part, 0.0) for part in parts)
 
 
 def _fit_seconds(planned: Planned, cell: Cell, device: str) -> float:
