@@ -132,7 +132,7 @@ def sampled(image: npt.NDArray[np.float32], size: tuple[int, int]) -> npt.NDArra
 
     Example:
         >>> half = sampled(np.eye(4, dtype=np.float32)[..., None].repeat(3, axis=2), (2, 2))
-        >>> half[..., 0].round(3).tolist()  # (-3, 19, 19, -3) / 32 of four
+        >>> half[..., 0].astype(float).round(3).tolist()  # (-3, 19, 19, -3) / 32 of four
         [[0.611, 0.0], [0.0, 0.611]]
     """
     import torch
