@@ -90,8 +90,23 @@ class Gallery:
 
 
 @dataclass
+class Grid:
+    """Pictures side by side: columns are views, rows what is compared, all named; None for none.
+
+    Example:
+        >>> grid = Grid("An edit", ["yaw 30"], [("before", [Picture("a.png", "before, yaw 30")])])
+        >>> [label for label, _ in grid.rows]
+        ['before']
+    """
+
+    caption: str
+    columns: list[str]
+    rows: list[tuple[str, list[Picture | None]]]
+
+
+@dataclass
 class Section:
-    """A heading with text, tables, figures and galleries, in this order.
+    """A heading with text, grids, tables, figures and galleries, in this order.
 
     A ``folded`` section is closed until a reader opens it.
 
@@ -107,6 +122,7 @@ class Section:
     figures: list[Picture] = field(default_factory=list)
     gallery: Gallery | None = None
     folded: bool = False
+    grids: list[Grid] = field(default_factory=list)
 
 
 @dataclass

@@ -22,6 +22,26 @@
     area.addEventListener("dragstart", (event) => event.preventDefault());
   }
 
+  // Pictures enlarge on a click or on Enter; sliders follow the pointer instead. Figures are drawn in the page.
+  const enlarged = document.querySelector("#enlarged");
+  const enlarge = (picture) => {
+    const copy = enlarged.querySelector("img");
+    const drawn = picture.tagName === "svg";
+    copy.src = drawn
+      ? `data:image/svg+xml,${encodeURIComponent(new XMLSerializer().serializeToString(picture))}`
+      : picture.src;
+    copy.alt = drawn ? picture.closest("figure").querySelector("figcaption").textContent : picture.alt;
+    enlarged.querySelector("figcaption").textContent = copy.alt;
+    enlarged.showModal();
+  };
+  for (const picture of all(".grid img, .gallery figure > img, .findings figure > img, .plots > img, .plots > svg")) {
+    if (picture.closest(".slider")) continue;
+    picture.tabIndex = 0;
+    picture.addEventListener("click", () => enlarge(picture));
+    picture.addEventListener("keydown", (event) => event.key === "Enter" && enlarge(picture));
+  }
+  enlarged.addEventListener("click", () => enlarged.close());
+
   // Tables: a click on a column's head sorts by it, numbers by value, undefined ones last.
   const value = (row, column) => {
     const text = row.cells[column].textContent.trim();

@@ -78,8 +78,10 @@ LARGEST = 5_400_000
 def _pictures(report: Report) -> set[str]:
     """The files of all pictures of a report."""
     entries = [finding.picture for finding in report.findings if finding.picture is not None]
-    for section in report.sections:
+    for section in [*([report.answer] if report.answer else []), *report.sections]:
         entries += [entry for _, row in (section.gallery or Gallery([])).rows for entry in row]
+        for grid in section.grids:
+            entries += [entry for _, row in grid.rows for entry in row if entry is not None]
     return {
         picture.path
         for entry in entries

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from statistics import fmean
 
 from attnwarp_eval.document.model import Section, Table
@@ -12,7 +12,7 @@ from attnwarp_eval.document.numbers import FEWEST_SCENES, number
 from attnwarp_eval.metrics.registry import Metric
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study.probe import probe
-from attnwarp_eval.study.probe_report import report_of
+from attnwarp_eval.study.probe_report import report_of, side_by_side
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import FIGURE, Answer, AnswerColumn
 from attnwarp_eval.study.turns import timed_in_turn
@@ -30,23 +30,36 @@ _UNITS = {
 """Unit of a metric -> the word behind its figure, where the figure is not changed."""
 
 
-def answer(results: Results, timings: bool = True) -> Section | None:
+def answer(results: Results, timings: bool = True, pictures: bool = True) -> Section | None:
     """The section that a report begins with; None where the study states no question.
 
     Args:
         results: of the run.
         timings: whether seconds are shown.
+        pictures: whether pictures are shown.
     """
     asked = results.study.answer
     if asked is None:
         return None
     section = Section(TITLE, [f"**{asked.question}**"])
-    section.text += [_filled(results, asked, sentence) for sentence in asked.sentences]
+    filled = (_filled(results, asked, sentence) for sentence in asked.sentences)
+    section.text += [sentence for sentence in filled if sentence]
     table, leaders = _table(results, asked, timings)
-    section.text.append(f"{_advice(results, asked, leaders)} {_how_sure(results)}")
+    told = [_advice(results, asked, leaders), _how_sure(results)]
+    if timings:
+        told[1:1] = _costs(results, asked, leaders)
+    section.text.append(" ".join(told))
     meanings = (f"- `{name}`: {words}" for name, words in asked.variants.items())
     section.text.append("\n".join(meanings))
     section.tables.append(table)
+    if pictures:
+        grids = (
+            side_by_side(
+                results, one.probe, one.variants, one.content, one.scene, one.caption, one.first
+            )
+            for one in asked.pictures
+        )
+        section.grids = [grid for grid in grids if grid is not None]
     return section
 
 
@@ -86,10 +99,17 @@ def _figure(results: Results, column: AnswerColumn, variant: str) -> tuple[Inter
 
 
 def _filled(results: Results, asked: Answer, sentence: str) -> str:
-    """A sentence with the run's figures in the place of ``{column|variant}``."""
+    """A sentence with the run's figures in the place of ``{column|variant}``; empty where the run
+    measured none of one.
+    """
+
+    columns = {**asked.figures, **asked.columns}
+    for title, variant in FIGURE.findall(sentence):
+        if not results.records(columns[title].probe, variant):
+            return ""
 
     def figure(match: re.Match[str]) -> str:
-        column = asked.columns[match[1]]
+        column = columns[match[1]]
         value, key = _figure(results, column, match[2])
         return in_words(value.mean, probe(column.probe).metric(key), key)
 
@@ -167,6 +187,29 @@ def _advice(results: Results, asked: Answer, leaders: list[str]) -> str:
     figure = in_words(value.mean, probe(column.probe).metric(key), key)
     several = " or ".join(f"`{name}`" for name in leaders)
     return f"Use {several} because of these variants it has the best {asked.decides}: {figure}."
+
+
+def _costs(results: Results, asked: Answer, leaders: list[str]) -> Iterator[str]:
+    """Sentences on seconds: those of the variant to use, and those behind the pictures."""
+    own = report_of(asked.columns[asked.decides].probe)
+    taken = {
+        name: _seconds(results, own.name, own.stage, own.cost, name) for name in asked.variants
+    }
+    cheapest = min(taken, key=lambda name: taken[name])
+    if leaders and cheapest != leaders[0] and taken[cheapest] > 0:
+        ratio = taken[leaders[0]] / taken[cheapest]
+        yield (
+            f"It takes {number(1000 * taken[leaders[0]], 2)} ms {own.cost_of}, {number(ratio, 2)}"
+            f" times as long as `{cheapest}`."
+        )
+    for shown in asked.pictures:
+        other = report_of(shown.probe)
+        seconds = {
+            name: results.seconds(shown.probe, name, other.cost).values() for name in shown.variants
+        }
+        if shown.probe != own.name and all(seconds.values()):
+            each = ", ".join(f"`{n}` {number(fmean(s), 2)} s" for n, s in seconds.items())
+            yield f"Time {other.cost_of}: {each}."
 
 
 def _how_sure(results: Results) -> str:

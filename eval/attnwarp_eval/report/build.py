@@ -97,7 +97,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
     if not timings:
         for section in sections:
             section.tables = [table.without_timings() for table in section.tables]
-    answered = answer(results, timings)
+    answered = answer(results, timings, pictures)
     if answered is not None:
         for section in sections:
             section.folded = True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from attnwarp_eval.document.model import Gallery, Picture, Section
 from attnwarp_eval.study.pictures import CLASSES, DEPTH_RANGE, EPE_RANGE, ORDER, SHARED
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of, reports
 from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.results import Results
@@ -11,8 +12,15 @@ from attnwarp_eval.study.results import Results
 
 def galleries(results: Results) -> list[Section]:
     """Sections of pictures, none if no cell has any."""
-    own = {p.name: section for p in reports() if (section := p.gallery(results)) is not None}
-    shared = _shared(results, set(own))
+    # Edits that the answer shows are not shown again.
+    asked = results.study.answer
+    shown = {one.probe for one in (asked.pictures if asked else ()) if probe(one.probe).edits}
+    own = {
+        p.name: section
+        for p in reports()
+        if p.name not in shown and (section := p.gallery(results)) is not None
+    }
+    shared = _shared(results, {*own, *shown})
     return [*own.values(), *shared]
 
 

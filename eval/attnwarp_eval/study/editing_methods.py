@@ -86,6 +86,7 @@ class Job:
         source_picture: (H, W, 3) sRGB in [0, 1], the source view edited by hand; None where the
             editor edits it. Only methods with ``takes_picture`` get one.
         donor: of the features that targets get in place of the source's; None for the source's.
+        segments: (H, W) bool of each view, outside which nothing may change; None for everywhere.
     """
 
     gaussians: Gaussians
@@ -100,6 +101,7 @@ class Job:
     budget: Budget | None = None
     source_picture: Image | None = None
     donor: Donor | None = None
+    segments: Sequence[npt.NDArray[np.bool_]] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,6 +245,7 @@ def _attention_warping(job: Job) -> EditedScene:
             folder=job.folder,
             source_picture=job.source_picture,
             budget=job.budget,
+            segments=job.segments,
         )
     )
 
@@ -369,6 +372,7 @@ def _baseline(name: str) -> Method:
                 methods.preset(name, **job.settings),
                 folder=job.folder,
                 budget=job.budget,
+                segments=job.segments,
             )
         )
 

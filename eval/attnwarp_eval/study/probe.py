@@ -4,7 +4,7 @@ probes by name.
 How a report shows one is in :mod:`attnwarp_eval.study.probe_report`.
 
 >>> [probe.name for probe in probes()]
-['audit', 'calibration', 'depth', 'editing', 'editing-timing', 'fit', 'ideal', 'labels',
+['audit', 'calibration', 'carry', 'depth', 'editing', 'editing-timing', 'fit', 'ideal', 'labels',
  'sensitivity', 'stability', 'timing', 'variability', 'warp']
 >>> probe("depth").metric("depth.abs_rel").direction
 'lower'
@@ -104,7 +104,17 @@ class Work:
         """
         yaw = self.world.yaw[view.rpartition("/")[2]]
         self.views.append(View(view, yaw, dict(metrics)))
-        if draw is None or view not in self.cell.pictures:
+        if draw is not None:
+            self.draw(view, draw)
+
+    def draw(self, view: str, draw: Callable[[], Mapping[str, bytes]]) -> None:
+        """Save the pictures of a view, of the source too, where the study wants them.
+
+        Args:
+            view: as in :meth:`add`.
+            draw: as in :meth:`add`.
+        """
+        if view not in self.cell.pictures:
             return
         with self.meter.stage("pictures"):
             for content, data in draw().items():

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -15,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
-from attnwarp_eval.document.model import Finding, Section, Table
+from attnwarp_eval.document.model import Finding, Grid, Picture, Section, Table
 from attnwarp_eval.document.numbers import pooled, spread
 from attnwarp_eval.study.probe import Probe, probe, probes
 from attnwarp_eval.study.results import Results
@@ -175,6 +176,61 @@ def _discover(module: str) -> None:
 def reports() -> list[ProbeReport]:
     """Reports of all probes, in their order."""
     return [report_of(each.name) for each in probes()]
+
+
+def in_degrees(view: str) -> str:
+    """A view's name as the head of a column.
+
+    Example:
+        >>> in_degrees("yaw030"), in_degrees("source")
+        ('30°', 'source')
+    """
+    return re.sub(r"^yaw0*(\d+)$", r"\1°", view)
+
+
+def side_by_side(
+    results: Results,
+    probe: str,
+    variants: Sequence[str],
+    content: str,
+    scene: str,
+    caption: str,
+    first: Mapping[str, str],
+) -> Grid | None:
+    """Pictures of variants in the views of one scene; None where the run has none.
+
+    Args:
+        results: of the run.
+        probe, variants: whose pictures; variants are the rows.
+        content: what they show.
+        scene: whose; the first one that has some where this has none.
+        caption: above them.
+        first: label of a row before them -> what it shows, the same for all variants.
+    """
+    found: dict[str, dict[str, dict[tuple[str, str], str]]] = {}
+    for variant in variants:
+        for name, _, record in results.records(probe, variant):
+            if record.pictures:
+                own = found.setdefault(name, {}).setdefault(variant, {})
+                for picture in record.pictures:
+                    own.setdefault((picture.view, picture.content), picture.path)
+    if not found:
+        return None
+    rows = found.get(scene) or next(iter(found.values()))
+    views = list(dict.fromkeys(view for own in rows.values() for view, _ in own))
+
+    def row(label: str, own: Mapping[tuple[str, str], str], shown: str) -> list[Picture | None]:
+        return [
+            Picture(own[view, shown], f"{label}, {in_degrees(view)}")
+            if (view, shown) in own
+            else None
+            for view in views
+        ]
+
+    shared = next(iter(rows.values()))
+    above = [(label, row(label, shared, shown)) for label, shown in first.items()]
+    below = [(name, row(name, own, content)) for name, own in rows.items()]
+    return Grid(caption, [in_degrees(view) for view in views], above + below)
 
 
 def mean_values(results: Results, probe: str, name: str, metrics: Iterable[str]) -> list[str]:

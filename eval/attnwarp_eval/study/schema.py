@@ -145,12 +145,33 @@ class AnswerColumn(Part):
     yaw: tuple[float, float] | None = None
 
 
-class Answer(Part):
-    """First words of a report: a question, sentences, one table.
+class AnswerPictures(Part):
+    """Pictures of an answer, side by side: columns are views, rows the variants.
 
-    A sentence holds figures as ``{column|variant}``. ``variants`` are the table's rows, each with
-    what it is in words; ``columns`` are titles with their metrics. ``decides`` is the column by
-    which a variant is recommended.
+    Args:
+        caption: above them.
+        probe: that draws them; the main probe if left out.
+        scene: whose they are; the first one that has some where this has none.
+        first: label of a row before those of the variants -> what it shows, the same for all.
+        content: what the variants' rows show.
+        variants: the rows.
+    """
+
+    caption: str
+    probe: str = ""
+    scene: str = ""
+    first: dict[str, str] = Field(default_factory=dict)
+    content: str
+    variants: Annotated[list[str], Field(min_length=1)]
+
+
+class Answer(Part):
+    """First words of a report: a question, sentences, pictures, one table.
+
+    A sentence holds figures as ``{column|variant}``; one with a figure that this run did not
+    measure is left out. ``variants`` are the table's rows, each with what it is in words;
+    ``columns`` are titles with their metrics, ``figures`` further ones, of sentences alone.
+    ``decides`` is the column by which a variant is recommended.
     """
 
     question: str
@@ -158,6 +179,8 @@ class Answer(Part):
     variants: Annotated[dict[str, str], Field(min_length=2, max_length=5)]
     columns: Annotated[dict[str, AnswerColumn], Field(min_length=1, max_length=4)]
     decides: str
+    figures: dict[str, AnswerColumn] = Field(default_factory=dict)
+    pictures: list[AnswerPictures] = Field(default_factory=list)
 
 
 class Pictures(Part):

@@ -69,13 +69,19 @@ class _Joined(Study):
                     {"probe": main, **entry} if isinstance(entry, dict) else entry
                     for entry in data[key]
                 ]
-        asked = data.get("answer")
-        if isinstance(asked, dict) and isinstance(asked.get("columns"), dict):
-            columns = {
-                title: {"probe": main, **column} if isinstance(column, dict) else column
-                for title, column in asked["columns"].items()
-            }
-            filled["answer"] = {**asked, "columns": columns}
+        if isinstance(asked := data.get("answer"), dict):
+            filled["answer"] = dict(asked)
+            for key in ("columns", "figures"):
+                if isinstance(asked.get(key), dict):
+                    filled["answer"][key] = {
+                        title: {"probe": main, **column} if isinstance(column, dict) else column
+                        for title, column in asked[key].items()
+                    }
+            if isinstance(asked.get("pictures"), list):
+                filled["answer"]["pictures"] = [
+                    {"probe": main, **entry} if isinstance(entry, dict) else entry
+                    for entry in asked["pictures"]
+                ]
         return filled
 
     @model_validator(mode="after")
@@ -116,28 +122,29 @@ class _Joined(Study):
     def _check_answer(self, available: dict[str, Probe[Any]]) -> None:
         if self.answer is None:
             return
-        for title, column in self.answer.columns.items():
-            key = f"answer.columns.{title}"
-            if column.probe not in available:
-                raise ValueError(
-                    f"{key}.probe: no probe {column.probe!r}{did_you_mean(column.probe, available)}"
+        asked = self.answer
+        tabled = [name for name, p in available.items() if p.tabled]
+        for key, columns in (("columns", asked.columns), ("figures", asked.figures)):
+            for title, column in columns.items():
+                _check_probe(column.probe, tabled, f"answer.{key}.{title}.probe")
+                _known_metric(
+                    column.metric, available[column.probe], f"answer.{key}.{title}.metric"
                 )
-            self.check_variants(self.answer.variants, "answer.variants", column.probe)
-            _known_metric(column.metric, available[column.probe], f"{key}.metric")
+        for column in asked.columns.values():
+            self.check_variants(asked.variants, "answer.variants", column.probe)
+        for i, entry in enumerate(asked.pictures):
+            _check_probe(entry.probe, tabled, f"answer.pictures[{i}].probe")
+            self.check_variants(entry.variants, f"answer.pictures[{i}].variants", entry.probe)
         if self.answer.decides not in self.answer.columns:
             near = did_you_mean(self.answer.decides, self.answer.columns)
             raise ValueError(f"answer.decides: no column {self.answer.decides!r}{near}")
         for sentence in self.answer.sentences:
             for title, variant in FIGURE.findall(sentence):
-                for name, known in (
-                    (title, self.answer.columns),
-                    (variant, self.answer.variants),
-                ):
-                    if name not in known:
-                        raise ValueError(
-                            f"answer.sentences: {{{title}|{variant}}} names"
-                            f" {name!r}{did_you_mean(name, known)}"
-                        )
+                columns = {**asked.figures, **asked.columns}
+                place = f"answer.sentences: {{{title}|{variant}}}"
+                if title not in columns:
+                    raise ValueError(f"{place} names {title!r}{did_you_mean(title, columns)}")
+                self.check_variants([variant], place, columns[title].probe)
 
     def _check_each_variant(self) -> None:
         for name, variant in self.variants.items():

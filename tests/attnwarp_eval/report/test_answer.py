@@ -7,6 +7,7 @@ from pydantic import ValidationError
 from attnwarp_eval.document.model import Report, Section, Table
 from attnwarp_eval.document.write import markdown
 from attnwarp_eval.report.answer import answer
+from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.study import parse_study
 
 SCENES = ["one", "two", "three"]
@@ -85,6 +86,57 @@ def test_a_figure_that_no_record_has_is_undefined_and_recommends_nobody():
     section = answer(run(asked=asked))
     assert section.tables[0].rows[0][1] == "undefined"
     assert section.text[1].startswith("No variant is better than the others")
+
+
+def test_a_sentence_with_a_figure_that_was_not_measured_is_left_out():
+    asked = {
+        **STUDY["answer"],
+        "figures": {"near": {"metric": HIDDEN, "yaw": [0, 60]}},
+        "sentences": ["Near: {near|open}.", "Near: {near|masked}."],
+    }
+    made = run(asked=asked)
+    del made.cells[:3]  # all of `masked`
+    assert answer(made).text[1] == "Near: 10 %."
+    assert answer(made).text[2].startswith(("Use", "No variant"))
+
+
+def test_pictures_stand_in_a_row_for_each_variant_and_a_column_for_each_view():
+    asked = {
+        **STUDY["answer"],
+        "pictures": [
+            {
+                "caption": "C",
+                "scene": "two",
+                "first": {"true": "target"},
+                "content": "warped",
+                "variants": ["open", "masked"],
+            }
+        ],
+    }
+    made = run(asked=asked)
+    for cell in made.cells[1::3]:  # of the scene "two"
+        name = cell.variants[0]
+        files = [("yaw030", "target"), ("yaw030", "warped"), ("yaw090", "warped")]
+        pictures = [PictureFile(view, what, f"{name}-{view}-{what}", "") for view, what in files]
+        object.__setattr__(cell.record, "pictures", tuple(pictures))
+    (grid,) = answer(made).grids
+    paths = [(label, [p and p.path for p in row]) for label, row in grid.rows]
+    assert grid.columns == ["30°", "90°"]
+    assert paths == [
+        ("true", ["open-yaw030-target", None]),
+        ("open", ["open-yaw030-warped", "open-yaw090-warped"]),
+        ("masked", ["masked-yaw030-warped", "masked-yaw090-warped"]),
+    ]
+    assert answer(run(asked=asked)).grids == []  # a run without pictures
+    assert answer(made, pictures=False).grids == []
+
+
+def test_the_variant_to_use_comes_with_its_time_beside_the_cheapest():
+    made = run()
+    for cell in made.cells[:3]:
+        cell.record.cost.seconds["steady"] = 0.1
+    assert "It takes 100 ms a view, 2.0 times as long as `open`." in answer(made).text[2]
+    assert "as long as" not in answer(made, timings=False).text[2]
 
 
 def test_a_study_without_a_question_has_no_answer():

@@ -168,7 +168,10 @@ VARIANT = {
 }  # fmt: skip
 
 
-OWN = {"ideal": {"editing": {"editor": {"ideal": {"parts": 6}}}}}
+OWN = {
+    "ideal": {"editing": {"editor": {"ideal": {"parts": 6}}}},
+    "carry": {"carry": {"edits": {"ball": "make the ball red"}}},
+}
 """Keys that a study of a probe has to have."""
 
 OTHER = {"ideal": {"editing": {"editor": {"ideal": {"parts": 7}}}}}

@@ -25,6 +25,11 @@ from attnwarp_eval.study.shared.splats import splats_meaning, splats_reads, spla
 
 E = TypeVar("E", bound=Extra)
 
+LEAST_PIXELS = 16
+"""Agreement is undefined where fewer pixels of a view are compared, the area of one cell of the
+bundled editors' latents. Views count alike in a mean, so a single pixel would weigh as much as a
+whole view."""
+
 
 class IdealPart(Part):
     """The ideal editor (docs/measuring/ideal-editor.md).

@@ -65,6 +65,7 @@ def run_method(
     budget: Budget | None = None,
     editor: Editor | None = None,
     donor: Donor | None = None,
+    segments: Sequence[npt.NDArray[np.bool_]] | None = None,
 ) -> EditedScene:
     """Edit a scene by the method of a cell.
 
@@ -76,6 +77,7 @@ def run_method(
         budget: limits of the method.
         editor: in place of the one that the spec names.
         donor: of the control's features; the other scene's source with the same editor if left out.
+        segments: (H, W) bool of each view, outside which nothing changes.
     """
     spec, world = work.spec, work.world
     with work.meter.stage("setup"):
@@ -98,6 +100,7 @@ def run_method(
             budget,
             source_by_hand(work, truth, names[0]),
             donor,
+            segments,
         )
         return EDITING_METHODS[spec["method"]].run(job)
 

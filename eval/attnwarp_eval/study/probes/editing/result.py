@@ -22,6 +22,7 @@ from attnwarp_eval.study.editing_methods import EditedScene
 from attnwarp_eval.study.probe import Work
 from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.schema import StudyError
+from attnwarp_eval.study.shared.edits import LEAST_PIXELS
 from attnwarp_eval.study.shared.method_run import source_by_hand
 
 if TYPE_CHECKING:
@@ -32,12 +33,6 @@ Image = npt.NDArray[np.float32]
 FIDELITY = ("psnr", "mse", "ssim")
 """Figures of :func:`attnwarp_eval.metrics.fidelity` that a record has, of the whole picture and
 inside the edited object."""
-
-
-LEAST_PIXELS = 16
-"""Agreement is undefined where fewer pixels of a view are compared, the area of one cell of the
-bundled editors' latents. Views count alike in a mean, so a single pixel would weigh as much as a
-whole view."""
 
 
 @dataclass(frozen=True)

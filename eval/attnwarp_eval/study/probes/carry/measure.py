@@ -1,0 +1,181 @@
+"""An edit of a thing in some views, judged by the views' agreement alone.
+
+True pictures of an edit cost more than the edit. This probe needs none: it shows a person what a
+method does. Nothing changes outside the thing's exact mask, and splats are not tuned.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence, Set
+from functools import partial
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from attnwarp_eval import metrics
+from attnwarp_eval.metrics.registry import METRICS, Registry
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study import pictures
+from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.edit_truth import EditTruth
+from attnwarp_eval.study.probe import Work, register
+from attnwarp_eval.study.record import Json, NoExtra
+from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, Whole, did_you_mean
+from attnwarp_eval.study.shared.edits import LEAST_PIXELS, MethodProbe, editor_of
+from attnwarp_eval.study.shared.method_run import own_seconds, run_method
+from attnwarp_eval.study.shared.splats import splats_of
+from attnwarp_eval.study.shared.things import thing_of
+
+Image = npt.NDArray[np.float32]
+
+LEAST_CHANGE = 5.0
+"""dE00 by which the source must change inside the thing: else there is no edit to carry."""
+
+
+class Carry(Part):
+    """Scenes that are edited, each with the words for its thing, and the views.
+
+    Args:
+        edits: scene -> words.
+        views: targets by name; the study's if empty.
+        size: side of the pictures in px, at most the study's, which it is if left out.
+    """
+
+    edits: dict[str, str] = Field(default_factory=dict)
+    views: list[str] = Field(default_factory=list)
+    size: Annotated[Whole, Field(ge=16)] | None = None
+
+
+class StudyPart(Part):
+    """Keys of a study that only this probe reads."""
+
+    carry: Carry = Carry()
+
+
+@register
+class CarryProbe(MethodProbe[NoExtra]):
+    """One edit of a scene's thing by one method, in a few views."""
+
+    name = "carry"
+    study_part = StudyPart
+    metrics = Registry({"multiview.delta_e": METRICS["multiview.delta_e"]})
+    study_keys = frozenset({"carry", "editing", "seeds", "size", "spp", "things", "views"})
+
+    def check(self, study: Study) -> None:
+        """Require an edit, variants that edit, and an editor that follows words."""
+        if self.name not in study.probes:
+            return
+        if not study.part(StudyPart).carry.edits:
+            raise ValueError("carry.edits: got none, expected a scene and the words for its edit")
+        for name in study.probes[self.name]:
+            variant = study.variants[name]
+            if editor_of(study, variant).ideal is not None:
+                raise ValueError(
+                    f"probes.carry: {name!r} has the ideal editor, which reads no words"
+                )
+
+    def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
+        """Refuse words for a scene that the study lacks: they would be tried nowhere."""
+        names = [*(scene.name for scene in scenes), *study.left_out]
+        for name in study.part(StudyPart).carry.edits:
+            if name not in names:
+                raise StudyError(
+                    f"carry.edits: the study has no scene {name!r}{did_you_mean(name, names)}"
+                )
+
+    def reads(self, study: Study, variant: Variant) -> Set[str]:
+        """Keys of the method and the editor; it runs whole, and edits its source itself."""
+        return set(super().reads(study, variant)) - {"budget", "by_hand"}
+
+    def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
+        """The method, the editor, and where splats and warps come from."""
+        spec = super().variant_spec(study, variant, seed)
+        return {key: value for key, value in spec.items() if key not in ("budget", "by_hand")}
+
+    def cells(
+        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
+    ) -> Iterator[Cell]:
+        """One for each scene that has words, variant and seed."""
+        part = study.part(StudyPart).carry
+        size = min(part.size or study.size, study.size)
+        for name, scene in scenes.items():
+            if scene.name not in part.edits:
+                continue
+            views = study.model_copy(update={"views": part.views or study.views}).views_of(scene)
+            for label in names:
+                variant = study.variants[label]
+                for seed in study.seeds:
+                    spec = {
+                        **self.common_spec(study, scene, seed),
+                        **self.variant_spec(study, variant, seed),
+                        "size": size,
+                        "views": views,
+                        "thing": thing_of(study, scene),
+                        # A description of the result, if a method asks for one, is the words.
+                        "edit": {
+                            "instruction": part.edits[scene.name],
+                            "target": part.edits[scene.name],
+                            "source": scene.title,
+                        },
+                    }
+                    sources = {"editor": editor_of(study, variant).name}
+                    yield Cell(
+                        spec,
+                        name,
+                        label,
+                        self.name,
+                        seed,
+                        (label,),
+                        (scene.source.name, *views),
+                        sources,
+                    )
+
+    def compute(self, work: Work) -> NoExtra:
+        """Edit the views, and hold each against the source at exact correspondences."""
+        spec, world, meter = work.spec, work.world, work.meter
+        source, names = world.source.name, [world.source.name, *spec["views"]]
+        objects = [world.scene.object_names.index(name) for name in spec["thing"]]
+        with meter.stage("truth"):
+            before = {name: np.clip(world.image(name, spec["spp"]), 0, 1) for name in names}
+            hits = {name: world.geometry.trace(world.camera(name)) for name in names}
+            inside = {name: np.isin(hit.object_id, objects) for name, hit in hits.items()}
+        with meter.stage("splats"):
+            model = splats_of(work)
+        segments = [inside[name] for name in names]
+        truth = EditTruth(before, {}, {}, inside)
+        result = run_method(work, truth, names, model, segments=segments)
+        for part, seconds in result.seconds.items():
+            meter.add(f"method: {part}", seconds)
+        meter.add("whole", own_seconds(result))
+        with meter.stage("checks"):
+            after = {
+                names[k]: picture.astype(np.float32) / np.float32(255)
+                for k, picture in result.edited.items()
+            }
+            done = _change(before[source], after[source], inside[source]) >= LEAST_CHANGE
+            shown = {"before": before, "after": after}
+            work.draw(source, partial(_jpegs, shown, source))
+            for name in spec["views"]:
+                pair = world.between(source, name)
+                difference = metrics.cross_view(after[source], after[name], pair, mask=inside[name])
+                judged = done and difference.counted.sum() >= LEAST_PIXELS
+                value = difference.delta_e[difference.counted].mean() if judged else math.nan
+                row = {"multiview.delta_e": float(value)}
+                work.add(name, row, partial(_jpegs, shown, name))
+        return NoExtra()
+
+
+def _change(before: Image, after: Image, mask: npt.NDArray[np.bool_]) -> float:
+    """Mean CIEDE2000 between two pictures inside a mask; 0 where it is empty."""
+    from skimage.color import deltaE_ciede2000, rgb2lab
+
+    if not mask.any():
+        return 0.0
+    return float(deltaE_ciede2000(rgb2lab(before[mask]), rgb2lab(after[mask])).mean())
+
+
+def _jpegs(shown: Mapping[str, Mapping[str, Image]], name: str) -> dict[str, bytes]:
+    return {kind: pictures.jpeg(pictures.enlarged(own[name])) for kind, own in shown.items()}

@@ -1,0 +1,65 @@
+"""Report of an edit in a few views: pictures side by side, and how well the views agree."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
+
+from attnwarp_eval.document.model import Section, Table
+from attnwarp_eval.document.numbers import number
+from attnwarp_eval.study.probe_report import (
+    Layout,
+    Place,
+    ProbeReport,
+    in_degrees,
+    register_report,
+    side_by_side,
+)
+from attnwarp_eval.study.probes.carry.measure import LEAST_CHANGE
+from attnwarp_eval.study.results import Results
+
+
+@register_report
+class CarryReport(ProbeReport):
+    """Colour difference of views at the same points, by variant and view."""
+
+    name = "carry"
+    tabulates_all = True
+    columns: ClassVar[Mapping[str, str]] = {"colour difference, dE00": "multiview.delta_e"}
+    cost = "whole"
+    cost_of = "an edit"
+    cost_text = "Seconds are those of the source's edit, the warps and the views' edits."
+
+    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+        """A table: the difference of each view from the source's."""
+        rows, views = [], dict[str, None]()
+        for cell, record in results.finished(self.name):
+            values = {view.name: view.metrics["multiview.delta_e"] for view in record.views}
+            views |= dict.fromkeys(values)
+            rows.append(
+                ([cell.scene, cell.variants[0], record.spec["edit"]["instruction"]], values)
+            )
+        if rows:
+            columns = ["scene", "variant", "words", *map(in_degrees, views)]
+            table = [[*row, *(number(values.get(view)) for view in views)] for row, values in rows]
+            text = (
+                "Mean CIEDE2000 between an edited view and the edited source, at the same points of"
+                " the thing by exact depth. A dash: the two share no 16 pixels of it, or the source"
+                f" changed by less than {LEAST_CHANGE:g} dE00, so that there is no edit to carry."
+            )
+            yield Place.RESULT, Section("An edit carried", [text], [Table(columns, table)])
+
+    def gallery(self, results: Results) -> Section | None:
+        """Pictures of each scene."""
+        variants = results.study.probes.get(self.name, [])
+        scenes = dict.fromkeys(cell.scene for cell, _ in results.finished(self.name))
+        grids = [
+            grid
+            for scene in scenes
+            if (grid := side_by_side(results, self.name, variants, "after", scene, scene, BEFORE))
+        ]
+        return Section("Edited views side by side", grids=grids) if grids else None
+
+
+BEFORE = {"before": "before"}
+"""Row before those of the variants."""
