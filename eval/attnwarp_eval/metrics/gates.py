@@ -62,6 +62,7 @@ GATES: Mapping[str, Margin] = {
     "depth.delta_1_01": Margin(5e-3),
     "depth.normal_median": Margin(0.05, 0.02),
     "depth.coverage": Margin(5e-3),
+    "multiview.delta_e": Margin(0.05, 0.02),
     "multiview.delta_e_above": Margin(0.05, 0.02),
     "multiview.same_answer": Margin(5e-3),
     "variability.within": Margin(0.05, 0.02),
