@@ -1,0 +1,100 @@
+"""The report of a run in a real browser, on a wide and on a narrow window."""
+
+import asyncio
+
+import browser
+import pytest
+
+from attnwarp_eval.report import write_report
+from attnwarp_eval.study import Store, load_study
+from attnwarp_eval.study.run import execute, plan
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(browser.executable() is None, reason="needs a Chromium (scripts/browser.sh)"),
+]  # fmt: skip
+
+WIDTHS = {1400: 900, 390: 844}
+
+CUT = """[...document.querySelectorAll('body *')].filter(e => {
+  if (e.closest('.scroll > *, nav > *, .plots > *, .slider > *, dialog')) return false;
+  const b = e.getBoundingClientRect();
+  return b.width && b.height && (b.left < -0.5 || b.right > document.documentElement.clientWidth + 0.5
+    || (e.children.length == 0 && e.clientWidth && e.scrollWidth > e.clientWidth + 1));
+}).map(e => e.outerHTML.slice(0, 90))"""
+"""Elements that leave the window, but for what lies in something that scrolls."""
+
+OVERLAPS = """(() => {
+  const found = [];
+  const compare = (parts) => {
+    const boxes = parts.map(e => [e, e.getBoundingClientRect()]).filter(([, b]) => b.width && b.height)
+      .sort(([, a], [, b]) => a.top - b.top);
+    boxes.forEach(([e, a], k) => {
+      for (const [f, b] of boxes.slice(k + 1)) {
+        if (b.top > a.bottom - 2) break;
+        if (!e.contains(f) && !f.contains(e) && Math.min(a.right, b.right) - Math.max(a.left, b.left) > 2
+          && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 2)
+          found.push([e.id || e.textContent.trim().slice(0, 40), f.id || f.textContent.trim().slice(0, 40)]);
+      }
+    });
+  };
+  compare([...document.querySelectorAll('h1, h2, h3, p, li, caption, figcaption, summary')]);
+  document.querySelectorAll('table').forEach(t => compare([...t.querySelectorAll('tr > *')]));
+  document.querySelectorAll('.plots svg').forEach(s => compare([...s.querySelectorAll('g[id*="text_"]')]));
+  return found;
+})()"""
+"""Pairs of texts that lie over each other: on the page, in a table, in a chart."""
+
+ENLARGE = """[...document.querySelectorAll('.grid img, .gallery figure:not(.slider) > img, .plots > svg')].map(picture => {
+  const dialog = document.querySelector('#enlarged');
+  picture.dispatchEvent(new MouseEvent('click', {bubbles: true}));
+  const large = dialog.querySelector('img'), box = dialog.getBoundingClientRect();
+  const right = dialog.open && large.getAttribute('src').startsWith('data:image')
+    && box.left >= 0 && box.right <= window.innerWidth && box.bottom <= window.innerHeight;
+  dialog.click();
+  return right && !dialog.open;
+})"""
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory, coarse_textures):
+    """Report of the demo's study on one scene, small: with pictures, an edit, charts, wide tables."""
+    folder = tmp_path_factory.mktemp("run")
+    store = Store(folder)
+    study = load_study("quick", scenes=["bear"], size=64, timing_rounds=3)
+    assert execute(plan(study, store), store).complete
+    write_report(store)
+    return folder / "report.html"
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_nothing_is_cut_no_label_overlaps_and_every_picture_enlarges(pages, width):
+    async def person():
+        async with browser.opened(pages.as_uri(), (width, WIDTHS[width])) as tab:
+            await tab.send(
+                "Emulation.setDeviceMetricsOverride", width=width, height=WIDTHS[width],
+                deviceScaleFactor=1, mobile=width < 500,
+            )  # fmt: skip
+            await tab.until(
+                "document.readyState == 'complete' && !!document.querySelector('#answer')"
+            )
+            first = await tab.run(
+                "[...document.querySelectorAll('.grid')].map(g => g.getBoundingClientRect().bottom)"
+            )
+            await tab.run("document.querySelectorAll('details').forEach(d => { d.open = true; })")
+            return (
+                first,
+                await tab.run("document.documentElement.scrollWidth"),
+                await tab.run(CUT),
+                await tab.run(OVERLAPS),
+                await tab.run(ENLARGE),
+            )
+
+    first, wide, cut, overlaps, large = asyncio.run(person())
+    assert len(first) == 2
+    if width == 1400:
+        assert max(first) <= WIDTHS[width] + 40  # the answer's pictures are on the first screen
+    assert wide <= width
+    assert cut == []
+    assert overlaps == []
+    assert len(large) > 50 and all(large)
