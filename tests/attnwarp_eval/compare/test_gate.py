@@ -23,6 +23,7 @@ from attnwarp_eval.study import Store, load_study, parse_study
 from attnwarp_eval.study.probes.depth import measure as depth
 from attnwarp_eval.study.probes.warp import measure as warp
 from attnwarp_eval.study.run import execute, plan
+from attnwarp_eval.study.shared import warps
 
 BASELINE = pathlib.Path(__file__).parents[3] / "reports" / "baseline" / "gate.jsonl"
 
@@ -67,8 +68,8 @@ def half_a_pixel(patch):
         moved = dataclasses.replace(view.correspondence, xy=view.correspondence.xy + 0.5)
         return dataclasses.replace(view, correspondence=moved)
 
-    warp_view = warp.warp_view
-    patch.setattr(warp, "warp_view", shifted)
+    warp_view = warps.warp_view
+    patch.setattr(warps, "warp_view", shifted)
 
 
 def one_percent_in_depth(patch):
@@ -85,8 +86,8 @@ def a_mask_rule_lost(patch):
         without = dataclasses.replace(settings, depth_agreement=False)
         return warp_view(model, source, target, without, **options)
 
-    warp_view = warp.warp_view
-    patch.setattr(warp, "warp_view", lax)
+    warp_view = warps.warp_view
+    patch.setattr(warps, "warp_view", lax)
 
 
 def a_dropped_metric(patch):

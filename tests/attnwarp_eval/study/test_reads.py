@@ -114,11 +114,11 @@ def test_a_variant_has_the_preset_of_its_method_that_it_names(method, name, expe
          ":6: variants.w: no probe measures it; name it under probes"),
         # Keys of the study.
         ("timing_rounds: 9\nvariants:\n  v: {}\nprobes: {warp: [v]}\n",
-         ":4: timing_rounds: nothing that this study measures reads it; add editing-timing or"),
+         ":4: timing_rounds: nothing that this study measures reads it; add audit or editing-timing"),
         ("edits: [snow]\nvariants:\n  v: {}\nprobes: {editing: [v]}\n",
          ":4: edits: nothing that this study measures reads it; add sensitivity to probes"),
         ("encoders: {clip: clip-small}\nvariants:\n  v: {}\nprobes: {variability: [v]}\nseeds: [0, 1]\n",
-         ":4: encoders: nothing that this study measures reads it; add audit, editing or"),
+         ":4: encoders: nothing that this study measures reads it; add audit or editing or"),
         ("splats: {count: 9}\nvariants:\n  v: {fitted: true}\nprobes: {warp: [v]}\n",
          ":4: splats: nothing that this study measures reads it"),
         ("splats: {count: 9}\nvariants:\n  v: {splats: {count: 8}}\nprobes: {warp: [v]}\n",
@@ -169,6 +169,7 @@ VARIANT = {
 
 
 OWN = {
+    "audit": {"audit": {"edit": "some_colour"}},
     "ideal": {"editing": {"editor": {"ideal": {"parts": 6}}}},
     "carry": {"carry": {"edits": {"ball": "make the ball red"}}},
 }
