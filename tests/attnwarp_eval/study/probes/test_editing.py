@@ -116,8 +116,8 @@ def test_true_pictures_have_the_highest_fidelity_the_least_disagreement_and_one_
     )
     # Without encoders; docs/measuring/gate.md.
     assert {METRICS[key].name for key in record.views[0].metrics if gated(key)} == {
-        "multiview.delta_e_above", "multiview.same_answer", "fidelity.mse", "fidelity.ssim",
-        "fidelity.preserved_mse", "fidelity.preserved_psnr", "image.mse", "image.psnr",
+        "multiview.delta_e", "multiview.delta_e_above", "multiview.same_answer", "fidelity.mse",
+        "fidelity.ssim", "fidelity.preserved_mse", "fidelity.preserved_psnr", "image.mse", "image.psnr",
         "depth.abs_rel",
     }  # fmt: skip
 

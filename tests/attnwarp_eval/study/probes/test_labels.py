@@ -112,6 +112,6 @@ def test_a_thing_that_the_scene_lacks_is_refused(tmp_path):
 def test_a_scene_with_answers_needs_no_names():
     from attnwarp_eval.study.shared.things import thing_of
 
-    study = load_study("suite")
+    study = load_study("quick")  # it names the things of spheres and fence alone
     assert thing_of(study, load_scene("bear")) == ["bear"]
     assert np.isin(thing_of(study, load_scene("spheres")), load_scene("spheres").object_names).all()
