@@ -141,11 +141,11 @@ def _table(results: Results, asked: Answer, timings: bool) -> tuple[Table, list[
             rows[name].append(text)
     timed: tuple[str, ...] = ()
     if timings:
-        own = report_of(asked.columns[asked.decides].probe)
-        timed = (f"time {own.cost_of}, ms",)
-        for name, row in rows.items():
-            seconds = _seconds(results, own.name, own.stage, own.cost, name)
-            row.append(number(1000 * seconds))
+        seconds = _in_turn(results, asked)
+        if seconds:
+            timed = (f"time {report_of(asked.columns[asked.decides].probe).cost_of}, ms",)
+            for name, row in rows.items():
+                row.append(number(1000 * seconds.get(name, math.nan)))
     return Table([*columns, *timed], list(rows.values()), timed=timed), decided
 
 
@@ -169,13 +169,13 @@ def _leaders(values: Mapping[str, float], metric: Metric) -> list[str]:
     return leaders if len(leaders) < len(size) else []
 
 
-def _seconds(results: Results, own: str, stage: str, cost: str, variant: str) -> float:
-    """Seconds of a variant, taken in turn where they were."""
+def _in_turn(results: Results, asked: Answer) -> dict[str, float]:
+    """Seconds of variants that were timed in turn; those of cells depend on what else ran."""
+    stage = report_of(asked.columns[asked.decides].probe).stage
     timed = timed_in_turn(results, stage) if stage else None
-    if timed is not None and variant in timed.names:
-        return timed.seconds(variant).mean
-    once = results.seconds(own, variant, cost).values()
-    return fmean(once) if once else math.nan
+    if timed is None:
+        return {}
+    return {name: timed.seconds(name).mean for name in asked.variants if name in timed.names}
 
 
 def _advice(results: Results, asked: Answer, leaders: list[str]) -> str:
@@ -192,11 +192,9 @@ def _advice(results: Results, asked: Answer, leaders: list[str]) -> str:
 def _costs(results: Results, asked: Answer, leaders: list[str]) -> Iterator[str]:
     """Sentences on seconds: those of the variant to use, and those behind the pictures."""
     own = report_of(asked.columns[asked.decides].probe)
-    taken = {
-        name: _seconds(results, own.name, own.stage, own.cost, name) for name in asked.variants
-    }
-    cheapest = min(taken, key=lambda name: taken[name])
-    if leaders and cheapest != leaders[0] and taken[cheapest] > 0:
+    taken = _in_turn(results, asked)
+    cheapest = min(taken, key=lambda name: taken[name], default="")
+    if leaders and cheapest != leaders[0] in taken and taken[cheapest] > 0:
         ratio = taken[leaders[0]] / taken[cheapest]
         yield (
             f"It takes {number(1000 * taken[leaders[0]], 2)} ms {own.cost_of}, {number(ratio, 2)}"
@@ -209,7 +207,7 @@ def _costs(results: Results, asked: Answer, leaders: list[str]) -> Iterator[str]
         }
         if shown.probe != own.name and all(seconds.values()):
             each = ", ".join(f"`{n}` {number(fmean(s), 2)} s" for n, s in seconds.items())
-            yield f"Time {other.cost_of}: {each}."
+            yield f"Time {other.cost_of}, in one pass: {each}."
 
 
 def _how_sure(results: Results) -> str:
