@@ -8,8 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from attnwarp_eval.scene.edits import apply
+from attnwarp_eval.scene.materials import TEXTURED, DiffuseMaterial
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import EditSpec, ObjectChange
+from attnwarp_eval.scene.textures import Plain
 
 EDIT = "Paint its parts"
 """Words of the edit."""
@@ -48,13 +50,15 @@ def answer_colors(count: int) -> list[str]:
 def painted(scene: Scene, objects: Sequence[str], color: str) -> Scene:
     """The scene with some objects in shades of one colour.
 
+    What shows no texture, as metal and glass, becomes matt.
+
     Args:
         scene: before.
-        objects: names; each shows a texture.
+        objects: names.
         color: as #rrggbb.
 
     Raises:
-        ValueError: no such object, or one that shows no texture.
+        ValueError: no such object, or a lamp.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -67,6 +71,15 @@ def painted(scene: Scene, objects: Sequence[str], color: str) -> Scene:
         instruction=EDIT,
         source=f"a photo of {scene.name}",
         target=f"a photo of {scene.name} in colours",
-        changes=tuple(ObjectChange(object=name, paint=color) for name in objects),
+        changes=tuple(_change(scene, name, color) for name in objects),
     )
     return Scene(apply(scene.spec, edit), scene.path)
+
+
+def _change(scene: Scene, name: str, color: str) -> ObjectChange:
+    items = {item.name: item for item in scene.spec.objects}
+    if name not in items or isinstance(items[name].material, TEXTURED):
+        return ObjectChange(object=name, paint=color)
+    return ObjectChange(
+        object=name, material=DiffuseMaterial(), texture=Plain(color=color, variation=0.0)
+    )

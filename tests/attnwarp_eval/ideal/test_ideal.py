@@ -13,10 +13,14 @@ import attnwarp.warp
 from attnwarp.editing.editor import edit
 from attnwarp.methods import attention_warping, preset
 from attnwarp_eval.ideal.editor import Answers, IdealEditor, schedule, tokens_of
+from attnwarp_eval.ideal.paint import painted
 from attnwarp_eval.ideal.parts import part_labels, token_parts
 from attnwarp_eval.ideal.share import Alone, Grams, alone, edit_alone, settling_steps, solve_share
 from attnwarp_eval.ideal.thing import Thing
 from attnwarp_eval.metrics.parts import part_answers, part_figures
+from attnwarp_eval.scene.edits import apply
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.controls import MovedView
 from attnwarp_eval.study.warping import warp_truth
 from attnwarp_eval.two_view import HIDDEN
@@ -296,3 +300,17 @@ def test_propagation_is_the_loop_written_out_in_float64(thing, share):
     for number, expected in ((0, source), (1, target)):
         assert np.abs(result.edited[number] / 255 - picture(expected)).max() <= 1 / 255
     assert np.abs(picture(run("yaw010")[0]) - picture(target)).max() > 20 / 255
+
+
+def test_metal_is_painted_matt():
+    """The oracle is the same bear of bronze, its looks written by hand as a file would say them."""
+    bear = load_scene("bear")
+    bronze = next(edit for edit in bear.spec.edits if edit.name == "bronze")
+    statue = Scene(apply(bear.spec, bronze), bear.path)
+    written = statue.spec.model_dump(mode="json", exclude_unset=True)
+    for item in written["objects"]:
+        if item["name"] == "bear":
+            item["material"] = {"type": "diffuse"}
+            item["texture"] = {"type": "plain", "color": "#c04040"}
+    edited = painted(statue, ["bear"], "#c04040")
+    assert edited.spec.objects == type(statue.spec).model_validate(written).objects
