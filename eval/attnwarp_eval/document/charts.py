@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import itertools
+import math
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -14,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.document.numbers import FEWEST_SCENES, number, spread
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.statistics.intervals import Interval, front
 
@@ -22,8 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from matplotlib.axes import Axes
-    from matplotlib.text import Annotation
-    from matplotlib.transforms import BboxBase
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#000000")
 """Okabe and Ito's colours, distinct for every kind of colour vision."""
@@ -60,6 +60,7 @@ def drawing(
 
     style: dict[Any, Any] = {
         "svg.hashsalt": "attnwarp",
+        "figure.dpi": 72,
         "font.size": 9,
         "axes.spines.top": False,
         "axes.spines.right": False,
@@ -67,6 +68,7 @@ def drawing(
         "grid.alpha": 0.25,
         "legend.frameon": False,
         "legend.fontsize": 8,
+        "axes.formatter.min_exponent": 4,
     }
     with matplotlib.rc_context(style):
         figure, axes = pyplot.subplots(
@@ -77,6 +79,10 @@ def drawing(
             layout="constrained",
         )
         yield list(axes.flat)
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # names stand about points, which must not move again
+        for each in axes.flat:
+            _place_names(each)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
         pyplot.close(figure)
@@ -158,8 +164,8 @@ def lines(
         if not keep.any():
             continue
         x_values = np.asarray(line.x, dtype=float)[keep]
-        low = np.array([v.low if v.bounded else v.mean for v in line.y])[keep]
-        high = np.array([v.high if v.bounded else v.mean for v in line.y])[keep]
+        both = np.array([ends(v) for v in line.y])[keep]
+        low, high = np.where(np.isfinite(both), both, mean[keep, None]).T
         shift = (i - (len(series) - 1) / 2) * apart
         bars = np.clip([mean[keep] - low, high - mean[keep]], 0, None)
         axes.errorbar(
@@ -298,7 +304,6 @@ def cost_front(
     cost = [points[n][0].mean for n in names]
     error = [points[n][1].mean for n in names]
     on_front = front(cost, error)
-    notes = []
     known = np.isfinite(cost) & np.isfinite(error)
     crowded = known.sum() > MOST_NAMES
     for i, name in enumerate(names):
@@ -321,23 +326,23 @@ def cost_front(
             zorder=3 if on and crowded else 2,
         )
         if on or not crowded:
-            notes.append(
-                axes.annotate(
-                    _plain(name),
-                    (seconds.mean, quality.mean),
-                    textcoords="offset points",
-                    xytext=(5, 5),
-                    fontsize=7.5,
-                    color=colour,
-                )
-            )
+            axes.annotate(
+                _plain(name),
+                (seconds.mean, quality.mean),
+                textcoords="offset points",
+                xytext=SPOTS[0],
+                fontsize=7.5,
+                color=colour,
+                bbox={"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 0.5},
+                arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.6},
+                zorder=5,
+            ).set_in_layout(False)
         text = f"{name}: {spread(quality)} in {number(1000 * seconds.mean)} ms"
         hover(axes, seconds.mean, quality.mean, text)
     if on_front:
-        axes.step(
-            [cost[i] for i in on_front],
-            [error[i] for i in on_front],
-            where="post",
+        axes.plot(
+            np.repeat([cost[i] for i in on_front], 2)[1:],
+            np.repeat([error[i] for i in on_front], 2)[:-1],
             color=PALETTE[0],
             linewidth=1,
             alpha=0.6,
@@ -347,30 +352,88 @@ def cost_front(
     )
     axes.set_title(_wrapped(title, 62), loc="left", fontsize=9.5)
     axes.margins(0.2)
-    _move_apart(axes, notes)
     return [names[i] for i in on_front]
 
 
-def _move_apart(axes: Axes, notes: Sequence[Annotation]) -> None:
-    """Raise each note, from the lowest on, until it covers none of those below."""
+SPOTS = [(5.0, 5.0)] + [
+    (radius * math.cos(angle), radius * math.sin(angle))
+    for radius in np.linspace(7, 190, 40)
+    for angle in np.linspace(0, 2 * math.pi, 24, endpoint=False)
+]
+"""Offsets from a point at which its name may begin or end, in 1/72 inch, nearest first."""
+
+
+def _place_names(axes: Axes) -> None:
+    """Put each name at the free spot nearest to its point: inside the axes, over no other name and,
+    where there is room, over no point and no bar. A line leads to a name that stands apart.
+    """
+    from matplotlib.text import Annotation, Text
+    from matplotlib.transforms import Bbox
+
     figure = axes.get_figure(root=True)
     assert figure is not None
-    figure.draw_without_rendering()
-    points = 72 / figure.dpi
-    settled: list[BboxBase] = []
-    for note in sorted(notes, key=lambda note: note.get_window_extent().y0):
-        box = note.get_window_extent()
-        raised = 0.0
-        while covered := [other for other in settled if box.overlaps(other)]:
-            up = max(other.y1 for other in covered) - box.y0 + 1
-            box, raised = box.translated(0, up), raised + up
-        note.xyann = (5, 5 + raised * points)
-        settled.append(box)
+    notes = [text for text in axes.texts if isinstance(text, Annotation)]
+    scale, frame = figure.dpi / 72, axes.get_window_extent()
+    places = axes.transData.transform([note.xy for note in notes] or np.empty((0, 2)))
+    strokes = np.concatenate([np.empty((0, 2)), *_strokes(axes)])
+    settled: list[Bbox] = []
+    # The rightmost have the least choice.
+    for note, (x, y) in sorted(zip(notes, places, strict=True), key=lambda pair: -pair[1][0]):
+        width, height = Text.get_window_extent(note).size
+        least, best = math.inf, Bbox.null()
+        for across, up in SPOTS:
+            if math.hypot(across, up) >= least:
+                break
+            left = x + across * scale - width * (0.5 if abs(across) < 1 else across < 0)
+            box = Bbox.from_bounds(left, y + up * scale - height * (up < 0), width, height)
+            near = box.padded(2 * scale)
+            inside = frame.x0 <= box.x0 and box.x1 <= frame.x1
+            inside = inside and frame.y0 <= box.y0 and box.y1 <= frame.y1
+            cost = math.hypot(across, up) + 10 * near.count_contains(places)
+            cost += near.count_contains(strokes)
+            cost += 1000 * (near.count_overlaps(settled) + (not inside))
+            if cost < least:
+                least, best = cost, box
+        note.xyann = ((best.x0 - x) / scale, (best.y0 - y) / scale)
+        settled.append(best)
+        assert note.arrow_patch is not None
+        apart = math.hypot(*np.clip((x, y), best.min, best.max) - (x, y)) > 12 * scale
+        note.arrow_patch.set_visible(apart)
+
+
+def _strokes(axes: Axes) -> Iterator[npt.NDArray[np.float64]]:
+    """Points along every bar and line, in pixels."""
+    from matplotlib.container import ErrorbarContainer
+
+    steps = np.linspace(0, 1, 40)[:, None]
+    errors = [each for each in axes.containers if isinstance(each, ErrorbarContainer)]
+    bars = [bar for each in errors for bar in each.lines[2]]
+    paths = [path for bar in bars for path in bar.get_segments()]
+    for path in [*paths, *(line.get_xydata() for line in axes.lines)]:
+        corners = axes.transData.transform(path)
+        for start, end in itertools.pairwise(corners):
+            yield start + steps * (end - start)
+
+
+def ends(value: Interval) -> tuple[float, float]:
+    """Ends of a bar: those of the interval, or of few scenes the lowest and the highest one.
+
+    Args:
+        value: NaN where it has no such ends.
+
+    Example:
+        >>> from attnwarp_eval.statistics.intervals import interval
+        >>> ends(interval({"bear": [1.0], "fence": [1.1], "glass": [0.9]}))
+        (0.9, 1.1)
+    """
+    few = value.scenes < FEWEST_SCENES and math.isfinite(value.least)
+    return (value.least, value.most) if few else (value.low, value.high)
 
 
 def _bars(value: Interval, log: bool) -> list[list[float]] | None:
-    if not value.bounded:
+    low, high = ends(value)
+    if not (math.isfinite(low) and math.isfinite(high)):
         return None
     # What crosses zero cannot be drawn on a logarithmic axis, and is cut just above it.
-    low = max(value.low, value.mean / 20) if log else value.low
-    return [[max(value.mean - low, 0.0)], [max(value.high - value.mean, 0.0)]]
+    low = max(low, value.mean / 20) if log else low
+    return [[max(value.mean - low, 0.0)], [max(high - value.mean, 0.0)]]

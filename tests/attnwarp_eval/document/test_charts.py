@@ -6,9 +6,11 @@ import itertools
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
+from scipy import stats
 
 from attnwarp_eval.document import charts
-from attnwarp_eval.statistics.intervals import Interval
+from attnwarp_eval.statistics.intervals import Interval, interval
 
 
 def around(value: float) -> Interval:
@@ -17,22 +19,39 @@ def around(value: float) -> Interval:
     )
 
 
+@pytest.mark.parametrize("spread", [0.02, 0.0])
 @pytest.mark.parametrize("log", [True, False])
-def test_names_at_a_front_do_not_cover_one_another(tmp_path, log) -> None:
+def test_names_at_a_front_cover_no_other_and_stay_inside(tmp_path, log, spread) -> None:
     random = np.random.default_rng(0)
     points = {
-        f"variant {k}": tuple(around(v) for v in (1 + 0.02 * random.random(2))) for k in range(8)
+        f"variant {k}": tuple(around(v) for v in (1 + spread * random.random(2))) for k in range(8)
     }
     points["alone"] = (around(10.0), around(10.0))
-    with charts.drawing(tmp_path / "front.svg") as (axes,):
-        charts.cost_front(axes, points, x="seconds", y="error", title="front", log=log)
-        axes.figure.draw_without_rendering()
+    # The second panel's label of y makes the first one narrower once its names stand.
+    with charts.drawing(tmp_path / "front.svg", columns=2) as panels:
+        for axes, y in zip(panels, ("error", "an error with a very long name " * 3), strict=True):
+            charts.cost_front(axes, points, x="seconds", y=y, title="front", log=log)
+    for axes in panels:
         notes = axes.texts
         assert sorted(note.get_text() for note in notes) == sorted(points)
-        for one, other in itertools.combinations(notes, 2):
-            assert not one.get_window_extent().overlaps(other.get_window_extent())
-        assert next(note for note in notes if note.get_text() == "alone").xyann == (5, 5)
+        boxes = {note.get_text(): Text.get_window_extent(note) for note in notes}
+        for one, other in itertools.combinations(boxes.values(), 2):
+            assert not one.overlaps(other)
+        frame = axes.get_window_extent().padded(1)
+        assert all(frame.contains(*box.min) and frame.contains(*box.max) for box in boxes.values())
+        (alone,) = [note for note in notes if note.get_text() == "alone"]
+        assert np.hypot(*alone.xyann) < 60 and not alone.arrow_patch.get_visible()
     assert "variant 3" in (tmp_path / "front.svg").read_text()
+
+
+def test_a_bar_ends_at_the_lowest_and_the_highest_of_few_scenes_and_else_at_the_interval() -> None:
+    values = {f"scene {k}": [float(k)] for k in range(1, 7)}
+    few = dict(list(values.items())[:5])
+    assert charts.ends(interval(few)) == (1.0, 5.0)
+    # By scipy: t(0.975, 5) = 2.5706 times the standard error of 1 to 6.
+    half = stats.t.ppf(0.975, 5) * np.std(np.arange(1, 7), ddof=1) / np.sqrt(6)
+    assert charts.ends(interval(values)) == pytest.approx((3.5 - half, 3.5 + half))
+    assert all(map(np.isnan, charts.ends(interval({"scene 1": [float("nan")]}))))
 
 
 @pytest.mark.parametrize("dominated", [charts.MOST_NAMES - 2, charts.MOST_NAMES - 1])

@@ -5,7 +5,11 @@ import asyncio
 import browser
 import pytest
 
+from attnwarp_eval.document import charts
+from attnwarp_eval.document.model import Picture, Report, Section
+from attnwarp_eval.document.write import write_files
 from attnwarp_eval.report import write_report
+from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study import Store, load_study
 from attnwarp_eval.study.run import execute, plan
 
@@ -65,6 +69,47 @@ def pages(tmp_path_factory, coarse_textures):
     assert execute(plan(study, store), store).complete
     write_report(store)
     return folder / "report.html"
+
+
+FRONT = """
+5k splats 27.1 0.487; 15k splats 30.1 0.342; corrected 37.2 0.287; 120k splats 57.4 0.259; 3DGS, peak 34.3 0.325;
+bounds only 31.5 0.896; paper 33.2 0.91; released 61.3 0.853; corrected, bilinear mask 30.2 0.343;
+corrected, depth blended in z 36.7 0.32
+"""
+"""Points of the demo at 512 px, two of them moved onto others: name, milliseconds, error."""
+
+
+@pytest.fixture(scope="module")
+def crowded(tmp_path_factory):
+    """A page of two fronts whose points lie close together."""
+    folder = tmp_path_factory.mktemp("crowded")
+    demo = [point.strip().rsplit(" ", 2) for point in FRONT.split(";")]
+    close = [(f"a rather long name {k}", 1 + k % 4 / 50, 1 + k / 90) for k in range(12)]
+    section = Section("Fronts")
+    for index, points in enumerate((demo, close)):
+        path = folder / f"front-{index}.svg"
+        intervals = {
+            name: tuple(interval({"a": [0.8 * float(v)], "b": [1.2 * float(v)]}) for v in values)
+            for name, *values in points
+        }
+        with charts.drawing(path) as (axes,):
+            charts.cost_front(axes, intervals, x="milliseconds", y="error", title="Front")
+        section.figures.append(Picture(path.name, "Front"))
+    write_files(Report("Crowded", [], [section]), folder, "report")
+    return folder / "report.html"
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_no_name_at_a_crowded_front_lies_over_another(crowded, width):
+    async def person():
+        async with browser.opened(crowded.as_uri(), (width, WIDTHS[width])) as tab:
+            await tab.until("document.querySelectorAll('.plots svg').length == 2")
+            names = "document.querySelectorAll('.plots svg g[id*=\"text_\"]').length"
+            return await tab.run(names), await tab.run(OVERLAPS)
+
+    names, overlaps = asyncio.run(person())
+    assert names > 22
+    assert overlaps == []
 
 
 @pytest.mark.parametrize("width", WIDTHS)

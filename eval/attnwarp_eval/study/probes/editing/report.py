@@ -7,14 +7,13 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, ClassVar
 
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Gallery, Picture, Section, Table
 from attnwarp_eval.document.numbers import decibels, number, pooled, spread
 from attnwarp_eval.metrics.multiview import BELOW_FLOOR
-from attnwarp_eval.statistics.intervals import Interval, common, interval
+from attnwarp_eval.statistics.intervals import common, interval
 from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, is_mse, register_report
 from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.results import Results
@@ -43,9 +42,6 @@ BY_SCENE = {
 }
 
 DISAGREEMENT = "multiview.delta_e_above.edit_inside"
-
-FEWEST = 3
-"""Scenes from which on intervals are drawn."""
 
 ONE_SOURCE = frozenset({"attention_warping", "true pictures"})
 """Methods whose source view is edited alike, whatever happens to the others."""
@@ -229,10 +225,7 @@ def by_yaw(results: Results, probe: str, names: Sequence[str], layout: Layout) -
     path = layout.figure("editing-by-yaw.svg")
     with charts.drawing(path, columns=len(BY_YAW)) as panels:
         for axes, (metric, title) in zip(panels, BY_YAW.items(), strict=True):
-            series = [
-                charts.Line(name, yaws, [_drawn(value) for value in curves[metric, name]])
-                for name in measured
-            ]
+            series = [charts.Line(name, yaws, curves[metric, name]) for name in measured]
             charts.lines(
                 axes,
                 series,
@@ -254,8 +247,8 @@ def by_yaw(results: Results, probe: str, names: Sequence[str], layout: Layout) -
     ]
     text = [
         (
-            "Means over the scenes whose source edit was done, with 95 % intervals over scenes from"
-            f" {FEWEST} scenes on."
+            "Means over the scenes whose source edit was done. Bars are 95 % intervals over scenes;"
+            " of fewer than six scenes they end at the lowest and the highest one."
         ),
         BELOW_FLOOR,
     ]
@@ -588,13 +581,6 @@ def _over_scenes(values: Iterable[tuple[str, float]]) -> float:
 
 def _editing(seconds: Mapping[str, float]) -> float:
     return seconds["source"] + seconds["warp"] + seconds["edit"]
-
-
-def _drawn(value: Interval) -> Interval:
-    """Without bounds that would hide the means: of two scenes an interval spans the figure."""
-    if value.scenes >= FEWEST:
-        return value
-    return replace(value, low=math.nan, high=math.nan)
 
 
 def _lists(table: Mapping[str, Mapping[str, float]]) -> dict[str, list[float]]:
