@@ -418,9 +418,11 @@ def _print_answer(results: Results) -> None:
     from rich.console import Console
 
     from attnwarp_eval.document.write import terminal
-    from attnwarp_eval.report.answer import answer
+    from attnwarp_eval.report.answer import answer, by_claims
+    from attnwarp_eval.report.claims import load_claims
+    from attnwarp_eval.report.judging import judge
 
-    section = answer(results)
+    section = answer(results) or by_claims(results, judge(results, load_claims()))
     if section is None:
         return
     console = Console(highlight=False)

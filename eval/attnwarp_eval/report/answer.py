@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from statistics import fmean
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
 from attnwarp_eval.metrics.registry import Metric
+from attnwarp_eval.report.judging import JudgedClaim
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of, side_by_side
@@ -18,6 +19,9 @@ from attnwarp_eval.study.schema import FIGURE, Answer, AnswerColumn
 from attnwarp_eval.study.turns import timed_in_turn
 
 TITLE = "Answer"
+
+ASKS = re.compile(r"(^|, )(what|which|how|where|do|does|is|are)\b", re.IGNORECASE)
+"""Beginning of a question, of a title or of its last part."""
 
 _UNITS = {
     "px": "px",
@@ -31,7 +35,7 @@ _UNITS = {
 
 
 def answer(results: Results, timings: bool = True, pictures: bool = True) -> Section | None:
-    """The section that a report begins with; None where the study states no question.
+    """The answer to a study's own question; None where it states none.
 
     Args:
         results: of the run.
@@ -61,6 +65,134 @@ def answer(results: Results, timings: bool = True, pictures: bool = True) -> Sec
         )
         section.grids = [grid for grid in grids if grid is not None]
     return section
+
+
+MOST_CLAIMS, MOST_TOLD = 12, 5
+"""Rows at most of a table of claims in an answer, and claims at most that its text speaks of."""
+
+OUTCOMES = {
+    "holds": "As expected",
+    "the opposite holds": "The opposite of what was expected",
+    "equal": "No difference, within a bound",
+    "depends on the editor": "One way with one editor, another way with another",
+    "can't tell": "Cannot be told",
+    "blind": "No verdict, since the control failed",
+}
+"""Verdict -> how it is said, in the order in which claims are shown."""
+
+
+def by_claims(
+    results: Results, judged: Sequence[JudgedClaim], timings: bool = True
+) -> Section | None:
+    """The answer of a study that judges claims and states no question of its own; None of a run
+    that gives no verdict.
+
+    Args:
+        results: of the run.
+        judged: the claims that it has measurements for.
+        timings: whether seconds are shown.
+    """
+    own = [one for one in judged if one.verdict is not None]
+    if not own or len(results.study.scenes) < FEWEST_SCENES:
+        return None
+    kinds = list(OUTCOMES)
+    own.sort(key=lambda one: (kinds.index(str(one.verdict)), one.claim.headline or math.inf, one.p))
+    counts = {kind: sum(one.verdict == kind for one in own) for kind in kinds}
+    counted = " ".join(f"{OUTCOMES[kind]}: {n}." for kind, n in counts.items() if n)
+    written = f"{len(own)} expectation{'s were' if len(own) > 1 else ' was'} written down"
+    text = [f"{written} before the study ran. {counted}"]
+    # The headlines, then what nobody expected; shown in their order, since one speaks of another.
+    chosen = sorted(
+        (one for one in judged if one.told),
+        key=lambda one: (one.claim.headline or math.inf, one.verdict != "the opposite holds"),
+    )[:MOST_TOLD]
+    told = [one for one in judged if any(one is other for other in chosen)]
+    text.append(
+        "\n".join(
+            f"- {OUTCOMES[str(one.verdict)]}: **{one.claim.text}** ({against(one)})."
+            for one in told
+        )
+    )
+    sure = [
+        f"This is said of {results.study.sampled}, and scenes like these. Each verdict allows for"
+        f" all {len(own)} being asked at once."
+        if len(own) > 1
+        else f"This is said of {results.study.sampled}, and scenes like these."
+    ]
+    if timings:
+        sure += _time_of_pair(results)
+    if told:
+        sure.append("Build on what has a verdict.")
+    if counts["can't tell"]:
+        sure.append('"Can\'t tell" does not mean equal: more scenes may tell.')
+    text.append(" ".join(sure))
+    if len(own) > MOST_CLAIMS:
+        text.append(f"The table has {MOST_CLAIMS} of the {len(own)}; a section below has all.")
+    rows = [
+        [one.claim.text, one.in_words, one.difference, against(one)] for one in own[:MOST_CLAIMS]
+    ]
+    columns = ["what was expected", "verdict", "difference", "measured"]
+    return Section(
+        TITLE,
+        question(results) + list(filter(None, text)),
+        [Table(columns, rows, "Expected, and found")],
+    )
+
+
+def against(judged: JudgedClaim) -> str:
+    """Mean of each side of a claim in words, the one that it speaks of first.
+
+    Args:
+        judged: the claim.
+    """
+    metric = probe(judged.claim.probe).metric(judged.metric)
+    means = [in_words(side.mean, metric, judged.metric) for side in judged.sides.values()]
+    return " against ".join(reversed(means))
+
+
+def question(results: Results) -> list[str]:
+    """The study's title in bold, where it is a question.
+
+    Args:
+        results: of the run.
+    """
+    title = results.study.title.rstrip("?. ")
+    return [f"**{title}?**"] if ASKS.search(title) else []
+
+
+def _time_of_pair(results: Results) -> Iterator[str]:
+    """A sentence on the seconds of the first table's baseline and its first variant."""
+    for ablation in results.study.ablations[:1]:
+        own = report_of(ablation.probe)
+        timed = timed_in_turn(results, own.stage) if own.stage else None
+        taken = {}
+        for name in (ablation.baseline, ablation.variants[0]):
+            if timed is not None and name in timed.names:
+                taken[name] = timed.seconds(name).mean
+            elif timed is None and (once := results.seconds(own.name, name, own.cost)):
+                taken[name] = fmean(once.values())
+        if len(taken) == 2:
+            each = ", ".join(f"`{name}` {number(s, 2)} s" for name, s in taken.items())
+            yield f"Time {own.cost_of}{'' if timed else ', in one pass'}: {each}."
+
+
+def measured_in_words(results: Results) -> str:
+    """Words on what a run measured, for a report that answers no question.
+
+    Args:
+        results: of the run.
+    """
+    study = results.study
+    things = dict.fromkeys(
+        "seconds taken in turn" if probe(name).times_in_turn else report_of(name).measures or name
+        for name in study.probes
+    )
+    variants = {name for names in study.probes.values() for name in names}
+    of = f"For {len(variants)} variants, this" if len(variants) > 1 else "This"
+    where = study.sampled or ", ".join(study.scene_names)
+    scenes = "" if study.sampled else f"scene{'s' if len(study.scenes) > 1 else ''} "
+    size = f" At {study.size} x {study.size} px, in {scenes}{where}." if study.scenes else ""
+    return f"{of} run measured {'; '.join(things)}.{size}"
 
 
 def in_words(value: float, metric: Metric, key: str) -> str:
@@ -133,9 +265,8 @@ def _table(results: Results, asked: Answer, timings: bool) -> tuple[Table, list[
         for name, (value, _) in figures.items():
             text = _cell(value.mean, metric, key, unit)
             text = f"**{text}**" if name in leaders else text
-            if 1 < value.scenes < FEWEST_SCENES:
-                low, high = (_cell(end, metric, key, unit) for end in (value.least, value.most))
-                text += f" ({low.removesuffix(' %')} to {high})"
+            if value.scenes and 1 < len(results.study.scenes) < FEWEST_SCENES:
+                text += f" ({_each(results, column, name, unit)})"
             if value.undefined and value.views:
                 text += f", {value.undefined} undefined"
             rows[name].append(text)
@@ -147,6 +278,18 @@ def _table(results: Results, asked: Answer, timings: bool) -> tuple[Table, list[
             for name, row in rows.items():
                 row.append(number(1000 * seconds.get(name, math.nan)))
     return Table([*columns, *timed], list(rows.values()), timed=timed), decided
+
+
+def _each(results: Results, column: AnswerColumn, variant: str, unit: str) -> str:
+    """Means of the scenes side by side, in the study's order."""
+    key = column.metric.format(layer=results.layer)
+    metric = probe(column.probe).metric(key)
+    table = results.views(column.probe, variant, key, column.yaw)
+    means = [
+        interval({"": list(table.get(s, {}).values())}).mean for s in results.study.scene_names
+    ]
+    texts = [_cell(mean, metric, key, unit) if math.isfinite(mean) else "–" for mean in means]
+    return ", ".join(text.removesuffix(" %") for text in texts) + (" %" if unit == "%" else "")
 
 
 def _cell(value: float, metric: Metric, key: str, unit: str) -> str:
@@ -217,7 +360,7 @@ def _how_sure(results: Results) -> str:
         return f"This is one scene, {study.scene_names[0]}: other scenes may differ."
     if count < FEWEST_SCENES:
         return (
-            f"Figures are means over {count} scenes ({', '.join(study.scene_names)}), and brackets"
-            " hold the lowest and the highest scene. So few scenes say nothing in general."
+            f"Figures are means over {count} scenes, and brackets hold those of"
+            f" {', '.join(study.scene_names)}, in this order. So few scenes say nothing in general."
         )
     return f"Figures are means over {count} scenes ({study.scenes_in_words})."

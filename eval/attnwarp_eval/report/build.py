@@ -8,7 +8,7 @@ from pathlib import Path
 from attnwarp_eval.document.model import Picture, Report, Section
 from attnwarp_eval.document.numbers import FEWEST_SCENES
 from attnwarp_eval.report.ablations import ablations, compared_of
-from attnwarp_eval.report.answer import answer
+from attnwarp_eval.report.answer import answer, by_claims, measured_in_words, question
 from attnwarp_eval.report.claims import load_claims
 from attnwarp_eval.report.commands import add_commands
 from attnwarp_eval.report.controls import controls
@@ -65,25 +65,28 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
         )
         if alone and study.variants:
             lead.append(
-                '**One scene gives no verdict in general: every test says "can\'t tell". Name more'
-                " scenes for one.**"
+                '**One scene says nothing of others: every test says "can\'t tell". Name six'
+                " scenes or more for a verdict.**"
             )
     for scene, lines in results.notices.items():
         # As code: names of files may have asterisks.
         lead += ["**Scene {}**: `{}`".format(scene, line.replace("`", "'")) for line in lines]
     layout = Layout(root, timings)
-    judged = judge(results, load_claims())
+    claims = load_claims()
+    judged = judge(results, claims)
     compared = compared_of(results, judged)
     of_probes: dict[Place, list[Section]] = {place: [] for place in Place}
     for own in reports():
         for place, section in own.sections(results, layout):
             of_probes[place].append(section)
     sections = [
+        *of_probes[Place.ANSWER],
         *(
-            [claims_section(results, judged), *settling(results, judged, timings)]
-            if study.scenes
+            [claims_section(results, judged)]
+            if judged or any(claim.study == study.name for claim in claims)
             else []
         ),
+        *(settling(results, judged, timings) if len(study.scenes) >= FEWEST_SCENES else []),
         *(galleries(results) if pictures else []),
         *of_probes[Place.INSTRUMENT],
         *controls(results),
@@ -97,8 +100,13 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
     if not timings:
         for section in sections:
             section.tables = [table.without_timings() for table in section.tables]
-    answered = answer(results, timings, pictures)
-    if answered is not None:
+    answered = answer(results, timings, pictures) or by_claims(results, judged, timings)
+    if answered is None and of_probes[Place.ANSWER]:
+        answered = sections.pop(0)
+        answered.text[:0] = question(results)
+    if answered is None:
+        answered = Section("What was measured", [measured_in_words(results)])
+    else:
         for section in sections:
             section.folded = True
         answered.figures += _front(study, sections)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from attnwarp_eval.document.model import Finding, Gallery, Picture, Section, Slider
 from attnwarp_eval.inspect.command import inspect_command
@@ -23,7 +23,7 @@ command's own choice."""
 
 
 def add_commands(
-    results: Results, sections: Iterable[Section], findings: Iterable[Finding]
+    results: Results, sections: Sequence[Section], findings: Iterable[Finding]
 ) -> None:
     """Give pictures of a variant in a target view their command; the others have none.
 
@@ -42,6 +42,10 @@ def add_commands(
                 scene, picture.command = commands[picture.path]
                 first.setdefault(scene, picture.command)
         gallery.commands = list(first.values())
+    for grid in (grid for section in sections for grid in section.grids):
+        for shown in (shown for _, row in grid.rows for shown in row):
+            if shown is not None and shown.path in commands:
+                shown.command = commands[shown.path][1]
     for finding in findings:
         entry = finding.picture
         pair = [entry.before, entry.after] if isinstance(entry, Slider) else [entry]

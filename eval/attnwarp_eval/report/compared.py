@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from attnwarp_eval.metrics.counted import COUNTED
 from attnwarp_eval.metrics.registry import Metric
 from attnwarp_eval.statistics.contrasts import Contrast, contrast
 from attnwarp_eval.statistics.intervals import ByView
+from attnwarp_eval.statistics.signflips import SignFlips
 from attnwarp_eval.study.probe import probe, probes
 from attnwarp_eval.study.results import Results
 
@@ -144,6 +147,28 @@ def difference_text(value: Contrast, unit: str, level: float = 0.95) -> str:
     brackets = "" if lone else f" ({texts[1]} to {texts[2]}{behind})"
     note = f" ({value.undefined} undefined)" if value.undefined else ""
     return f"{texts[0]}{behind}{brackets}{note}"
+
+
+def scene_texts(value: Contrast, unit: str, scenes: Sequence[str]) -> list[str]:
+    """The difference of each scene; a dash where it is undefined.
+
+    Args:
+        value: the difference.
+        unit: of the metric.
+        scenes: names, in the order wanted.
+
+    Example:
+        >>> tables = [{f"s{k}": {"v": v + 0.01 * v * k} for k in range(2)} for v in (1.0, 0.6)]
+        >>> scene_texts(contrast(*tables, "ratio"), "px", ["s0", "s1", "s2"])
+        ['-40 %', '-40 %', '–']
+    """
+
+    def alone(scene: str) -> Contrast:
+        own = {scene: value.by_scene[scene]} if scene in value.by_scene else {}
+        flips = SignFlips(np.array(list(own.values())), value.flips.rounding)
+        return replace(value, by_scene=own, flips=flips, undefined=0)
+
+    return [difference_text(alone(scene), unit) for scene in scenes]
 
 
 def detectable_text(value: Contrast) -> str:

@@ -8,10 +8,10 @@ from statistics import fmean
 from typing import Literal
 
 from attnwarp_eval.document.model import Section, Table
-from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.document.numbers import FEWEST_SCENES, number, spread
 from attnwarp_eval.metrics.multiview import ABOVE_FLOOR, BELOW_FLOOR
 from attnwarp_eval.report.claims import Claim, Measured, load_claims
-from attnwarp_eval.report.compared import difference_text
+from attnwarp_eval.report.compared import difference_text, scene_texts
 from attnwarp_eval.statistics.contrasts import EQUAL_LEVEL, Contrast
 from attnwarp_eval.statistics.intervals import (
     ROUNDING,
@@ -257,15 +257,29 @@ HEAD = (
     "- **Here** speaks of these scenes alone. `seen`: the difference has the expected sign in every"
     " scene of the study. `seen where defined`: in every scene that has values, and some have none."
     " `not seen`: in no scene.\n"
-    "- **In general**: one study judges each claim, on scenes that were drawn. Other reports show"
-    " the same difference without a verdict.\n"
-    "- **Difference**: errors as ratios, in percent (or as factors, ×); shares by their odds; the"
-    " rest as they are. Below six scenes the brackets hold the lowest and the highest scene.\n"
-    "- **Scenes**: those in which the difference is defined. **Views that agree** have the"
-    " expected sign.\n"
+    "{columns}"
+    " **Views that agree** have the expected sign.\n"
     "- **Measured** are means. Those of two variants are over the views that both have, so that the"
     " difference is theirs."
 )
+
+SCALE = (
+    "errors as ratios, in percent (or as factors, ×); shares by their odds; the rest as they are."
+)
+
+MANY = (
+    "- **In general**: one study judges each claim, on scenes that were drawn. Other reports show"
+    " the same difference without a verdict.\n"
+    f"- **Difference**: {SCALE}\n"
+    "- **Scenes**: those in which the difference is defined."
+)
+"""Meaning of the columns of six scenes and more."""
+
+FEW = (
+    f"- Each scene's column has its difference: {SCALE} A dash: undefined. So few scenes give no"
+    " verdict; one study judges each claim, on scenes that were drawn."
+)
+"""Meaning of the columns of fewer scenes."""
 
 SAMPLED = (
     "**In general** is said of {scenes}, and scenes like these. Flipped signs of the scenes'"
@@ -287,55 +301,50 @@ def claims_section(results: Results, findings: Sequence[JudgedClaim]) -> Section
     """
     declared = {claim.id: claim for claim in load_claims()}
     judges = any(finding.judges for finding in findings)
-    rows, scenes = [], len(results.study.scenes)
+    rows, names = [], results.study.scene_names
+    few = len(names) < FEWEST_SCENES
     for finding in findings:
         claim = finding.claim
         sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
         agree, views = finding.agreement
-        ps = [
-            number(finding.p),
-            number(finding.contrast.student.p),
-            finding.measured.control or "–",
-        ]
-        rows.append(
-            [
-                claim.text,
-                finding.here,
-                finding.in_words,
-                _scenes(finding, scenes),
-                f"{agree} of {views}",
-                finding.difference,
-                *(ps if judges else []),
-                sides,
-                finding.metric,
-            ]
-        )
+        own = [finding.in_words, _scenes(finding, len(names)), finding.difference]
+        if judges:
+            own += [number(finding.p), number(finding.contrast.student.p)]
+            own.append(finding.measured.control or "–")
+        if few:
+            unit = probe(claim.probe).metric(finding.metric).unit
+            own = scene_texts(finding.contrast, unit, names)
+            below = finding.below_floor
+            own = [t + " (below)" * (n in below) for n, t in zip(names, own, strict=True)]
+        rows.append([claim.text, finding.here, *own, f"{agree} of {views}", sides, finding.metric])
         editors = declared[claim.id].editors if claim.id in declared else ()
-        own = [other for other in findings if other.claim.id == claim.id]
-        if editors and finding is own[-1]:
-            here, verdict = together(own, editors)
+        alike = [other for other in findings if other.claim.id == claim.id]
+        if editors and finding is alike[-1]:
+            here, verdict = together(alike, editors)
             text = f"**{declared[claim.id].text}: both editors together**"
-            dashes = ["–"] * (4 + 3 * judges)
-            rows.append([text, here, verdict or finding.in_words, *dashes, finding.metric])
+            dashes = ["–"] * len(own)
+            if not few:
+                dashes[0] = verdict or finding.in_words
+            rows.append([text, here, *dashes, "–", "–", finding.metric])
     made = Section("What was expected, and what was seen")
     if not rows:
         made.text = ["Nothing that a claim speaks of was measured."]
         return made
-    made.text = ["A claim that does not hold on these scenes is a result, not an error.", HEAD]
-    if judges:
+    head = HEAD.format(columns=FEW if few else MANY)
+    made.text = ["A claim that does not hold on these scenes is a result, not an error.", head]
+    if judges and not few:
         made.text.append(SAMPLED.format(scenes=results.study.sampled))
     if any(finding.metric.startswith(ABOVE_FLOOR) for finding in findings):
-        made.text.append(f"{BELOW_FLOOR} The column of scenes names those in which both sides are.")
-    columns = [
-        "claim",
-        "here",
-        "in general",
-        "scenes",
-        "views that agree",
-        "difference",
-        *(["adjusted p", "p by t", "control"] if judges else []),
-        "measured",
-        "metric",
+        named = (
+            'Where both sides are, a scene\'s column says "below".'
+            if few
+            else "The column of scenes names those in which both sides are."
+        )
+        made.text.append(f"{BELOW_FLOOR} {named}")
+    columns = ["in general", "scenes", "difference"]
+    columns += ["adjusted p", "p by t", "control"] if judges else []
+    columns = names if few else columns
+    made.tables = [
+        Table(["claim", "here", *columns, "views that agree", "measured", "metric"], rows)
     ]
-    made.tables = [Table(columns, rows)]
     return made

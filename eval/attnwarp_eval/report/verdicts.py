@@ -14,12 +14,11 @@ from attnwarp.errors import InputError
 from attnwarp_eval.document.model import Table
 from attnwarp_eval.document.numbers import ratio_text
 from attnwarp_eval.document.write import markdown_table
-from attnwarp_eval.report.answer import in_words
+from attnwarp_eval.report.answer import against
 from attnwarp_eval.report.claims import Claim, load_claims
 from attnwarp_eval.report.judging import JudgedClaim, decided, found
 from attnwarp_eval.report.raw import read_raw, together
 from attnwarp_eval.statistics.intervals import time_ratio
-from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.turns import Timed, timed_in_turn
@@ -52,11 +51,7 @@ class Judged:
     @property
     def measured(self) -> str:
         """Mean of each side in words, the one that the claim speaks of first."""
-        if self.judged is None:
-            return "–"
-        metric = probe(self.claim.probe).metric(self.judged.metric)
-        means = [in_words(s.mean, metric, self.judged.metric) for s in self.judged.sides.values()]
-        return " against ".join(reversed(means))
+        return "–" if self.judged is None else against(self.judged)
 
 
 def verdicts(folder: Path) -> list[Judged]:

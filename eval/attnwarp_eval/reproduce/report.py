@@ -244,8 +244,8 @@ def _geometry(results: Results) -> list[Section]:
     columns = ["view", "valid, 2DGS", "valid, 3DGS", "apart, 2DGS", "apart, 3DGS"]
     text = [
         "The source's picture, warped into a target by the depth of both kinds of splats, under the"
-        " rules of the preset `paper`. Black is not valid. *Apart* is the mean absolute difference"
-        " to the target's picture where valid, of values in [0, 1]."
+        " rules of the preset `paper`. Black is not valid. **Apart** is the mean absolute"
+        " difference to the target's picture where valid, of values in [0, 1]."
     ]
     return [Section("2DGS against 3DGS", text, [Table(columns, rows)], gallery=Gallery(pictures))]
 

@@ -27,6 +27,9 @@ K = TypeVar("K", bound="type[ProbeReport]")
 class Place(IntEnum):
     """Place of a probe's section in the report; probes of one place stand in their order."""
 
+    ANSWER = -1
+    """Before everything else; the first words of a report whose study asks nothing itself."""
+
     INSTRUMENT = 0
     """Before the tables of variants: whether the instrument can be trusted."""
 
@@ -70,10 +73,12 @@ class ProbeReport:
             cost.
         cost, cost_of, cost_text: stage of a cell's seconds that its figures cost where nothing was
             taken in turn, what they are seconds of, and what is in them.
+        measures: what it measures, for the first sentence of a report; its name if empty.
         picture_label: title of its pictures; the variant's name if empty.
     """
 
     name: str = ""
+    measures: ClassVar[str] = ""
     columns: ClassVar[Mapping[str, str]] = {}
     tabulates_all: ClassVar[bool] = False
     contrasts: ClassVar[Sequence[str]] = ()

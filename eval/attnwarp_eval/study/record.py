@@ -191,6 +191,11 @@ class Record(Generic[E]):
     environment: Environment
     extra: E
 
+    @property
+    def comparable(self) -> bool:
+        """False where the source's edit was not done: the figures say nothing of a method."""
+        return bool(getattr(self.extra, "comparable", True))
+
     def to_json(self) -> Json:
         """Entries for :meth:`attnwarp_eval.study.store.Store.write`."""
         own = self.extra.to_json()

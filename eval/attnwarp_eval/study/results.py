@@ -150,7 +150,8 @@ class Results:
     def views(
         self, probe: str, variant: str, metric: str, yaw: tuple[float, float] | None = None
     ) -> dict[str, dict[str, float]]:
-        """Scene -> view (and seed) -> value; NaN where undefined.
+        """Scene -> view (and seed) -> value; NaN where undefined, as is every figure of an edit
+        whose source was not done: such an edit takes part in no comparison.
 
         Args:
             probe, variant: whose records.
@@ -161,7 +162,7 @@ class Results:
         for scene, seed, record in self.records(probe, variant):
             for view in record.views:
                 if yaw is None or yaw[0] <= view.yaw <= yaw[1]:
-                    value = _value(view.metrics, metric)
+                    value = _value(view.metrics, metric) if record.comparable else math.nan
                     table.setdefault(scene, {})[f"{view.name}/{seed}"] = float(value)
         return table
 

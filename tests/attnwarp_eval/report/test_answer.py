@@ -66,20 +66,21 @@ def test_an_answer_has_the_means_over_scenes_of_views_in_range_as_words():
     table = section.tables[0]
     assert table.columns == ["variant", "hidden", "feature error", "time a view, ms"]
     assert table.rows == [
-        ["`masked`", "**2.0 %** (1.0 to 3.0 %)", "**20 %** (10 to 30 %)", "50.0"],
-        ["`open`", "70 % (60 to 80 %)", "90 % (80 to 100 %)", "50.0"],
+        ["`masked`", "**2.0 %** (2.0, 1.0, 3.0 %)", "**20 %** (20, 30, 10 %)", "50.0"],
+        ["`open`", "70 % (60, 70, 80 %)", "90 % (90, 80, 100 %)", "50.0"],
     ]
 
 
 def test_views_without_a_value_are_counted_and_not_averaged_in():
     made = run()
     made.cells[0].record.views[0].metrics[ERROR] = float("nan")  # one of two views of one scene
-    assert answer(made).tables[0].rows[0][2] == "**20 %** (10 to 30 %), 1 undefined"
+    assert answer(made).tables[0].rows[0][2] == "**20 %** (20, 30, 10 %), 1 undefined"
 
 
 def test_the_variant_that_is_best_where_it_decides_is_recommended():
     advice = answer(run()).text[2]
     assert advice.startswith("Use `masked`") and "feature error: 20 %" in advice
+    assert "brackets hold those of one, two, three, in this order." in advice
     assert "So few scenes say nothing in general." in advice
 
 

@@ -15,8 +15,10 @@ from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.document.write import inline, markdown
 from attnwarp_eval.metrics.occlusion import COUNTS
 from attnwarp_eval.report.ablations import ablations, compared_of
+from attnwarp_eval.report.answer import by_claims
 from attnwarp_eval.report.build import build, problems
 from attnwarp_eval.report.claims import Claim, load_claims
+from attnwarp_eval.report.compared import between
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.judging import claims_section, decided, found, judge, together
 from attnwarp_eval.report.settling import settling
@@ -761,7 +763,12 @@ def test_an_undefined_scene_neither_agrees_nor_disagrees_and_seen_needs_every_sc
     missing = results({"good": [[0.1]] * 3, "slipped": [[0.6], None, [0.7]]})
     assert [one.here for one in judge(missing, [SLIP_CLAIM])] == [here]
     (table,) = claims_section(missing, judge(missing, load_claims())).tables
-    assert {row[table.columns.index("scenes")] for row in table.rows} == {"2 of 3"}
+    # Fewer than six scenes stand side by side, and nothing is said in general.
+    assert table.columns[:5] == ["claim", "here", *SCENES]
+    assert not {"in general", "difference", "scenes"} & set(table.columns)
+    for row in table.rows:
+        # 0.6 and 0.7 px against 0.1 px; nothing of scene two.
+        assert row[2:5] == ["× 6.00", "–", "× 7.00"]
     (finding,) = judge(
         results({"good": [[0.9], [None], [0.9]], "slipped": [[0.6]] * 3}), [SLIP_CLAIM]
     )
@@ -805,12 +812,75 @@ def test_a_study_of_one_scene_says_at_its_top_that_no_verdict_is_possible(tmp_pa
     ]
     text = markdown(build(written_runs.results(study(scenes=["one"]), cells), tmp_path))
     lead = text[: text.index("\n## ")]
-    assert "One scene gives no verdict in general" in lead
+    assert "One scene says nothing of others" in lead
+    assert lead.count("one, two, three") == 0 and "At 512 x 512 px, in scene one." in lead
     assert "means over the views of one scene, which has no interval" in lead and "±" not in lead
     # It is true: a difference of 0.8 in every view stays undecided.
     row = next(line for line in text.splitlines() if line.startswith(f"| slipped | {SLIP}"))
-    assert "can't tell" in row and "judged by `suite`" in text
-    assert "One scene gives" not in markdown(build(results(CLEAR), tmp_path))
+    assert "can't tell" in row and "| in general |" not in text
+    assert "One scene says" not in markdown(build(results(CLEAR), tmp_path))
+
+
+def test_a_study_that_judges_claims_begins_with_their_verdicts():
+    clear = {"good": [[0.1] * 8], "slipped": [[0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.6]]}
+    claims = [SLIP_CLAIM, dataclasses.replace(SLIP_CLAIM, text="It does not", expect="lower")]
+    run = drawn(clear, title="What slips")
+    asked, counted, told, sure = by_claims(run, judge(run, claims)).text
+    assert asked == "**What slips?**"
+    assert counted == (
+        "2 expectations were written down before the study ran. As expected: 1."
+        " The opposite of what was expected: 1."
+    )
+    # The mean of the eight is 0.65 px.
+    assert told.splitlines() == [
+        "- As expected: **It slips** (0.65 px of a 64 grid against 0.10 px of a 64 grid).",
+        "- The opposite of what was expected: **It does not** (0.65 px of a 64 grid against 0.10"
+        " px of a 64 grid).",
+    ]
+    assert "8 scenes drawn by generator" in sure and "all 2 being asked at once" in sure
+    assert "Time a view, in one pass: `good` 0.10 s, `slipped` 0.10 s." in sure
+    assert by_claims(results(CLEAR), judge(results(CLEAR), claims)) is None
+
+
+def test_a_study_that_asks_nothing_begins_with_what_was_measured(tmp_path):
+    text = markdown(build(results(CLEAR, name="other"), tmp_path))
+    first = text.split("\n", 1)[1].lstrip().split("\n")[0]
+    assert first == (
+        "For 2 variants, this run measured warps and masks against exact correspondences."
+        " At 512 x 512 px, in scenes one, two, three."
+    )
+    # A claim that no study of this name judges is not missed, where nothing of it was measured.
+    bare = written_runs.results(
+        study(variants={}, probes={"stability": []}, ablations=[], scenes=[]), []
+    )
+    assert "claim" not in markdown(build(bare, tmp_path)).lower()
+
+
+def test_a_method_whose_source_edit_failed_stands_in_no_ordering():
+    """By hand: of scene two only ``A`` did its source edit."""
+    metrics = (
+        "embedding.dino_image.render",
+        "embedding.clip_image.render",
+        "image.psnr.edit_render",
+    )
+    for metric in metrics:
+        cells = [
+            edited("A", 0.5, metric=metric),
+            edited("A", 0.7, metric=metric, scene="two"),
+            edited("B", 0.4, metric=metric),
+            edited("B", 0.9, metric=metric, scene="two", done=False),
+        ]
+        content = study(
+            scenes=["one", "two"],
+            variants={"A": {}, "B": {"options": {"stages": 1}}},
+            probes={"editing": ["A", "B"]},
+            ablations=[],
+        )
+        run = written_runs.results(content, cells)
+        mean = run.mean("editing", "B", metric)
+        assert (mean.mean, mean.scenes, mean.undefined) == (0.4, 1, 1)
+        assert run.mean("editing", "A", metric).mean == pytest.approx(0.6)
+        assert between(run, "editing", "A", "B", metric).by_scene == {"one": pytest.approx(-0.1)}
 
 
 def calibrated(**changes):

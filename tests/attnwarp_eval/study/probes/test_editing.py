@@ -212,12 +212,15 @@ def test_each_method_stands_beside_its_own_edit_of_the_source(tmp_path):
         pictures = [
             (caption, Image.open(store.root / path).getpixel((0, 0))) for caption, path in row
         ]
+        source, view = "source's edit", "15°"
+        methods = [(name, head) for name in sources for head in (source, view)]
+        truths = ["truth: alone, third", "truth: warped"]
         assert [caption for caption, _ in pictures] == [
-            "before", "source edit: alone, third", "alone", "source edit: warped", "warped", "third",
-            "truth of the source's answer: alone, third", "truth of the source's answer: warped",
-        ]  # fmt: skip
+            f"{label}, {head}"
+            for label, head in [("before", view), *methods, *((one, view) for one in truths)]
+        ]
         # JPEG moves a plain colour by a few steps.
-        expected = [(128, 128, 128), red, white, green, white, white, red, green]
+        expected = [(128, 128, 128), red, white, green, white, red, white, red, green]
         for (caption, color), planned_color in zip(pictures, expected, strict=True):
             assert color == pytest.approx(planned_color, abs=4), caption
 

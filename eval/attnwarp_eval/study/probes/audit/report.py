@@ -194,6 +194,7 @@ class AuditReport(ProbeReport):
     """Presentation of the metrics: which of them can be believed."""
 
     name = "audit"
+    measures = "which flaws of an edit each consistency metric sees"
 
     def findings(self, results: Results) -> Iterator[Finding]:
         """Find the metric without truth that sees the flaws that matter most best."""
@@ -216,7 +217,7 @@ class AuditReport(ProbeReport):
         if not records:
             return
         pairs = Pairs(records)
-        yield Place.INSTRUMENT, _answer(results, pairs, layout)
+        yield Place.ANSWER, _answer(results, pairs, layout)
         yield (
             Place.INSTRUMENT,
             Section(

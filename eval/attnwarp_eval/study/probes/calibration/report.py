@@ -33,6 +33,7 @@ class CalibrationReport(ProbeReport):
     """The error of the instrument, in every report."""
 
     name = "calibration"
+    measures = "the error of the instrument itself"
     picture_label = "truth's own depth"
 
     def problems(self, results: Results) -> list[str]:

@@ -24,6 +24,7 @@ class CarryReport(ProbeReport):
     """Colour difference of views at the same points, by variant and view."""
 
     name = "carry"
+    measures = "an edit carried to a few views"
     tabulates_all = True
     columns: ClassVar[Mapping[str, str]] = {"colour difference, dE00": "multiview.delta_e"}
     cost = "whole"

@@ -31,6 +31,7 @@ class DepthReport(ProbeReport):
     """Depth and normals by variant."""
 
     name = "depth"
+    measures = "depth and normals of sampled splats"
     columns: ClassVar[Mapping[str, str]] = {
         "AbsRel": "depth.abs_rel",
         "RMSE": "depth.rmse",

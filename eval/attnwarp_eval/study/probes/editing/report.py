@@ -10,12 +10,20 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 from attnwarp_eval.document import charts
-from attnwarp_eval.document.model import Gallery, Picture, Section, Table
+from attnwarp_eval.document.model import Grid, Picture, Section, Table
 from attnwarp_eval.document.numbers import decibels, number, pooled, spread
 from attnwarp_eval.metrics.multiview import BELOW_FLOOR
 from attnwarp_eval.statistics.intervals import common, interval
-from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, is_mse, register_report
-from attnwarp_eval.study.record import PictureFile
+from attnwarp_eval.study.probe_report import (
+    Layout,
+    Place,
+    ProbeReport,
+    in_degrees,
+    is_mse,
+    register_report,
+)
+from attnwarp_eval.study.probes.editing.result import EditResult
+from attnwarp_eval.study.record import PictureFile, Record
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.shared.edits import EditingPart
 from attnwarp_eval.study.shared.encoders import encoders_named
@@ -56,6 +64,7 @@ class EditingReport(ProbeReport):
     """Agreement, fidelity and seconds of edits by variant."""
 
     name = "editing"
+    measures = "edits of scenes against true pictures of the edit"
     tabulates_all = True
     columns: ClassVar[Mapping[str, str]] = {
         "same answer": "multiview.same_answer.edit",
@@ -346,55 +355,64 @@ def _part(
     return "no view in common"
 
 
+SOURCE = "source's edit"
+"""Column of what each method made of the source."""
+
+UNDONE = "**source edit failed**"
+"""Stands behind a method's name whose edit of the source was not done."""
+
+
 def side_by_side(results: Results, probe: str) -> Section | None:
-    """A row for each view of an edit: before, each variant's source edit and edited view, the
-    truth.
-    """
-    rows: dict[tuple[str, str], dict[str, dict[str, PictureFile]]] = {}
+    """A grid for each edit: columns are views, rows the view before, each method, and the truth."""
+    edits: dict[tuple[str, str], dict[str, Record[EditResult]]] = {}
     for cell, record in results.finished(probe):
-        for picture in record.pictures:
-            own = rows.setdefault((cell.scene, picture.view), {})
-            own.setdefault(cell.variants[0], {})[picture.content] = picture
-    if not rows:
+        if record.pictures:
+            own = edits.setdefault((cell.scene, record.extra.name), {})
+            own.setdefault(cell.variants[0], record)
+    if not edits:
         return None
-    gallery = [
-        (f"**{scene}, {view}**", _row_of_view(variants)) for (scene, view), variants in rows.items()
+    grids = [
+        _grid(f"{scene}: “{next(iter(own.values())).extra.instruction}”", own)
+        for (scene, _), own in edits.items()
     ]
     text = [
-        "The view before the edit; each variant's edit of the source and its edited view; the truth"
-        " of the answer that the source's edit gave. Variants with the same picture share it."
+        "Rows are methods, columns views. The truth is that of the answer that a source's edit"
+        " gave. A method whose source edit failed takes part in no comparison."
     ]
-    return Section("Edited views side by side", text, gallery=Gallery(gallery))
+    return Section("Edited views side by side", text, grids=grids)
 
 
-def _row_of_view(variants: Mapping[str, Mapping[str, PictureFile]]) -> list[Picture]:
-    """Pictures of one view, by variant and content."""
-    by_hand, sources, truths = (
-        _owners(variants, content) for content in ("by-hand", "source-edit", "truth")
-    )
-    row = [Picture(next(iter(variants.values()))["before"].path, "before")]
-    for name, files in variants.items():
-        if name in by_hand:
-            row.append(Picture(files["by-hand"].path, f"source by hand{by_hand[name]}"))
-        if name in sources:
-            row.append(Picture(files["source-edit"].path, f"source edit{sources[name]}"))
-        if "edited" in files:
-            row.append(Picture(files["edited"].path, name))
-    for name, owners in truths.items():
-        row.append(Picture(variants[name]["truth"].path, f"truth of the source's answer{owners}"))
-    return row
-
-
-def _owners(variants: Mapping[str, Mapping[str, PictureFile]], content: str) -> dict[str, str]:
-    """The variants that share a picture, by the first of them; empty for all of them."""
-    shared: dict[str, list[str]] = {}
-    for name, files in variants.items():
-        if content in files:
-            shared.setdefault(files[content].sha256, []).append(name)
-    return {
-        names[0]: "" if len(names) == len(variants) else f": {', '.join(names)}"
-        for names in shared.values()
+def _grid(caption: str, methods: Mapping[str, Record[EditResult]]) -> Grid:
+    """Pictures of one edit, by method and view."""
+    files = {
+        name: {(p.content, p.view.rpartition("/")[2]): p for p in record.pictures}
+        for name, record in methods.items()
     }
+    views = list(dict.fromkeys(view for own in files.values() for _, view in own))
+
+    def row(
+        label: str, own: Mapping[tuple[str, str], PictureFile], shown: str, source: str = ""
+    ) -> tuple[str, list[Picture | None]]:
+        first = next((p for (content, _), p in own.items() if content == source), None)
+        pictures = [first, *(own.get((shown, view)) for view in views)]
+        heads = [SOURCE, *map(in_degrees, views)]
+        return label, [
+            None if picture is None else Picture(picture.path, f"{label}, {head}")
+            for picture, head in zip(pictures, heads, strict=True)
+        ]
+
+    rows = [row("before", next(iter(files.values())), "before")]
+    truths: dict[tuple[str, ...], list[str]] = {}
+    for name, own in files.items():
+        undone = "" if methods[name].comparable else f" {UNDONE}"
+        by_hand = any(content == "by-hand" for content, _ in own)
+        rows.append(row(name + undone, own, "edited", "by-hand" if by_hand else "source-edit"))
+        if truth := tuple(p.sha256 for (content, _), p in own.items() if content == "truth"):
+            truths.setdefault(truth, []).append(name)
+    for names in truths.values():
+        label = "truth" if len(truths) == 1 else f"truth: {', '.join(names)}"
+        rows.append(row(label, files[names[0]], "truth"))
+    return Grid(caption, [SOURCE, *map(in_degrees, views)], rows)
 
 
 def parts_of_time(results: Results, probe: str) -> Section:

@@ -63,6 +63,11 @@ class EditResult:
     injected: float
     budget: Spent | None = None
 
+    @property
+    def comparable(self) -> bool:
+        """True where the source's edit was done; no other edit takes part in a comparison."""
+        return self.source.done
+
     def to_json(self) -> Json:
         """The record's entry ``edit``."""
         data = dict(without_nan(asdict(self)))

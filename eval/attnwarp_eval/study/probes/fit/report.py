@@ -38,6 +38,7 @@ class FitReport(ProbeReport):
     """Pictures, depth and normals of fits by variant."""
 
     name = "fit"
+    measures = "splats fitted to true pictures"
     columns: ClassVar[Mapping[str, str]] = {
         "PSNR, dB": "fit.psnr",
         "PSNR, pooled": "fit.mse",

@@ -16,6 +16,7 @@ class IdealReport(ProbeReport):
     """Seen, through, bleed and dE by variant; they are read together."""
 
     name = "ideal"
+    measures = "edits in parts by the ideal editor"
     columns: ClassVar[Mapping[str, str]] = {
         "seen": "parts.seen.edit",
         "through": "parts.through.edit",

@@ -15,6 +15,7 @@ class LabelReport(ProbeReport):
     """Labels of a thing's parts that arrive, by variant."""
 
     name = "labels"
+    measures = "where labels of parts arrive"
     columns: ClassVar[Mapping[str, str]] = {
         "right": "labels.right",
         "wrong": "labels.wrong",

@@ -95,6 +95,7 @@ class SensitivityReport(ProbeReport):
     """Shares of right results that metrics rank above flawed ones."""
 
     name = "sensitivity"
+    measures = "which flaws each metric sees"
 
     def findings(self, results: Results) -> Iterator[Finding]:
         """Find what the metrics that need no truth see best, and what they miss most, of the flaws

@@ -21,6 +21,7 @@ class StabilityReport(ProbeReport):
     """Verdicts, errors against hardness, and every error."""
 
     name = "stability"
+    measures = "hard cases of the numerics"
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """The verdicts, the errors against hardness, and every error."""

@@ -23,6 +23,7 @@ class VariabilityReport(ProbeReport):
     """Variety between seeds, and agreement within one, by variant."""
 
     name = "variability"
+    measures = "edits by several seeds"
     tabulates_all = True
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:

@@ -42,6 +42,7 @@ class WarpReport(ProbeReport):
     """Endpoint error, feature error and mask scores by variant."""
 
     name = "warp"
+    measures = "warps and masks against exact correspondences"
     columns: ClassVar[Mapping[str, str]] = {
         "EPE, image px": "warp.epe_median",
         "EPE p95": "warp.epe_p95",
