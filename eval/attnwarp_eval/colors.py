@@ -1,7 +1,8 @@
-"""The sRGB transfer curve, in one place (IEC 61966-2-1)."""
+"""The sRGB transfer curve (IEC 61966-2-1), and the difference of two pictures' colours."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -34,3 +35,14 @@ def to_linear(srgb: npt.ArrayLike) -> npt.NDArray[Any]:
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(
         value.dtype
     )
+
+
+def color_difference(
+    a: npt.NDArray[Any], b: npt.NDArray[Any], mask: npt.NDArray[np.bool_]
+) -> float:
+    """Mean CIEDE2000 of two (H, W, 3) sRGB pictures inside a mask; NaN where it is empty."""
+    from skimage.color import deltaE_ciede2000, rgb2lab
+
+    if not mask.any():
+        return math.nan
+    return float(deltaE_ciede2000(rgb2lab(a[mask]), rgb2lab(b[mask])).mean())

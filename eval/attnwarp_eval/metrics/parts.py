@@ -5,13 +5,12 @@ They are read together: ``seen`` alone rewards painting everything.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp_eval.colors import color_difference
 from attnwarp_eval.metrics.arrays import share
 
 Image = npt.NDArray[np.float32]
@@ -142,21 +141,12 @@ def part_figures(
     shown = truth.errors(picture).argmin(axis=0)
     source = answered(truth, answers)
     seen = visible & (truth.pixels >= 0) & np.isfinite(source).all(axis=-1)
+    edited = np.asarray(picture, dtype=np.float64)
     return {
         "parts.seen": share(int((there == answers)[known].sum()), int(known.sum())),
         "parts.through": share(int((shown == front)[asked].sum()), int(asked.sum())),
-        "parts.bleed": _delta_e(picture, truth.before, truth.outside),
-        "parts.delta_e": _delta_e(picture, source, seen),
+        "parts.bleed": color_difference(edited, truth.before.astype(np.float64), truth.outside),
+        "parts.delta_e": color_difference(edited, source.astype(np.float64), seen),
         "parts.seen_parts": int(known.sum()),
         "parts.hidden_pixels": int(asked.sum()),
     }
-
-
-def _delta_e(first: Any, second: Any, among: Mask) -> float:
-    """Mean CIEDE2000 of pixels; NaN for none."""
-    from skimage.color import deltaE_ciede2000, rgb2lab
-
-    if not among.any():
-        return math.nan
-    pair = (rgb2lab(np.asarray(image, dtype=np.float64)[among]) for image in (first, second))
-    return float(np.mean(deltaE_ciede2000(*pair)))

@@ -67,7 +67,7 @@ def run_method(
     donor: Donor | None = None,
     segments: Sequence[npt.NDArray[np.bool_]] | None = None,
 ) -> EditedScene:
-    """Edit a scene by the method of a cell.
+    """Edit a scene by the method of a cell; its seconds go to the work's meter.
 
     Args:
         work: of the cell, whose spec has ``method``, ``settings``, ``editor`` and ``edit``.
@@ -102,7 +102,10 @@ def run_method(
             donor,
             segments,
         )
-        return EDITING_METHODS[spec["method"]].run(job)
+        result = EDITING_METHODS[spec["method"]].run(job)
+    for part, seconds in result.seconds.items():
+        work.meter.add(f"method: {part}", seconds)
+    return result
 
 
 def source_by_hand(work: Work, truth: EditTruth, source: str) -> Image | None:

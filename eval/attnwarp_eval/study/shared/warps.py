@@ -2,14 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from typing import Any
 
 from attnwarp.warp import WarpedView, WarpSettings, parts_read, render_surface, warp_view
-from attnwarp_eval.study.probe import Work
-from attnwarp_eval.study.shared.splats import splats_of
+from attnwarp_eval.study.probe import Probe, Work
+from attnwarp_eval.study.reads import warp_reads
+from attnwarp_eval.study.record import Json, NoExtra
+from attnwarp_eval.study.schema import Study, Variant
+from attnwarp_eval.study.shared.splats import (
+    splats_of,
+    surface_meaning,
+    surface_reads,
+    surface_spec,
+)
 from attnwarp_eval.study.warping import warp_truth
 from attnwarp_eval.two_view import TwoView
+
+
+class WarpProbe(Probe[NoExtra]):
+    """Base of probes that judge a variant's warp."""
+
+    def reads(self, study: Study, variant: Variant) -> Set[str]:
+        """Depth and rules."""
+        truth = variant.geometry == "truth"
+        return surface_reads(variant) | warp_reads(variant.settings(), truth)
+
+    def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
+        """Depth and rules."""
+        return {
+            **surface_spec(study, variant, seed),
+            "spp": study.spp,
+            "settings": variant.settings().to_dict(),
+        }
+
+    def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
+        """Splats may be fitted."""
+        return surface_meaning(study, variant)
 
 
 def warped_views(work: Work, grids: Sequence[int]) -> Iterator[tuple[str, TwoView, WarpedView]]:

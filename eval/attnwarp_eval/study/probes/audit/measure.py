@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Annotated, Any
 
@@ -34,10 +33,17 @@ from attnwarp_eval.scene.spec import ObjectChange
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import answers_of
 from attnwarp_eval.study.flaws import CONDITIONS, Edited
-from attnwarp_eval.study.probe import Probe, Work, metrics_of, register
+from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.schema import Part, Splats, Study, StudyError, check_distinct
-from attnwarp_eval.study.shared.encoders import EncodersPart, encoder_identities, loaded
+from attnwarp_eval.study.shared.encoders import (
+    EncodersPart,
+    MetricsProbe,
+    Seconds,
+    encoder_identities,
+    encoder_sources,
+    loaded,
+)
 from attnwarp_eval.truth import appearance
 from attnwarp_eval.truth.edits import edit_mask, touched
 from attnwarp_eval.two_view import TwoView
@@ -83,35 +89,14 @@ class StudyPart(EncodersPart):
     audit: Audit = Audit()
 
 
-@dataclass(frozen=True)
-class Seconds:
-    """Seconds of one pair by metric and round, taken in turn."""
-
-    seconds: Mapping[str, list[float]]
-
-    def to_json(self) -> Json:
-        """The entry ``rounds`` of the record's cost."""
-        return {"cost": {"rounds": dict(self.seconds)}} if self.seconds else {}
-
-
 @register
-class AuditProbe(Probe[Seconds]):
+class AuditProbe(MetricsProbe):
     """One cell a scene and seed: all metrics judge the same pictures."""
 
     name = "audit"
     study_part = StudyPart
     metrics = metrics_of("consistency.", "embedding.", "multiview.")
-    judges_variants = False
-    draws = False
     study_keys = frozenset({"size", "seeds", "spp", "timing_rounds", "encoders", "audit"})
-
-    def check(self, study: Study) -> None:
-        """Variants change no metric."""
-        if study.probes.get(self.name):
-            raise ValueError(
-                "probes.audit: got variants, expected []; it judges metrics, which no variant"
-                " changes"
-            )
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
@@ -140,20 +125,16 @@ class AuditProbe(Probe[Seconds]):
                     "answers": answers,
                     "yaws": part.audit.yaws,
                 }
-                sources = {str(kind): part.encoders[kind] for kind in sorted(part.encoders)}
                 yield Cell(
                     spec, name, "metrics", self.name, seed, ("metrics",),
-                    sources={**sources, "other": files[other]},
+                    sources={**encoder_sources(part), "other": files[other]},
                 )  # fmt: skip
 
     def compute(self, work: Work) -> Seconds:
         """Every metric on every condition at every yaw."""
         spec, world, meter = work.spec, work.world, work.meter
         with meter.stage("setup"):
-            encoders = loaded(
-                {k: v for k, v in work.cell.sources.items() if k in spec["encoders"]},
-                spec["encoders"],
-            )
+            encoders = loaded(work.cell.sources, spec["encoders"])
         with meter.stage("truth"):
             cameras = {yaw: turned(world.scene, yaw) for yaw in spec["yaws"]}
             for camera in cameras.values():
@@ -202,11 +183,6 @@ class AuditProbe(Probe[Seconds]):
                     seconds = _rounds(pair, whole, spec)
             work.add(camera.name, figures)
         return Seconds(seconds)
-
-    def read_extra(self, data: Json) -> Seconds:
-        """Read from the record's cost."""
-        rounds = data["cost"].get("rounds", {})
-        return Seconds({key: [float(v) for v in values] for key, values in rounds.items()})
 
 
 def _answers(scene: Scene, edit: str) -> list[list[str]]:

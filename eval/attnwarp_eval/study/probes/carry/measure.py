@@ -16,6 +16,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from attnwarp_eval import metrics
+from attnwarp_eval.colors import color_difference
 from attnwarp_eval.metrics.registry import METRICS, Registry
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study import pictures
@@ -147,15 +148,13 @@ class CarryProbe(MethodProbe[NoExtra]):
         segments = [inside[name] for name in names]
         truth = EditTruth(before, {}, {}, inside)
         result = run_method(work, truth, names, model, segments=segments)
-        for part, seconds in result.seconds.items():
-            meter.add(f"method: {part}", seconds)
         meter.add("whole", own_seconds(result))
         with meter.stage("checks"):
             after = {
                 names[k]: picture.astype(np.float32) / np.float32(255)
                 for k, picture in result.edited.items()
             }
-            done = _change(before[source], after[source], inside[source]) >= LEAST_CHANGE
+            done = color_difference(before[source], after[source], inside[source]) >= LEAST_CHANGE
             shown = {"before": before, "after": after}
             work.draw(source, partial(_jpegs, shown, source))
             for name in spec["views"]:
@@ -166,15 +165,6 @@ class CarryProbe(MethodProbe[NoExtra]):
                 row = {"multiview.delta_e": float(value)}
                 work.add(name, row, partial(_jpegs, shown, name))
         return NoExtra()
-
-
-def _change(before: Image, after: Image, mask: npt.NDArray[np.bool_]) -> float:
-    """Mean CIEDE2000 between two pictures inside a mask; 0 where it is empty."""
-    from skimage.color import deltaE_ciede2000, rgb2lab
-
-    if not mask.any():
-        return 0.0
-    return float(deltaE_ciede2000(rgb2lab(before[mask]), rgb2lab(after[mask])).mean())
 
 
 def _jpegs(shown: Mapping[str, Mapping[str, Image]], name: str) -> dict[str, bytes]:

@@ -37,7 +37,12 @@ from attnwarp_eval.study.shared.edits import (
     reference_of,
     settings_of,
 )
-from attnwarp_eval.study.shared.encoders import EncodersPart, encoder_identities, loaded
+from attnwarp_eval.study.shared.encoders import (
+    EncodersPart,
+    encoder_identities,
+    encoder_sources,
+    loaded,
+)
 from attnwarp_eval.study.shared.method_run import own_seconds, run_method
 from attnwarp_eval.study.shared.splats import splats_of
 
@@ -146,7 +151,7 @@ class EditingProbe(MethodProbe[EditResult]):
         """One for each scene, edit, variant and seed."""
         wanted = study.part(EncodersPart)
         encoders = encoder_identities(wanted)
-        sources = {str(kind): name for kind, name in wanted.encoders.items()}
+        sources = encoder_sources(wanted)
         for name, scene in scenes.items():
             edits = list(edits_of(study, scene))
             for label in names:
@@ -189,8 +194,6 @@ class EditingProbe(MethodProbe[EditResult]):
         budget = self._budget(work, truth, names)
         result = run_method(work, truth, names, before, budget)
         STOPWATCH.note(_decisive(spec), own_seconds(result))
-        for part, seconds in result.seconds.items():
-            meter.add(f"method: {part}", seconds)
         meter.add("whole", own_seconds(result))
         meter.count(**{k: int(v) for k, v in result.counters.items() if k != "injected"})
         with meter.stage("checks"):

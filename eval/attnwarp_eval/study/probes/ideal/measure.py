@@ -159,8 +159,6 @@ class IdealProbe(MethodProbe[IdealResult]):
         spec["edit"] = {"instruction": EDIT, "target": EDIT, "source": world.scene.title}
         result = run_method(work, _truth(thing), names, before, editor=editor, donor=donor)
         del spec["edit"]
-        for part, seconds in result.seconds.items():
-            meter.add(f"method: {part}", seconds)
         meter.add("whole", own_seconds(result))
         with meter.stage("checks"):
             edited: dict[str, Image] = {

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 
@@ -14,13 +14,11 @@ from attnwarp_eval.ideal.parts import token_parts
 from attnwarp_eval.ideal.thing import labels_of
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.probe import Probe, Work, metrics_of, register
-from attnwarp_eval.study.reads import warp_reads
+from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Part, Study, Variant, Whole
-from attnwarp_eval.study.shared.splats import surface_meaning, surface_reads, surface_spec
 from attnwarp_eval.study.shared.things import check_things, thing_of
-from attnwarp_eval.study.shared.warps import warped_views
+from attnwarp_eval.study.shared.warps import WarpProbe, warped_views
 
 GRIDS = (8, 16, 32, 64)
 """Sides of the token grids that are measured where a study names none."""
@@ -47,7 +45,7 @@ class StudyPart(Part):
 
 
 @register
-class LabelTransport(Probe[NoExtra]):
+class LabelTransport(WarpProbe):
     """Labels of a thing's parts, carried along the tokens of a warp."""
 
     name = "labels"
@@ -68,11 +66,6 @@ class LabelTransport(Probe[NoExtra]):
         """A thing of a scene that is not there would be measured nowhere."""
         check_things(study, [scene.name for scene in scenes])
 
-    def reads(self, study: Study, variant: Variant) -> Set[str]:
-        """Depth and rules."""
-        truth = variant.geometry == "truth"
-        return surface_reads(variant) | warp_reads(variant.settings(), truth)
-
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
@@ -85,16 +78,10 @@ class LabelTransport(Probe[NoExtra]):
         """Depth, rules, grids and parts."""
         part = study.part(StudyPart).labels
         return {
-            **surface_spec(study, variant, seed),
-            "spp": study.spp,
-            "settings": variant.settings().to_dict(),
+            **super().variant_spec(study, variant, seed),
             "grids": part.grids or [grid for grid in GRIDS if study.size % grid == 0],
             "parts": part.parts,
         }
-
-    def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
-        """Splats may be fitted."""
-        return surface_meaning(study, variant)
 
     def compute(self, work: Work) -> NoExtra:
         """Warp, carry and count, view by view."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,10 +20,16 @@ from attnwarp_eval.metrics.arrays import Array
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.flawed_edits import CONDITIONS, RIGHT, Shot, Task, shots_of, tasks
-from attnwarp_eval.study.probe import Probe, Work, metrics_of, register
-from attnwarp_eval.study.record import Json
+from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.schema import Study, StudyError, check_distinct, did_you_mean
-from attnwarp_eval.study.shared.encoders import EncodersPart, encoder_identities, loaded
+from attnwarp_eval.study.shared.encoders import (
+    EncodersPart,
+    MetricsProbe,
+    Seconds,
+    encoder_identities,
+    encoder_sources,
+    loaded,
+)
 from attnwarp_eval.two_view import TwoView
 
 FIDELITY = (
@@ -56,19 +61,8 @@ class StudyPart(EncodersPart):
         return self
 
 
-@dataclass(frozen=True)
-class Seconds:
-    """Seconds of one picture by metric and round, taken in turn."""
-
-    seconds: Mapping[str, list[float]]
-
-    def to_json(self) -> Json:
-        """The entry ``rounds`` of the record's cost."""
-        return {"cost": {"rounds": dict(self.seconds)}} if self.seconds else {}
-
-
 @register
-class Sensitivity(Probe[Seconds]):
+class Sensitivity(MetricsProbe):
     """One cell for all metrics of a scene: they judge the same pictures, and run in turn.
 
     A view of a record is named ``task/target``, a figure ``metric.condition``.
@@ -77,17 +71,7 @@ class Sensitivity(Probe[Seconds]):
     name = "sensitivity"
     study_part = StudyPart
     metrics = metrics_of("fidelity.", "consistency.", "embedding.")
-    judges_variants = False
-    draws = False
     study_keys = frozenset({"size", "views", "seeds", "spp", "timing_rounds", "encoders", "edits"})
-
-    def check(self, study: Study) -> None:
-        """Variants change no metric."""
-        if study.probes.get(self.name):
-            raise ValueError(
-                "probes.sensitivity: got variants, expected []; it judges metrics, which no variant"
-                " changes"
-            )
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
@@ -110,8 +94,10 @@ class Sensitivity(Probe[Seconds]):
                     "encoders": identities,
                     "tasks": [task.to_dict() for task in _tasks_of(scene, part.edits)],
                 }
-                sources = {str(kind): part.encoders[kind] for kind in sorted(part.encoders)}
-                yield Cell(spec, name, "metrics", self.name, seed, ("metrics",), sources=sources)
+                yield Cell(
+                    spec, name, "metrics", self.name, seed, ("metrics",),
+                    sources=encoder_sources(part),
+                )  # fmt: skip
 
     def compute(self, work: Work) -> Seconds:
         """Every metric on every condition of every task; metrics without an encoder are left
@@ -154,11 +140,6 @@ class Sensitivity(Probe[Seconds]):
                         )
                 work.add(f"{task.name}/{name}", measured)
         return Seconds(seconds)
-
-    def read_extra(self, data: Json) -> Seconds:
-        """Read from the record's cost."""
-        rounds = data["cost"].get("rounds", {})
-        return Seconds({key: [float(v) for v in values] for key, values in rounds.items()})
 
 
 def _tasks_of(scene: Scene, edits: Sequence[str]) -> list[Task]:

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from attnwarp.methods.pictures import enlarged_change
 from attnwarp_eval import metrics
+from attnwarp_eval.colors import color_difference
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.cell import Cell
@@ -127,8 +128,6 @@ class VariabilityProbe(MethodProbe[Varied]):
                 )
                 for k, pixels in result.edited.items()
             }
-            for part, seconds in result.seconds.items():
-                meter.add(f"method: {part}", seconds)
             meter.count(network_rows=int(result.counters.get("network_rows", 0)))
         with meter.stage("checks"):
             other = neighbours(world, spec["views"])
@@ -160,8 +159,8 @@ class VariabilityProbe(MethodProbe[Varied]):
         return {
             WITHIN: _mean(np.nanmean(values) for values in same if np.isfinite(values).any()),
             FLOOR: float(np.nanmean(floor)) if np.isfinite(floor).any() else math.nan,
-            BETWEEN: _mean(_difference(a, b, mask) for a, b in itertools.combinations(own, 2)),
-            CHANGE: _mean(_difference(image, originals[view], mask) for image in own),
+            BETWEEN: _mean(color_difference(a, b, mask) for a, b in itertools.combinations(own, 2)),
+            CHANGE: _mean(color_difference(image, originals[view], mask) for image in own),
         }
 
     def _draw(
@@ -177,15 +176,6 @@ class VariabilityProbe(MethodProbe[Varied]):
     def read_extra(self, data: Json) -> Varied:
         """Read from the record's entry ``varied``."""
         return Varied.from_json(data["varied"])
-
-
-def _difference(a: Image, b: Image, mask: npt.NDArray[np.bool_]) -> float:
-    """Mean CIEDE2000 of two (H, W, 3) sRGB pictures inside a mask; NaN where it is empty."""
-    from skimage.color import deltaE_ciede2000, rgb2lab
-
-    if not mask.any():
-        return math.nan
-    return float(deltaE_ciede2000(rgb2lab(a[mask]), rgb2lab(b[mask])).mean())
 
 
 def _mean(values: Iterable[Any]) -> float:

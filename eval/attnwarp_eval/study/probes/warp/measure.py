@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Set
 from functools import partial
-from typing import Any
 
 from pydantic import Field
 
 from attnwarp_eval.study import pictures
-from attnwarp_eval.study.probe import Probe, Work, metrics_of, register
-from attnwarp_eval.study.reads import warp_reads
+from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Part, Study, Variant
-from attnwarp_eval.study.shared.splats import surface_meaning, surface_reads, surface_spec
-from attnwarp_eval.study.shared.warps import warped_views
+from attnwarp_eval.study.shared.warps import WarpProbe, warped_views
 from attnwarp_eval.study.warping import warp_figures
 
 
@@ -31,7 +27,7 @@ class StudyPart(Part):
 
 
 @register
-class Warp(Probe[NoExtra]):
+class Warp(WarpProbe):
     """One warp for each view: endpoint error, feature error and mask scores."""
 
     name = "warp"
@@ -47,24 +43,13 @@ class Warp(Probe[NoExtra]):
         names = study.part(StudyPart).yaw.variants
         study.check_variants(names, "yaw.variants", self.name)
 
-    def reads(self, study: Study, variant: Variant) -> Set[str]:
-        """Depth and rules."""
-        truth = variant.geometry == "truth"
-        return surface_reads(variant) | warp_reads(variant.settings(), truth)
-
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """Depth, rules and feature grids."""
         return {
-            **surface_spec(study, variant, seed),
-            "spp": study.spp,
-            "settings": variant.settings().to_dict(),
+            **super().variant_spec(study, variant, seed),
             "feature_sizes": study.feature_sizes,
             "feature_channels": study.feature_channels,
         }
-
-    def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
-        """Splats may be fitted."""
-        return surface_meaning(study, variant)
 
     def compute(self, work: Work) -> NoExtra:
         """Warp and measure, view by view."""
