@@ -78,22 +78,6 @@ MODULES = (projection, binning, compositing, backward, projection_backward)
 """Modules that have kernels."""
 
 
-def compile_for(architecture: int, folder: Path) -> list[Path]:
-    """Compile every kernel for a GPU of an architecture, which need not be here.
-
-    Args:
-        architecture: 80 for sm_80, 90 for sm_90.
-        folder: where the binaries go.
-
-    Returns:
-        The paths of the binaries, one for each module.
-    """
-    paths: list[Path] = []
-    for module in MODULES:
-        paths += wp.compile_aot_module(module, arch=architecture, module_dir=folder, use_ptx=False)
-    return paths
-
-
 @contextlib.contextmanager
 def _on(device: torch.device) -> Iterator[None]:
     """Launches go to torch's stream: what torch has queued before comes first."""

@@ -33,9 +33,6 @@ it brings torch.
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of the scales, finest first: Wang, Simoncelli & Bovik 2003, section 3.2."""
 
-MS_SSIM_LEAST = WINDOW * 2 ** (len(MS_SSIM_WEIGHTS) - 1)
-"""Smallest side in pixels for which the coarsest scale holds a window: 176."""
-
 
 def mse(image: Any, target: Any, mask: Any = None) -> float:
     """Mean over the mask's pixels and channels of the squared difference; NaN for an empty mask.

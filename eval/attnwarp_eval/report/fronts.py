@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from statistics import fmean
 
 import numpy as np
@@ -19,7 +19,7 @@ from attnwarp_eval.statistics.intervals import (
 )
 from attnwarp_eval.statistics.intervals import front as pareto
 from attnwarp_eval.study.probe import probes
-from attnwarp_eval.study.probe_report import Layout, report_of
+from attnwarp_eval.study.probe_report import Layout, ProbeReport, report_of
 from attnwarp_eval.study.results import Results, Shared
 from attnwarp_eval.study.schema import Front
 from attnwarp_eval.study.turns import Timed, timed_in_turn
@@ -37,21 +37,23 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
         results: of the run.
         layout: of the report.
     """
-    section = Section(TITLE)
-    section.text = _text(results)
+    reports = {front.probe: report_of(front.probe) for front in results.study.fronts}
+    in_turn = {own.stage: timed_in_turn(results, own.stage) for own in reports.values()}
+    text = _text(reports.values(), in_turn)
+    section = Section(TITLE, list(text))
     for index, front in enumerate(results.study.fronts):
         metric = front.metric.format(layer=results.layer)
         shared = results.shared(front.probe, front.variants, metric)
         if results.finished(front.probe) and not any(map(any, shared.tables.values())):
             section.text.append(f"{front.title}: no view has a value of `{metric}`.")
             continue
-        points, rows = _points(results, front, shared)
+        own = reports[front.probe]
+        timed = in_turn[own.stage]
+        points, rows = _points(results, front, shared, own.cost, timed)
         if not points:
             continue
-        timed = timed_in_turn(results, report_of(front.probe).stage)
         section.text += shared.text(front.title)
         path = layout.figure(f"front-{index}.svg")
-        own = report_of(front.probe)
         specification = own.probe.metric(metric)
         label = f"{metric} ({specification.unit})"
         once = "" if timed else ", one pass"
@@ -63,7 +65,7 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
                 y=f"{specification.description}, {specification.unit}",
                 title=front.title,
                 # A difference of colours above a floor may be negative.
-                log=own.probe.metric(metric).unit != "dE00",
+                log=specification.unit != "dE00",
             )
         section.figures.append(Picture(f"figures/{path.name}", f"{front.title}{once}"))
         time = f"ms {own.cost_of}{once}"
@@ -81,7 +83,7 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
             ]
         section.tables.append(Table(columns, marked, front.title))
         section.tables += _cheapest(results, shared, points, time)
-    return [section] if section.tables or len(section.text) > len(_text(results)) else []
+    return [section] if section.tables or len(section.text) > len(text) else []
 
 
 def _probabilities(timed: Timed, shared: Shared, names: Sequence[str]) -> dict[str, str]:
@@ -128,14 +130,13 @@ def _cheapest(
     return [Table(columns, rows, caption, folded=True)]
 
 
-def _text(results: Results) -> list[str]:
-    contents = dict.fromkeys(report_of(front.probe).cost_text for front in results.study.fronts)
+def _text(reports: Collection[ProbeReport], in_turn: Mapping[str, Timed | None]) -> list[str]:
+    contents = dict.fromkeys(own.cost_text for own in reports)
     text = [
         f"{' '.join(contents)} A point is on the front when nothing"
         " cheaper is as good, by the means."
     ]
-    for stage in dict.fromkeys(report_of(front.probe).stage for front in results.study.fronts):
-        timed = timed_in_turn(results, stage)
+    for stage, timed in in_turn.items():
         text.append(_once(stage) if timed is None else _in_turn(timed))
     return list(dict.fromkeys(text))
 
@@ -166,10 +167,9 @@ def _in_turn(timed: Timed) -> str:
 
 
 def _points(
-    results: Results, front: Front, shared: Shared
+    results: Results, front: Front, shared: Shared, cost: str, timed: Timed | None
 ) -> tuple[dict[str, tuple[Interval, Interval]], list[list[str]]]:
     """Seconds and quality of each comparable variant; the rows but for their last column."""
-    timed = timed_in_turn(results, report_of(front.probe).stage)
     points: dict[str, tuple[Interval, Interval]] = {}
     rows = []
     for name in front.variants:
@@ -187,7 +187,7 @@ def _points(
             text = "1" if base else ratio_text(ratio)
             judged = "baseline" if base else timed.judge(ratio)
         else:
-            once = results.seconds(front.probe, name, report_of(front.probe).cost)
+            once = results.seconds(front.probe, name, cost)
             if not once:
                 continue
             seconds, text, judged = (

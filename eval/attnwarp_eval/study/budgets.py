@@ -53,11 +53,6 @@ class Spent:
     network_rows: int | None
     cut: str | None
 
-    @property
-    def by_seconds(self) -> bool:
-        """True if the result depends on the machine."""
-        return self.seconds is not None
-
 
 def timed(spec: Mapping[str, Any]) -> bool:
     """Return True if a cell's result depends on how fast the machine is.
