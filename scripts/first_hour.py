@@ -1,4 +1,4 @@
-"""Walk docs/start/first-hour.md in a fresh clone and report the seconds of each of its commands.
+"""Walk docs/start/quickstart.md in a fresh clone and report the seconds of each of its commands.
 
     python -m scripts.first_hour [--work FOLDER] [--out reports/first-hour/report.md]
 
@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PAGE = "docs/start/first-hour.md"
+PAGE = "docs/start/quickstart.md"
 BLOCK = re.compile(r"^```(sh|yaml)\n(.*?)^```|^## (.+?)$", re.MULTILINE | re.DOTALL)
 
 

@@ -127,16 +127,12 @@ image_srgb, target_srgb, truth_srgb, original = random.uniform(size=(4, 32, 32, 
 source_srgb = target_srgb
 mask = np.zeros((32, 32), bool)
 mask[8:24, 8:24] = True
-edited, rendered = {"0": image_srgb}, {"0": target_srgb}
+edited_views, rendered_views = {"0": image_srgb}, {"0": target_srgb}
 scene = load_scene("spheres")
 geometry = Geometry(scene)
 source, target = (camera.resize(32, 32) for camera in scene.cameras[:2])
-""",
-    "docs/measuring/consistency.md": """
 originals = list(np.random.default_rng(0).random((3, 64, 64, 3)))
 edited = [1 - picture for picture in originals]
-source, target = originals[:2]
-source_edited, target_edited = edited[:2]
 from few_splats import few_splats
 splats = few_splats()
 from attnwarp import Camera

@@ -1,4 +1,4 @@
-"""Tests for each line of docs/method/conventions.md, by numbers that can be worked out in the head."""
+"""Tests for each line of docs/start/concepts.md, by numbers that can be worked out in the head."""
 
 import math
 import re
@@ -300,7 +300,7 @@ PINNED = {
 
 
 def test_every_line_of_the_page_is_pinned_by_a_test_here():
-    page = (Path(__file__).parents[2] / "docs/method/conventions.md").read_text()
+    page = (Path(__file__).parents[2] / "docs/start/concepts.md").read_text()
     lines = re.findall(r"^\| ([^|]+?) \| [^|]", page, re.MULTILINE)
     names = [line.replace("`", "") for line in lines if line not in ("what", "---")]
     assert names == list(PINNED)
