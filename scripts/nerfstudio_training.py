@@ -3,7 +3,7 @@
 Run it by the Python of an environment with nerfstudio, which wants older packages than ours:
 
     attnwarp-eval scenes export spheres DATA --views 16 --size 64
-    NERFSTUDIO/bin/python scripts/survey/nerfstudio_training.py DATA --out report.md
+    NERFSTUDIO/bin/python scripts/nerfstudio_training.py DATA --out report.md
 
 The exit code is 1 if a split or a ray differs from transforms.json, or if the loss does not fall.
 """

@@ -1,1 +1,0 @@
-"""A survey of files: what our readers make of them, and what independent readers do."""
