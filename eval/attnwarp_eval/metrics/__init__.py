@@ -57,12 +57,9 @@ from attnwarp_eval.metrics.known_geometry import (
 )
 from attnwarp_eval.metrics.labels import carried_labels, label_transport
 from attnwarp_eval.metrics.multiview import (
-    YawMean,
     above_floor,
     answers_by_view,
     edit_fidelity,
-    mean_by_yaw,
-    same_answer,
 )
 from attnwarp_eval.metrics.occlusion import COUNTS, YawBin, by_yaw, confusion, mask_error, scores
 from attnwarp_eval.metrics.registry import METRICS, at_size, metric
@@ -78,7 +75,6 @@ __all__ = [
     "Similarity",
     "Tsed",
     "YawBin",
-    "YawMean",
     "above_floor",
     "answers_by_view",
     "approximation_error",
@@ -108,7 +104,6 @@ __all__ = [
     "mask_error",
     "match_features",
     "match_similarity",
-    "mean_by_yaw",
     "metric",
     "ms_ssim",
     "mse",
@@ -117,7 +112,6 @@ __all__ = [
     "perceptual",
     "perceptual_consistency",
     "psnr",
-    "same_answer",
     "scores",
     "sift_features",
     "sift_matches",

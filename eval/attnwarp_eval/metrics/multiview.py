@@ -1,13 +1,9 @@
-"""Agreement of an edit's views: disagreement above its floor, one answer everywhere, fidelity to
-the nearest truth, each by yaw.
-"""
+"""Agreement of an edit's views: disagreement above its floor, one answer, fidelity to it."""
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,10 +16,6 @@ from attnwarp_eval.metrics.image import Distance, mse
 
 if TYPE_CHECKING:
     from attnwarp_eval.two_view import TwoView
-
-YAW_EDGES = (0, 15, 30, 60, 90, 120, 150, 180)
-"""Ends of the bins in degrees, those of :func:`attnwarp_eval.metrics.by_yaw`."""
-
 
 ABOVE_FLOOR = "multiview.delta_e_above"
 """Beginning of the names of disagreement above its floor."""
@@ -129,41 +121,6 @@ def answers_by_view(
     return result
 
 
-def same_answer(nearest: Mapping[str, str | None], source: str) -> dict[str, float]:
-    """The share of the views whose nearest answer is the source's.
-
-    Args:
-        nearest: from :func:`answers_by_view`.
-        source: the source view's name.
-
-    Returns:
-        ``multiview.same_answer`` over the other views that have an answer, their number
-        ``multiview.views``, and ``multiview.views_undefined``, which have none. NaN where the
-        source or every other view has none.
-
-    Raises:
-        ValueError: the source is not among the views.
-
-    Example:
-        >>> from attnwarp_eval import metrics
-        >>> nearest = {"source": "red", "a": "red", "b": "blue", "c": None}
-        >>> figures = metrics.same_answer(nearest, "source")
-        >>> figures["multiview.same_answer"], figures["multiview.views_undefined"]
-        (0.5, 1)
-    """
-    if source not in nearest:
-        raise ValueError(f"source: got {source!r}, expected one of {', '.join(nearest)}")
-    own = nearest[source]
-    others = [answer for view, answer in nearest.items() if view != source]
-    defined = [answer for answer in others if answer is not None]
-    equal = sum(answer == own for answer in defined)
-    return {
-        "multiview.same_answer": share(equal, len(defined)) if own is not None else math.nan,
-        "multiview.views": len(defined),
-        "multiview.views_undefined": len(others) - len(defined),
-    }
-
-
 def edit_fidelity(
     images: Mapping[str, Any],
     answers: Mapping[str, Mapping[str, Any]],
@@ -217,67 +174,3 @@ def edit_fidelity(
         )
         for view, image in images.items()
     }
-
-
-@dataclass(frozen=True)
-class YawMean:
-    """Views whose yaw lies in [low, high), the last bin with its upper end.
-
-    Attributes:
-        low, high: degrees.
-        views: those with a value.
-        undefined: those without.
-        mean: of the values, each view counting alike; NaN without any.
-
-    Example:
-        >>> from attnwarp_eval.metrics import YawMean
-        >>> YawMean(0, 90, views=2, undefined=0, mean=0.5).mean
-        0.5
-    """
-
-    low: float
-    high: float
-    views: int
-    undefined: int
-    mean: float
-
-
-def mean_by_yaw(
-    values: Mapping[str, float], yaw: Mapping[str, float], edges: Sequence[float] = YAW_EDGES
-) -> list[YawMean]:
-    """Means of a figure over the views of each bin of yaw.
-
-    Args:
-        values: by the view's name; NaN where undefined.
-        yaw: by the view's name, degrees from the source, of either sign.
-        edges: ends of the bins, rising from 0 to 180.
-
-    Returns:
-        One entry for each bin, empty ones included.
-
-    Raises:
-        ValueError: edges that do not rise from 0 to 180, or a view without a yaw.
-
-    Example:
-        >>> from attnwarp_eval import metrics
-        >>> values, yaw = {"a": 1.0, "b": 3.0}, {"a": -10, "b": 350}
-        >>> metrics.mean_by_yaw(values, yaw, edges=(0, 90, 180))[0].mean
-        2.0
-    """
-    ends = [float(edge) for edge in edges]
-    rising = all(a < b for a, b in itertools.pairwise(ends))
-    if len(ends) < 2 or ends[0] != 0 or ends[-1] != 180 or not rising:
-        raise ValueError(f"edges: got {list(edges)}, expected rising degrees from 0 to 180")
-    bins: list[list[float]] = [[] for _ in ends[1:]]
-    for view, value in values.items():
-        if view not in yaw:
-            raise ValueError(f"yaw: lacks the view {view!r} of values")
-        folded = abs((float(yaw[view]) + 180) % 360 - 180)
-        index = min(int(np.searchsorted(ends, folded, side="right")) - 1, len(bins) - 1)
-        bins[index].append(float(value))
-    result = []
-    for low, high, entries in zip(ends, ends[1:], bins, strict=False):
-        defined = np.array([value for value in entries if not math.isnan(value)])
-        missing = len(entries) - len(defined)
-        result.append(YawMean(low, high, len(defined), missing, mean(defined)))
-    return result

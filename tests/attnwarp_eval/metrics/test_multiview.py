@@ -92,29 +92,6 @@ def test_the_nearest_answer_of_a_view_is_that_of_least_error_in_its_mask():
     assert len(set(nearest.values())) > 2  # several answers and None
 
 
-def test_same_answer_counts_the_views_that_answer_as_the_source():
-    nearest = {"s": "red", "a": "red", "b": "blue", "c": "red", "d": None}
-    figures = metrics.same_answer(nearest, "s")
-    assert figures["multiview.same_answer"] == 2 / 3
-    assert figures["multiview.views"] == 3
-    assert figures["multiview.views_undefined"] == 1
-    assert math.isnan(metrics.same_answer({**nearest, "s": None}, "s")["multiview.same_answer"])
-    assert math.isnan(metrics.same_answer({"s": "red", "d": None}, "s")["multiview.same_answer"])
-    with pytest.raises(ValueError, match="source: got 'x'"):
-        metrics.same_answer(nearest, "x")
-
-
-def test_random_answers_agree_by_chance_and_one_answer_always():
-    random = np.random.default_rng(0)
-    shares = []
-    for _ in range(400):
-        answers = random.integers(0, 4, 11)
-        nearest = {f"v{k}": str(a) for k, a in enumerate(answers)}
-        shares.append(metrics.same_answer(nearest, "v0")["multiview.same_answer"])
-    # Mean of 4000 independent trials of 1/4: standard deviation 0.007; 5 of them.
-    assert abs(np.mean(shares) - 0.25) < 0.035
-
-
 def test_fidelity_is_to_the_answer_that_is_nearest_over_all_views():
     names, truth, images, _ = worlds(size=16)
     everywhere = {name: dict.fromkeys(names, np.ones((16, 16), bool)) for name in truth}
@@ -128,27 +105,6 @@ def test_fidelity_is_to_the_answer_that_is_nearest_over_all_views():
         assert figures[view]["fidelity.psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-9)
 
 
-def test_means_by_yaw_are_those_of_each_bin():
-    random = np.random.default_rng(1)
-    yaw = {f"v{k}": float(y) for k, y in enumerate(random.uniform(-360, 360, 200))}
-    values = {view: float(random.normal()) for view in yaw}
-    values["v7"] = math.nan
-    bins = metrics.mean_by_yaw(values, yaw)
-    folded = {v: math.degrees(math.acos(math.cos(math.radians(y)))) for v, y in yaw.items()}
-    for entry in bins:
-        inside = [v for v, y in folded.items() if entry.low <= y < entry.high]
-        defined = [values[v] for v in inside if not math.isnan(values[v])]
-        assert (entry.views, entry.undefined) == (len(defined), len(inside) - len(defined))
-        assert entry.mean == pytest.approx(sum(defined) / len(defined), rel=1e-9)
-    assert sum(entry.views + entry.undefined for entry in bins) == 200
-    last = metrics.mean_by_yaw({"a": 1.0}, {"a": 180.0})[-1]
-    assert (last.views, last.mean) == (1, 1.0)
-    with pytest.raises(ValueError, match="edges"):
-        metrics.mean_by_yaw(values, yaw, edges=(0, 90))
-
-
 def test_every_figure_is_registered(pair):
     figures = metrics.above_floor((noise(0), noise(1)), (noise(0), noise(1)), pair)
-    figures |= metrics.same_answer({"s": "a", "t": "a"}, "s")
-    registered = {name for name in METRICS if name.startswith("multiview.")}
-    assert set(figures) == registered
+    assert METRICS.keys() >= figures.keys()
