@@ -3,7 +3,6 @@
 import copy
 import hashlib
 import json
-import re
 import shutil
 import time
 import weakref
@@ -30,7 +29,7 @@ from attnwarp.editing.editor import edit, shared_noise
 from attnwarp.editing.schedule import Schedule
 from attnwarp.editing.small import load_editor
 from attnwarp.errors import InputError, InputWarning
-from attnwarp.io import FileFormatError, read_image, read_ply
+from attnwarp.io import read_image, read_ply
 from attnwarp.io.images import encode_png
 from attnwarp.methods import attention_warping, geometry, preset
 from attnwarp.methods import base as run_module
@@ -537,21 +536,6 @@ def test_a_folder_of_another_edit_is_refused_by_name(
 
 
 @pytest.mark.door
-def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(scene, editor, tmp_path):
-    refusals = []
-
-    def again(*_):
-        with pytest.raises(InputError, match="another run writes to this folder") as caught:
-            run(scene, editor, tmp_path)
-        refusals.append(caught)
-
-    result = run(scene, editor, tmp_path, report=Watched(again))
-    assert refusals
-    # Nothing of the first is lost, and the folder is free again.
-    assert run(scene, editor, tmp_path).edited.keys() == result.edited.keys()
-
-
-@pytest.mark.door
 def test_a_folder_that_was_tuned_by_other_weights_is_refused(scene, editor, tmp_path):
     """One folder of LPIPS weights, with another network in it."""
     weights = tmp_path / "lpips"
@@ -585,35 +569,6 @@ def test_a_folder_that_was_tuned_by_other_weights_is_refused(scene, editor, tmp_
 
 @pytest.mark.door
 @pytest.mark.parametrize(
-    ("record", "key"),
-    [("rounds/1/v0", "sha256"), ("rounds/2/{}", "sha256")],
-)
-def test_a_record_that_lacks_something_is_named_and_made_anew_once_it_is_gone(
-    finished, scene, editor, tmp_path, record, key
-):
-    folder = finished[1]
-    name = record.format(min((folder / "rounds/2").glob("*.png")).stem)
-    shutil.copytree(folder, tmp_path / "edit")
-    path = tmp_path / "edit" / f"{name}.json"
-    path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != key}))
-    lacks = f"{re.escape(str(path))}: lacks '{key}'; remove it"
-    with pytest.raises(FileFormatError, match=lacks):
-        run(scene, editor, tmp_path / "edit")
-    path.unlink()
-    run(scene, editor, tmp_path / "edit")
-    assert files(tmp_path / "edit") == files(folder)
-
-
-@pytest.mark.door
-def test_seconds_that_are_none_are_named(finished, scene, editor, tmp_path):
-    shutil.copytree(finished[1], tmp_path / "edit")
-    (tmp_path / "edit" / "times.json").write_text('{"edit": "x"}')
-    with pytest.raises(FileFormatError, match="times.json: edit: got 'x', expected seconds"):
-        run(scene, editor, tmp_path / "edit")
-
-
-@pytest.mark.door
-@pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"gaussians": "a.ply"}, "gaussians: got str, expected attnwarp.Gaussians"),
@@ -634,22 +589,6 @@ def test_an_argument_of_another_type_is_named(scene, editor, changes, message):
         attention_warping(**{**given, "instruction": "a bear", "settings": QUICK, **changes})
 
 
-@pytest.mark.door
-@pytest.mark.parametrize(
-    ("name", "remedy"), [("times.json", "remove it"), ("manifest.json", "name another folder")]
-)
-@pytest.mark.parametrize(
-    ("text", "problem"), [("[1]", "holds no JSON object"), ("{", "not JSON .*")]
-)
-def test_json_that_is_no_object_is_refused_by_its_file(
-    name, remedy, text, problem, scene, editor, tmp_path
-):
-    (tmp_path / name).write_text(text)
-    settings = replace(QUICK, sources=2)  # which the manifest is asked for first
-    with pytest.raises(FileFormatError, match=f"{name}: {problem}; {remedy}"):
-        run(scene, editor, tmp_path, settings)
-
-
 @pytest.mark.parametrize("words", ["a bear", "a robot"])
 def test_results_without_a_manifest_are_taken_for_no_edit_and_stay(
     words, finished, scene, editor, tmp_path
@@ -662,15 +601,6 @@ def test_results_without_a_manifest_are_taken_for_no_edit_and_stay(
     with pytest.raises(InputError, match=r"has no manifest\.json, so it can't be told what"):
         run(scene, editor, folder, words=words)
     assert files(folder) == before
-
-
-@pytest.mark.door
-def test_pictures_of_another_program_where_results_go_are_refused_and_stay(scene, editor, tmp_path):
-    (tmp_path / "masks").mkdir()
-    (tmp_path / "masks" / "v1.png").write_bytes(b"a person's own")
-    with pytest.raises(InputError, match=r"what .*masks/v1\.png is of; name another folder"):
-        run(scene, editor, tmp_path)
-    assert files(tmp_path) == {"masks/v1.png": b"a person's own"}
 
 
 @pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(b"cut")])
