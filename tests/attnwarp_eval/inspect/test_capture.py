@@ -107,36 +107,16 @@ def test_disagreement_is_the_difference_of_the_edits_along_the_warp(edited, fold
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda m: m.update(source="../../etc/passwd"), "view '../../etc/passwd', which DATA has"),
-        (lambda m: m.update(rounds=[{"views": ["../x"]}]), "view '../x', which DATA has"),
-        (lambda m: m.update(rounds=[{"views": [1]}]), "not the manifest of an edit"),
-        (lambda m: m.update(rounds=7), "not the manifest of an edit"),
-        (lambda m: m["settings"].update(warp={"opaque": 7}), "not the manifest of an edit"),
-        (lambda m: m.clear(), "not the manifest of an edit"),
+        ({"source": "elsewhere"}, "view 'elsewhere', which DATA has"),
+        ({"rounds": 7}, "not the manifest of an edit"),
+        ({"settings": {}}, "not the manifest of an edit"),
     ],
 )
-def test_a_manifest_that_lies_is_refused_in_one_line(folders, tmp_path, change, message):
+def test_a_manifest_of_something_else_is_refused(folders, tmp_path, change, message):
     manifest = json.loads((folders / "edit/manifest.json").read_text())
-    change(manifest)
-    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(InputError, match=message) as error:
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest | change))
+    with pytest.raises(InputError, match=message):
         read_edit(tmp_path, [str(k) for k in range(5)])
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.door
-@pytest.mark.parametrize("text", ["[" * 100_000, "{", "\x00", '"a"', "[]", "\ud800"])
-def test_a_damaged_manifest_is_refused_in_one_line(tmp_path, text):
-    (tmp_path / "manifest.json").write_bytes(text.encode("utf-8", "surrogatepass"))
-    with pytest.raises(InputError, match="not the manifest of an edit"):
-        read_edit(tmp_path, ["0"])
-
-
-def test_a_huge_manifest_is_not_read(tmp_path):
-    with (tmp_path / "manifest.json").open("wb") as stream:
-        stream.truncate(2**30)
-    with pytest.raises(InputError, match="expected an edit's manifest"):
-        read_edit(tmp_path, ["0"])
 
 
 def test_inspecting_an_edit_writes_nothing_to_its_folder(folders, tmp_path):
