@@ -840,20 +840,6 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch):
 
 
 @pytest.mark.door
-def test_half_a_jpeg_is_refused_by_name(data, tmp_path):
-    folder = tmp_path / "data"
-    shutil.copytree(data, folder)
-    text = (folder / "transforms.json").read_text().replace("4.png", "4.jpg")
-    (folder / "transforms.json").write_text(text)
-    cv2.imwrite(str(folder / "images/4.jpg"), cv2.imread(str(folder / "images/4.png")))
-    whole = (folder / "images/4.jpg").read_bytes()
-    (folder / "images/4.jpg").write_bytes(whole[: len(whole) // 2])
-    done = in_process("fit", folder, "--out", tmp_path / "out", "--iterations", 1)
-    assert done.exit_code == 2
-    assert f"{folder / 'images/4.jpg'}: the picture is damaged" in done.stderr
-
-
-@pytest.mark.door
 def test_a_command_that_is_stopped_before_it_made_its_folder_says_so(tmp_path, capsys):
     for there, expected in (
         (False, "stopped; nothing was written"),

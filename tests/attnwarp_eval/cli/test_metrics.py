@@ -15,7 +15,6 @@ from torch_threads import on_one_thread
 from typer.testing import CliRunner
 
 from attnwarp.encoders import load_encoder
-from attnwarp.errors import InputError
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.metrics.registry import metric
 from attnwarp_eval.study.store import Store
@@ -527,15 +526,6 @@ def test_a_bad_picture_is_wrong_input_and_is_named(data, models, spoil, complain
 
 def cut(path):
     path.write_bytes(path.read_bytes()[:-900])
-
-
-def test_a_broken_jpeg_is_not_filled_up_with_grey(tmp_path):
-    random = np.random.default_rng(0)
-    path = write(tmp_path / "x.jpg", random_picture(random, (64, 64)))
-    path.write_bytes(path.read_bytes()[:1500])
-    assert cv2.imread(str(path)) is not None  # OpenCV reads it, with a line on stderr
-    with pytest.raises(InputError, match=r"x\.jpg: the picture is damaged"):
-        read_picture(path)
 
 
 @pytest.mark.parametrize("turn", [2, 3, 6, 7, 8])
