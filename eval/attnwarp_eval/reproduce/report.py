@@ -169,6 +169,11 @@ def _table(results: Results, table: TablePart) -> list[Section]:
         )
     if table.against is not None and (verdicts := _verdicts(results, table)) is not None:
         tables.append(verdicts)
+        text.append(
+            "Orderings are paired over scenes, edits and seeds, and tested by sign flips over"
+            " scenes, adjusted for all rows together (Benjamini-Hochberg). Below six scenes there"
+            " is no verdict."
+        )
     return [Section(table.title, text, tables)]
 
 
@@ -207,17 +212,17 @@ def _verdicts(results: Results, table: TablePart) -> Table | None:
         order = "above" if sign > 0 else "below"
         agrees = {"better": sign > 0, "worse": sign < 0}.get(verdict)
         said = verdict if agrees is None else "holds" if agrees else "fails"
-        mean, low, high = apart.shown(apart.level(p))
-        text = number(mean)
-        if math.isfinite(low) and math.isfinite(high):
-            text += f" [{number(low)}, {number(high)}]"
-        rows.append([f"{name} {order} {against}", head, f"{sign:+.3f}", text, str(said)])
+        here = difference(apart, apart.level(p))
+        rows.append([f"{name} {order} {against}", head, f"{sign:+.3f}", here, str(said)])
     columns = ["the paper's ordering", "figure", "paper", "here [95 % interval]", "verdict"]
-    note = (
-        "Paired over scenes, edits and seeds; sign-flip tests over scenes, adjusted for all rows"
-        " together (Benjamini-Hochberg). Below six scenes there is no verdict."
-    )
-    return Table(columns, rows, note)
+    return Table(columns, rows, "The paper's orderings.")
+
+
+def difference(apart: Contrast, level: float = 0.95) -> str:
+    """Mean of a contrast with its interval over scenes, where there are enough for one."""
+    mean, low, high = apart.shown(level)
+    bounded = math.isfinite(low) and math.isfinite(high)
+    return f"{number(mean)} [{number(low)}, {number(high)}]" if bounded else number(mean)
 
 
 def _geometry(results: Results) -> list[Section]:

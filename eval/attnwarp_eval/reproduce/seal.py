@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,22 @@ from attnwarp_eval.cost import environment
 from attnwarp_eval.document.model import Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.reproduce.manifest import FIGURES
-from attnwarp_eval.reproduce.report import RESULTS
+from attnwarp_eval.reproduce.report import RESULTS, difference
+from attnwarp_eval.statistics.contrasts import contrast
+from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.store import Problems, Store
 
 SEAL = "seal.json"
 """File of hashes: of the code and its packages, of what went in, and of every other file."""
+
+APART = "second - first [95 % interval]"
+NOTE = "Paired over scenes, edits and seeds. The interval is over scenes; fewer than six have none."
+
+Key = tuple[str, str, str, int]
+"""Row, capture, edit and seed."""
+
+Cells = dict[Key, dict[str, Any]]
+"""Figures by their title, of each cell."""
 
 
 def is_reproduction(run: Path) -> bool:
@@ -99,20 +109,36 @@ def side_by_side(one: Path, two: Path) -> tuple[list[str], Table]:
         if (b := seals[1]["versions"].get(name)) != a
     ]
     rows = []
-    methods = dict.fromkeys(m for cells in (first, second) for key in cells for m in key[:1])
-    for method in methods:
-        shared = [key for key in first if key in second and key[0] == method]
-        row = [method, str(len(shared))]
-        for title in FIGURES.values():
-            a, b = (_mean([cells[key].get(title) for key in shared]) for cells in (first, second))
-            row += [number(a), number(b), number(b - a)]
-        rows.append(row)
-    columns = ["method", "cells of both"]
-    columns += [f"{head}, {which}" for head in FIGURES for which in ("first", "second", "apart")]
-    return lines, Table(columns, rows)
+    for method in dict.fromkeys(key[0] for key in (*first, *second)):
+        keys = [key for key in first if key in second and key[0] == method]
+        for head, title in FIGURES.items():
+            a, b = _pairs(first, second, keys, title)
+            means = [interval({s: [*v.values()] for s, v in side.items()}).mean for side in (a, b)]
+            apart = contrast(a, b, "plain")
+            rows.append([
+                method, head, str(apart.views), str(apart.scenes), *map(number, means),
+                difference(apart),
+            ])  # fmt: skip
+    columns = ["method", "figure", "cells of both", "scenes", "first", "second", APART]
+    return lines, Table(columns, rows, NOTE)
 
 
-def _read(run: Path) -> tuple[dict[str, Any], dict[tuple[str, str, str, int], dict[str, Any]]]:
+def _pairs(
+    first: Cells, second: Cells, keys: Sequence[Key], title: str
+) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, float]]]:
+    """Scene -> edit and seed -> figure of both, where both have it."""
+    a: dict[str, dict[str, float]] = {}
+    b: dict[str, dict[str, float]] = {}
+    for key in keys:
+        one, two = (cells[key].get(title) for cells in (first, second))
+        if one is not None and two is not None:
+            _, scene, edit, seed = key
+            for side, value in ((a, one), (b, two)):
+                side.setdefault(scene, {})[f"{edit}/{seed}"] = value
+    return a, b
+
+
+def _read(run: Path) -> tuple[dict[str, Any], Cells]:
     """Content of ``study.json``, and figures by row, capture, edit and seed."""
     if not is_reproduction(run):
         raise InputError(f"{run}: has no {SEAL}; name the folder of a finished reproduction")
@@ -131,8 +157,3 @@ def _read(run: Path) -> tuple[dict[str, Any], dict[tuple[str, str, str, int], di
 
 def _differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
     return [name for name in {**a, **b} if a.get(name) != b.get(name)]
-
-
-def _mean(values: list[float | None]) -> float:
-    defined = [value for value in values if value is not None]
-    return sum(defined) / len(defined) if defined else math.nan
