@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +19,7 @@ import numpy.typing as npt
 
 from attnwarp.devices import device_of
 from attnwarp.editing.small import guide_of
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, InputWarning
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.document import write
 from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
@@ -53,6 +54,12 @@ GUIDES: dict[Guide, tuple[str, str]] = {
     "depth": ("--depth-editor", "depth maps"),
 }
 """The option that names an editor, and what that editor takes, by its guide."""
+
+COUNTS = (
+    "Edit PSNR is of edited views alone, and more edits cost more; options.views_per_stage of a"
+    " variant with attention_warping, or options.views of one that draws views, makes them equal"
+)
+"""Meaning of different numbers of edited views, and the remedy."""
 
 PICTURED = 4
 """Views side by side in the report, evenly spread."""
@@ -197,6 +204,7 @@ def compare(
         for title, metric in report_of("editing").columns.items()
         if not metric.startswith(WITHOUT_TRUTH)
     }
+    _warn_of_counts(study, usable, len(views.cameras))
     originals = write_originals(views, out / "originals")
     seconds: dict[str, float] = {}
     for place, name in enumerate(usable):
@@ -222,6 +230,21 @@ def compare(
     report.step(len(usable), len(usable), "report")
     _write(study, words, views.cameras, result, out)
     return result
+
+
+def _warn_of_counts(study: Study, names: Sequence[str], views: int) -> None:
+    """Warn before anything is edited where methods edit different numbers of views."""
+    counts = {}
+    for name in names:
+        variant = study.variants[name]
+        method = EDITING_METHODS[variant.part(edits.VariantPart).method]
+        if method.edited is not None:
+            counts[name] = method.edited(edits.settings_of(study, variant, study.seeds[0]), views)
+    if len(set(counts.values())) > 1:
+        listed = ", ".join(f"{name} {count}" for name, count in counts.items())
+        warnings.warn(
+            f"of {views} views, variants edit {listed}; {COUNTS}", InputWarning, stacklevel=2
+        )
 
 
 def _reference(variant: Variant) -> str | None:
@@ -415,6 +438,10 @@ def report(study: Study, words: Words, cameras: Sequence[Camera], result: Compar
     ]
     listed = [f"{name} `{row['page']}`" for name, row in result.rows.items() if row["page"]]
     pages = [f"The splats, and all else of a method: {', '.join(listed)}."] if listed else []
+    counts = {name: row["edited_views"] for name, row in result.rows.items()}
+    if len(set(counts.values())) > 1:
+        numbers = ", ".join(f"{name} {edits}" for name, edits in counts.items())
+        lead.append(f"**Variants edited different numbers of views: {numbers}.** {COUNTS}.")
     cut = [name for name, row in result.rows.items() if row["cut"]]
     if cut:
         lead.append(f"**Did not finish within their budget: {', '.join(cut)}.**")

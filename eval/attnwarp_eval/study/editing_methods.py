@@ -142,6 +142,8 @@ class Method:
             ``options.steps``. A study that sets another is refused.
         takes_budget: whether it can be cut short by a budget.
         takes_picture: whether its source view can be edited by hand.
+        edited: how many of a number of views it edits at most with these settings; None where that
+            is not known.
     """
 
     settings: Callable[[str | None, dict[str, Any], int], dict[str, Any]]
@@ -149,6 +151,7 @@ class Method:
     reads: Callable[[Mapping[str, Any]], Set[str]] = _reads_all
     takes_budget: bool = False
     takes_picture: bool = False
+    edited: Callable[[Mapping[str, Any], int], int] | None = None
 
 
 def _attention_warping_settings(
@@ -343,6 +346,26 @@ def _true_pictures_reads(settings: Mapping[str, Any]) -> Set[str]:
     return warp | options | _options(settings, settings.keys() - read)
 
 
+def _warped_views(settings: Mapping[str, Any], views: int) -> int:
+    """The sources, and the views that the stages draw."""
+    from attnwarp.methods import AttentionWarpingSettings
+    from attnwarp.methods.stages import draw_stages
+
+    s = AttentionWarpingSettings.from_dict(dict(settings))
+    sources = min(s.sources, views)
+    return sources + len(set().union(*draw_stages(range(sources, views), s)))
+
+
+def _drawn_views(settings: Mapping[str, Any], views: int) -> int:
+    """All views, or as many as the rounds draw."""
+    from attnwarp.methods.work import parts_of
+
+    if "views" not in settings:
+        return views
+    rounds = parts_of(settings["iterations"], settings["every"]) if "every" in settings else [0]
+    return min(views, settings["views"] * len(rounds))
+
+
 def _baseline(name: str) -> Method:
     """A method of :mod:`attnwarp.methods`."""
 
@@ -376,7 +399,7 @@ def _baseline(name: str) -> Method:
             )
         )
 
-    return Method(settings, run, reads, takes_budget=True)
+    return Method(settings, run, reads, takes_budget=True, edited=_drawn_views)
 
 
 EDITING_METHODS: dict[str, Method] = {
@@ -386,6 +409,7 @@ EDITING_METHODS: dict[str, Method] = {
         _attention_warping_reads,
         takes_budget=True,
         takes_picture=True,
+        edited=_warped_views,
     ),
     "true pictures": Method(_attention_warping_settings, _true_pictures, _true_pictures_reads),
     **{name: _baseline(name) for name in PRESETS if name != "attention_warping"},

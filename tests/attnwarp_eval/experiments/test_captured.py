@@ -168,6 +168,33 @@ def test_smaller_copies_of_the_pictures_are_read_by_their_scale(folder, tmp_path
     assert left["variant inverted"] == "it inverts with the words of --source-prompt"
 
 
+@pytest.mark.filterwarnings("always::attnwarp.errors.InputWarning")
+def test_different_numbers_of_edited_views_are_told_before_and_in_the_report(folder, tmp_path):
+    """Oracle: the pictures that each method left."""
+    quick = {"steps": 1, "iterations": 1}
+    own = {
+        "variants": {
+            "every": {"method": "by_view", "options": quick},
+            "drawn": {"method": "dge", "options": {**quick, "every": 1, "views": 2}},
+            "staged": {"options": {**quick, "stages": 1, "views_per_stage": 1}},
+        },
+        "probes": {"editing": ["every", "drawn", "staged"]},
+    }
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump(STUDY | own))
+    out = tmp_path / "out"
+    done = CliRunner().invoke(app, [
+        "run", str(tmp_path / "study.yaml"), "--data", str(folder), "--ply", str(folder / "scene.ply"),
+        "--out", str(out), "--instruction", "make it red",
+    ])  # fmt: skip
+    assert done.exit_code == 0, done.output
+    rows = json.loads((out / "captured.json").read_text())["variants"]
+    counts = [len(list((out / row["folder"] / "edited").iterdir())) for row in rows.values()]
+    assert counts == [3, 2, 2]
+    assert "of 3 views, variants edit every 3, drawn 2, staged 2; Edit PSNR" in done.stderr
+    told = "Variants edited different numbers of views: every 3, drawn 2, staged 2."
+    assert told in (out / "captured.md").read_text()
+
+
 def test_editors_of_ones_own_stand_for_the_studys_by_what_they_take(folder, tmp_path, monkeypatch):
     """Oracle: the digest of the weights in each folder, beside what each method wrote of its editor."""
     pix2pix().save_pretrained(tmp_path / "picture")
