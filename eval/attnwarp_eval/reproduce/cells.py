@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
-from attnwarp.encoders import Kind
+from attnwarp.encoders import Kind, load_encoder
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods import Budget, Result
 from attnwarp.reporting import SILENT, Reporter
@@ -124,6 +124,12 @@ def editor_of(name: str, device: str) -> Any:
     from attnwarp.editing.small import load_editor
 
     return load_editor(name, device=device, dtype=type_of("auto", device))
+
+
+@cache
+def encoder_of(name: str, kind: Kind, *, device: str) -> Any:
+    """An encoder, which a process keeps: its cells are measured with the same few."""
+    return load_encoder(name, kind, device=device)
 
 
 @dataclass(frozen=True)
@@ -249,7 +255,7 @@ class Job:
         )  # fmt: skip
         done = measure.measure(
             inputs, {**names, "perceptual": measure.OFF}, Store(folder / "measured"),
-            device=self.device,
+            device=self.device, load=encoder_of,
         )  # fmt: skip
         return {row.title: row.value for row in done.rows if row.encoder or not authors}
 

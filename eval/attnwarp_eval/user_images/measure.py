@@ -10,7 +10,7 @@ import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -186,6 +186,7 @@ def measure(
     store: Store,
     *,
     device: str = "cpu",
+    load: Callable[..., Any] = load_encoder,
     report: Reporter = SILENT,
 ) -> Measured:
     """Compute every figure of the paper's table that the pictures and prompts allow.
@@ -198,6 +199,7 @@ def measure(
         store: finished batches are read from there and written there, so that a killed call
             goes on where it was. Views are known by the content of their files.
         device: "cpu" or "cuda", for real encoders.
+        load: gives an encoder, as :func:`attnwarp.encoders.load_encoder` does.
         report: receives each batch of views.
 
     Raises:
@@ -233,7 +235,7 @@ def measure(
     wanted = _possible(inputs, folders, encoders, done)
     # Also where bundled encoders alone are needed, which would leave it unread.
     device_of(device)
-    loaded = load_encoders(wanted, encoders, device, done)
+    loaded = load_encoders(wanted, encoders, device, done, load)
     wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
     if not wanted:
         raise InputError(
@@ -360,7 +362,11 @@ def _possible(
 
 
 def load_encoders(
-    wanted: Sequence[Figure], encoders: Mapping[Kind, str | None], device: str, done: Measured
+    wanted: Sequence[Figure],
+    encoders: Mapping[Kind, str | None],
+    device: str,
+    done: Measured,
+    load: Callable[..., Any] = load_encoder,
 ) -> dict[Kind, Any]:
     """Load the encoders of figures; those that cannot be loaded cost their figures.
 
@@ -378,7 +384,7 @@ def load_encoders(
     for kind in dict.fromkeys(figure.encoder for figure in wanted if figure.encoder is not None):
         named = encoders.get(kind)
         try:
-            loaded[kind] = load_encoder(named or DEFAULTS[kind], kind, device=device)
+            loaded[kind] = load(named or DEFAULTS[kind], kind, device=device)
         except InputError as error:
             if named is not None:
                 raise InputError(f"--{kind}: {error}") from None
