@@ -10,19 +10,29 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 
 from attnwarp.methods import Budget
 from attnwarp.reporting import Reporter
 from attnwarp_eval.cost import peak_memory_mb, reset_peak_memory
 from attnwarp_eval.reproduce.captures import ready
 from attnwarp_eval.reproduce.cells import Job, Made, Planned
+from attnwarp_eval.reproduce.report import asked_about
 from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.userstudy.material import MOST_VIEWS, read_picture
 
 STEPS = (1, 3)
 """Steps of denoising of the two pilots of a method: their difference is what a step takes."""
 
 EDITS, BRANCHES, ITERATIONS = 8, 3, 8
 """Edits of a pilot, as far as a budget for so many branches goes, and iterations of its tuning."""
+
+WARPED, BESIDE = 6, 2
+"""Pictures of a warp; and on the page that asks people, those beside the methods': the original and
+a scrambled one."""
+
+BASE64 = 4 / 3
+"""Characters of a byte on a page."""
 
 EDITING = ("source", "warp", "edit", "write")
 """Parts of a method's seconds that grow with its edits."""
@@ -39,6 +49,7 @@ class Unit:
         edits, iterations, rounds: of a whole run on this capture.
         views: of the capture.
         files, state, picture: bytes of a cell's other files, of a round's end, of an edit.
+        original, asked: bytes of a view's picture, and of one in the page that asks people.
         memory: GiB of the process, with the features of all steps.
         gpu: GiB of a GPU; NaN without one.
     """
@@ -53,6 +64,8 @@ class Unit:
     files: float
     state: float
     picture: float
+    original: float
+    asked: float
     memory: float
     gpu: float
 
@@ -92,12 +105,13 @@ def estimate(
                 warm = False
             units[name] = _measured(planned, cell, folder, devices[0])
         fits = [
-            (cell, _fit_seconds(planned, cell, devices[0]))
-            for cell in left
+            _fit_cost(planned, cell, Path(place) / f"fit-{number}", devices[0])
+            for number, cell in enumerate(left)
             if cell.spec["kind"] == "fit"
         ]
-    total = sum(seconds for _, seconds in fits)
-    disk, hours = 0.0, total / 3600
+    total, disk = (sum(costs) for costs in zip((0.0, 0.0), *fits, strict=True))
+    hours, fitted = total / 3600, disk
+    disk += _shared_bytes(planned, left, list(units.values())) / 1e9
     for name, unit in units.items():
         own = [cell for cell in edits if cell.variant == name]
         seconds = sum(unit.seconds(views[cell.scene]) for cell in own)
@@ -109,7 +123,10 @@ def estimate(
         )
         total, disk = total + seconds, disk + gigabytes
     if fits:
-        yield f"fits: {len(fits)}, {hours:.2g} hours while splats are as few as at the beginning"
+        yield (
+            f"fits: {len(fits)}, {hours:.2g} hours, {fitted:.2g} GB while splats are as few as at"
+            " the beginning"
+        )
     count = len(devices)
     yield (
         f"to do: {len(left)} cells, {total / 3600:.3g} hours of one device"
@@ -144,6 +161,8 @@ def _measured(planned: Planned, cell: Cell, folder: Path, device: str) -> Unit:
         _bytes(last) - state - 3 * pictures,
         state,
         3 * pictures / edits,
+        _bytes(last.parents[1] / "originals") / planned.checked.views[cell.scene],
+        BASE64 * len(read_picture(next((last / "renders").iterdir()))),
         peak_memory_mb() / 1024 + features,
         math.nan if device == "cpu" else max(short.gpu, long.gpu),
     )
@@ -176,8 +195,25 @@ def _spent(made: Made, parts: Sequence[str]) -> float:
     return sum(made.seconds.get(part, 0.0) for part in parts)
 
 
-def _fit_seconds(planned: Planned, cell: Cell, device: str) -> float:
-    """Seconds of a fit, from some iterations on its first splats."""
+def _shared_bytes(planned: Planned, left: Sequence[Cell], units: Sequence[Unit]) -> float:
+    """Bytes beside fits and edits: the captures' pictures, warps, and the page that asks people."""
+    if not units:
+        return 0.0
+    views = planned.checked.views
+    original, asked = (
+        fmean(getattr(unit, name) for unit in units) for name in ("original", "asked")
+    )
+    pictures = sum(views[name] for name in {cell.scene for cell in left})
+    pictures += WARPED * sum(cell.spec["kind"] == "warp" for cell in left)
+    shown = sum(
+        (len(cells) + BESIDE) * min(MOST_VIEWS, views[scene])
+        for (scene, _, _), cells in asked_about(planned, planned.edits).items()
+    )
+    return original * pictures + asked * shown
+
+
+def _fit_cost(planned: Planned, cell: Cell, folder: Path, device: str) -> tuple[float, float]:
+    """Seconds and GB of a fit, from some iterations on its first splats."""
     from attnwarp.fit import FitSettings, first_splats, fit
 
     capture = ready(planned.loaded, cell.scene)
@@ -185,7 +221,8 @@ def _fit_seconds(planned: Planned, cell: Cell, device: str) -> float:
     start = first_splats(capture.dataset, capture.cameras, settings).to(device=device)
     short = settings.changed(iterations=2 * ITERATIONS, densify=False)
     fit(start, capture.views, short.changed(iterations=1))  # compiles
-    return fit(start, capture.views, short).seconds / (2 * ITERATIONS) * settings.iterations
+    seconds = fit(start, capture.views, short, folder=folder).seconds / (2 * ITERATIONS)
+    return seconds * settings.iterations, _bytes(folder) / 1e9
 
 
 def _bytes(folder: Path, ends: Sequence[str] | None = None) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -339,22 +339,27 @@ def _people(results: Results) -> Section:
     )
 
 
+def asked_about(
+    planned: Planned, edits: Iterable[Cell]
+) -> dict[tuple[str, str, int], dict[str, Cell]]:
+    """Cells of the first table that people choose between, by row: of one capture, edit, seed."""
+    m = planned.loaded.manifest
+    named = m.tables[0].rows if m.tables else list(m.methods)
+    groups: dict[tuple[str, str, int], dict[str, Cell]] = {}
+    for cell in edits:
+        for name in set(named).intersection(cell.labels):
+            groups.setdefault((cell.scene, cell.spec["edit"], cell.seed), {})[name] = cell
+    return {key: cells for key, cells in groups.items() if len(cells) > 1}
+
+
 def _ask_people(results: Results) -> Path | None:
     """Write the page that compares the rows of the first table; None where there is no pair."""
     from attnwarp_eval.userstudy.material import CAPTURED, read_items
     from attnwarp_eval.userstudy.page import Design, build_page
 
-    tables = results.planned.loaded.manifest.tables
-    named = tables[0].rows if tables else list(results.rows)
-    groups: dict[tuple[str, str, int], dict[str, Cell]] = {}
-    for cell, _ in results.edits():
-        for name in set(named).intersection(cell.labels):
-            key = (cell.scene, cell.spec["edit"], cell.seed)
-            groups.setdefault(key, {})[name] = cell
     folders = []
+    groups = asked_about(results.planned, (cell for cell, _ in results.edits()))
     for (scene, edit, seed), cells in groups.items():
-        if len(cells) < 2:
-            continue
         folder = results.root / "asked" / f"{scene}-{edit}-{seed}"
         words = results.planned.loaded.manifest.captures[scene].edits[edit]
         data = {

@@ -19,6 +19,7 @@ from skimage.metrics import peak_signal_noise_ratio
 from typer.testing import CliRunner
 
 from attnwarp.editing.small import load_editor
+from attnwarp.encoders import pretrained
 from attnwarp.io import read_ply
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.colors import to_srgb
@@ -161,12 +162,28 @@ def test_a_sealed_run_is_verified_and_held_beside_another(folder, run):
         path.write_bytes(whole_file)
 
 
-def test_quick_runs_two_methods_on_one_scene(folder, run):
+def test_quick_runs_two_methods_on_one_scene(folder, monkeypatch):
+    """Oracle: the files' sizes; and that of two cells, each with four figures' encoders, the second
+    loads none."""
     out = folder / "quick"
     lines = whole(folder, out, "--quick", "--dry-run").stdout.splitlines()
     assert lines[-1].startswith("to do: 3 cells, ") and "GB of disk" in lines[-1]
     assert not (out / "cells").exists()
-    whole(folder, out, "--quick")
+    loaded = []
+
+    def spy(kind, place, *rest):
+        loaded.append(place.name)
+        return load(kind, place, *rest)
+
+    load = pretrained._load
+    monkeypatch.setattr(pretrained, "_load", spy)
+    done = CliRunner().invoke(app, command(folder, out, "--quick")[3:])
+    assert done.exit_code == 0, done.output
+    # Once in the check, then with both preprocessings.
+    assert sorted(loaded) == 3 * ["clip"] + 3 * ["dino"]
+    size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
+    told = float(lines[-1].split(", ")[-1].removesuffix(" GB of disk"))
+    assert told == pytest.approx(size / 1e9, rel=0.25)
     results = json.loads((out / "results.json").read_text())
     assert [(c["scene"], c["methods"]) for c in results["cells"] if c["kind"] == "edit"] == [
         ("spheres", ["attention warp"]),
