@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from attnwarp.cli.shell import fail
 from attnwarp.reporting import reporter
 from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, resumable
+
+if TYPE_CHECKING:
+    from attnwarp_eval.reproduce.manifest import Loaded
 
 
 def reproduce(
@@ -43,6 +46,14 @@ def reproduce(
             "--dry-run", help="Check everything, tell hours, disk and memory, and run nothing."
         ),
     ] = False,
+    write_probes: Annotated[
+        bool,
+        typer.Option(
+            "--write-probes",
+            help="Write the probe values that MANIFEST lacks into it, from your weights; run"
+            " nothing.",
+        ),
+    ] = False,
 ) -> None:
     """Run the paper's tables on captures and weights of one's own, beside its numbers.
 
@@ -50,7 +61,7 @@ def reproduce(
     """
     from attnwarp.devices import device_of
     from attnwarp_eval.reproduce import cells, check
-    from attnwarp_eval.reproduce.manifest import load_manifest
+    from attnwarp_eval.reproduce.manifest import lacking, load_manifest, shipped
     from attnwarp_eval.study.store import Store
 
     if scheduler is not None and jobs is not None:
@@ -61,6 +72,12 @@ def reproduce(
         devices = [part.strip() for part in device.split(",")]
         for name in devices if scheduler is None else ():
             device_of(name)
+        unknown = lacking(loaded.manifest)
+        if write_probes:
+            if manifest in shipped():
+                raise fail(f"--write-probes: {manifest} ships with the package; copy it first")
+            _write_probes(Path(manifest), loaded, unknown, devices[0])
+            return
         store = Store(out)
         report.log("checking captures and weights")
         checked = check.check(loaded, out, devices[0] if scheduler is None else "cpu")
@@ -69,6 +86,12 @@ def reproduce(
         left = cells.todo(planned.cells, store)
         for name, (sha256, probe) in checked.weights.items():
             report.log(f"{name}: probe {probe:.6g}, sha256 {sha256}")
+        if unknown:
+            report.log(
+                f"{', '.join(unknown)}: the manifest has no probe value, so another checkpoint of"
+                " the same shapes would pass too; whoever has the published weights fills it in"
+                " with --write-probes"
+            )
         report.log(f"{len(planned.cells)} cells, {len(planned.cells) - len(left)} done in {out}")
         if dry_run:
             from attnwarp_eval.reproduce.estimate import estimate
@@ -92,3 +115,18 @@ def reproduce(
         raise fail(
             f"{len(failures)} cells failed; the same command tries them again: {listed}", TOO_LITTLE
         )
+
+
+def _write_probes(path: Path, loaded: Loaded, unknown: list[str], device: str) -> None:
+    """Write the probe values of weights that the manifest can't tell from others."""
+    from attnwarp_eval.reproduce import check, manifest
+
+    checked = check.Checked()
+    check.check_weights(loaded, device, checked)
+    checked.refuse()
+    found = {key: checked.weights[key][1] for key in unknown}
+    manifest.write_probes(path, found)
+    for key, value in found.items():
+        typer.echo(f"{path}: {key}.probe: {value:.6g}")
+    if not found:
+        typer.echo(f"{path}: has a probe value or a hash of all weights")

@@ -80,13 +80,18 @@ def check(loaded: Loaded, run: Path, device: str = "cpu") -> Checked:
     for name in loaded.manifest.captures:
         with done.asking(f"captures.{name}"):
             _check_capture(loaded, name, run, done)
+    check_weights(loaded, device, done)
+    return done
+
+
+def check_weights(loaded: Loaded, device: str, done: Checked) -> None:
+    """Check weights, and whether methods and editors fit."""
     for name in loaded.manifest.editors:
         with done.asking(f"editors.{name}"):
             _check_editor(loaded, name, device, done)
     for kind in ("clip", "dino", "perceptual"):
         with done.asking(f"encoders.{kind}"):
             _check_encoder(loaded, kind, device, done)
-    return done
 
 
 def _check_capture(loaded: Loaded, name: str, run: Path, done: Checked) -> None:

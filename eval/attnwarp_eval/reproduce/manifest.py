@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationError, field_validator
 
 from attnwarp.errors import InputError, suggest
+from attnwarp_eval.files import write_atomic
 from attnwarp_eval.scene import explain
 from attnwarp_eval.scene.yaml import YamlError, line_of, read_yaml
 from attnwarp_eval.study.schema import Part, Whole
@@ -275,6 +276,56 @@ def load_manifest(name_or_path: str) -> Loaded:
         ) from None
     _check_names(path, manifest)
     return Loaded(manifest, Path() if name_or_path in own else path.parent)
+
+
+def write_probes(path: Path, probes: Mapping[str, float]) -> None:
+    """Write probe values into a manifest, before the ``folder`` of what they are of.
+
+    Args:
+        path: of the manifest; all else in it stays, comments too.
+        probes: by key, such as ``editors.pix2pix``.
+
+    Raises:
+        InputError: the file's notation leaves no place that is sure; nothing is written.
+    """
+    text = path.read_text(encoding="utf-8")
+    where, wanted = read_yaml(text)
+    lines = text.splitlines(keepends=True)
+    for key, value in probes.items():
+        part, name = key.split(".", 1)
+        wanted[part][name]["probe"] = float(f"{value:.6g}")
+        number = where.get((part, name, "folder"), 1) - 1
+        before, found, after = lines[number].partition("folder:")
+        end = ", " if before.strip() else f"\n{before}"  # {folder: ...}, or a line of its own
+        lines[number] = f"{before}probe: {value:.6g}{end}{found}{after}"
+    changed = "".join(lines)
+    try:
+        same = read_yaml(changed)[1] == wanted
+    except YamlError:
+        same = False
+    if not same:
+        raise InputError(
+            f"{path}: give each of {', '.join(probes)} a line `folder: ...` of its own"
+        )
+    write_atomic(path, changed.encode())
+
+
+def lacking(manifest: Manifest) -> list[str]:
+    """Keys of weights in folders that neither a probe value nor a hash tells from others."""
+    from attnwarp.editing.small import bundled
+    from attnwarp.encoders import BUNDLED
+
+    known = {*bundled(), *BUNDLED}
+    encoders = {k: getattr(manifest.encoders, k) for k in ("clip", "dino", "perceptual")}
+    named = {
+        **{f"editors.{k}": w for k, w in manifest.editors.items()},
+        **{f"encoders.{k}": w for k, w in encoders.items() if w is not None},
+    }
+    return [
+        key
+        for key, w in named.items()
+        if w.folder not in known and w.probe is None and w.sha256 is None
+    ]
 
 
 def _explained(problem: Any, model: Any) -> str:

@@ -19,7 +19,7 @@ from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Tabl
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.reproduce.cells import Made, Planned, cell_folder, made_of
-from attnwarp_eval.reproduce.manifest import FIGURES, Row, TablePart
+from attnwarp_eval.reproduce.manifest import FIGURES, Row, TablePart, lacking
 from attnwarp_eval.statistics.contrasts import Contrast, contrast
 from attnwarp_eval.statistics.intervals import benjamini_hochberg, interval
 from attnwarp_eval.study.cell import Cell
@@ -132,6 +132,11 @@ def report(results: Results) -> Report:
     ]
     if ours:
         lead.append(f"Prompts that were not published and are this manifest's: {'; '.join(ours)}.")
+    if unknown := lacking(m):
+        lead.append(
+            f"**Which checkpoint {', '.join(unknown)} held was not checked**: the manifest has no"
+            " probe value of the published weights, so others of the same shapes pass."
+        )
     if results.missing:
         lead.append(
             f"**{results.missing} of {len(results.planned.cells)} cells are missing; the same"

@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+import yaml
 from PIL import Image
 from reproduction import save, write_small
 from tiny_editors import pix2pix, unet
@@ -58,6 +59,35 @@ def test_a_right_manifest_has_no_problem_and_its_probe_values_are_the_models_own
         out = pipe.unet(x, torch.tensor(500), encoder_hidden_states=text).sample
         latents = pipe.vae.encode(2 * picture - 1).latent_dist.mode()
     assert done.weights["editors.pix2pix"][1] == pytest.approx(rms(out) + rms(latents), rel=1e-5)
+
+
+def test_probe_values_are_written_into_the_manifest_and_hold_other_weights_off(copied):
+    """Oracle: the manifest as it was but for the values, which the check computes on its own."""
+    folder, manifest = copied
+    weights = told(folder, manifest).weights
+    path = save(folder, manifest)
+    flow = (
+        "  dino: {folder: weights/dino, shapes: {embeddings.register_tokens: [1, 4, 32]}} # ours\n"
+    )
+    start, rest = path.read_text().split("  dino:\n")
+    path.write_text(f"{start}{flow}{rest[rest.index('methods:') :]}")
+    expected = yaml.safe_load(path.read_text())
+    for place, (_, value) in weights.items():
+        part, key = place.split(".")
+        if key != "perceptual":  # left out of the manifest: the bundled one
+            expected[part][key]["probe"] = pytest.approx(value, rel=1e-5)
+    shutil.rmtree(folder / "captures")  # not needed
+
+    def call():
+        return CliRunner().invoke(app, ["reproduce", str(path), "--write-probes"])
+
+    done = call()
+    assert done.exit_code == 0, done.output
+    assert yaml.safe_load(path.read_text()) == expected and "} # ours" in path.read_text()
+    assert "has a probe value" in call().stdout
+    unet(8, seed=5).save_pretrained(folder / "weights/pix2pix/unet")
+    other = call()
+    assert other.exit_code == 2 and "editors.pix2pix.probe" in other.stderr
 
 
 def two_names(folder, manifest):
