@@ -42,7 +42,10 @@ EXTRAS = {
         ("pyvista",), "no window of a warp in 3D; reports have their pictures"
     ),
     "web": Extra(("trame", "trame_vtk", "trame_vuetify"), "no warp in 3D in a browser"),
-    "gpu": Extra(("warp",), "splats are rendered on the processor"),
+    "gpu": Extra(
+        ("accelerate", "warp"),
+        "splats are rendered on the processor, and --low-memory is refused",
+    ),
 }  # fmt: skip
 """Every extra that a user may lack, by its name in pyproject.toml."""
 

@@ -34,6 +34,7 @@ from attnwarp.cli.options import (
     DataArgument,
     DeviceOption,
     DtypeOption,
+    LowMemoryOption,
     MaxSizeOption,
     Reading,
     ScreenFilterOption,
@@ -91,6 +92,7 @@ def baseline(
     max_size: MaxSizeOption = None,
     device: DeviceOption = "auto",
     dtype: DtypeOption = "auto",
+    low_memory: LowMemoryOption = False,
     threads: ThreadsOption = None,
     control: ControlOption = None,
     turntable: TurntableOption = None,
@@ -129,7 +131,7 @@ def baseline(
             method, dataset, splats, editor, instruction, settings, out,
             budget=budget, marks=marks, tune_outside=tune_outside,
             source=source, max_size=max_size, device=device,
-            dtype=dtype, threads=threads,
+            dtype=dtype, low_memory=low_memory, threads=threads,
             control=control, turntable=turntable, report=report,
         )  # fmt: skip
         ended = f", cut short by its {result.cut.replace('_', ' ')}" if result.cut else ""

@@ -40,6 +40,7 @@ from attnwarp.cli.options import (
     DeviceOption,
     DtypeOption,
     Kind,
+    LowMemoryOption,
     MaxSizeOption,
     Reading,
     ScreenFilterOption,
@@ -136,6 +137,7 @@ def edit(
     store: Annotated[Store, typer.Option(help="Where recorded features are kept.")] = Store.cpu,
     device: DeviceOption = "auto",
     dtype: DtypeOption = "auto",
+    low_memory: LowMemoryOption = False,
     threads: ThreadsOption = None,
     control: ControlOption = None,
     turntable: TurntableOption = None,
@@ -208,7 +210,8 @@ def edit(
             source_picture=source_picture, marks=marks,
             tune_outside=tune_outside, max_size=max_size,
             store=store.value,
-            device=device, dtype=dtype, threads=threads, control=control, turntable=turntable,
+            device=device, dtype=dtype, low_memory=low_memory, threads=threads,
+            control=control, turntable=turntable,
             report=report,
         )  # fmt: skip
         seconds = sum(result.seconds.values())

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from attnwarp.cli.options import DeviceOption, DtypeOption
+from attnwarp.cli.options import DeviceOption, DtypeOption, LowMemoryOption
 from attnwarp.editing.small import bundled, check_words, guide_of
 from attnwarp.errors import InputWarning
 from attnwarp.reporting import reporter
@@ -125,6 +125,7 @@ def edit_image(
     ] = None,
     device: DeviceOption = "auto",
     dtype: DtypeOption = "auto",
+    low_memory: LowMemoryOption = False,
     threads: ThreadsOption = None,
 ) -> None:
     """Edit a picture by an instruction."""
@@ -169,7 +170,9 @@ def edit_image(
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
     given = {name: value for name, value in guidance.items() if value is not None}
     device = choose(device, splats=False)
-    model = load_editor(editor, device=device, dtype=type_of(dtype, device), **given)
+    model = load_editor(
+        editor, device=device, dtype=type_of(dtype, device), low_memory=low_memory, **given
+    )
     check_instruction(editor, model, instruction)
     torch.set_num_threads(thread_count(model, threads))
     longest = size or own_size(model)

@@ -65,6 +65,14 @@ DtypeOption = Annotated[
     ),
 ]
 
+LowMemoryOption = Annotated[
+    bool,
+    typer.Option(
+        "--low-memory",
+        help="Weights wait in main memory, block by block; large pictures are decoded in tiles.",
+    ),
+]
+
 DataArgument = Annotated[
     Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
 ]

@@ -207,7 +207,8 @@ def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | Depth
             Stable Diffusion and of its ControlNet.
         settings: as in :meth:`attnwarp.editing.pix2pix.InstructPix2Pix.from_folder` or in
             :meth:`attnwarp.editing.controlnet.DepthControlNet.from_folder`. ``draws=False`` takes
-            from a bundled editor what lets the noise's mean choose an answer.
+            from a bundled editor what lets the noise's mean choose an answer; ``low_memory=True``
+            is :func:`attnwarp.editing.memory.save_memory`.
 
     Raises:
         InputError: no such editor or folder, or files that are missing, by name.
@@ -222,6 +223,7 @@ def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | Depth
     require_diffusers()
 
     from attnwarp.editing.controlnet import DepthControlNet
+    from attnwarp.editing.memory import save_memory
     from attnwarp.editing.pix2pix import InstructPix2Pix
 
     folder, control = folders_of(name_or_folder)
@@ -233,12 +235,19 @@ def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | Depth
             else {"guidance": DEPTH_GUIDANCE}
         )
         settings = {**guidance, **settings}
-    draws = settings.pop("draws", True)
-    if control is None:
+    draws, low_memory = settings.pop("draws", True), settings.pop("low_memory", False)
+    device = settings.get("device", "cpu")
+    if low_memory:
+        settings["device"] = "cpu"
+    editor: InstructPix2Pix | DepthControlNet
+    if control is not None:
+        editor = DepthControlNet.from_folder(folder, control, **settings)
+    else:
         editor = InstructPix2Pix.from_folder(folder, **settings)
         if not draws:
             if not hasattr(editor.unet, "draw"):
                 raise InputError(f"draws: the editor {name_or_folder!r} has no draw; leave it out")
             editor.unet.draw = None
-        return editor
-    return DepthControlNet.from_folder(folder, control, **settings)
+    if low_memory:
+        save_memory(editor, device)
+    return editor

@@ -14,6 +14,7 @@ import torch
 
 from attnwarp.devices import choose, peak_memory, type_of
 from attnwarp.editing.editor import own_size
+from attnwarp.editing.memory import weight_bytes
 from attnwarp.editing.small import bundled, check_instruction, load_editor, thread_count
 from attnwarp.errors import InputError, suggest
 from attnwarp.fit import (
@@ -89,6 +90,7 @@ def edit_dataset(
     store: Any,
     device: str,
     dtype: str = "auto",
+    low_memory: bool = False,
     threads: int | None,
     control: bool | None = None,
     turntable: Path | None = None,
@@ -112,6 +114,7 @@ def edit_dataset(
         store: see :func:`attnwarp.methods.attention_warping`.
         device: of the editor and the splats, "auto", "cpu" or "cuda".
         dtype: of the editor; see :func:`attnwarp.devices.type_of`.
+        low_memory: see :func:`attnwarp.editing.memory.save_memory`.
         threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
         control: also edit the page's views each alone; None does so with a bundled editor.
         turntable: file of the scene's turn, GIF or MP4.
@@ -140,7 +143,7 @@ def edit_dataset(
         # Again in the edit, but here before an editor is loaded and a fit spends its minutes.
         check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
     segments = marked(marks, editor_name, dataset, views, images, index, out, device, report)
-    editor = load_editor(editor_name, device=device, dtype=type_of(dtype, device))
+    editor = _editor(editor_name, device, dtype, low_memory, report)
     check_instruction(editor_name, editor, instruction)
     if settings.size is None:
         settings = replace(settings, size=own_size(editor))
@@ -200,6 +203,7 @@ def run_baseline(
     max_size: int | None,
     device: str,
     dtype: str = "auto",
+    low_memory: bool = False,
     threads: int | None,
     control: bool | None = None,
     turntable: Path | None = None,
@@ -222,6 +226,7 @@ def run_baseline(
         max_size: larger pictures are averaged down to it.
         device: of the editor and the splats, "auto", "cpu" or "cuda".
         dtype: of the editor; see :func:`attnwarp.devices.type_of`.
+        low_memory: see :func:`attnwarp.editing.memory.save_memory`.
         threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
         control: also edit the page's views each alone; None does so with a bundled editor.
         turntable: file of the scene's turn, GIF or MP4.
@@ -239,7 +244,7 @@ def run_baseline(
     images = images_of(views)
     index = view_of(views.cameras, source, dataset)
     segments = marked(marks, editor_name, dataset, views, images, index, out, device, report)
-    editor = load_editor(editor_name, device=device, dtype=type_of(dtype, device))
+    editor = _editor(editor_name, device, dtype, low_memory, report)
     check_instruction(editor_name, editor, instruction)
     torch.set_num_threads(thread_count(editor, threads))
     if settings.size is None:
@@ -265,6 +270,18 @@ def run_baseline(
         editor=editor if _has_control(control, editor_name) else None,
     )  # fmt: skip
     return result, page
+
+
+def _editor(name: str, device: str, dtype: str, low_memory: bool, report: Reporter) -> Any:
+    """The editor; on a GPU with a line about the memory of its weights."""
+    editor = load_editor(name, device=device, dtype=type_of(dtype, device), low_memory=low_memory)
+    if device != "cpu":
+        kind = str(editor.unet.dtype).removeprefix("torch.")
+        place = "main memory" if low_memory else "the GPU"
+        report.log(
+            f"weights of the editor, {kind}: {weight_bytes(editor) / 2**30:.2f} GiB of {place}"
+        )
+    return editor
 
 
 def _report_memory(device: str, report: Reporter) -> None:
