@@ -5,7 +5,8 @@
   in the same process where it is installed. gsplat has no median depth, no normals of 3D splats and
   no distortion that is exact, so it does less.
 - A fit of 64 views at 256 px with 30,000 splats.
-- An edit of 64 views at 512 px with networks of Stable Diffusion 1.5's sizes and random weights.
+- An edit of 64 views at 512 px with networks of Stable Diffusion 1.5's sizes and random weights,
+  and again with ``--low-memory``.
 
 Each has the most memory that torch held on the GPU. Without a GPU there is nothing to measure: the
 command says so and exits with code 2. ``--device cpu`` runs everything on Warp's CPU device, to see
@@ -160,21 +161,21 @@ def time_once(
     view: Camera,
     device: str,
 ) -> tuple[float, float, int | None]:
-    """Milliseconds of a forward pass, and of one with a backward pass; the most bytes of that."""
+    """Milliseconds of a forward pass, and of a backward pass; the most bytes of the latter."""
     with torch.no_grad():
         forward = milliseconds(lambda: draw(splats, view), device)
     traced = leaves_of(splats)
 
-    def both() -> None:
-        differentiate([output.nan_to_num() for output in draw(traced, view)])
+    def backward() -> float:
+        outputs = [output.nan_to_num() for output in draw(traced, view)]
+        return milliseconds(lambda: differentiate(outputs), device)
 
-    taken, peak = peak_bytes(device, lambda: milliseconds(both, device))
-    return forward, taken, peak
+    return forward, *peak_bytes(device, backward)
 
 
 def rendering(device: str, sizes: Sizes) -> list[dict[str, Any]]:
-    """Milliseconds of a forward and of a forward with a backward pass, medians of contestants in
-    turn, and the ratio to gsplat's."""
+    """Milliseconds of a forward and of a backward pass, medians of contestants in turn, and the
+    ratios to gsplat's."""
     contestants = {"attnwarp": by_us}
     if device != "cpu" and importlib.util.find_spec("gsplat") is not None:
         contestants["gsplat"] = by_gsplat
@@ -188,15 +189,15 @@ def rendering(device: str, sizes: Sizes) -> list[dict[str, Any]]:
             times: dict[tuple[str, str], list[float]] = {}
             for turn in range(sizes.rounds + 2):
                 for name, draw in contestants.items():
-                    forward, both, peak = time_once(draw, splats, view, device)
+                    forward, backward, peak = time_once(draw, splats, view, device)
                     if turn < 2:
                         continue  # compiles, and fills torch's pool
                     times.setdefault((name, "forward"), []).append(forward)
-                    times.setdefault((name, "both"), []).append(both)
+                    times.setdefault((name, "backward"), []).append(backward)
                     row[f"{name}_bytes"] = peak
             for (name, part), values in times.items():
                 row[f"{name}_{part}_ms"] = round(statistics.median(values), 3)
-            for part in ("forward", "both"):
+            for part in ("forward", "backward"):
                 if "gsplat" in contestants:
                     ours, theirs = row[f"attnwarp_{part}_ms"], row[f"gsplat_{part}_ms"]
                     row[f"{part}_ratio"] = round(ours / theirs, 2)
@@ -298,13 +299,18 @@ def random_editor(device: str, sizes: Sizes, dtype: torch.dtype) -> Any:
     return InstructPix2Pix(unet, vae, text, tokenizer, scheduler)
 
 
-def editing(device: str, sizes: Sizes, dtype: torch.dtype) -> dict[str, Any]:
-    """Seconds of a whole edit by part."""
+def editing(
+    device: str, sizes: Sizes, dtype: torch.dtype, low_memory: bool = False
+) -> dict[str, Any]:
+    """Seconds of a whole edit by part; with the option ``--low-memory`` of an edit."""
+    from attnwarp.editing.memory import save_memory
     from attnwarp.methods import attention_warping, preset
 
     cameras = ring(sizes.views, sizes.edit_pixels)
     images = photographs(cameras, device)
-    editor = random_editor(device, sizes, dtype)
+    editor = random_editor("cpu" if low_memory else device, sizes, dtype)
+    if low_memory:
+        save_memory(editor, device)
     splats = scene("2d", sizes.fit_splats, 0.03).to(device=device)
     settings = preset(
         "attention_warping", size=sizes.edit_pixels, steps=sizes.edit_steps,
@@ -342,6 +348,7 @@ def run(device: str, sizes: Sizes) -> dict[str, Any]:
         ("rendering", lambda: rendering(device, sizes)),
         ("fit", lambda: fitting(device, sizes)),
         ("edit", lambda: editing(device, sizes, half)),
+        ("edit in low memory", lambda: editing(device, sizes, half, low_memory=True)),
     ):
         print(f"{name} ...", file=sys.stderr)
         figures[name] = measure()

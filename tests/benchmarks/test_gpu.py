@@ -22,6 +22,6 @@ def test_every_figure_is_made(tmp_path):
     figures = json.loads((tmp_path / "gpu.json").read_text())
     assert all(row["color"] < 1e-5 and row["gradient"] < 1e-4 for row in figures["agreement"])
     assert {row["kind"] for row in figures["rendering"]} == {"2d", "3d"}
-    assert all(row["attnwarp_both_ms"] > 0 for row in figures["rendering"])
+    assert all(row["attnwarp_backward_ms"] > 0 for row in figures["rendering"])
     assert figures["fit"]["views"] == 3 and figures["fit"]["seconds"] > 0
     assert figures["edit"]["edited"] == 3 and set(figures["edit"]["parts"]) >= {"edit", "tune"}
