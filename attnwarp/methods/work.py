@@ -14,7 +14,7 @@ from torch import Tensor
 from attnwarp.editing.editor import Editor, guided, shared_noise, side_multiple
 from attnwarp.editing.schedule import Grid, steps_as_published
 from attnwarp.gaussians import Gaussians
-from attnwarp.methods.noise import own_seed
+from attnwarp.methods.noise import FRESH, own_seed
 from attnwarp.methods.pictures import Image, Segment, Size, composite, edit_size, resized
 from attnwarp.methods.scene import Scene, near_of, render_picture
 from attnwarp.methods.settings import MethodSettings
@@ -160,12 +160,17 @@ class Work:
         return torch.Generator().manual_seed(self.seed(purpose, *numbers))
 
     def noise(self, number: int, views: Sequence[int]) -> Tensor:
-        """(B, C, h, w) noise of edits in a round; a view's does not depend on those beside it."""
+        """(B, C, h, w) noise of edits in a round; a view's does not depend on those beside it.
+
+        In the first round it is that of attention warping with noise of each view's own, so that
+        methods can be compared at equal noise.
+        """
         h, w = (side // self.editor.factor for side in self.sizes[views[0]])
         one = (1, self.editor.unet.config.out_channels, h, w)
         if self.settings.noise == "shared":
             return shared_noise((len(views), *one[1:]), self.settings.seed)
-        seeds = [self.seed(NOISE, number, view) for view in views]
+        purpose = (NOISE, number) if number else (FRESH,)
+        seeds = [self.seed(*purpose, view) for view in views]
         return torch.cat([shared_noise(one, seed) for seed in seeds])
 
     def timestep(self, number: int, view: int, limits: tuple[int, int]) -> int:

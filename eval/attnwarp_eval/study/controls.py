@@ -22,8 +22,9 @@ OTHER_SCENE: Control = "another scene"
 OTHER_SEED: Control = "another seed"
 """Negative control: the same variant with other noise and other stages."""
 
-SEED_STEP = 1_000_003
-"""Difference of the seed of :data:`OTHER_SEED` from the study's."""
+SEED_STEP, SCENE_STEP = 1_000_003, 1009
+"""Difference of the seed of :data:`OTHER_SEED` from the study's, and of a drawn scene's from
+that of the scene before it."""
 
 DISPLACEMENT = 1 / 8
 """Share of the source's width by which ``displaced`` moves what is taken."""

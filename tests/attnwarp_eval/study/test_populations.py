@@ -1,5 +1,6 @@
 """Oracles: scenes drawn outside the study, and the same study told in files."""
 
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -132,3 +133,14 @@ def test_a_population_that_cannot_be_is_refused_with_its_line(study_file, scenes
     with pytest.raises(StudyError) as error:
         load_study(str(study_file))
     assert message in str(error.value) and f"{study_file}:3: scenes: " in str(error.value)
+
+
+def test_each_drawn_scene_has_noise_of_its_own_and_methods_share_it():
+    """The seeds in the cells themselves; a scene's are equal but for the control with another."""
+    study = load_study("ablation", scenes=["drawn-2", "drawn-5"])
+    seeds = defaultdict(set)
+    for cell in cells_of(study, {name: load_scene(name) for name in study.scenes}):
+        if cell.probe == "editing":
+            seeds[cell.scene, "another seed" in cell.labels].add(cell.spec["settings"]["seed"])
+    assert all(len(own) == 1 for own in seeds.values())
+    assert len(set.union(*seeds.values())) == len(seeds) == 4

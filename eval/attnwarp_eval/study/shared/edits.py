@@ -13,7 +13,7 @@ from pydantic import Field
 from attnwarp.errors import InputError
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.budgets import BudgetPart
-from attnwarp_eval.study.controls import OTHER_SCENE, OTHER_SEED, SEED_STEP, Control
+from attnwarp_eval.study.controls import OTHER_SCENE, OTHER_SEED, SCENE_STEP, SEED_STEP, Control
 from attnwarp_eval.study.edit_truth import answers_of
 from attnwarp_eval.study.editing_methods import EDITING_METHODS
 from attnwarp_eval.study.hand_made import Kind
@@ -226,6 +226,16 @@ class MethodProbe(Probe[E]):
             ]
 
         return kind(variant) == kind(wanted)
+
+
+def scene_seed(study: Study, scene: str, seed: int) -> int:
+    """Seed of a scene's noise: the study's own, and on drawn scenes another for each.
+
+    An open instruction's answer follows from the noise's mean, so that with one seed most scenes
+    get the same answer. Scenes of a sample have to be independent.
+    """
+    sample = study.population.names if study.population else []
+    return seed + SCENE_STEP * sample.index(scene) if scene in sample else seed
 
 
 def settings_of(study: Study, variant: Variant, seed: int) -> dict[str, Any]:

@@ -35,6 +35,7 @@ from attnwarp_eval.study.shared.edits import (
     editor_of,
     edits_of,
     reference_of,
+    scene_seed,
     settings_of,
 )
 from attnwarp_eval.study.shared.encoders import (
@@ -165,7 +166,7 @@ class EditingProbe(MethodProbe[EditResult]):
                 for seed in study.seeds:
                     decided = {
                         **self.common_spec(study, scene, seed),
-                        **self.variant_spec(study, variant, seed),
+                        **self.variant_spec(study, variant, scene_seed(study, name, seed)),
                     }
                     donor, files = self.other_scene(study, variant, name, scenes)
                     decided |= donor

@@ -21,7 +21,13 @@ from attnwarp_eval.study.probe import InTurn, Work, register
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Outcome
 from attnwarp_eval.study.schema import Part, Study
-from attnwarp_eval.study.shared.edits import MethodProbe, VariantPart, editor_of, edits_of
+from attnwarp_eval.study.shared.edits import (
+    MethodProbe,
+    VariantPart,
+    editor_of,
+    edits_of,
+    scene_seed,
+)
 from attnwarp_eval.study.shared.method_run import EDITING_PARTS, PARTS, WHOLE, run_method
 from attnwarp_eval.study.shared.splats import splats_of
 
@@ -107,7 +113,9 @@ class EditingTimingProbe(MethodProbe[Rounds]):
                 "spp": study.spp,
                 "edit": next(iter(edits_of(study, scene))),
                 "rounds": study.timing_rounds,
-                "contestants": [self.variant_spec(study, v, seed) for v in variants],
+                "contestants": [
+                    self.variant_spec(study, v, scene_seed(study, name, seed)) for v in variants
+                ],
             }
             editors = {f"editor {k}": editor_of(study, v).name for k, v in enumerate(variants)}
             yield Cell(spec, name, "all", self.name, seed, tuple(names), sources=editors)

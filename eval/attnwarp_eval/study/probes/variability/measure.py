@@ -26,7 +26,13 @@ from attnwarp_eval.study.edit_truth import EditTruth, neighbours, planned_truth
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.schema import Study
-from attnwarp_eval.study.shared.edits import MethodProbe, VariantPart, editor_of, edits_of
+from attnwarp_eval.study.shared.edits import (
+    MethodProbe,
+    VariantPart,
+    editor_of,
+    edits_of,
+    scene_seed,
+)
 from attnwarp_eval.study.shared.method_run import run_method
 from attnwarp_eval.study.shared.splats import splats_of
 
@@ -96,7 +102,7 @@ class VariabilityProbe(MethodProbe[Varied]):
                 variant = study.variants[label]
                 spec = {
                     **self.common_spec(study, scene, first),
-                    **self.variant_spec(study, variant, first),
+                    **self.variant_spec(study, variant, scene_seed(study, name, first)),
                     "seeds": list(study.seeds),
                     "edit": edit,
                 }
@@ -118,7 +124,8 @@ class VariabilityProbe(MethodProbe[Varied]):
             before = splats_of(work)
         edited: dict[int, dict[str, Image]] = {}
         for seed in spec["seeds"]:
-            own = {**spec, "settings": {**spec["settings"], "seed": seed}}
+            drawn = spec["settings"]["seed"] + seed - spec["seeds"][0]
+            own = {**spec, "settings": {**spec["settings"], "seed": drawn}}
             result = run_method(
                 replace(work, cell=replace(work.cell, spec=own)), truth, names, before
             )
