@@ -47,7 +47,8 @@ def settling(
         "**Scenes needed**: with so many, a difference would be told in 80 % of studies, were the"
         " true difference and its spread between scenes those seen here. Its test is at the level"
         " that the adjustment for all claims leaves it here. Difference and spread are estimates"
-        " from few scenes; the brackets have 80 % of what is compatible with them."
+        " from few scenes; the brackets have 80 % of what is compatible with them. A verdict names"
+        " fewer where those would rather show that the difference lies within its bound."
     ]
     if math.isfinite(hours):
         notes.append(
