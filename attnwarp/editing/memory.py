@@ -20,12 +20,12 @@ NETWORKS: dict[str, dict[str, Any]] = {
 
 
 def weight_bytes(editor: Any) -> int:
-    """Bytes of an editor's weights, as in its files; what layers compute comes on top.
+    """Bytes of an editor's weights as loaded; what layers compute comes on top.
 
     Example:
         >>> from attnwarp.editing.small import load_editor
         >>> round(weight_bytes(load_editor("small-plain")) / 2**20)  # MiB
-        7
+        14
     """
     return sum(
         tensor.numel() * tensor.itemsize

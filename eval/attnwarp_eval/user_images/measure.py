@@ -186,7 +186,7 @@ def measure(
     store: Store,
     *,
     device: str = "cpu",
-    load: Callable[..., Any] = load_encoder,
+    load: Callable[..., Any] | None = None,
     report: Reporter = SILENT,
 ) -> Measured:
     """Compute every figure of the paper's table that the pictures and prompts allow.
@@ -199,7 +199,7 @@ def measure(
         store: finished batches are read from there and written there, so that a killed call
             goes on where it was. Views are known by the content of their files.
         device: "cpu" or "cuda", for real encoders.
-        load: gives an encoder, as :func:`attnwarp.encoders.load_encoder` does.
+        load: gives an encoder, in place of :func:`attnwarp.encoders.load_encoder`.
         report: receives each batch of views.
 
     Raises:
@@ -366,7 +366,7 @@ def load_encoders(
     encoders: Mapping[Kind, str | None],
     device: str,
     done: Measured,
-    load: Callable[..., Any] = load_encoder,
+    load: Callable[..., Any] | None = None,
 ) -> dict[Kind, Any]:
     """Load the encoders of figures; those that cannot be loaded cost their figures.
 
@@ -384,7 +384,7 @@ def load_encoders(
     for kind in dict.fromkeys(figure.encoder for figure in wanted if figure.encoder is not None):
         named = encoders.get(kind)
         try:
-            loaded[kind] = load(named or DEFAULTS[kind], kind, device=device)
+            loaded[kind] = (load or load_encoder)(named or DEFAULTS[kind], kind, device=device)
         except InputError as error:
             if named is not None:
                 raise InputError(f"--{kind}: {error}") from None
