@@ -153,10 +153,11 @@ def headlines(judged: list[Judged]) -> list[str]:
     lines = []
     for number, each in enumerate((e for e in chosen if e.judged is not None), 1):
         assert each.judged is not None
-        verdict = each.judged.in_words
+        verdict, _, needed = each.judged.in_words.partition(": ")
+        needed = f" ({needed})" if needed else ""
         lines.append(
-            f"{number}. **{each.claim.text}.** {verdict[0].upper()}{verdict[1:]}: {each.measured},"
-            f" over {each.population}."
+            f"{number}. **{each.claim.text}.** {verdict[0].upper()}{verdict[1:]}{needed}:"
+            f" {each.measured}, over {each.population}."
         )
     return lines
 
