@@ -59,7 +59,7 @@ class EditingProbe(MethodProbe[EditResult]):
     """One edit of one scene by one method."""
 
     name = "editing"
-    protocol = 2
+    protocol = 3
     other_scenes = True
     study_part = EditingPart
     variant_part = VariantPart

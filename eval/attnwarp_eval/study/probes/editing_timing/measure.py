@@ -74,6 +74,7 @@ class EditingTimingProbe(MethodProbe[Rounds]):
     """One cell of a scene for all contestants: seconds of separate cells cannot be compared."""
 
     name = "editing-timing"
+    protocol = 2
     study_part = StudyPart
     times_in_turn = STAGES
     draws = False

@@ -75,6 +75,7 @@ class VariabilityProbe(MethodProbe[Varied]):
     """One edit of one scene by one method, with several seeds."""
 
     name = "variability"
+    protocol = 2
     metrics = metrics_of("variability.")
     study_keys = frozenset({"size", "views", "seeds", "spp", "editing"})
 
