@@ -244,10 +244,10 @@ def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | Depth
         editor = DepthControlNet.from_folder(folder, control, **settings)
     else:
         editor = InstructPix2Pix.from_folder(folder, **settings)
-        if not draws:
-            if not hasattr(editor.unet, "draw"):
-                raise InputError(f"draws: the editor {name_or_folder!r} has no draw; leave it out")
-            editor.unet.draw = None
+    if not draws:
+        if not hasattr(editor.unet, "draw"):
+            raise InputError(f"draws: the editor {name_or_folder!r} has no draw; leave it out")
+        editor.unet.draw = None
     if low_memory:
         save_memory(editor, device)
     return editor

@@ -48,12 +48,14 @@ class EditorPart(Part):
     """An editor of single views.
 
     ``name`` is bundled or a folder in diffusers' format. Guidance left out is the editor's own.
+    ``draws: false`` takes from a bundled editor what lets the noise's mean choose an answer.
     ``ideal`` takes the ideal editor in place of these, for the probe ``ideal``.
     """
 
     name: str = "small-plain"
     text_guidance: float | None = Field(default=None, ge=0)
     image_guidance: float | None = Field(default=None, ge=0)
+    draws: bool = True
     ideal: IdealPart | None = None
 
 
@@ -144,7 +146,7 @@ class MethodProbe(Probe[E]):
             read -= {"editor"}
             if editor_of(study, variant).ideal is not None:
                 return (read | {"editor.ideal"}) - GUIDANCE
-            read |= {"editor.name"}
+            read |= {"editor.name", "editor.draws"}
             read |= {f"editor.{name}" for name in guidance if settings.get(name) is None}
         return read
 
@@ -271,7 +273,8 @@ def editor_identity(editor: EditorPart) -> Json:
     if editor.ideal is not None:
         return {"ideal": editor.ideal.model_dump()}
     guidance = {"text": editor.text_guidance, "image": editor.image_guidance}
-    return {"sha256": files_digest(editor.name), "guidance": guidance}
+    draws = {} if editor.draws else {"draws": False}
+    return {"sha256": files_digest(editor.name), "guidance": guidance, **draws}
 
 
 @lru_cache

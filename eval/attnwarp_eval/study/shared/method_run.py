@@ -150,13 +150,15 @@ def own_seconds(result: EditedScene) -> float:
 
 @lru_cache(maxsize=2)
 def _loaded(
-    name: str, guidance: tuple[tuple[str, float], ...], device: str
+    name: str, guidance: tuple[tuple[str, float], ...], draws: bool, device: str
 ) -> InstructPix2Pix | DepthControlNet:
     from attnwarp.editing.small import guide_of, load_editor
 
     given: dict[str, Any] = {f"{kind}_guidance": value for kind, value in guidance}
     if guide_of(name) == "depth" and "text_guidance" in given:
         given["guidance"] = given.pop("text_guidance")
+    if not draws:
+        given["draws"] = False
     return load_editor(name, device=device, **given)
 
 
@@ -174,7 +176,7 @@ def load(name: str, planned: Json, device: str = "cpu") -> InstructPix2Pix | Dep
         )
     given = planned["guidance"].items()
     guidance = tuple((kind, value) for kind, value in given if value is not None)
-    return _loaded(name, guidance, device)
+    return _loaded(name, guidance, planned.get("draws", True), device)
 
 
 def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:

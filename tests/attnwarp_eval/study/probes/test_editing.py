@@ -462,6 +462,29 @@ def test_an_editor_of_depth_maps_gets_the_description_and_others_the_instruction
     assert words == [("depth", edit["target"]), ("picture", edit["instruction"])]
 
 
+def test_an_editor_without_its_draw_edits_in_a_cell_of_its_own(folder, tmp_path, monkeypatch):
+    nets = []
+
+    def run(job):
+        nets.append(job.editor.unet.draw)
+        return planned(["red"] * 4).run(job)
+
+    monkeypatch.setitem(
+        EDITING_METHODS, "planned", Method(EDITING_METHODS["attention_warping"].settings, run)
+    )
+    ids = {
+        record_of(
+            folder,
+            tmp_path,
+            variants={"planned": {"method": "planned", "editor": {"draws": draws}}},
+        ).id
+        for draws in (True, False)
+    }
+    assert len(ids) == 2
+    assert nets[0] is not None
+    assert nets[1] is None
+
+
 @pytest.mark.parametrize("method", ["gaussctrl", "attention_warping"])
 def test_the_scenes_words_are_handed_to_an_inversion_that_asks_for_them(
     method, folder, tmp_path, monkeypatch
