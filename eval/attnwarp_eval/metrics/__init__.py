@@ -56,6 +56,7 @@ from attnwarp_eval.metrics.known_geometry import (
     perceptual_consistency,
 )
 from attnwarp_eval.metrics.labels import carried_labels, label_transport
+from attnwarp_eval.metrics.masks import mask_overlap
 from attnwarp_eval.metrics.multiview import (
     above_floor,
     answers_by_view,
@@ -102,6 +103,7 @@ __all__ = [
     "image_similarity",
     "label_transport",
     "mask_error",
+    "mask_overlap",
     "match_features",
     "match_similarity",
     "metric",

@@ -50,6 +50,7 @@ GATES: Mapping[str, Margin] = {
     "labels.none": Margin(0.02),
     "labels.painted_hidden": Margin(0.02),
     "labels.painted_outside": Margin(0.01),
+    "masks.iou": Margin(0.02),
     # One part of a view that changes its answer moves these by a tenth.
     "parts.seen": Margin(0.1),
     "parts.through": Margin(0.1),

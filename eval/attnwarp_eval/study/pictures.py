@@ -92,6 +92,35 @@ def of_fit(surface: Surface, hits: Hits, image: npt.NDArray[np.uint8]) -> dict[s
     )
 
 
+MARKS = {
+    "the thing, marked": "#2ca25f",
+    "the thing, not marked": "#1f78b4",
+    "something else, marked": "#e31a1c",
+}
+"""Colours of a lifted mask against the exact one."""
+
+
+def of_mask(
+    world: World, name: str, marked: npt.NDArray[np.bool_], thing: npt.NDArray[np.bool_], spp: int
+) -> dict[str, bytes]:
+    """JPEG file of a lifted mask in the colours of :data:`MARKS` over the darkened target.
+
+    Args:
+        world: of the scene.
+        name: the target view.
+        marked: (H, W) bool, the mask.
+        thing: (H, W) bool, the exact one.
+        spp: samples a pixel of the true view.
+    """
+    target = world.image(name, spp)
+    classes = (marked & thing, ~marked & thing, marked & ~thing)
+    grey = 0.35 * target.mean(axis=2, keepdims=True).repeat(3, axis=2)
+    image = grey
+    for color, pixels in zip(MARKS.values(), classes, strict=True):
+        image = np.where(pixels[..., None], grey + 0.65 * rgb(color), image)
+    return _jpegs({"target": target, "lifted": enlarged(image.astype(np.float32))})
+
+
 def _jpegs(images: dict[str, Image]) -> dict[str, bytes]:
     return {name: jpeg(image) for name, image in images.items()}
 

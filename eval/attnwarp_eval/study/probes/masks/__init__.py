@@ -1,0 +1,1 @@
+"""Masks of a thing, lifted through splats into other views."""
