@@ -1,5 +1,5 @@
-"""The choices a warp is made of, and three presets: the paper's text, its released code, and what
-measures right.
+"""The choices a warp is made of, and presets: the paper's text, its released code, what measures
+right, and the same for small pictures and fitted splats.
 """
 
 from __future__ import annotations
@@ -128,8 +128,9 @@ PRESETS: Named[WarpSettings] = Named(
         mask_resize="bilinear",
     ),
     corrected=WarpSettings(),
+    tolerant=WarpSettings(depth_relative=2e-2, depth_spread=0.2),
 )
-"""Three sets of choices.
+"""Four sets of choices.
 
 ``paper``: the text. The mask is "inside the image", with the target's size; nothing asks whether a
 point lies in front of the source camera or is hidden from it. Gaussians whose normals, each "as
@@ -156,6 +157,11 @@ intersection, its median along the ray, carried to a feature grid in 1 / z witho
 edges. The mask's mean over each feature pixel. The numbers (0.5, 1e-2, 0.05) are for rendered
 splats and come from the measurements in reports/warp/choices.md; exact depth takes
 ``attnwarp.warp.rules.EXACT_DEPTH_TOLERANCE`` and ``attnwarp.warp.depth.TAP_SPREAD``.
+
+``tolerant``: ``corrected`` for small pictures and fitted splats, whose depth is less sure for its
+pixels. A surface may recede by a fifth from one tap to the next, and depths may differ by 2 %: more
+features reach what the source shows, and a little more is taken by what it does not
+(reports/rules/report.md).
 """
 
 
@@ -163,7 +169,7 @@ def preset(name: str, **changes: Any) -> WarpSettings:
     """A preset, with some of its fields changed.
 
     Args:
-        name: "paper", "released" or "corrected".
+        name: "paper", "released", "corrected" or "tolerant".
         changes: fields of :class:`WarpSettings`.
 
     Raises:

@@ -161,7 +161,7 @@ class Subject:
 
 
 def of_scene(scene: str, size: int = SIZE) -> Subject:
-    """A scene under the three presets, with splats as studies put them on its surfaces.
+    """A scene under the presets, with splats as studies put them on its surfaces.
 
     Args:
         scene: a name, or the path of a file.
@@ -172,7 +172,7 @@ def of_scene(scene: str, size: int = SIZE) -> Subject:
 
     Example:
         >>> sorted(of_scene("spheres", 16).variants)
-        ['corrected', 'paper', 'released']
+        ['corrected', 'paper', 'released', 'tolerant']
     """
     from attnwarp_eval.world import world
 
@@ -289,7 +289,7 @@ def of_capture(
     Example:
         >>> subject = of_capture(Path("scene.ply"), Path("my_capture"), size=32)
         >>> subject.targets[:2], sorted(subject.variants)
-        (('1', '2'), ['corrected', 'paper', 'released'])
+        (('1', '2'), ['corrected', 'paper', 'released', 'tolerant'])
     """
     # A camera without a picture is shown with a render.
     dataset = read_dataset(data, images=images, missing_images="none", points=False)
