@@ -56,7 +56,7 @@ def inspect(
         str,
         typer.Option(
             help="picture, mask, rules, incidence; with truth: endpoint error, depth error,"
-            " covered by; of an edit: edit disagreement."
+            " covered by; of an edit: edit disagreement; of a run with labels: labels."
         ),
     ] = "mask",
     splats: Annotated[bool, typer.Option(help="Draw the splats as discs.")] = False,

@@ -53,6 +53,7 @@ class CellReport:
         taps: the source cells that are read, with their weights.
         label: of the truth on this grid, "" without truth.
         true_xy: (2,) exact position in cells; NaN without truth.
+        token: what becomes of its label, in words; "" where no run has labels.
 
     Example:
         >>> from attnwarp.warp import PRESETS
@@ -77,6 +78,7 @@ class CellReport:
     taps: tuple[Tap, ...]
     label: str
     true_xy: Vector
+    token: str = ""
 
     def lines(self) -> list[str]:
         """The report in words, a line each."""
@@ -98,7 +100,7 @@ class CellReport:
         ]
         text.append(f"mask: {self.share:.3f} of the cell's pixels, above 0.5 counts")
         text.append("gets features" if self.accepted else "keeps its own")
-        return text
+        return [*text, self.token] if self.token else text
 
 
 def cell_of(pair: Pair, size: Size, column: int, row: int) -> tuple[int, int]:
@@ -147,7 +149,7 @@ def cell_report(pair: Pair, size: Size, column: int, row: int) -> CellReport:
     source, target = correspondence.source, correspondence.target
     depth = float(correspondence.target_depth[cell])
     centre = np.array([column + 0.5, row + 0.5])
-    truth = pair.truth_at(size)
+    truth, carried = pair.truth_at(size), pair.carried(size)
     return CellReport(
         column=column,
         row=row,
@@ -162,6 +164,7 @@ def cell_report(pair: Pair, size: Size, column: int, row: int) -> CellReport:
         taps=_taps(pair, size, cell, source.height, source.width),
         label="" if truth is None else LABELS[int(truth.label[cell])],
         true_xy=np.full(2, np.nan) if truth is None else truth.xy[cell],
+        token="" if carried is None else carried.text(row, column),
     )
 
 

@@ -30,6 +30,7 @@ from attnwarp.warp import (
 )
 from attnwarp.warp.view import near_plane
 from attnwarp_eval.inspect.capture import Capture, Edit, rendered
+from attnwarp_eval.inspect.labels import KINDS, OTHER, Carried, Parts
 from attnwarp_eval.inspect.run import RunEdit
 from attnwarp_eval.study import pictures
 from attnwarp_eval.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
@@ -46,6 +47,8 @@ LABELS = {NONE: "none", VISIBLE: "visible", HIDDEN: "hidden", AMBIGUOUS: "ambigu
 
 EDIT_DISAGREEMENT = "edit disagreement"
 
+PART_LABELS = "labels"
+
 COLORINGS = (
     "picture",
     "mask",
@@ -55,6 +58,7 @@ COLORINGS = (
     "incidence",
     "covered by",
     EDIT_DISAGREEMENT,
+    PART_LABELS,
 )
 """Colourings of the surface that the target sees; :attr:`Pair.colorings` has those that a pair can
 show.
@@ -106,6 +110,7 @@ class Pair:
         spp: samples a pixel of the true pictures.
         edit: of the scene.
         exact_mask: whether the mask is the truth's, as an oracle's.
+        thing: the scene's thing, in as many parts as a run's probe ``labels`` has, by number.
     """
 
     views: World | Capture
@@ -115,6 +120,7 @@ class Pair:
     spp: int = 8
     edit: Edit | RunEdit | None = None
     exact_mask: bool = False
+    thing: Parts | None = None
 
     @property
     def world(self) -> World | None:
@@ -362,7 +368,8 @@ class Pair:
             sides = (target.height, target.width, source.height, source.width)
             if all(side % factor == 0 for side in sides) and min(sides) >= 2 * factor:
                 sizes.append((target.height // factor, target.width // factor))
-        return tuple(sizes)
+        own = () if self.thing is None else self.thing.grids
+        return tuple(sorted({*sizes, *((g, g) for g in own if g != target.height)}, reverse=True))
 
     def layer(self, size: Size) -> FeatureWarp:
         """The warp of an (h, w) feature grid."""
@@ -374,6 +381,12 @@ class Pair:
             return self.view.mask.numpy()
         return blocks(self.layer(layer).mask.numpy(), self.size)
 
+    def carried(self, layer: Size | None = None) -> Carried | None:
+        """Labels of a thing's parts on a feature grid, or by pixels; None where no run has any."""
+        if self.thing is None or self.truth is None:
+            return None
+        return self.thing.carried(self.layer(layer or self.size), self.target, self.truth)
+
     # --- colours
 
     @property
@@ -384,6 +397,7 @@ class Pair:
             for name in COLORINGS
             if (self.truth is not None or name not in NEEDS_TRUTH)
             and (self.edit is not None or name != EDIT_DISAGREEMENT)
+            and (self.thing is not None or name != PART_LABELS)
         )
 
     def colors(self, coloring: str, layer: Size | None = None, step: str | None = None) -> Image:
@@ -391,7 +405,7 @@ class Pair:
 
         Args:
             coloring: one of :attr:`colorings`.
-            layer: (h, w) of a feature grid, whose mask "mask" then shows.
+            layer: (h, w) of a feature grid, whose mask "mask" and whose tokens "labels" then show.
             step: of the edit, whose scene "picture" then shows.
         """
         if coloring not in self.colorings:
@@ -412,6 +426,12 @@ class Pair:
             return incidence_map(self.incidence)
         if coloring == EDIT_DISAGREEMENT:
             return disagreement_map(self.disagreement)
+        if coloring == PART_LABELS:
+            carried = self.carried(layer)
+            assert carried is not None
+            return tinted(
+                [c for _, c in (*KINDS.values(), OTHER)], blocks(carried.kind, self.size), target
+            )
         assert truth is not None
         if coloring == "endpoint error":
             return pictures.endpoint_map(self.view.correspondence.xy.numpy(), truth)
@@ -432,6 +452,8 @@ class Pair:
                 for number, rule in enumerate(self.view.rules)
             ]
             return [("accepted", ACCEPTED), *rules]
+        if coloring == PART_LABELS:
+            return [*KINDS.values(), OTHER]
         if coloring == "covered by":
             views = zip(self._covering_views(), CATEGORIES, strict=False)
             return [*views, ("no view", REJECTED)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -25,9 +25,10 @@ from attnwarp_eval.inspect.capture import (
     one_of,
     read_edit,
 )
+from attnwarp_eval.inspect.labels import Parts
 from attnwarp_eval.inspect.pair import Pair
 from attnwarp_eval.inspect.run import Measured, measured
-from attnwarp_eval.study.schema import Splats, Variant
+from attnwarp_eval.study.schema import Splats, Study, Variant
 from attnwarp_eval.study.store import Store
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ class Subject:
         measured: what a run has of its variants, where they edit the scene or fit splats to it.
         elsewhere: what to open for an edited view that a run has no pictures of; empty for
             anything but a run of edits.
+        thing: parts that a run carries labels of; None where it carries none.
 
     Example:
         >>> subject = of_scene("spheres", 16)
@@ -76,6 +78,7 @@ class Subject:
     edit: Edit | None = field(default=None, repr=False)
     measured: Mapping[str, Measured] = field(default_factory=dict, repr=False)
     elsewhere: str = ""
+    thing: Parts | None = field(default=None, repr=False)
     _pairs: dict[tuple[str, str], Pair] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -119,6 +122,7 @@ class Subject:
             self.spp,
             own.edits.get(target),
             own.exact_mask,
+            self.thing,
         )
 
     @property
@@ -242,10 +246,32 @@ def of_run(
     elsewhere = ""
     if any(own.edited for own in records.values()):
         elsewhere = _elsewhere(folder, pictured, edited)
-    scene = files[name]
-    targets = (*edited, *(study.views or views.targets))
+    scene, seen = files[name], study.views or views.targets
     return Subject(
-        scene, size, study.spp, seed, variants, targets, measured=records, elsewhere=elsewhere
+        scene,
+        size,
+        study.spp,
+        seed,
+        variants,
+        (*edited, *seen),
+        measured=records,
+        elsewhere=elsewhere,
+        thing=_parts(study, views, seen) if "labels" in study.probes else None,
+    )
+
+
+def _parts(study: Study, views: World, targets: Iterable[str]) -> Parts:
+    """Parts that the probe ``labels`` of a study carries, in the first of its numbers."""
+    from attnwarp_eval.study.probes.labels.measure import StudyPart, grids_of
+    from attnwarp_eval.study.shared.things import thing_of
+
+    size = views.source.width
+    return Parts(
+        views,
+        (views.source.name, *targets),
+        tuple(thing_of(study, views.scene)),
+        study.part(StudyPart).labels.parts[0],
+        tuple(grid for grid in grids_of(study, size) if size % grid == 0),
     )
 
 

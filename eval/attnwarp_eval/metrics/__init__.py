@@ -55,7 +55,7 @@ from attnwarp_eval.metrics.known_geometry import (
     feature_consistency,
     perceptual_consistency,
 )
-from attnwarp_eval.metrics.labels import carried_labels, label_transport
+from attnwarp_eval.metrics.labels import carried_labels, label_tokens, label_transport
 from attnwarp_eval.metrics.masks import mask_overlap
 from attnwarp_eval.metrics.multiview import (
     above_floor,
@@ -101,6 +101,7 @@ __all__ = [
     "flow_error",
     "image_error",
     "image_similarity",
+    "label_tokens",
     "label_transport",
     "mask_error",
     "mask_overlap",

@@ -79,6 +79,46 @@ def most(pixels: Mask, size: tuple[int, int]) -> Mask:
     return np.asarray(2 * cells > (H // h) * (W // w))
 
 
+def label_tokens(
+    carried: Labels, tokens: Labels, pixels: Labels, visible: Mask, unseen: Mask
+) -> dict[str, Mask]:
+    """Tokens of each kind that :func:`label_transport` counts.
+
+    Args:
+        carried, tokens, pixels, visible, unseen: as there.
+
+    Returns:
+        (h, w) bool: "right", "wrong" and "none" are the "visible" ones; "painted_hidden" are among
+        the "hidden", "painted_outside" among those "outside".
+
+    Raises:
+        ValueError: shapes that do not fit.
+    """
+    h, w = tokens.shape
+    H, W = pixels.shape
+    check.shape(carried, (h, w), "carried")
+    for name, array in (("visible", visible), ("unseen", unseen)):
+        check.shape(array, (H, W), name)
+    if H % h or W % w:
+        raise ValueError(f"tokens: got {h} x {w} for {H} x {W} px, expected divisors of them")
+    own = pixels == np.repeat(np.repeat(tokens, H // h, axis=0), W // w, axis=1)
+    thing = tokens >= 0
+    seen = thing & most(own & visible, (h, w))
+    hidden = thing & most(own & unseen, (h, w))
+    painted = carried >= 0
+    right, none = carried == tokens, carried == NONE
+    return {
+        "visible": seen,
+        "hidden": hidden,
+        "outside": ~thing,
+        "right": seen & right,
+        "wrong": seen & ~right & ~none,
+        "none": seen & none,
+        "painted_hidden": hidden & painted,
+        "painted_outside": ~thing & painted,
+    }
+
+
 def label_transport(
     carried: Labels, tokens: Labels, pixels: Labels, visible: Mask, unseen: Mask
 ) -> dict[str, float]:
@@ -113,30 +153,12 @@ def label_transport(
         >>> figures["labels.right"], figures["labels.painted_hidden"]
         (1.0, 1.0)
     """
-    h, w = tokens.shape
-    H, W = pixels.shape
-    check.shape(carried, (h, w), "carried")
-    for name, array in (("visible", visible), ("unseen", unseen)):
-        check.shape(array, (H, W), name)
-    if H % h or W % w:
-        raise ValueError(f"tokens: got {h} x {w} for {H} x {W} px, expected divisors of them")
-    own = pixels == np.repeat(np.repeat(tokens, H // h, axis=0), W // w, axis=1)
-    thing = tokens >= 0
-    seen = thing & most(own & visible, (h, w))
-    hidden = thing & most(own & unseen, (h, w))
-    painted = carried >= 0
-    right, none = carried == tokens, carried == NONE
-    counts = {
-        "visible": int(seen.sum()),
-        "hidden": int(hidden.sum()),
-        "outside": int((~thing).sum()),
-    }
-    figures = {
-        "right": share(int((seen & right).sum()), counts["visible"]),
-        "wrong": share(int((seen & ~right & ~none).sum()), counts["visible"]),
-        "none": share(int((seen & none).sum()), counts["visible"]),
-        "painted_hidden": share(int((hidden & painted).sum()), counts["hidden"]),
-        "painted_outside": share(int((~thing & painted).sum()), counts["outside"]),
-        **counts,
+    kinds = label_tokens(carried, tokens, pixels, visible, unseen)
+    counts = {name: int(kind.sum()) for name, kind in kinds.items()}
+    figures: dict[str, float] = {
+        **{name: share(counts[name], counts["visible"]) for name in ("right", "wrong", "none")},
+        "painted_hidden": share(counts["painted_hidden"], counts["hidden"]),
+        "painted_outside": share(counts["painted_outside"], counts["outside"]),
+        **{name: counts[name] for name in ("visible", "hidden", "outside")},
     }
     return {f"labels.{name}": value for name, value in figures.items()}

@@ -44,6 +44,17 @@ class StudyPart(Part):
     labels: Labels = Labels()
 
 
+def grids_of(study: Study, size: int) -> list[int]:
+    """Sides of the token grids that a study measures.
+
+    Args:
+        study: with or without the probe.
+        size: of the pictures, in px.
+    """
+    grids = study.part(StudyPart).labels.grids
+    return grids or [grid for grid in GRIDS if size % grid == 0]
+
+
 @register
 class LabelTransport(WarpProbe):
     """Labels of a thing's parts, carried along the tokens of a warp."""
@@ -76,11 +87,10 @@ class LabelTransport(WarpProbe):
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """Depth, rules, grids and parts."""
-        part = study.part(StudyPart).labels
         return {
             **super().variant_spec(study, variant, seed),
-            "grids": part.grids or [grid for grid in GRIDS if study.size % grid == 0],
-            "parts": part.parts,
+            "grids": grids_of(study, study.size),
+            "parts": study.part(StudyPart).labels.parts,
         }
 
     def compute(self, work: Work) -> NoExtra:

@@ -1,0 +1,97 @@
+"""A thing in parts: where the labels of its parts arrive along a warp, token by token."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp_eval import metrics
+from attnwarp_eval.ideal.parts import token_parts
+from attnwarp_eval.ideal.thing import labels_of
+from attnwarp_eval.two_view import TwoView
+
+if TYPE_CHECKING:
+    from attnwarp_eval.world import World
+
+KINDS = {
+    "right": ("right", "#2ca25f"),
+    "wrong": ("wrong", "#e31a1c"),
+    "none": ("none, though visible", "#1f78b4"),
+    "painted_hidden": ("painted, though hidden", "#ff7f00"),
+    "painted_outside": ("painted, outside the thing", "#ffd92f"),
+}
+"""Text and colour of each kind of token, in order."""
+
+OTHER = ("left alone, or not counted", "#4a4a4a")
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Parts of a scene's thing, as the probe ``labels`` of a study tells them apart.
+
+    Attributes:
+        world: of the scene.
+        views: names of the views whose surface points are pooled, the source among them.
+        objects: names of what the thing is made of.
+        count: number of parts.
+        grids: sides of the token grids.
+    """
+
+    world: World
+    views: tuple[str, ...]
+    objects: tuple[str, ...]
+    count: int
+    grids: tuple[int, ...]
+
+    @cached_property
+    def labels(self) -> Mapping[str, npt.NDArray[np.int16]]:
+        """(H, W) part of each pixel by the view's name, -1 outside the thing."""
+        cameras = [self.world.camera(name) for name in self.views]
+        return labels_of(self.world.scene, self.world.geometry, cameras, self.objects, self.count)
+
+    def carried(self, layer: Any, target: str, truth: TwoView) -> Carried:
+        """Labels that the tokens of a target take along a warp.
+
+        Args:
+            layer: the warp of the tokens' grid, (h, w).
+            target: name of the view.
+            truth: of the pair.
+        """
+        size = tuple(layer.mask.shape)
+        source, own = (token_parts(self.labels[n], size) for n in (self.world.source.name, target))
+        taken = metrics.carried_labels(layer, source)
+        kinds = metrics.label_tokens(taken, own, self.labels[target], truth.visible, truth.unseen)
+        return Carried(own, taken, np.select([kinds[k] for k in KINDS], range(len(KINDS)), -1))
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """Labels of a grid's tokens.
+
+    Attributes:
+        own: (h, w) true part, -1 outside the thing.
+        taken: (h, w) the part that arrives, -1 for what is no part, -2 for none.
+        kind: (h, w) index into :data:`KINDS`, -1 for :data:`OTHER`.
+    """
+
+    own: npt.NDArray[np.int16]
+    taken: npt.NDArray[np.int16]
+    kind: npt.NDArray[np.int64]
+
+    def text(self, row: int, column: int) -> str:
+        """Words for what happens at a token.
+
+        Example:
+            >>> one = np.ones((1, 1), np.int16)
+            >>> Carried(3 * one, 5 * one, np.array([[1]])).text(0, 0)
+            'label: part 3 takes part 5: wrong'
+        """
+        own, taken, kind = (int(grid[row, column]) for grid in (self.own, self.taken, self.kind))
+        what = "no part" if own < 0 else f"part {own}"
+        takes = {-2: "nothing", -1: "what is no part"}.get(taken, f"part {taken}")
+        return f"label: {what} takes {takes}: {[*(t for t, _ in KINDS.values()), OTHER[0]][kind]}"
