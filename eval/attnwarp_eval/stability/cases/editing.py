@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import get_args
 
+import mpmath
 import numpy as np
 import torch
 
@@ -11,7 +13,9 @@ from attnwarp.camera import Camera
 from attnwarp.editing.injection import constant, inject
 from attnwarp.editing.layers import Layer
 from attnwarp.editing.recording import RecordingPlan, record
+from attnwarp.editing.schedule import Prediction, Schedule
 from attnwarp.warp import FeatureWarp, Surface, WarpedView, warp_surfaces
+from attnwarp_eval.ideal.editor import Answers, IdealUNet
 from attnwarp_eval.stability.bilinear import Extended, extended, sampling_matrix
 from attnwarp_eval.stability.case import Bound, Case, Way, exact, ways
 from attnwarp_eval.stability.cases.warps import (
@@ -242,6 +246,78 @@ ONE_VIEW = Bound(
     "five roundings of a token, five or six of its warp and its blend, each by half a step",
 )
 
+
+def _step(alpha: float, way: Way) -> float:
+    """Error of a DDIM step from an alpha-bar half of the way to 1, in steps of the type at its
+    largest term, over all that a network may predict.
+    """
+    alphas = torch.tensor([(1 + alpha) / 2, alpha], dtype=torch.float64).float()
+    generator = torch.Generator().manual_seed(0)
+    x, output = torch.randn((2, 64), generator=generator, dtype=torch.float64).to(way.dtype)
+    worst = 0.0
+    for prediction in get_args(Prediction):
+        if prediction == "epsilon" and not alpha:
+            continue  # noise alone tells nothing of x_0
+        result = Schedule(alphas, prediction, 1.0).step(output, x, 1, 0)
+        for got, one, out in zip(result.double(), x.double(), output.double(), strict=True):
+            terms = _step_terms(prediction, float(one), float(out), *map(float, alphas))
+            scale = max(map(abs, terms)) * torch.finfo(way.dtype).eps
+            worst = max(worst, abs(float(got) - math.fsum(terms)) / scale)
+    return worst
+
+
+def _step_terms(prediction: str, x: float, out: float, then: float, now: float) -> list[float]:
+    """Terms of a step's result, each rounded once from mpmath: of x_0, and of the noise."""
+    with mpmath.workdps(50):
+        a, b = mpmath.mpf(now), mpmath.mpf(then)
+        ra, rb, na, nb = (mpmath.sqrt(v) for v in (a, b, 1 - a, 1 - b))
+        match prediction:
+            case "sample":
+                terms = [rb * out, nb * x / na, -nb * ra * out / na]
+            case "epsilon":
+                terms = [rb * x / ra, -rb * na * out / ra, nb * out]
+            case _:
+                terms = [rb * ra * x, -rb * na * out, nb * ra * out, nb * na * x]
+        return [float(term) for term in terms]
+
+
+def _ideal(tokens: int, alpha: float, way: Way) -> float:
+    """Error of the ideal editor's picture, at an alpha-bar, of a part of so many tokens of 64."""
+    random, answers = np.random.default_rng(int(tokens)), 3
+    before = random.random((32, 32, 3)).astype(np.float32)
+    after = random.random((answers, 32, 32, 3)).astype(np.float32)
+    parts = np.full(64, -1)
+    parts[random.permutation(64)[:tokens]] = 0
+    view = Answers(before, after, parts.reshape(8, 8))
+    a = torch.tensor([alpha], dtype=torch.float64).float()
+    net = IdealUNet([view], a).to(way.dtype)
+    z, change = net.before[0].double(), net.change[0].double()
+    generator = torch.Generator().manual_seed(1)
+    noise = torch.randn(z.shape, generator=generator, dtype=torch.float64)
+    x = (a.double().sqrt() * (z + change[1]) + (1 - a.double()).sqrt() * noise).to(way.dtype)
+    result = net(x.T.reshape(1, -1, 8, 8), 0, views=[0])[0].flatten(1).T.double()
+
+    now, inside = mpmath.mpf(float(a)), parts >= 0
+    with mpmath.workdps(40):
+        root = mpmath.sqrt(now)
+        logs = []
+        for k in range(answers):
+            # |x - sqrt(a) z_k|^2 but for what all answers share, from exact sums of products.
+            d, rest = change[k][inside].flatten(), x[inside].double().flatten()
+            fit = mpmath.fdot(d.tolist(), rest.tolist())
+            own = mpmath.fdot(d.tolist(), z[inside].flatten().tolist())
+            energy = mpmath.fdot(d.tolist(), d.tolist())
+            logs.append((root * fit - now * own - now / 2 * energy) / (1 - now))
+        weights = [mpmath.exp(value - max(logs)) for value in logs]
+        shares = torch.tensor([float(w / sum(weights)) for w in weights], dtype=torch.float64)
+    expected = z + torch.where(
+        torch.from_numpy(inside)[:, None], torch.einsum("k,knc->nc", shares, change), 0.0
+    )
+    return float((result - expected).abs().max())
+
+
+IDEAL = Bound("of 1", 1e-3, "a quarter of a step of an 8-bit picture is 1e-3")
+
 CASES = [
     Case(
         41,
@@ -332,5 +408,49 @@ CASES = [
         bounds={"forward": Bound("px of the layer", 1e-4, "numerics of the warp")},
         ways=EVERY_TYPE,
         measure=_latents,
+    ),
+    Case(
+        60,
+        "alpha_bar",
+        "Steps of denoising where alpha-bar is almost 0, and almost 1",
+        input="a DDIM step half of the way to 1, for each kind of prediction",
+        oracle="the formula in mpmath with 50 digits",
+        hardness="alpha-bar",
+        levels=(0.5, 0.01, 0.99, 1e-4, 0.9999, 1e-8, 0.999999, 0.9999999, 0),
+        required=0,
+        quick=(0.5, 0.9999, 0),
+        bounds={
+            "forward": Bound("steps of the type", 4, "eight roundings of its terms, each by half")
+        },
+        ways=ways("schedule", precisions=("float64", "float32", *HALVES)),
+        measure=_step,
+    ),
+    Case(
+        60,
+        "ideal_alpha_bar",
+        "The ideal editor where alpha-bar is almost 0, and almost 1",
+        input="a part of 16 tokens with three answers, noised from one of them",
+        oracle="Bayes' rule over the answers in mpmath",
+        hardness="alpha-bar",
+        levels=(0.01, 1e-4, 0.5, 1e-8, 0.9999, 0.9999999, 0),
+        required=0,
+        quick=(0.01, 0.9999, 0),
+        bounds={"forward": IDEAL},
+        ways=ways("ideal"),
+        measure=lambda alpha, way: _ideal(16, alpha, way),
+    ),
+    Case(
+        61,
+        "part_of_one_token",
+        "The ideal editor and parts of a few tokens, and of one",
+        input="a part with three answers among 64 tokens, at an alpha-bar of 0.01",
+        oracle="Bayes' rule over the answers in mpmath",
+        hardness="tokens of the part",
+        levels=(64, 16, 4, 2, 1),
+        required=1,
+        quick=(16, 1),
+        bounds={"forward": IDEAL},
+        ways=ways("ideal"),
+        measure=lambda tokens, way: _ideal(int(tokens), 0.01, way),
     ),
 ]

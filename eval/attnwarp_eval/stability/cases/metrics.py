@@ -14,6 +14,7 @@ import numpy as np
 from attnwarp_eval import metrics
 from attnwarp_eval.metrics.embedding import TINY_DISPLACEMENT, TINY_NORM
 from attnwarp_eval.stability.case import Bound, Case, Way, ways
+from attnwarp_eval.statistics.scales import compared
 
 FLOATS = ways("metrics")
 COSINE = Bound("cosine", 1e-6, "encoders compute in float32")
@@ -119,6 +120,38 @@ def _nothing(values: np.ndarray) -> None:
     values[:] = np.nan
 
 
+def _visible_tokens(visible: float, way: Way) -> float:
+    """Error of the shares of right, wrong and missing labels among a few visible tokens of 64."""
+    tokens, seen = np.zeros((8, 8), np.int16), np.zeros((8, 8), bool)
+    seen.ravel()[np.random.default_rng(0).permutation(64)[: int(visible)]] = True
+    carried = (np.arange(64) % 3 - 2).astype(np.int16).reshape(8, 8)  # none, outside, right
+    result = metrics.label_transport(carried, tokens, tokens, seen, ~seen)
+    taken = [int(label) for label, shown in zip(carried.flat, seen.flat, strict=True) if shown]
+    hidden = [int(label) for label, shown in zip(carried.flat, seen.flat, strict=True) if not shown]
+    counted = {
+        "right": (taken.count(0), taken),
+        "wrong": (taken.count(-1), taken),
+        "none": (taken.count(-2), taken),
+        "painted_hidden": (hidden.count(0), hidden),
+    }
+    return max(
+        _against(float(Fraction(n, len(of))) if of else math.nan, result[f"labels.{name}"])
+        for name, (n, of) in counted.items()
+    )
+
+
+def _ends(distance: float, way: Way) -> float:
+    """Error of the difference of logits of two shares of 1,000, at a distance from 0 and from 1."""
+    count, low, high = 1000, distance, 1 - distance
+    with mpmath.workdps(40):
+        logits = [
+            mpmath.log((k + 0.5) / (count - k + 0.5))
+            for k in (mpmath.mpf(share) * count for share in (low, high))
+        ]
+        exact = float(logits[1] - logits[0])
+    return _against(exact, compared(low, high, "odds", counts=(count, count)))
+
+
 CASES = [
     Case(
         31,
@@ -218,5 +251,33 @@ CASES = [
         bounds={"forward": DECIBELS},
         ways=FLOATS,
         measure=_masked(_equal),
+    ),
+    Case(
+        62,
+        "visible_tokens",
+        "Labels of a few visible tokens, and of none",
+        input="8 x 8 tokens of one part, some of which the source shows",
+        oracle="counts by a loop, as fractions; undefined without a token",
+        hardness="visible tokens",
+        levels=(64, 32, 8, 2, 1, 0),
+        required=0,
+        quick=(32, 1, 0),
+        bounds={"forward": Bound("of 1", 1e-12, "a fraction of whole numbers")},
+        ways=(Way("metrics"),),
+        measure=_visible_tokens,
+    ),
+    Case(
+        63,
+        "shares_at_the_ends",
+        "Shares of almost 0 and 1, and of exactly these, on the scale of odds",
+        input="two shares of 1,000 things, one from each end",
+        oracle="empirical logits in mpmath",
+        hardness="distance from 0 and from 1",
+        levels=(0.5, 0.1, 1e-3, 1e-6, 1e-9, 1e-15, 0),
+        required=0,
+        quick=(0.5, 1e-3, 0),
+        bounds={"forward": Bound("of a logit", 1e-9, "reports show three digits")},
+        ways=(Way("statistics"),),
+        measure=_ends,
     ),
 ]

@@ -111,6 +111,33 @@ def _duplicates(count: float) -> Shot:
     return Shot(made, front_camera(), CROSS[:3])
 
 
+def _distortion(gap: float, way: Way) -> float:
+    """Error of w_i w_j |z_i - z_j| over all pairs of facing discs on one ray, or of its gradient.
+
+    On the middle ray alpha is the opacity, so weights are powers and depths are as stored.
+    """
+    opacity, count, depth = 0.3, 6, 4.0
+    means = np.zeros((count, 3))
+    means[:, 2] = depth * (1 + gap * np.random.default_rng(0).permutation(count))
+    made = Shot(splats(means, 1.0, opacity), front_camera(1, 30.0), [(0, 0)])
+    base = made.gaussians.to(dtype=way.dtype)
+    a, z = float(base.opacities[0].double()), base.means[:, 2].double().numpy()
+    w = np.empty(count)
+    w[np.argsort(z, kind="stable")] = a * (1 - a) ** np.arange(count)
+    pairs, steps = np.outer(w, w), z[:, None] - z
+    if way.direction == "forward":
+        exact = math.fsum((pairs * abs(steps)).ravel())
+        return abs(float(made.render(way, base).distortion_l1[0, 0]) - exact) / depth
+    means_of = base.means.clone().requires_grad_()
+    made.render(way, dataclasses.replace(base, means=means_of)).distortion_l1.sum().backward()
+    assert means_of.grad is not None
+    # Where depths are equal, any slope between -1 and 1 is a subgradient; pairs cancel in the sum.
+    slopes = means_of.grad[:, 2].double().numpy()
+    apart = np.abs(slopes - 2 * (pairs * np.sign(steps)).sum(axis=1))
+    free = 2 * (pairs * ((steps == 0) & ~np.eye(count, dtype=bool))).sum(axis=1)
+    return float(max((apart - free).max(), abs(slopes.sum())))
+
+
 def _deep_ray(count: float, way: Way) -> float:
     """Transmittance of equal splats on one ray, and its gradient, against powers of 1 - a."""
     n, opacity = int(count), 0.005
@@ -329,6 +356,23 @@ CASES = [
         ),
         ways=RENDERERS,
         measure=against_exact(_faint, ("depth",)),
+    ),
+    Case(
+        59,
+        "distortion_equal_depth",
+        "Depth distortion of splats of almost equal depth, and of equal depth",
+        input="six facing discs on one ray, in another order in memory",
+        oracle="the double sum over pairs of the stored depths; at equal ones any subgradient",
+        hardness="gap, of the depth",
+        levels=(0.1, 1e-3, 1e-5, 1e-7, 1e-9, 1e-12, 0),
+        required=0,
+        quick=(0.1, 1e-5, 0),
+        bounds={
+            "forward": Bound("of the depth", 1e-6, "depths in float32 have steps of 6e-8"),
+            "backward": Bound("of 1", 1e-5, "a weight is below 1; 0.001 % of it"),
+        },
+        ways=tuple(way for way in RENDERERS if way.backend != "gpu"),
+        measure=_distortion,
     ),
     Case(
         24,
