@@ -262,7 +262,8 @@ class Job:
     def warp(self) -> Made:
         """The source's picture warped into a target by both kinds of splats, with its mask."""
         from attnwarp.methods.scene import near_of, to_float
-        from attnwarp.warp import PRESETS, sample, warp_view
+        from attnwarp.warp import PRESETS, warp_view
+        from attnwarp_eval.study.pictures import carried
 
         capture, folder, target = self.capture, self.folder(), self.cell.spec["target"]
         source = to_float(capture.images[capture.source])
@@ -274,8 +275,7 @@ class Job:
                 splats, capture.cameras[capture.source], capture.cameras[target],
                 PRESETS["paper"], near=near_of(capture.cameras, splats), warn_empty=False,
             )  # fmt: skip
-            planes = torch.from_numpy(np.ascontiguousarray(source.transpose(2, 0, 1)))
-            warped = sample(planes, view.correspondence)[0].numpy().transpose(1, 2, 0)
+            warped = carried(source, view)
             mask = view.mask.cpu().numpy()
             figures[f"valid, {kind}gs"] = float(mask.mean())
             apart = np.abs(warped - truth)[mask]

@@ -156,15 +156,16 @@ def checkered(shape: tuple[int, int], step: int = 16) -> Image:
     return np.repeat((0.78 + 0.1 * ((x + y) % 2))[..., None], 3, axis=2).astype(np.float32)
 
 
+def carried(source: Image, view: WarpedView) -> Image:
+    """(H, W, 3) the source image warped to the target, whatever the mask says."""
+    planes = torch.from_numpy(np.ascontiguousarray(source.transpose(2, 0, 1)))
+    return sample(planes, view.correspondence)[0].permute(1, 2, 0).numpy()
+
+
 def warped(source: Image, view: WarpedView) -> Image:
     """(H, W, 3) the source image warped to the target; squares where the mask rejects."""
-    image, _ = sample(
-        torch.from_numpy(np.ascontiguousarray(source.transpose(2, 0, 1))), view.correspondence
-    )
     height, width = view.mask.shape
-    return np.where(
-        view.mask.numpy()[..., None], image.permute(1, 2, 0).numpy(), checkered((height, width))
-    )
+    return np.where(view.mask.numpy()[..., None], carried(source, view), checkered((height, width)))
 
 
 def mask_against_truth(mask: npt.NDArray[np.bool_], truth: TwoView, target: Image) -> Image:
