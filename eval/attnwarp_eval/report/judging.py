@@ -181,12 +181,15 @@ def decided(claims: Iterable[JudgedClaim]) -> list[JudgedClaim]:
 
 
 def _verdict(judged: JudgedClaim, p: float) -> Verdict:
-    control = judged.measured.control
-    if control == "not seen":
-        return "blind"
+    claim, control = judged.claim, judged.measured.control
     if control == "not measured":
         return "can't tell"
-    told = judged.contrast.verdict(judged.claim.expect, adjusted_p=p, bound=judged.claim.bound)
+    told = judged.contrast.verdict(claim.expect, adjusted_p=p, bound=claim.bound)
+    if control == "not seen":
+        # That wrong features do as well takes a gain from the right ones, and every null its
+        # meaning. It explains no loss.
+        lost = told == "worse" and "worse" in (claim.control or {})
+        return "the opposite holds" if lost else "blind"
     words: dict[str, Verdict] = {"better": "holds", "worse": "the opposite holds", "equal": "equal"}
     return words.get(told, "can't tell")
 

@@ -121,12 +121,15 @@ class Contrast:
         Args:
             adjusted_p, bound: as for :meth:`verdict`.
         """
-        by = [scenes_needed(self.flips.mean, self.deviation, level=self.level(adjusted_p))]
+        level = self.level(adjusted_p)
+        # No flips of fewer scenes' signs are as rare as the level asks: p is at least 2 / 2**n.
+        fewest = math.ceil(1 - math.log2(1 - level))
+        by = [max(fewest, scenes_needed(self.flips.mean, self.deviation, level=level))]
         own = self._bounded
         if bound is not None and abs(own.mean) < bound:
             spread = float(np.std(own.differences, ddof=1))
             by.append(scenes_needed(bound - abs(own.mean), spread, level=EQUAL_LEVEL))
-        return max(FEWEST, min(by))
+        return max(FEWEST, self.scenes + 1, min(by))
 
 
 def contrast(

@@ -311,6 +311,20 @@ def test_a_claim_whose_control_does_no_worse_than_its_last_side_is_blind(factor,
     assert (finding.measured.control, finding.verdict) == (control, verdict)
 
 
+@pytest.mark.parametrize(
+    ("expected", "verdict"), [("worse", "the opposite holds"), ("better", "blind")]
+)
+def test_wrong_features_that_do_as_well_explain_no_loss(expected, verdict):
+    """True pictures that do no better do: the figure cannot tell good from bad."""
+    table = {"good": [[0.5 + 0.01 * k for k in range(8)]], "slipped": [[0.1] * 8]}
+    table["wrong"] = [[0.1] * 8]
+    variants = {**study()["variants"], "wrong": {"set": {"depth_agreement": False}}}
+    run = drawn(table, variants=variants, probes={"warp": list(variants)})
+    claim = dataclasses.replace(SLIP_CLAIM, control={expected: variants["wrong"]})
+    (finding,) = judge(run, [claim])
+    assert (finding.measured.control, finding.verdict) == ("not seen", verdict)
+
+
 def test_p_values_are_adjusted_over_the_claims_of_all_studies_that_judge_and_no_others():
     """Oracle: Benjamini and Hochberg by hand: 4 / 256 of one, and 2 / 256 of another, of two."""
     clear = [0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.6]

@@ -164,3 +164,15 @@ def test_an_adjusted_interval_agrees_with_the_adjusted_verdict():
             _, low, high = value.shown(value.level(adjusted))
             told = value.verdict("higher", adjusted_p=adjusted) != "can't tell"
             assert told == (not math.isnan(low) and not low <= 0 <= high)
+
+
+@pytest.mark.parametrize(("adjusted", "scenes"), [(2 / 64, 7), (4 / 64, 7), (8 / 64, 8)])
+def test_no_fewer_scenes_are_asked_for_than_the_test_can_ever_tell_with(adjusted, scenes):
+    """Oracle: of n scenes' flips only two, all as seen and all turned, are so far out, so p is at
+    least 2 / 2**n. An adjustment by 2 asks for p <= 1 / 40, one by 4 for 1 / 80.
+    """
+    table = {f"s{k}": {"v": 1.0 + 0.01 * k} for k in range(6)}
+    nothing = {scene: {"v": 0.0} for scene in table}
+    value = contrast(nothing, table, "plain")
+    assert value.flips.p == 2 / 64
+    assert value.needed(adjusted) == scenes
