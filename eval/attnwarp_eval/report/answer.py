@@ -124,7 +124,10 @@ def by_claims(
     if told:
         sure.append("Build on what has a verdict.")
     if counts["can't tell"]:
-        sure.append('"Can\'t tell" does not mean equal: more scenes may tell.')
+        sure.append(
+            '"Can\'t tell" does not mean equal: more scenes may tell, or `attnwarp-eval verdicts`,'
+            " which adjusts over the claims of all studies together."
+        )
     text.append(" ".join(sure))
     if len(own) > MOST_CLAIMS:
         text.append(f"The table has {MOST_CLAIMS} of the {len(own)}; a section below has all.")
