@@ -24,6 +24,7 @@ class LabelReport(ProbeReport):
         "painted, outside": "labels.painted_outside",
     }
     contrasts = tuple(columns.values())
+    stage = "pair"
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
         """Figures by the grid's side, a table for each number of parts."""
