@@ -109,6 +109,7 @@ class Round:
         views: numbers of the views that it edits, in the order of editing.
         training: numbers of the views that it tunes on.
         iterations: of tuning.
+        rows: through the UNet that its edits take.
 
     Example:
         >>> from attnwarp.methods import Round
@@ -119,6 +120,7 @@ class Round:
     views: tuple[int, ...] = ()
     training: tuple[int, ...] = ()
     iterations: int = 0
+    rows: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +247,8 @@ class Plan:
 
     def edit(self, number: int, views: Sequence[int], edit: Edit, *, rows: int) -> None:
         """Plan an edit of views together."""
-        self._change(number, views=(*self._round(number).views, *views))
+        now = self._round(number)
+        self._change(number, views=(*now.views, *views), rows=now.rows + rows)
 
     def tune(
         self, number: int, views: Sequence[int], iterations: int, order: Order | None = None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import math
 import tempfile
 import time
@@ -46,7 +45,7 @@ class Unit:
         whole: seconds of a cell beside edits and tuning: renders, files, figures.
         edit: seconds of an edit with all its steps.
         iteration: seconds of one of tuning.
-        edits, iterations, rounds: of a whole run on this capture.
+        rows, edits, iterations, rounds: of a whole run on this capture; rows through the UNet.
         views: of the capture.
         files, state, picture: bytes of a cell's other files, of a round's end, of an edit.
         original, asked: bytes of a view's picture, and of one in the page that asks people.
@@ -57,6 +56,7 @@ class Unit:
     whole: float
     edit: float
     iteration: float
+    rows: int
     edits: int
     iterations: int
     rounds: int
@@ -73,6 +73,10 @@ class Unit:
         """Seconds of a cell on a capture of so many views."""
         whole = self.whole * views / self.views
         return whole + self._edits(views) * self.edit + self.iterations * self.iteration
+
+    def network_rows(self, views: int) -> float:
+        """Rows through the UNet of a cell on a capture of so many views."""
+        return self.rows * self._edits(views) / self.edits
 
     def gigabytes(self, views: int) -> float:
         """Files of a cell on a capture of so many views."""
@@ -116,10 +120,11 @@ def estimate(
         own = [cell for cell in edits if cell.variant == name]
         seconds = sum(unit.seconds(views[cell.scene]) for cell in own)
         gigabytes = sum(unit.gigabytes(views[cell.scene]) for cell in own)
+        rows = sum(unit.network_rows(views[cell.scene]) for cell in own)
         gpu = "" if math.isnan(unit.gpu) else f", {unit.gpu:.1f} GiB of the GPU"
         yield (
-            f"{name}: {len(own)} cells, {seconds / 3600:.2g} hours, {gigabytes:.2g} GB,"
-            f" {unit.memory:.1f} GiB of memory{gpu}"
+            f"{name}: {len(own)} cells, {rows:,.0f} network rows, {seconds / 3600:.2g} hours,"
+            f" {gigabytes:.2g} GB, {unit.memory:.1f} GiB of memory{gpu}"
         )
         total, disk = total + seconds, disk + gigabytes
     if fits:
@@ -137,8 +142,7 @@ def estimate(
 def _measured(planned: Planned, cell: Cell, folder: Path, device: str) -> Unit:
     """Costs of a cell's method from its plan and two short cells."""
     plan = _job(planned, cell, folder / "plan", device, 0)
-    plan.run_method(plan.editor())
-    rounds = json.loads((plan.folder() / "run" / "manifest.json").read_text())["rounds"]
+    rounds = plan.run_method(plan.editor())[0].rounds
     gc.collect()
     reset_peak_memory()
     (short, _, whole), (long, last, _) = (
@@ -154,8 +158,9 @@ def _measured(planned: Planned, cell: Cell, folder: Path, device: str) -> Unit:
         whole,
         one + step * (steps - STEPS[0]),
         tuned / max(1, sum(made.counts["iterations"] for made in (short, long))),
-        sum(len(part["views"]) for part in rounds),
-        sum(part["iterations"] for part in rounds),
+        sum(part.rows for part in rounds),
+        sum(len(part.views) for part in rounds),
+        sum(part.iterations for part in rounds),
         len(rounds),
         planned.checked.views[cell.scene],
         _bytes(last) - state - 3 * pictures,

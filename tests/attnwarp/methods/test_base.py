@@ -57,6 +57,7 @@ def whole(finished, run, editor, depth_editor, tmp_path_factory):
 def test_counters_are_what_hooks_and_files_count(name, whole, run, editor, depth_editor):
     folder, rows, result = whole(name)
     assert result.counters["network_rows"] == sum(rows) > 0
+    assert sum(part.rows for part in result.rounds) == sum(rows)
     assert result.counters["edits"] == len(list(folder.glob("rounds/*/*.png")))
     assert result.counters["views"] == len(list(folder.glob("views/*.png"))) == len(result.edited)
     iterations = QUICK[name].iterations * getattr(QUICK[name], "stages", 1)

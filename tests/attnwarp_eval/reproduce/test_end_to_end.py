@@ -189,4 +189,8 @@ def test_quick_runs_two_methods_on_one_scene(folder, monkeypatch):
         ("spheres", ["attention warp"]),
         ("spheres", ["IGS2GS"]),
     ]
+    for name in ("attention warp", "IGS2GS"):
+        (cell,) = (c for c in results["cells"] if c["methods"] == [name])
+        told = f"{name}: 1 cells, {cell['counts']['network_rows']} network rows, "
+        assert any(line.startswith(told) for line in lines)
     assert yaml.safe_load((folder / "manifest.yaml").read_text())["seeds"] == [0]
