@@ -260,21 +260,25 @@ def fitting(device: str, sizes: Sizes) -> dict[str, Any]:
     }
 
 
-def random_editor(device: str, sizes: Sizes, dtype: torch.dtype) -> Any:
-    """An InstructPix2Pix of Stable Diffusion 1.5's sizes with random weights."""
-    from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
+def random_editor(device: str, sizes: Sizes, dtype: torch.dtype, depth: bool = False) -> Any:
+    """An InstructPix2Pix of Stable Diffusion 1.5's sizes with random weights, or a depth
+    ControlNet."""
+    from diffusers import AutoencoderKL, ControlNetModel, DDIMScheduler, UNet2DConditionModel
     from diffusers.utils import logging
     from transformers import CLIPTextConfig, CLIPTextModel
 
+    from attnwarp.editing.controlnet import DepthControlNet
     from attnwarp.editing.pix2pix import InstructPix2Pix
     from attnwarp.editing.small import load_editor
 
     logging.set_verbosity_error()
     tokenizer = load_editor("small-plain").tokenizer
+    tokenizer.model_max_length = 77  # as Stable Diffusion's
     torch.manual_seed(0)
     levels = len(sizes.channels)
     unet = UNet2DConditionModel(
-        sample_size=64, in_channels=8, out_channels=4, block_out_channels=sizes.channels,
+        sample_size=64, in_channels=4 if depth else 8, out_channels=4,
+        block_out_channels=sizes.channels,
         down_block_types=(*["CrossAttnDownBlock2D"] * (levels - 1), "DownBlock2D"),
         up_block_types=("UpBlock2D", *["CrossAttnUpBlock2D"] * (levels - 1)),
         cross_attention_dim=sizes.context, attention_head_dim=8,
@@ -296,7 +300,10 @@ def random_editor(device: str, sizes: Sizes, dtype: torch.dtype) -> Any:
         beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False,
         set_alpha_to_one=False, steps_offset=1,
     )  # fmt: skip
-    return InstructPix2Pix(unet, vae, text, tokenizer, scheduler)
+    if not depth:
+        return InstructPix2Pix(unet, vae, text, tokenizer, scheduler)
+    control = ControlNetModel.from_unet(unet).to(device, dtype)
+    return DepthControlNet(unet, vae, text, tokenizer, scheduler, control)
 
 
 def editing(
