@@ -9,7 +9,7 @@ import typer
 
 from attnwarp.cli.shell import fail
 from attnwarp.reporting import reporter
-from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, resumable
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, resumable, scheduler_lost
 
 if TYPE_CHECKING:
     from attnwarp_eval.reproduce.manifest import Loaded
@@ -101,9 +101,10 @@ def reproduce(
             return
         with store.lock(), resumable(lambda: f"{len(store.done())} cells are kept"):
             store.write_study(cells.expected(planned))
-            failures = cells.execute(
-                planned, store, jobs=jobs or len(devices), scheduler=scheduler, report=report
-            )
+            with scheduler_lost(scheduler, lambda: len(store.done())):
+                failures = cells.execute(
+                    planned, store, jobs=jobs or len(devices), scheduler=scheduler, report=report
+                )
             from attnwarp_eval.reproduce.report import write_report
             from attnwarp_eval.reproduce.seal import write_seal
 

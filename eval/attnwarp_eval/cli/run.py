@@ -11,7 +11,7 @@ import typer
 
 from attnwarp.cli.shell import fail, log, warn
 from attnwarp.reporting import reporter
-from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, names, resumable
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, names, resumable, scheduler_lost
 
 if TYPE_CHECKING:
     from attnwarp_eval.study.cell import Cell
@@ -334,7 +334,6 @@ def run_study(
     """
     from attnwarp_eval.cache import limit_bytes
     from attnwarp_eval.report import problems, read_results
-    from attnwarp_eval.study.cluster import ClusterLost
     from attnwarp_eval.study.run import plan
     from attnwarp_eval.study.store import Store
 
@@ -361,14 +360,8 @@ def run_study(
                         " scenes, seeds or settings than this run; they are kept, and the report is"
                         " of this run alone. Name another folder with --out to keep the former."
                     )
-                try:
+                with scheduler_lost(scheduler, lambda: len(store.done())):
                     summary = _watch(planned, store, jobs, scheduler, keep_going)
-                except ClusterLost:
-                    raise fail(
-                        f"the connection to the scheduler {scheduler} broke;"
-                        f" {len(store.done())} cells are kept, the same command goes on from here",
-                        TOO_LITTLE,
-                    ) from None
                 results = read_results(store)
                 _print_answer(results)
                 _write_report(store)

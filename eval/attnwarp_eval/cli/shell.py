@@ -68,6 +68,26 @@ def resumable(state: Callable[[], str]) -> Iterator[None]:
         raise fail(message, STOPPED) from None
 
 
+@contextmanager
+def scheduler_lost(scheduler: str | None, kept: Callable[[], int]) -> Iterator[None]:
+    """Turn a broken connection to a scheduler into one clear line and exit code 3.
+
+    Args:
+        scheduler: its address or file.
+        kept: counts the cells that are stored.
+    """
+    from attnwarp_eval.study.cluster import ClusterLost
+
+    try:
+        yield
+    except ClusterLost:
+        raise fail(
+            f"the connection to the scheduler {scheduler} broke; {kept()} cells are kept, the same"
+            " command goes on from here",
+            TOO_LITTLE,
+        ) from None
+
+
 def names(text: str | None) -> list[str] | None:
     """The parts of a comma-separated option; None if the option was left out."""
     return None if text is None else [part.strip() for part in text.split(",") if part.strip()]

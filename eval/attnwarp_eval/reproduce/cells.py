@@ -6,7 +6,7 @@ files lie in the run's folder, so that workers have to see that folder and the m
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
@@ -37,7 +37,6 @@ from attnwarp_eval.study.editing_methods import with_source_words
 from attnwarp_eval.study.probe import Probe, Work, register, unregister
 from attnwarp_eval.study.record import Failure, Json, with_nan
 from attnwarp_eval.study.store import Store
-from attnwarp_eval.study.work import compute_and_write
 from attnwarp_eval.user_images import measure
 
 PROTOCOL = 1
@@ -446,8 +445,8 @@ def execute(
         scheduler: a dask scheduler whose workers see the run's folder and the manifest's.
         report: receives each cell.
     """
-    from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
     from attnwarp_eval.study.reporting import CellReporter
+    from attnwarp_eval.study.run import compute_cells
 
     failures: list[Failure] = []
     register(Reproduction)
@@ -455,30 +454,12 @@ def execute(
         for wave in planned.waves:
             left = todo(wave, store)
             cells = CellReporter(left, len(wave) - len(left), report)
-            if not left:
-                continue
-            if scheduler is not None:
-                work = run_on_scheduler(left, store, {}, scheduler, cells)
-            elif jobs > 1 and len(left) > 1:
-                work = run_on_workers(left, store.root, min(jobs, len(left)), cells)
-            else:
-                work = _here(left, store, cells)
-            for cell, failure in work:
-                if failure is not None:
-                    store.write_failure(cell.id, asdict(failure))
-                    failures.append(failure)
-                cells.end(cell, failure)
+            failures = compute_cells(left, store, cells, jobs=jobs, scheduler=scheduler, scenes={})
             if failures:
                 break
     finally:
         unregister(Reproduction.name)
     return failures
-
-
-def _here(left: Sequence[Cell], store: Store, cells: Any) -> Generator[tuple[Cell, Failure | None]]:
-    for cell in left:
-        cells.start(cell)
-        yield cell, compute_and_write(Reproduction(), cell, str(store.root))
 
 
 def made_of(planned: Planned, store: Store) -> Iterator[tuple[Cell, Any]]:

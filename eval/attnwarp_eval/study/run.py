@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -303,35 +303,64 @@ def execute(
         ClusterLost: the connection to the scheduler broke; what had ended is stored.
     """
     start = time.perf_counter()
-    jobs = min(jobs, len(plan.todo), core_count())
     store.write_study(expected(plan))
-    summary = Summary(expected=len(plan.cells), reused=plan.reused)
-
     cells = CellReporter(plan.todo, plan.reused, report)
+    failures = compute_cells(
+        plan.todo, store, cells, jobs=min(jobs, core_count()), scheduler=scheduler,
+        scenes=plan.scenes, keep_going=keep_going,
+    )  # fmt: skip
+    computed = cells.done - plan.reused - len(failures)
+    seconds = time.perf_counter() - start
+    return Summary(len(plan.cells), plan.reused, computed, failures, seconds)
+
+
+def compute_cells(
+    cells: list[Cell],
+    store: Store,
+    report: CellReporter,
+    *,
+    jobs: int,
+    scheduler: str | None,
+    scenes: Mapping[str, Scene],
+    keep_going: bool = True,
+) -> list[Failure]:
+    """Compute cells, in this process or on workers, and return what failed.
+
+    Args:
+        cells: of registered probes.
+        store: the run's folder, which gets every record and failure.
+        report: of these cells.
+        jobs: worker processes, at most one a cell; 1 stays in this process.
+        scheduler: see :func:`execute`.
+        scenes: by the names that cells give them.
+        keep_going: see :func:`execute`.
+
+    Raises:
+        ClusterError, ClusterLost: see :func:`execute`.
+    """
+    jobs = min(jobs, len(cells))
     if scheduler is not None:
-        work = run_on_scheduler(plan.todo, store, plan.scenes, scheduler, cells)
+        work = run_on_scheduler(cells, store, scenes, scheduler, report)
     elif jobs > 1:
-        work = run_on_workers(plan.todo, store.root, jobs, cells)
+        work = run_on_workers(cells, store.root, jobs, report)
     else:
-        work = _in_this_process(plan, store, cells)
+        work = _in_this_process(cells, store, report)
+    failures = []
     # Closed here and now: an interrupt must end the workers before the command ends.
     with contextlib.closing(work):
         for cell, failure in work:
-            if failure is None:
-                summary.computed += 1
-            else:
+            if failure is not None:
                 store.write_failure(cell.id, asdict(failure))
-                summary.failures.append(failure)
-            cells.end(cell, failure)
+                failures.append(failure)
+            report.end(cell, failure)
             if failure is not None and not keep_going:
                 break
-    summary.seconds = time.perf_counter() - start
-    return summary
+    return failures
 
 
 def _in_this_process(
-    plan: Plan, store: Store, cells: CellReporter
+    cells: list[Cell], store: Store, report: CellReporter
 ) -> Generator[tuple[Cell, Failure | None]]:
-    for cell in plan.todo:
-        cells.start(cell)
+    for cell in cells:
+        report.start(cell)
         yield cell, compute_and_write(probe(cell.probe), cell, str(store.root))
