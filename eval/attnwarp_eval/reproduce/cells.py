@@ -449,12 +449,15 @@ def execute(
     from attnwarp_eval.study.run import compute_cells
 
     failures: list[Failure] = []
+    needs = [store.root / "study.json", *planned.loaded.paths()]
     register(Reproduction)
     try:
         for wave in planned.waves:
             left = todo(wave, store)
             cells = CellReporter(left, len(wave) - len(left), report)
-            failures = compute_cells(left, store, cells, jobs=jobs, scheduler=scheduler, scenes={})
+            failures = compute_cells(
+                left, store, cells, jobs=jobs, scheduler=scheduler, scenes={}, needs=needs
+            )
             if failures:
                 break
     finally:

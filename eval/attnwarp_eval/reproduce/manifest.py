@@ -160,6 +160,16 @@ class Loaded:
         """A path of the manifest."""
         return self.folder / Path(name).expanduser()
 
+    def paths(self) -> list[Path]:
+        """Paths of captures, splats, masks and weights; what is bundled has none."""
+        names: list[str | None] = []
+        for c in self.manifest.captures.values():
+            mask = c.mask or MaskPart()
+            names += [c.data, c.images, *c.splats.values(), mask.folder, mask.source]
+        for weights in in_folders(self.manifest).values():
+            names += [part.strip() for part in weights.folder.split(",")]
+        return [self.path(name) for name in names if name is not None]
+
     def editor(self, name: str) -> str:
         """An editor of the manifest as :func:`attnwarp.editing.small.load_editor` takes it."""
         from attnwarp.editing.small import bundled
@@ -310,8 +320,8 @@ def write_probes(path: Path, probes: Mapping[str, float]) -> None:
     write_atomic(path, changed.encode())
 
 
-def lacking(manifest: Manifest) -> list[str]:
-    """Keys of weights in folders that neither a probe value nor a hash tells from others."""
+def in_folders(manifest: Manifest) -> dict[str, Weights]:
+    """Weights that are not bundled, by key."""
     from attnwarp.editing.small import bundled
     from attnwarp.encoders import BUNDLED
 
@@ -321,11 +331,13 @@ def lacking(manifest: Manifest) -> list[str]:
         **{f"editors.{k}": w for k, w in manifest.editors.items()},
         **{f"encoders.{k}": w for k, w in encoders.items() if w is not None},
     }
-    return [
-        key
-        for key, w in named.items()
-        if w.folder not in known and w.probe is None and w.sha256 is None
-    ]
+    return {key: w for key, w in named.items() if w.folder not in known}
+
+
+def lacking(manifest: Manifest) -> list[str]:
+    """Keys of weights in folders that neither a probe value nor a hash tells from others."""
+    weights = in_folders(manifest).items()
+    return [key for key, w in weights if w.probe is None and w.sha256 is None]
 
 
 def _explained(problem: Any, model: Any) -> str:

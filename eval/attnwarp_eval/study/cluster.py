@@ -12,7 +12,7 @@ import signal
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Collection, Generator, Iterator, Mapping
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -241,16 +241,18 @@ def run_on_scheduler(
     scenes: Mapping[str, Scene],
     scheduler: str,
     report: CellReporter,
+    needs: Sequence[Path] = (),
 ) -> Generator[Ended]:
     """Compute cells on the workers of the user's own scheduler, and write them here.
 
     Args:
         cells: what to compute.
-        store: the run's folder, which no worker needs to see.
+        store: the run's folder, which no worker needs to see unless ``needs`` has it.
         scenes: by the names that cells give them.
         scheduler: its address, such as ``tcp://host:8786``, or its scheduler file.
         report: receives each cell as it is handed out, and a line about a worker that is refused
             or lost.
+        needs: paths that a worker has to see.
 
     Yields:
         Each cell as it ends, with what went wrong.
@@ -263,7 +265,7 @@ def run_on_scheduler(
         stack.enter_context(_silent())
         client = stack.enter_context(_closed(_connect(scheduler)))
         place = _Remote(store, scenes)
-        yield from _Runner(client, cells, place, report, this_code()).run()
+        yield from _Runner(client, cells, place, report, this_code(), needs).run()
 
 
 def _connect(scheduler: str) -> Client:
@@ -350,6 +352,7 @@ class _Runner:
         place: how a cell travels.
         report: receives each cell as it is handed out, and lines about workers.
         code: that a worker must have; workers are not asked if None.
+        needs: paths that a worker has to see.
     """
 
     def __init__(
@@ -359,8 +362,10 @@ class _Runner:
         place: Workplace,
         report: CellReporter,
         code: Code | None = None,
+        needs: Sequence[Path] = (),
     ) -> None:
         self.client = client
+        self.needs = [str(path.resolve()) for path in needs]
         self.place = place
         self.report = report
         self.code = code
@@ -403,7 +408,9 @@ class _Runner:
             if self.code is None:
                 self.accepted.add(worker)
             else:
-                question = self.client.submit(code_of_worker, workers=[worker], pure=False)
+                question = self.client.submit(
+                    code_of_worker, 0, self.needs, workers=[worker], pure=False
+                )
                 self.asked[worker] = self._watched(worker, question)
         for worker in (self.accepted | self.refused.keys() | self.asked.keys()) - addresses:
             yield from self._give_up(worker)
@@ -523,7 +530,7 @@ class _Runner:
                     return None
 
     def _judge(self, worker: str, future: Future) -> None:
-        """Accept a worker that has this code, refuse any other."""
+        """Accept a worker that has this code and sees what it needs, refuse any other."""
         assert self.code is not None
         try:
             result = self._result(worker, future)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,14 +32,16 @@ class Code:
         source: SHA-256 of the source files of both packages and of the plugins.
         versions: of Python (major and minor) and of the packages that results depend on.
         worker: its name in the cluster; empty outside one.
+        unseen: paths that a cell needs and the worker cannot read.
     """
 
     source: str
     versions: Mapping[str, str]
     worker: str = ""
+    unseen: Sequence[str] = ()
 
     def difference(self, expected: Code) -> str:
-        """Difference of a worker's code from the expected; empty where it is the same."""
+        """Difference of a worker from the expected one; empty where its cells would be the same."""
         names = sorted(self.versions.keys() | expected.versions.keys())
         parts = [
             f"{name} {self.versions.get(name, 'missing')}, expected"
@@ -49,6 +51,8 @@ class Code:
         ]
         if self.source != expected.source:
             parts.append(f"source {self.source[:12]}, expected {expected.source[:12]}")
+        if self.unseen:
+            parts.append(f"cannot read {', '.join(self.unseen)}, expected under these paths")
         return "; ".join(parts)
 
 
@@ -61,15 +65,17 @@ def this_code() -> Code:
     return Code(source_hash(), versions)
 
 
-def code_of_worker(request: int = 0) -> Code:
+def code_of_worker(request: int = 0, needs: Sequence[str] = ()) -> Code:
     """The code of the worker that this runs on.
 
     Args:
         request: tells calls apart.
+        needs: paths that it has to see.
     """
     from distributed import get_worker
 
-    return replace(this_code(), worker=str(get_worker().name))
+    unseen = [path for path in needs if not os.access(path, os.R_OK)]
+    return replace(this_code(), worker=str(get_worker().name), unseen=unseen)
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
@@ -322,6 +323,7 @@ def compute_cells(
     jobs: int,
     scheduler: str | None,
     scenes: Mapping[str, Scene],
+    needs: Sequence[Path] = (),
     keep_going: bool = True,
 ) -> list[Failure]:
     """Compute cells, in this process or on workers, and return what failed.
@@ -333,6 +335,7 @@ def compute_cells(
         jobs: worker processes, at most one a cell; 1 stays in this process.
         scheduler: see :func:`execute`.
         scenes: by the names that cells give them.
+        needs: paths that a scheduler's workers have to see.
         keep_going: see :func:`execute`.
 
     Raises:
@@ -340,7 +343,7 @@ def compute_cells(
     """
     jobs = min(jobs, len(cells))
     if scheduler is not None:
-        work = run_on_scheduler(cells, store, scenes, scheduler, report)
+        work = run_on_scheduler(cells, store, scenes, scheduler, report, needs)
     elif jobs > 1:
         work = run_on_workers(cells, store.root, jobs, report)
     else:

@@ -254,6 +254,25 @@ def test_a_scheduler_that_is_none_is_refused_in_one_line(home, monkeypatch, sche
     assert done.stderr.splitlines()[-1].startswith("attnwarp-eval: --scheduler: ")
 
 
+def test_a_worker_that_cannot_read_what_its_cells_need_is_refused_by_name(tmp_path, monkeypatch):
+    from distributed import LocalCluster
+
+    module = attnwarp_eval.study.cluster
+    monkeypatch.setattr(module, "REFUSED_SECONDS", 0.5)
+    cells = [module.Cell({}, "ball", "v", "warp", 0)]
+    needs = [tmp_path, tmp_path / "nowhere"]
+    place = {"dashboard_address": "127.0.0.1:0", "scheduler_kwargs": {"dashboard": False}}
+    with LocalCluster(1, processes=False, threads_per_worker=1, memory_limit=0, **place) as cluster:
+        report = CellReporter(cells, 0, SILENT)
+        address = cluster.scheduler_address
+        work = module.run_on_scheduler(cells, Store(tmp_path), {}, address, report, needs)
+        with pytest.raises(module.ClusterError) as raised:
+            list(work)
+    told = f"cannot read {tmp_path}/nowhere, expected under these paths"
+    assert "every worker was refused: worker 0 (" in str(raised.value)
+    assert str(raised.value).endswith(told)
+
+
 def test_workers_that_start_together_start_with_different_probes_and_get_every_cell_once():
     cells = [
         attnwarp_eval.study.cluster.Cell({}, scene, "v", probe, 0)
