@@ -27,6 +27,7 @@ import numpy.typing as npt
 from attnwarp import check, losses
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor
+from attnwarp.encoders import load_encoder
 from attnwarp.fit import compile_kernels
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
@@ -85,6 +86,8 @@ class Options(TypedDict, total=False):
         checkpoint_seconds: between two checkpoints of tuning (30); more where one takes long.
         backend: of :func:`attnwarp.render.render` ("auto").
         report: receives how the run stands, :class:`attnwarp.reporting.Reporter`.
+        load: loads the perceptual distance, :func:`attnwarp.encoders.load_encoder`. One that keeps
+            what it loaded serves several runs.
 
     Example:
         >>> from attnwarp.methods import Budget, Options
@@ -99,6 +102,7 @@ class Options(TypedDict, total=False):
     checkpoint_seconds: float
     backend: str
     report: Reporter
+    load: Callable[..., Any]
 
 
 @dataclass(frozen=True)
@@ -333,7 +337,7 @@ class _Run:
         self.tuning = Tuning(
             work.frozen, work.scene.cameras, work.settings,
             sum(part.iterations for part in self.rounds), work.backend,
-            work.membership() if self.bound else None,
+            work.membership() if self.bound else None, options.get("load", load_encoder),
         )  # fmt: skip
         tuned = sorted({view for part in self.rounds for view in part.training})
         self.tuning.check_sizes(

@@ -54,17 +54,22 @@ class PerceptualLoss(Protocol):
         ...
 
 
-def perceptual_net(settings: MethodSettings, device: str = "cpu") -> PerceptualLoss | None:
+def perceptual_net(
+    settings: MethodSettings, device: str = "cpu", load: Callable[..., Any] = load_encoder
+) -> PerceptualLoss | None:
     """The perceptual distance of the settings on a device; None where no iteration takes it.
+
+    Args:
+        settings: name it.
+        device: of its network.
+        load: called as :func:`attnwarp.encoders.load_encoder` is.
 
     Raises:
         InputError: no such encoder, or one of another kind.
     """
     if not (settings.perceptual and settings.iterations):
         return None
-    return cast(
-        PerceptualLoss, load_encoder(settings.perceptual_encoder, "perceptual", device=device)
-    )
+    return cast(PerceptualLoss, load(settings.perceptual_encoder, "perceptual", device=device))
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +175,7 @@ class Tuning:
         backend: of the renderer.
         membership: (N,) in [0, 1], factor of each splat's steps; None for 1. A splat of 0 keeps its
             bytes.
+        load: of the perceptual distance, see :func:`perceptual_net`.
 
     Attributes:
         iteration: iterations done, over all rounds.
@@ -189,6 +195,7 @@ class Tuning:
         iterations: int,
         backend: str = "auto",
         membership: npt.NDArray[np.floating[Any]] | None = None,
+        load: Callable[..., Any] = load_encoder,
     ) -> None:
         self.settings, self.iterations, self.backend = settings, iterations, backend
         rates = FitSettings(kind=start.kind)
@@ -217,7 +224,7 @@ class Tuning:
         self.loss = math.nan
         self.visits: dict[int, int] = {}
         # Here and not at its first use: before it, views are edited for hours.
-        net = perceptual_net(settings, str(self.model.device))
+        net = perceptual_net(settings, str(self.model.device), load)
         self._smallest: list[tuple[str, int, str]] = []
         if net is not None:
             name = f"the perceptual distance {net.about.name}"

@@ -127,7 +127,7 @@ def editor_of(name: str, device: str) -> Any:
 
 @cache
 def encoder_of(name: str, kind: Kind, *, device: str) -> Any:
-    """An encoder, which a process keeps: its cells are measured with the same few."""
+    """An encoder, which a process keeps: its cells are tuned and measured with the same few."""
     return load_encoder(name, kind, device=device)
 
 
@@ -221,7 +221,7 @@ class Job:
         result = METHODS[spec["method"]](
             splats, capture.cameras, capture.images, editor, spec["text"],
             preset(spec["method"], **spec["settings"]), folder=folder / "run",
-            segments=marked, report=self.report, **options,
+            segments=marked, report=self.report, load=encoder_of, **options,
         )  # fmt: skip
         return result, splats
 
