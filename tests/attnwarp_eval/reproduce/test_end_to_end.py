@@ -11,15 +11,16 @@ import time
 
 import numpy as np
 import pytest
-import yaml
+from distributed import LocalCluster
 from edit_folders import files
 from PIL import Image
-from reproduction import EDIT, SIZE, VIEWS, write
+from reproduction import EDIT, MANIFEST, SIZE, VIEWS, save, write
 from skimage.metrics import peak_signal_noise_ratio
+from tiny_models import linear_layers, save_backbone
 from typer.testing import CliRunner
 
 from attnwarp.editing.small import load_editor
-from attnwarp.encoders import pretrained
+from attnwarp.encoders import lpips, pretrained
 from attnwarp.io import read_ply
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.colors import to_srgb
@@ -33,13 +34,13 @@ from attnwarp_eval.truth import appearance
 pytestmark = pytest.mark.slow
 
 
-def command(folder, out, *more):
-    arguments = ["reproduce", str(folder / "manifest.yaml"), "--out", str(out), *more]
+def command(folder, out, *more, manifest="manifest.yaml"):
+    arguments = ["reproduce", str(folder / manifest), "--out", str(out), *more]
     return [sys.executable, "-m", "attnwarp_eval", *arguments]
 
 
-def whole(folder, out, *more):
-    done = subprocess.run(command(folder, out, *more), capture_output=True, text=True)
+def whole(*arguments, **more):
+    done = subprocess.run(command(*arguments, **more), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
     return done
 
@@ -51,7 +52,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(folder):
-    whole(folder, folder / "run", "--jobs", "2")
+    whole(folder, folder / "run", "--device", "cpu,cpu")
     return folder / "run"
 
 
@@ -62,7 +63,7 @@ def records(run):
 
 
 def test_a_run_that_was_killed_half_way_gives_the_same_bytes(folder, run):
-    """Oracle: the run of two processes that nothing disturbed."""
+    """Oracle: the run that nothing disturbed, of two devices, each with a process of its own."""
     killed = folder / "killed"
     for cells in (2, 8):
         process = subprocess.Popen(
@@ -162,25 +163,39 @@ def test_a_sealed_run_is_verified_and_held_beside_another(folder, run):
         path.write_bytes(whole_file)
 
 
-def test_quick_runs_two_methods_on_one_scene(folder, monkeypatch):
-    """Oracle: the files' sizes; and that of two cells, each with four figures' encoders, the second
-    loads none."""
+@pytest.fixture(scope="module")
+def quick(folder):
+    """A run of two methods, the weights that were loaded for it, and what was told before."""
+    weights = folder / "weights" / "lpips"
+    weights.mkdir()
+    save_backbone(weights / "alexnet-owt-7be5be79.pth", "alex")
+    shutil.copy(linear_layers() / "alex.pth", weights)
+    encoders = {**MANIFEST["encoders"], "perceptual": {"folder": "weights/lpips"}}
+    save(folder, {**MANIFEST, "encoders": encoders}, "quick.yaml")
     out = folder / "quick"
-    lines = whole(folder, out, "--quick", "--dry-run").stdout.splitlines()
-    assert lines[-1].startswith("to do: 3 cells, ") and "GB of disk" in lines[-1]
+    lines = whole(folder, out, "--quick", "--dry-run", manifest="quick.yaml").stdout.splitlines()
     assert not (out / "cells").exists()
     loaded = []
 
-    def spy(kind, place, *rest):
-        loaded.append(place.name)
-        return load(kind, place, *rest)
+    def spy(load, number):
+        def loads(*arguments, **more):
+            loaded.append(arguments[number].name)
+            return load(*arguments, **more)
 
-    load = pretrained._load
-    monkeypatch.setattr(pretrained, "_load", spy)
-    done = CliRunner().invoke(app, command(folder, out, "--quick")[3:])
+        return loads
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pretrained, "_load", spy(pretrained._load, 1))
+        patch.setattr(lpips, "load_lpips", spy(lpips.load_lpips, 0))
+        done = CliRunner().invoke(app, command(folder, out, "--quick", manifest="quick.yaml")[3:])
     assert done.exit_code == 0, done.output
-    # Once in the check, then with both preprocessings.
-    assert sorted(loaded) == 3 * ["clip"] + 3 * ["dino"]
+    return out, loaded, lines
+
+
+def test_quick_runs_two_methods_on_one_scene(quick):
+    """Oracle: the files' sizes, and rows that the methods counted while they ran."""
+    out, _, lines = quick
+    assert lines[-1].startswith("to do: 3 cells, ") and "GB of disk" in lines[-1]
     size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
     told = float(lines[-1].split(", ")[-1].removesuffix(" GB of disk"))
     assert told == pytest.approx(size / 1e9, rel=0.25)
@@ -193,4 +208,18 @@ def test_quick_runs_two_methods_on_one_scene(folder, monkeypatch):
         (cell,) = (c for c in results["cells"] if c["methods"] == [name])
         told = f"{name}: 1 cells, {cell['counts']['network_rows']} network rows, "
         assert any(line.startswith(told) for line in lines)
-    assert yaml.safe_load((folder / "manifest.yaml").read_text())["seeds"] == [0]
+
+
+def test_two_cells_of_a_process_load_each_encoder_once(quick):
+    """Once in the check, then with both preprocessings; the perceptual distance has one."""
+    assert sorted(quick[1]) == 3 * ["clip"] + 3 * ["dino"] + 2 * ["lpips"]
+
+
+def test_two_workers_of_a_scheduler_give_the_bytes_of_one_process(folder, quick):
+    out = folder / "workers"
+    place = {"dashboard_address": "127.0.0.1:0", "scheduler_kwargs": {"dashboard": False}}
+    with LocalCluster(2, threads_per_worker=1, memory_limit=0, **place) as cluster:
+        address = ("--scheduler", cluster.scheduler_address)
+        whole(folder, out, "--quick", *address, manifest="quick.yaml")
+    assert (out / "results.json").read_bytes() == (quick[0] / "results.json").read_bytes()
+    assert files(out / "made") == files(quick[0] / "made")
