@@ -752,6 +752,20 @@ def test_the_study_that_judges_a_claim_measures_its_sides_and_its_control(claim)
             assert any(asked.meaning(study, variant) == meant for variant in measured), side
 
 
+@pytest.mark.parametrize("name", sorted({claim.study for claim in load_claims()}))
+def test_a_study_without_the_settings_that_a_claim_names_has_no_such_variant(name):
+    """A warp from inverted latents goes with no study whose views have noise of their own."""
+    study = load_study(name)
+    for claim in load_claims():
+        labels = study.probes.get(claim.probe, ())
+        for side in filter(None, (claim.a, claim.b)):
+            wanted = parse_variant(dict(side))
+            alike = [
+                x for x in labels if probe(claim.probe).alike(study, study.variants[x], wanted)
+            ]
+            assert "latents" not in side.get("options", {}) or not alike or name == claim.study
+
+
 def test_every_claim_names_a_metric_of_its_probe_and_a_claim_only_once():
     declared = load_claims()
     assert len({claim.id for claim in declared}) == len(declared)

@@ -227,7 +227,11 @@ class MethodProbe(Probe[E]):
                 for part in self.meaning(study, of)
             ]
 
-        return kind(variant) == kind(wanted)
+        try:
+            asked = kind(wanted)
+        except ValueError:  # what is asked does not go with the study's options
+            return False
+        return kind(variant) == asked
 
 
 def scene_seed(study: Study, scene: str, seed: int) -> int:
