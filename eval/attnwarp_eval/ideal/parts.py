@@ -14,6 +14,9 @@ Labels = npt.NDArray[np.int16]
 MOST_POINTS = 20_000
 """Surface points that k-means sees; evenly taken from all views."""
 
+GRAIN = 1e-9
+"""Step of their coordinates, as a share of the thing's extent: far above rounding."""
+
 
 def part_labels(points: Mapping[str, Array], parts: int) -> dict[str, Labels]:
     """Parts of a thing in every view: k-means cells of its surface points, pooled over the views.
@@ -42,7 +45,10 @@ def part_labels(points: Mapping[str, Array], parts: int) -> dict[str, Labels]:
     if not len(pooled):
         raise ValueError("points: no view shows the thing; choose other objects or views")
     every = max(1, len(pooled) // MOST_POINTS)
-    sample = np.unique(pooled[::every], axis=0)
+    # A processor's rounding must not decide the order of points that share a coordinate, as those
+    # of a box's face do: k-means begins with points drawn by their number, and ends elsewhere.
+    grain = GRAIN * max(float(np.ptp(pooled, axis=0).max()), np.finfo(float).tiny)
+    sample = grain * np.unique(np.round(pooled[::every] / grain) + 0.0, axis=0)
     count = min(parts, len(sample))
     centers, _ = kmeans2(sample, count, minit="++", rng=np.random.default_rng(0), iter=50)
     # By place, so that numbers do not depend on the order in which k-means found them.
