@@ -51,6 +51,10 @@ GATES: Mapping[str, Margin] = {
     "labels.painted_hidden": Margin(0.02),
     "labels.painted_outside": Margin(0.01),
     "masks.iou": Margin(0.02),
+    "masks.precision": Margin(0.02),
+    "masks.recall": Margin(0.02),
+    "masks.given": Margin(0.02),
+    "masks.back": Margin(0.02),
     # One part of a view that changes its answer moves these by a tenth.
     "parts.seen": Margin(0.1),
     "parts.through": Margin(0.1),
@@ -86,10 +90,10 @@ squared error where both sides have that; 0.2 dB are 5 % of it.
 
 EDITED = frozenset(
     (*(kind + of for kind in ("edit", "render") for of in ("", "_inside", "_next", "_seen")),
-     "edit_render", "after")
+     "edit_render", "after", "seen", "unseen")
 )  # fmt: skip
 """Endings of a metric's name where an edit is measured: edited views, renders of edited splats,
-their edited object, their neighbours, what the source saw.
+their edited object, their neighbours, what the source saw; of a lifted mask also what it did not.
 """
 
 

@@ -93,6 +93,14 @@ def label_tokens(
 
     Raises:
         ValueError: shapes that do not fit.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> parts, everywhere = np.array([[0, 1]]), np.ones((1, 2), dtype=bool)
+        >>> kinds = metrics.label_tokens(np.array([[0, 0]]), parts, parts, everywhere, ~everywhere)
+        >>> kinds["right"].tolist(), kinds["wrong"].tolist()
+        ([[True, False]], [[False, True]])
     """
     h, w = tokens.shape
     H, W = pixels.shape
