@@ -176,7 +176,7 @@ def _time_of_pair(results: Results) -> Iterator[str]:
                 taken[name] = fmean(once.values())
         if len(taken) == 2:
             each = ", ".join(f"`{name}` {number(s, 2)} s" for name, s in taken.items())
-            yield f"Time {own.cost_of}{'' if timed else ', in one pass'}: {each}."
+            yield f"Time of {own.cost_of}{'' if timed else ', in one pass'}: {each}."
 
 
 def measured_in_words(results: Results) -> str:
@@ -353,7 +353,7 @@ def _costs(results: Results, asked: Answer, leaders: list[str]) -> Iterator[str]
         }
         if shown.probe != own.name and all(seconds.values()):
             each = ", ".join(f"`{n}` {number(fmean(s), 2)} s" for n, s in seconds.items())
-            yield f"Time {other.cost_of}, in one pass: {each}."
+            yield f"Time of {other.cost_of}, in one pass: {each}."
 
 
 def _how_sure(results: Results) -> str:

@@ -866,7 +866,7 @@ def test_a_study_that_judges_claims_begins_with_their_verdicts():
         " px of a 64 grid).",
     ]
     assert "8 scenes drawn by generator" in sure and "all 2 being asked at once" in sure
-    assert "Time a view, in one pass: `good` 0.10 s, `slipped` 0.10 s." in sure
+    assert "Time of a view, in one pass: `good` 0.10 s, `slipped` 0.10 s." in sure
     assert by_claims(results(CLEAR), judge(results(CLEAR), claims)) is None
 
 
