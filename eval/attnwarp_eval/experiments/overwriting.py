@@ -25,7 +25,7 @@ def check_nothing_is_lost(
         path: of the table's JSON, in the run's folder; there may be none yet.
         table: the key of the list of rows; None where the list is all there is.
         fields: the keys of a row that name it.
-        available: the rows that the call makes or reads from cells.
+        available: the rows that the call makes.
 
     Returns:
         The rows of the table.
@@ -47,7 +47,7 @@ def check_nothing_is_lost(
         more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
         names = ", ".join(" of ".join(key) for key in lost[:3])
         raise InputError(
-            f"{path}: {names}{more} would be lost, as this call cannot restore them from the"
-            f" folder's cells; {remedy}"
+            f"{path}: {names}{more} would be lost; ask for them too (what is finished in this"
+            f" folder is not measured again), {remedy}"
         )
     return stored

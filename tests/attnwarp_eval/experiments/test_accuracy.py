@@ -2,8 +2,7 @@
 
 import json
 import os
-import shutil
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -12,8 +11,6 @@ from effect_scenes import FLOOR, PLAIN, SKY, SUN, ball, make
 from typer.testing import CliRunner
 
 from attnwarp.errors import InputError
-from attnwarp_eval._open3d import open3d
-from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.experiments import accuracy, suite
 from attnwarp_eval.experiments.accuracy import geometry, point_visibility
@@ -92,12 +89,12 @@ def test_where_source_and_target_share_no_surface_the_panel_is_left_out_by_name(
     views = {"source": {"yaw": 0, "height": 0.5}, "targets": [{"yaw": 180, "height": 0.5}]}
     scene = make([{"name": "box", "shape": box, "texture": PLAIN}], [SKY], cameras=views)
     panel = point_visibility.visibility(scene, size=32, points=10, rounds=3, maps=(8,))
-    store_panel(tmp_path, replace(panel, scene="earlier"))
     write([panel, depth_panel("one")], tmp_path)
-    assert (
-        "Left out: visibility of earlier, test. No point" in (tmp_path / "accuracy.md").read_text()
-    )
-    assert scenes_in(tmp_path) == ["one"] and not (tmp_path / "visibility.svg").exists()
+    assert "Left out: visibility of test. No point" in (tmp_path / "accuracy.md").read_text()
+    shown = json.loads((tmp_path / "accuracy.json").read_text())["panels"]
+    assert [panel["scene"] for panel in shown] == ["one"] and not (
+        tmp_path / "visibility.svg"
+    ).exists()
 
 
 def test_a_depth_map_of_a_slanted_plane_answers_right_in_both_ways():
@@ -113,12 +110,12 @@ def test_a_depth_map_of_a_slanted_plane_answers_right_in_both_ways():
             assert (answer == expected).all()
 
 
-def depth_panel(scene, wrong=0.25):
+def depth_panel(scene):
     slow = Contestant(
         "slow", (0.5, 0.4, 0.6), (2.0, 2.2, 2.4), {"median": 0.1, "p99": 0.2, "wrong": 0.0}
     )
     fast = Contestant(
-        "fast", (0.0, 0.0, 0.0), (1.0, 1.1, 1.2), {"median": 0.0, "p99": 0.0, "wrong": wrong}
+        "fast", (0.0, 0.0, 0.0), (1.0, 1.1, 1.2), {"median": 0.0, "p99": 0.0, "wrong": 0.25}
     )
     return Panel("depth", scene, "largest relative error of depth", (slow, fast), (2.0, 2.2, 2.4))
 
@@ -132,67 +129,21 @@ def test_the_bias_of_a_picture_has_students_interval(tmp_path):
     assert "+0.10 % ± 0.24" in (tmp_path / "accuracy.md").read_text()
 
 
-def store_panel(folder, panel, **changes):
-    """Store a panel as a call does that measured it; the spec is written out, as former versions'
-    cells are.
-    """
-    spec = {"probe": "accuracy", "protocol": 1, "question": panel.question, "scene": "a" * 64,
-            "name": panel.scene, "rounds": 3, "open3d": open3d().__version__}  # fmt: skip
-    spec |= changes
-    Store(folder).write({"id": digest(spec), "spec": spec, "panel": asdict(panel)})
-
-
-def scenes_in(folder):
-    return [p["scene"] for p in json.loads((folder / "accuracy.json").read_text())["panels"]]
-
-
-def test_what_was_measured_of_other_scenes_stays_and_tables_show_the_known_ratio(tmp_path):
-    for scene in ("two", "one"):  # as two calls do, of which each measures a scene
-        store_panel(tmp_path, depth_panel(scene))
-        assert tmp_path / "accuracy.html" in write([depth_panel(scene)], tmp_path)
+def test_tables_show_the_known_ratio_of_each_scene(tmp_path):
+    written = write([depth_panel("one"), depth_panel("two")], tmp_path)
+    assert tmp_path / "accuracy.html" in written and (tmp_path / "depth.svg").is_file()
     text = (tmp_path / "accuracy.md").read_text()
     assert "**one**" in text and "**two**" in text and "| 0.500 |" in text and "25.00 %" in text
-    assert "| again |" in text and (tmp_path / "depth.svg").is_file() and "Left out" not in text
-    assert scenes_in(tmp_path) == ["one", "two"]
-    # The file is made of the cells: what was written into it since does not count.
-    measured = (tmp_path / "accuracy.json").read_text()
-    (tmp_path / "accuracy.json").write_text(measured.replace("0.25", "0.75"))
-    write([depth_panel("two")], tmp_path)
-    assert (tmp_path / "accuracy.json").read_text() == measured
-    # A copy's files may have other times, and another scene may be the one that is asked for.
-    shutil.copytree(tmp_path / "cells", tmp_path / "copy" / "cells")
-    for number, path in enumerate(sorted((tmp_path / "copy").rglob("*.json"))):
-        os.utime(path, (number, number))
-    write([depth_panel("one")], tmp_path / "copy")
-    assert (tmp_path / "copy" / "accuracy.json").read_text() == measured
-    # A damaged cell is not believed, and the panel that only the file still has is not lost.
-    (cell,) = (c for c in (tmp_path / "cells").rglob("*.json") if '"name": "one"' in c.read_text())
-    cell.write_text(cell.read_text().replace("0.25", "0.75"))
-    with pytest.raises(InputError, match="accuracy.json: depth of one would be lost"):
-        write([depth_panel("two")], tmp_path)
-    assert (tmp_path / "accuracy.json").read_text() == measured
-    (tmp_path / "accuracy.json").unlink()
-    write([depth_panel("two")], tmp_path)
-    assert scenes_in(tmp_path) == ["two"]
+    assert "| again |" in text and "Left out" not in text
 
 
-def test_panels_of_other_versions_or_contents_do_not_stand_under_todays_lead(tmp_path):
-    of_far = {"scene": load_scene("far").content_hash}
-    store_panel(tmp_path, depth_panel("far"), **of_far)
-    store_panel(tmp_path, depth_panel("far", 0.625), **of_far, rounds=9)
-    store_panel(tmp_path, depth_panel("bear"))  # the scene that ships has another content
-    store_panel(tmp_path, depth_panel("old"), open3d="0.1.0")
-    store_panel(tmp_path, depth_panel("mine"))
-    store_panel(tmp_path, depth_panel("changed"), scene="b" * 64)
-    store_panel(tmp_path, depth_panel("changed"), scene="c" * 64)
-    former = {"mitsuba": "3.0.0", "variant": "scalar_rgb", "appearance": 1}
-    pictures = replace(depth_panel("far"), question="pictures")
-    store_panel(tmp_path, pictures, **of_far, **former)
-    write([depth_panel("new")], tmp_path)
-    assert scenes_in(tmp_path) == ["far", "mine", "new"]
-    text = (tmp_path / "accuracy.md").read_text()
-    out = "Left out: pictures of far, depth of bear, depth of changed, depth of old. "
-    assert out in text and "62.50 %" in text  # of 3 and 9 rounds the 9
+def test_a_scene_of_an_earlier_call_is_not_dropped(tmp_path):
+    Store(tmp_path).write({"id": "0" * 64, "spec": {}})  # what a call leaves that measured
+    write([depth_panel("bear"), depth_panel("far")], tmp_path)
+    before = (tmp_path / "accuracy.json").read_bytes()
+    with pytest.raises(InputError, match=r"depth of bear would be lost; ask for them too"):
+        next(accuracy.measure(["far"], out=tmp_path))
+    assert (tmp_path / "accuracy.json").read_bytes() == before
 
 
 def test_a_report_whose_panels_are_in_no_cell_is_not_overwritten(tmp_path):

@@ -15,12 +15,12 @@ from pathlib import Path
 from attnwarp.errors import InputError
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.canonical_json import without_nan
-from attnwarp_eval.experiments.accuracy.earlier import check_overwriting
 from attnwarp_eval.experiments.accuracy.geometry import depth, triangles
 from attnwarp_eval.experiments.accuracy.images import pictures
 from attnwarp_eval.experiments.accuracy.panel import Panel, panel_spec
 from attnwarp_eval.experiments.accuracy.point_visibility import visibility
 from attnwarp_eval.experiments.distinct_scenes import distinct_scenes
+from attnwarp_eval.experiments.overwriting import check_nothing_is_lost
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.store import Store
@@ -53,7 +53,8 @@ def measure(
     from attnwarp_eval.truth.mitsuba import forget
 
     cells = _cells(distinct_scenes(names))
-    check_overwriting(out, {(question.__name__, scene.name) for question, scene in cells})
+    asked = {(question.__name__, scene.name) for question, scene in cells}
+    check_nothing_is_lost(out / "accuracy.json", "panels", ("question", "scene"), asked)
     tasks = (_task(question, scene, rounds) for question, scene in cells)
     for panel in results(Store(out), tasks, len(cells), report):
         yield panel

@@ -12,9 +12,6 @@ from attnwarp_eval.study.record import Json, with_nan
 PROTOCOL = 1
 """Raised whenever a panel would come out otherwise."""
 
-QUESTIONS = ("pictures", "depth", "visibility")
-"""Questions in the order of the report."""
-
 
 @dataclass(frozen=True)
 class Contestant:

@@ -10,21 +10,12 @@ from typing import Any
 import numpy as np
 
 from attnwarp_eval.canonical_json import without_nan, write_json
-from attnwarp_eval.experiments.accuracy.earlier import check_overwriting, with_earlier
-from attnwarp_eval.experiments.accuracy.panel import QUESTIONS, Panel
+from attnwarp_eval.experiments.accuracy.panel import Panel
 from attnwarp_eval.statistics.intervals import RATIO_INTERVAL
-from attnwarp_eval.study.store import Store
 
 
 def write(panels: Sequence[Panel], out: Path) -> list[Path]:
-    """Write the report of panels, accuracy.json and the figures below ``out``; return their paths.
-
-    Panels of other scenes that ``out`` has stay in the report, so that scenes can be measured one
-    by one. Panels of other versions, variants or contents of a scene are left out by name.
-
-    Raises:
-        InputError: ``accuracy.json`` has panels that would be lost.
-    """
+    """Write the report of panels, accuracy.json and the figures; return the files' paths."""
     from attnwarp_eval.cost import environment
     from attnwarp_eval.document import charts
     from attnwarp_eval.document.model import Picture, Report
@@ -34,8 +25,6 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
 
     out.mkdir(parents=True, exist_ok=True)
     nan = float("nan")
-    check_overwriting(out, {(panel.question, panel.scene) for panel in panels})
-    panels, left_out = with_earlier(panels, Store(out))
     unmeasured = [panel.scene for panel in panels if not panel.contestants]
     panels = [panel for panel in panels if panel.contestants]
 
@@ -52,7 +41,7 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
         return seconds, Interval(mean, low, high, 1, 1, 0, nan, nan)
 
     drawn = []
-    for question in QUESTIONS:
+    for question in TITLES:
         selected = [panel for panel in panels if panel.question == question]
         if not selected:
             continue
@@ -87,12 +76,6 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
             " everything on show, and `scenes effects --prove`."
         ),
     ]
-    if left_out:
-        lead.append(
-            f"Left out: {', '.join(f'{question} of {scene}' for question, scene in left_out)}. They"
-            " were measured with other versions, another variant, or of another content of the"
-            " scene. Measure these scenes again to have them here."
-        )
     if unmeasured:
         lead.append(
             f"Left out: visibility of {', '.join(unmeasured)}. No point of the middle target faces"
