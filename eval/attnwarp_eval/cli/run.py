@@ -434,7 +434,9 @@ def _write_report(store: Store, *, timings: bool = True, pictures: bool = True) 
 
 
 def report(
-    run: Annotated[Path, typer.Argument(help="The run's folder.")],
+    run: Annotated[
+        Path, typer.Argument(help="The run's folder, or one of raw results (results*.jsonl.xz).")
+    ],
     timings: Annotated[bool, typer.Option(help="Without: no seconds, to compare runs.")] = True,
     pictures: Annotated[bool, typer.Option(help="Without: tables and figures alone.")] = True,
     raw: Annotated[
@@ -445,12 +447,19 @@ def report(
         ),
     ] = None,
 ) -> None:
-    """Make report.md, report.html and results.jsonl again from the cells of a run."""
-    from attnwarp_eval.report import read_results
-    from attnwarp_eval.report.raw import write_raw
+    """Make report.md, report.html and results.jsonl again from the cells of a run.
+
+    Raw results of a study's parts make one report.md and report.html, without pictures.
+    """
+    from attnwarp_eval.report import read_results, write_report_of_parts
+    from attnwarp_eval.report.raw import PARTS, write_raw
     from attnwarp_eval.study.store import Store
 
     with clear_errors():
+        if raw is None and not (run / "study.json").exists() and any(run.glob(PARTS)):
+            for path in write_report_of_parts(run, timings=timings):
+                typer.echo(path)
+            return
         store = Store(run)
         _write_report(store, timings=timings, pictures=pictures)
         results = read_results(store)

@@ -10,11 +10,12 @@ from pathlib import Path
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.report.build import build, problems
+from attnwarp_eval.report.raw import read_parts
 from attnwarp_eval.report.results import lines, read_results
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.store import Store, StoreError
 
-__all__ = ["problems", "read_results", "write_report"]
+__all__ = ["problems", "read_results", "write_report", "write_report_of_parts"]
 
 
 def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -> list[Path]:
@@ -52,6 +53,24 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
     write_atomic(path, content)
     write_atomic(_sum_of(path), _sum_line(path, content))
     return [path, *write_files(report, store.root, "report")]
+
+
+def write_report_of_parts(folder: Path, *, timings: bool = True) -> list[Path]:
+    """Write the report of a folder of raw results, without the views' pictures.
+
+    Args:
+        folder: of ``results*.jsonl.xz``, parts of one study.
+        timings: see :func:`write_report`.
+
+    Returns:
+        The files written, the one a person opens first at the end.
+
+    Raises:
+        InputError: raw results that cannot be read, or are of no one study.
+    """
+    results = read_parts(folder)
+    report = build(results, folder, timings=timings, pictures=False)
+    return write_files(report, folder, "report")
 
 
 def wrong_results(store: Store) -> list[str]:

@@ -98,13 +98,13 @@ def _section(results: Results, ablation: Ablation, compared: Sequence[Row]) -> S
     for name in names:
         work = results.counters(own.name, name)
         views = sum(len(record.views) for _, _, record in results.records(own.name, name))
-        once = results.seconds(own.name, name, own.cost)
+        once = results.usual_seconds(own.name, name, own.cost)
         rows.append(
             [
                 name,
                 *mean_values(results, own.name, name, columns.values()),
                 *([number(work["pairs"] / views / 1e6) if views else "–"] if counted else []),
-                number(1000 * sum(once.values()) / len(once)) if once else "–",
+                number(1000 * once) if math.isfinite(once) else "–",
             ]
         )
     time = f"ms {own.cost_of}, one pass"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from statistics import fmean
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
@@ -172,9 +171,9 @@ def _time_of_pair(results: Results) -> Iterator[str]:
         for name in (ablation.baseline, ablation.variants[0]):
             if timed is not None and name in timed.names:
                 taken[name] = timed.seconds(name).mean
-            elif timed is None and (once := results.seconds(own.name, name, own.cost)):
-                taken[name] = fmean(once.values())
-        if len(taken) == 2:
+            elif timed is None:
+                taken[name] = results.usual_seconds(own.name, name, own.cost)
+        if len(taken) == 2 and all(map(math.isfinite, taken.values())):
             each = ", ".join(f"`{name}` {number(s, 2)} s" for name, s in taken.items())
             yield f"Time of {own.cost_of}{'' if timed else ', in one pass'}: {each}."
 
@@ -349,10 +348,10 @@ def _costs(results: Results, asked: Answer, leaders: list[str]) -> Iterator[str]
     for shown in asked.pictures:
         other = report_of(shown.probe)
         seconds = {
-            name: results.seconds(shown.probe, name, other.cost).values() for name in shown.variants
+            name: results.usual_seconds(shown.probe, name, other.cost) for name in shown.variants
         }
-        if shown.probe != own.name and all(seconds.values()):
-            each = ", ".join(f"`{n}` {number(fmean(s), 2)} s" for n, s in seconds.items())
+        if shown.probe != own.name and all(map(math.isfinite, seconds.values())):
+            each = ", ".join(f"`{n}` {number(s, 2)} s" for n, s in seconds.items())
             yield f"Time of {other.cost_of}, in one pass: {each}."
 
 

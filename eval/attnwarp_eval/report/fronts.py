@@ -145,9 +145,9 @@ def _once(stage: str) -> str:
     able = " or ".join(f"`{p.name}`" for p in probes() if stage in p.times_in_turn)
     advice = f": a study with a {able} probe takes them in turn" if able else ""
     return (
-        "These seconds come from one pass over the views, each variant at another time, and"
-        f" are for orientation{advice}. So a front is of that one pass, and nothing is said of how"
-        " probable it is."
+        "These seconds come from one pass over the views, each variant at another time, as the"
+        f" median over scenes, and are for orientation{advice}. So a front is of that one pass, and"
+        " nothing is said of how probable it is."
     )
 
 
@@ -187,14 +187,10 @@ def _points(
             text = "1" if base else ratio_text(ratio)
             judged = "baseline" if base else timed.judge(ratio)
         else:
-            once = results.seconds(front.probe, name, cost)
-            if not once:
+            once = results.usual_seconds(front.probe, name, cost)
+            if not math.isfinite(once):
                 continue
-            seconds, text, judged = (
-                interval({scene: [v] for scene, v in once.items()}),
-                "one pass",
-                "–",
-            )
+            seconds, text, judged = interval({"all": [once]}), "one pass", "–"
         if name not in shared.apart:
             points[name] = (seconds, quality)
         rows.append([name, shown, number(1000 * seconds.mean), text, judged])

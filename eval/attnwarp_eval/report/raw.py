@@ -28,6 +28,9 @@ FORMAT = 1
 
 NAME = "results.jsonl.xz"
 
+PARTS = "results*.jsonl.xz"
+"""Files of raw results in a folder; several are parts of one study."""
+
 DIGITS = 9
 """Significant digits of a figure: more than any tolerance asks for."""
 
@@ -59,7 +62,8 @@ def _lines(store: Store) -> Iterator[str]:
     if study.get("population"):
         study["scenes"] = [Path(name).name for name in study["scenes"]]
     notices = {name: entry.get("notices", []) for name, entry in stored["scenes"].items()}
-    yield canonical_json({"raw": FORMAT, "study": study, "notices": notices})
+    # Not sorted: tables follow the order in which a study names its variants.
+    yield json.dumps({"raw": FORMAT, "study": study, "notices": notices}, separators=(",", ":"))
     for cell in stored["cells"]:
         record: dict[str, Any] | None = None
         if cell["id"] in done:
@@ -107,6 +111,15 @@ def _outcome(cell: dict[str, Any], record: dict[str, Any] | None) -> Outcome:
         cell["seed"],
         None if record is None else probe(cell["probe"]).read(record),
     )
+
+
+def read_parts(folder: Path) -> Results:
+    """The results that a folder's files of raw results hold, as one run.
+
+    Raises:
+        InputError: see :func:`read_raw` and :func:`together`.
+    """
+    return together([read_raw(path) for path in sorted(folder.glob(PARTS))])
 
 
 def together(parts: Sequence[Results]) -> Results:

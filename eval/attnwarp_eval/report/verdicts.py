@@ -17,14 +17,11 @@ from attnwarp_eval.document.write import markdown_table
 from attnwarp_eval.report.answer import against
 from attnwarp_eval.report.claims import Claim, load_claims
 from attnwarp_eval.report.judging import JudgedClaim, decided, found
-from attnwarp_eval.report.raw import read_raw, together
+from attnwarp_eval.report.raw import PARTS, read_raw, together
 from attnwarp_eval.statistics.intervals import time_ratio
 from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.turns import Timed, timed_in_turn
-
-FILES = "results*.jsonl.xz"
-"""Files of raw results, at any depth below a folder of reports; several of one study are parts."""
 
 TABLE, LINES = "verdicts", "headlines"
 """Marks of the blocks that :func:`filled` fills: ``<!-- verdicts -->`` and its end."""
@@ -64,7 +61,7 @@ def verdicts(folder: Path) -> list[Judged]:
         InputError: raw results that cannot be read, or are of no one study.
     """
     parts: dict[str, list[tuple[Path, Results]]] = defaultdict(list)
-    for path in sorted(folder.rglob(FILES)):
+    for path in sorted(folder.rglob(PARTS)):
         results = read_raw(path)
         parts[results.study.name].append((path, results))
     studies: dict[str, tuple[Path, Results]] = {}

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from statistics import median
 from typing import Any
 
 from attnwarp_eval.statistics.intervals import ByView, Interval, common, interval
@@ -199,6 +200,13 @@ class Results:
             if value is not None:
                 by_scene.setdefault(scene, []).append(float(value))
         return {scene: sum(v) / len(v) for scene, v in by_scene.items()}
+
+    def usual_seconds(self, probe: str, variant: str, stage: str) -> float:
+        """Median over scenes of a stage's seconds, NaN without any. No mean: the first cell of a
+        process compiles kernels, which takes a hundred times as long as an edit.
+        """
+        taken = self.seconds(probe, variant, stage).values()
+        return median(taken) if taken else math.nan
 
     def counters(self, probe: str, variant: str) -> Counter[str]:
         """Work counters summed over a variant's cells."""

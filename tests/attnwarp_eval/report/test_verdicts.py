@@ -104,6 +104,15 @@ def test_raw_results_hold_every_figure_of_the_run_and_no_path_of_this_machine(
         assert "0 worse, 0 can't tell, 0 better" in same.output
 
 
+@pytest.mark.parametrize("name", ["variants", "edits"])
+def test_a_folder_of_raw_results_gives_the_report_of_its_run(folder, name, tmp_path):
+    store, raw = Store(folder / name), tmp_path / "reports"
+    assert invoke("report", store.root, "--no-pictures", "--raw", raw).exit_code == 0
+    done = invoke("report", raw)
+    assert done.exit_code == 0 and str(raw / "report.html") in done.output
+    assert (raw / "report.md").read_text() == (store.root / "report.md").read_text()
+
+
 def test_damaged_raw_results_are_refused_with_what_to_do(tmp_path):
     path = tmp_path / "results.jsonl.xz"
     for content in (b"nothing", lzma.compress(b"[]"), lzma.compress(b'{"raw": 0}')):

@@ -467,7 +467,7 @@ def choice(results: Results, probe: str, names: Sequence[str], metrics: Sequence
     measured = [name for name in names if results.records(probe, name)]
     timed = timed_in_turn(results, WHOLE)
     if timed is None:
-        seconds = {name: _mean(results.seconds(probe, name, WHOLE).values()) for name in measured}
+        seconds = {name: results.usual_seconds(probe, name, WHOLE) for name in measured}
         origin = "Seconds are those of the fronts: of one pass, for orientation."
     else:
         seconds = {name: timed.seconds(name).mean for name in measured if name in timed.names}
