@@ -63,6 +63,7 @@ from attnwarp_eval.metrics.multiview import (
     edit_fidelity,
 )
 from attnwarp_eval.metrics.occlusion import COUNTS, YawBin, by_yaw, confusion, mask_error, scores
+from attnwarp_eval.metrics.refit import refit_psnr
 from attnwarp_eval.metrics.registry import METRICS, at_size, metric
 from attnwarp_eval.metrics.warp import endpoint_error, feature_error
 
@@ -115,6 +116,7 @@ __all__ = [
     "perceptual",
     "perceptual_consistency",
     "psnr",
+    "refit_psnr",
     "scores",
     "sift_features",
     "sift_matches",

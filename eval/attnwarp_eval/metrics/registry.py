@@ -198,6 +198,7 @@ _SPECS = (
     Metric("consistency.tsed_pairs", "views", "none", 0, 0, "view pairs that were judged"),
     Metric("consistency.tsed_few_matches", "views", "none", 0, 0, "of them, pairs with fewer than 10 matches, which count against"),
     Metric("consistency.tsed_no_baseline", "views", "none", 0, 0, "of them, pairs with one centre of projection, left out"),
+    Metric("consistency.edit_psnr", "dB", "higher", 1e-2, 1e-3, "PSNR of edited views and of splats whose colours alone were fitted to them"),
     Metric("consistency.edit_delta_e", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 of two views at known correspondences that the edit adds, changed pixels"),
     Metric("consistency.edit_delta_e_p90", "dE00", "lower", 1e-2, 1e-2, "90th percentile of it"),
     Metric("consistency.edit_pixels", "pixels", "none", 0, 0, "changed pixels that were compared"),

@@ -18,7 +18,14 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import StudyError, cells_of, load_study
 from attnwarp_eval.study.flaws import CONDITIONS
 from attnwarp_eval.study.probe import probe
-from attnwarp_eval.study.probes.audit.measure import PAIRS, RIGHT, SHINY
+from attnwarp_eval.study.probes.audit.measure import (
+    METAL,
+    PAIRS,
+    RIGHT,
+    TRAPS,
+    VARNISHED,
+    _varnished,
+)
 from attnwarp_eval.study.probes.audit.report import ROWS, Pairs
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.truth import Geometry, appearance, two_view
@@ -167,7 +174,7 @@ def test_the_report_says_what_the_numbers_say(tmp_path):
             return None if yaw > 60 else 1.0
         if key == "consistency.rendered_delta_e":  # sees slides from 4 px on, and fears highlights
             slid = name.startswith("slid=") and float(name.partition("=")[2]) >= 4
-            return 5.0 + scene if slid or name == SHINY else 1.0 + scene / 100
+            return 5.0 + scene if slid or name == VARNISHED else 1.0 + scene / 100
         return float(scene)
 
     run = by_hand(8, value)
@@ -180,6 +187,7 @@ def test_the_report_says_what_the_numbers_say(tmp_path):
     assert pairs.smallest(colours, flaws["slid"]) == 4
     assert pairs.smallest(colours, flaws["hue"]) is None
     assert pairs.alarms(colours) == 1
+    assert pairs.alarms(colours, METAL) == 0
     assert pairs.alarms(best) == 0
     assert pairs.undefined(rows["consistency.tsed_distance"], 120) == 1
     assert pairs.shown(rows["consistency.perceptual"], flaws["slid"]).value == 0.5
@@ -195,5 +203,14 @@ def test_the_report_says_what_the_numbers_say(tmp_path):
     assert (tmp_path / "figures/audit.svg").is_file()
 
 
-def test_right_pairs_are_not_the_glossy_ones():
-    assert SHINY not in RIGHT
+def test_a_coat_reflects_4_percent_ahead_and_all_of_the_light_that_grazes_it():
+    from types import SimpleNamespace
+
+    paint, metal = np.full((1, 3, 3), 0.2), np.full((1, 3, 3), 1.2)
+    hits = SimpleNamespace(cosine=np.array([[1.0, 0.0, np.nan]]))
+    found = _varnished(paint, metal, hits, np.array([[True, True, False]]))
+    np.testing.assert_allclose(found[0, :, 0], [0.24, 1.2, 0.2])
+
+
+def test_right_pairs_are_not_the_traps():
+    assert not set(TRAPS) & set(RIGHT)

@@ -46,19 +46,29 @@ from attnwarp_eval.study.shared.encoders import (
 )
 from attnwarp_eval.truth import appearance
 from attnwarp_eval.truth.edits import edit_mask, touched
-from attnwarp_eval.two_view import TwoView
+from attnwarp_eval.two_view import Hits, TwoView
 from attnwarp_eval.world import World, changed, splats, turned
 
 RIGHT = ("right", "right_other")
 """Right pairs without highlights: one answer in both views, and another one in both."""
 
-SHINY = "right_shiny"
-"""Right pair whose object is made of rough metal, so that its true views differ by highlights."""
+VARNISHED, METAL = TRAPS = ("right_varnished", "right_metal")
+"""Right pairs that truly differ: the object's paint lies under a coat, which shows highlights, or
+the object is of rough metal without paint, which shows its surroundings everywhere."""
 
-PAIRS = (*RIGHT, SHINY)
+PAIRS = (*RIGHT, *TRAPS)
 
-GLOSS = MetalMaterial(type="metal", metal="Al", roughness=0.3)
-"""Surface of the object in that pair: broad highlights, and no texture."""
+ROUGH = MetalMaterial(type="metal", metal="Al", roughness=0.3)
+
+ROUGH_SAMPLES = 2
+"""Samples of metal for each of paint: what it reflects of lamps is rare and bright, and the noise
+of as few would be taken for disagreement."""
+
+COAT = 0.04
+"""Share of light that a coat of refractive index 1.5 reflects where it is seen straight on."""
+
+REFIT_SIZE = 128
+"""Side in px of the pictures that splats' colours are fitted to."""
 
 Where = tuple[Array, Mask]
 """(H, W, 2) px of the source for each target pixel, and (H, W) bool where they are trusted."""
@@ -94,6 +104,7 @@ class AuditProbe(MetricsProbe):
     """One cell a scene and seed: all metrics judge the same pictures."""
 
     name = "audit"
+    protocol = 2
     study_part = StudyPart
     metrics = metrics_of("consistency.", "embedding.", "multiview.")
     study_keys = frozenset({"size", "seeds", "spp", "timing_rounds", "encoders", "audit"})
@@ -164,16 +175,23 @@ class AuditProbe(MetricsProbe):
             def views(state: str, camera: Camera = camera) -> tuple[_Shown, _Shown]:
                 return shown[state][world.source.name], shown[state][camera.name]
 
-            pair = _Pair(truth, warp, views("before"), dict(map(views, PAIRS)), encoders, texts)
+            refit = partial(_refit, model, (world.source, camera))
+            pair = _Pair(
+                truth, warp, refit, views("before"), dict(map(views, PAIRS)), encoders, texts
+            )
+            judged = {name: views(name) for name in PAIRS} | {
+                name: (views("right")[0], _Shown(picture, encoders))
+                for name, picture in flawed.items()
+                if picture is not None
+            }
             figures: dict[str, float] = {}
             with meter.stage("checks"):
-                for name in PAIRS:
-                    figures |= _named(pair.figures(*views(name)), name)
-                for name, picture in flawed.items():
+                pair.refit_all(list(judged.values()))
+                for name in (*PAIRS, *flawed):
                     values = (
-                        dict.fromkeys(pair.contestants, math.nan)
-                        if picture is None
-                        else pair.figures(views("right")[0], _Shown(picture, encoders))
+                        pair.figures(*judged[name])
+                        if name in judged
+                        else dict.fromkeys(pair.contestants, math.nan)
                     )
                     figures |= _named(values, name)
             meter.count(pictures=len(PAIRS) + len(flawed))
@@ -209,37 +227,54 @@ def _true_pictures(work: Work, cameras: Mapping[float, Camera]) -> dict[str, dic
             raise changed(f"edit {edit!r} of scene {world.scene.name!r}")
     first, second = (world.scene.edited(edit, name) for name, _ in spec["answers"])
     states = {"before": world.scene, "right": first, "right_other": second}
-    states[SHINY] = _glossy(first, touched(world.scene, edit, spec["answers"][0][0]))
+    states[METAL] = _metallic(first, touched(world.scene, edit, spec["answers"][0][0]))
     if spec["other"] is not None:
         other = load_scene(work.cell.sources["other"])
         if other.content_hash != spec["other"]:
             raise changed(f"scene {other.name!r}")
         states["elsewhere"] = other.with_size(spec["size"], spec["size"])
     # Scene by scene: Mitsuba caches the last one, and loading costs more than rendering.
-    return {
+    light: dict[str, dict[str, Array]] = {
         state: {
-            camera.name: to_srgb(
-                np.clip(
-                    appearance(
-                        scene,
-                        turned(scene, yaw) if state == "elsewhere" else camera,
-                        spp=spec["spp"],
-                        seed=0,
-                    ),
-                    0,
-                    1,
-                )
-            )
+            camera.name: appearance(
+                scene,
+                turned(scene, yaw) if state == "elsewhere" else camera,
+                spp=spec["spp"] * (ROUGH_SAMPLES if state == METAL else 1),
+                seed=0,
+            ).astype(np.float64)
             for yaw, camera in zip((0.0, *cameras), views, strict=True)
         }
         for state, scene in states.items()
     }
+    light[VARNISHED] = {
+        camera.name: _varnished(
+            light["right"][camera.name],
+            light[METAL][camera.name],
+            hits := world.geometry.trace(camera),
+            edit_mask(world.scene, edit, hits, spec["answers"][0][0]),
+        )
+        for camera in views
+    }
+    return {
+        state: {name: to_srgb(np.clip(one, 0, 1)) for name, one in pictures.items()}
+        for state, pictures in light.items()
+    }
 
 
-def _glossy(scene: Scene, objects: Sequence[int]) -> Scene:
+def _varnished(paint: Array, metal: Array, hits: Hits, mask: Mask) -> Array:
+    """(H, W, 3) linear light of an object's paint under a rough clear coat.
+
+    The coat reflects what rough metal does, by the share that Schlick's formula gives, and lets the
+    rest through to the paint.
+    """
+    share = np.where(mask, COAT + (1 - COAT) * (1 - np.nan_to_num(hits.cosine, nan=1)) ** 5, 0)
+    return paint + share[..., None] * (metal - paint)
+
+
+def _metallic(scene: Scene, objects: Sequence[int]) -> Scene:
     """The scene whose objects are of rough metal."""
     items = [
-        changed_object(item, ObjectChange(object=item.name, material=GLOSS))
+        changed_object(item, ObjectChange(object=item.name, material=ROUGH))
         if place in objects and not item.emission
         else item
         for place, item in enumerate(scene.spec.objects)
@@ -275,6 +310,23 @@ def _warp(
 ) -> WarpedView:
     """The warp by rendered depth; ``surface`` is the source's, rendered if left out."""
     return warp_view(model, source, target, source_surface=surface, warn_empty=False)
+
+
+def _refit(
+    model: Gaussians, cameras: Sequence[Camera], pairs: Sequence[tuple[_Shown, _Shown]]
+) -> list[float]:
+    """Edit PSNR of splats whose colours are fitted to each pair."""
+    import cv2
+
+    size = tuple(min(REFIT_SIZE, side) for side in (cameras[0].width, cameras[0].height))
+    return metrics.refit_psnr(
+        model,
+        [camera.resize(*size) for camera in cameras],
+        [
+            [cv2.resize(one.picture, size, interpolation=cv2.INTER_AREA) for one in views]
+            for views in pairs
+        ],
+    )
 
 
 def _rounds(pair: _Pair, warp: Callable[[], WarpedView], spec: Json) -> dict[str, list[float]]:
@@ -336,6 +388,7 @@ class _Pair:
     Args:
         truth: exact relation of the two.
         warp: makes the warp by rendered depth.
+        refit: Edit PSNR of each of several pairs.
         before: source and target before the edit.
         partners: the true target of each true source after the edit, the right edit's first.
         encoders: by kind.
@@ -349,6 +402,7 @@ class _Pair:
         self,
         truth: TwoView,
         warp: Callable[[], WarpedView],
+        refit: Callable[[Sequence[tuple[_Shown, _Shown]]], list[float]],
         before: tuple[_Shown, _Shown],
         partners: Mapping[_Shown, _Shown],
         encoders: Mapping[str, Any],
@@ -356,7 +410,7 @@ class _Pair:
     ) -> None:
         self.truth, self.before, self.partners = truth, before, partners
         self.encoders, self.texts = encoders, texts
-        self._warp = warp
+        self._warp, self._refit = warp, refit
         self.exact = truth.xy, truth.visible & ~truth.edge
         self.contestants = self._contestants()
 
@@ -364,7 +418,12 @@ class _Pair:
         """Copy of the pair with nothing made yet."""
         before = self.before[0].again(), self.before[1].again()
         partners = {source.again(): target.again() for source, target in self.partners.items()}
-        return _Pair(self.truth, warp, before, partners, self.encoders, self.texts)
+        return _Pair(self.truth, warp, self._refit, before, partners, self.encoders, self.texts)
+
+    def refit_all(self, pairs: Sequence[tuple[_Shown, _Shown]]) -> None:
+        """Fit splats' colours to all pairs at once, which costs little more than to one."""
+        for (_, target), value in zip(pairs, self._refit(pairs), strict=True):
+            target.once("refit", partial(float, value))
 
     def figures(self, source: _Shown, target: _Shown) -> dict[str, float]:
         """Every metric of two pictures."""
@@ -378,6 +437,7 @@ class _Pair:
             "consistency.flow_delta_e.dis": lambda s, t: _colors(self._dis, s, t),
             "consistency.flow_delta_e.farneback": lambda s, t: _colors(self._farneback, s, t),
             "consistency.rendered_delta_e": lambda s, t: _colors(self._rendered, s, t),
+            "consistency.edit_psnr": lambda s, t: t.once("refit", lambda: self._refit([(s, t)])[0]),
             "consistency.edit_delta_e": lambda s, t: self._added("", s, t),
             "consistency.edit_delta_e_p90": lambda s, t: self._added("_p90", s, t),
             "consistency.delta_e": self._exactly,

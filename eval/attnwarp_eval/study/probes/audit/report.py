@@ -18,7 +18,7 @@ from attnwarp_eval.statistics.auroc import Auroc, auroc
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study.flaws import CONDITIONS, FLAWS, Flaw
 from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
-from attnwarp_eval.study.probes.audit.measure import RIGHT, SHINY, Seconds
+from attnwarp_eval.study.probes.audit.measure import METAL, REFIT_SIZE, RIGHT, VARNISHED, Seconds
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.shared.encoders import encoders_named
@@ -63,6 +63,7 @@ ROWS = (
     Row("embedding.clip_similarity", "CLIP similarity", "prompt"),
     Row("embedding.clip_image", "CLIP image similarity", "nothing"),
     Row("embedding.dino_image", "DINO image similarity", "nothing"),
+    Row("consistency.edit_psnr", "Edit PSNR, colours refitted", "splats"),
     Row("consistency.features.rendered", "features, rendered depth", "splats"),
     Row("consistency.perceptual", "perceptual, rendered depth", "splats"),
     Row("consistency.rendered_delta_e", "colour, rendered depth", "splats"),
@@ -141,15 +142,15 @@ class Pairs:
         """Lowest AUROC among the flaws that matter most; NaN where one is undefined."""
         return float(np.min([self.shown(row, flaw).value for flaw in COUNTED]))
 
-    def alarms(self, row: Row) -> float:
-        """Share of pairs that are right but for highlights above the threshold that
-        :data:`ALARM` of the other right pairs pass, mean over the near yaws.
+    def alarms(self, row: Row, trap: str = VARNISHED) -> float:
+        """Share of a trap's right pairs above the threshold that :data:`ALARM` of the other right
+        pairs pass, mean over the near yaws.
         """
         shares = []
         for yaw in self.near:
             right, shiny = (
                 np.array([v for own in self.values(row, names, yaw).values() for v in own])
-                for names in (RIGHT, [SHINY])
+                for names in (RIGHT, [trap])
             )
             right, shiny = right[np.isfinite(right)], shiny[np.isfinite(shiny)]
             if len(right) and len(shiny):
@@ -286,13 +287,14 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
                 _two(pairs.lowest(row)),
                 area_text(pairs.shown(row, elsewhere), intervals=False),
                 percent(pairs.alarms(row)),
+                percent(pairs.alarms(row, METAL)),
                 percent(float(np.mean([pairs.undefined(row, yaw) for yaw in pairs.near]))),
                 number(1000 * seconds.mean) if seconds else "–",
             ]
         )
     columns = [
         "metric", "needs", "AUROC, five flaws", "lowest of five", "another scene",
-        "false alarms on highlights", "undefined", "ms a pair",
+        "false alarms: varnish", "metal", "undefined", "ms a pair",
     ]  # fmt: skip
     what = "; ".join(flaw.at(flaw.reference) for flaw in COUNTED)
     text = [
@@ -309,10 +311,12 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
         (
             f"Five flaws were named as those that matter most before the study ran, and are"
             f" framed: {what}. The first table is of yaws up to {max(pairs.near):g} degrees."
-            f" A pair without a value is left out and counted. False alarms: pairs whose object is"
-            f" truly glossy, so that its true views differ by highlights, above the threshold that"
-            f" {percent(ALARM)} of the matt right pairs pass. Edit PSNR compares pictures with a"
-            f" fit, not with one another, so it is not here."
+            f" A pair without a value is left out and counted. False alarms: right pairs whose"
+            f" object is varnished, so that highlights move over its paint, or of metal, so that it"
+            f" mirrors its surroundings everywhere, above the threshold that {percent(ALARM)} of"
+            f" the matt right pairs pass. Edit PSNR is that of the scene's splats, whose colours"
+            f" alone were fitted to the two pictures at {min(spec['size'], REFIT_SIZE)} px: a fit"
+            f" of all that splats have would cost hours, and hide more."
         ),
         encoders_named(results.study, spec),
     ]
@@ -351,7 +355,7 @@ def _advice(pairs: Pairs) -> list[str]:
         careful = [row for row in pairs.known() if pairs.alarms(row) <= MANY_ALARMS]
         other = max(careful, key=lambda row: pairs.counted(row, pairs.near).value, default=None)
         text.append(
-            f"**It is for matt edits**: it takes highlights of a truly glossy object for a flaw in"
+            f"**It is for matt edits**: it takes highlights of a varnished object for a flaw in"
             f" {percent(alarms)} of pairs."
             + (
                 f" Of the metrics that do so in at most {percent(MANY_ALARMS)},"
