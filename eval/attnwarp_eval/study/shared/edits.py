@@ -273,12 +273,22 @@ def editor_of(study: Study, variant: Variant) -> EditorPart:
 
 
 def editor_identity(editor: EditorPart) -> Json:
-    """Parts of an editor that decide its pictures: its files and its guidance, not its folder."""
+    """Parts of an editor that decide its pictures: its files and its guidance, not its folder.
+
+    Raises:
+        StudyError: there is none of that name, or it has no draw to leave out.
+    """
+    from attnwarp.editing.small import guide_of
+
     if editor.ideal is not None:
         return {"ideal": editor.ideal.model_dump()}
     guidance = {"text": editor.text_guidance, "image": editor.image_guidance}
-    draws = {} if editor.draws else {"draws": False}
-    return {"sha256": files_digest(editor.name), "guidance": guidance, **draws}
+    identity = {"sha256": files_digest(editor.name), "guidance": guidance}
+    if editor.draws:
+        return identity
+    if guide_of(editor.name) == "depth":
+        raise StudyError(f"editor.draws: {editor.name!r} has no draw; leave the key out")
+    return {**identity, "draws": False}
 
 
 @lru_cache

@@ -485,6 +485,11 @@ def test_an_editor_without_its_draw_edits_in_a_cell_of_its_own(folder, tmp_path,
     assert nets[1] is None
 
 
+def test_an_editor_that_has_no_draw_is_refused_when_its_study_is_read():
+    with pytest.raises(StudyError, match="draws: 'small-depth' has no draw"):
+        edits.editor_identity(edits.EditorPart(name="small-depth", draws=False))
+
+
 @pytest.mark.parametrize("method", ["gaussctrl", "attention_warping"])
 def test_the_scenes_words_are_handed_to_an_inversion_that_asks_for_them(
     method, folder, tmp_path, monkeypatch
