@@ -238,6 +238,16 @@ def side_by_side(
     return Grid(caption, [in_degrees(view) for view in views], above + below)
 
 
+def scenes_side_by_side(
+    results: Results, probe: str, content: str, first: Mapping[str, str]
+) -> list[Grid]:
+    """Grids of :func:`side_by_side`, one for each scene that the probe has measured."""
+    variants = results.study.probes.get(probe, [])
+    scenes = dict.fromkeys(cell.scene for cell, _ in results.finished(probe))
+    grids = (side_by_side(results, probe, variants, content, s, s, first) for s in scenes)
+    return [grid for grid in grids if grid]
+
+
 def mean_values(results: Results, probe: str, name: str, metrics: Iterable[str]) -> list[str]:
     """Cells of a table: the means over scenes of a variant's metrics, with their intervals. A mean
     squared error is shown in decibels, as a pooled PSNR.

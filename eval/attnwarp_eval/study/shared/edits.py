@@ -120,6 +120,9 @@ class MethodProbe(Probe[E]):
     edits = True
     other_scenes = False
     """True where a cell can take features of another scene."""
+    whole = False
+    """True where methods run whole and edit their source themselves: ``budget`` and ``by_hand``
+    decide nothing."""
     shared: ClassVar[Mapping[tuple[str, ...], str]] = {
         ("editing", "options"): "options",
         ("editing", "editor"): "editor",
@@ -129,7 +132,8 @@ class MethodProbe(Probe[E]):
         """Keys that the method reads, and those of its editor and its splats."""
         own = variant.part(VariantPart)
         settings = settings_of(study, variant, 0)
-        read = {"method", "budget", "by_hand", *splats_reads(variant)}
+        limits = set() if self.whole else {"budget", "by_hand"}
+        read = {"method", *limits, *splats_reads(variant)}
         warps = EDITING_METHODS[own.method].takes_picture and settings["method"] == "warp"
         if own.control == OTHER_SEED or (
             warps and (own.control != OTHER_SCENE or self.other_scenes)
@@ -154,6 +158,10 @@ class MethodProbe(Probe[E]):
         """The method with all its settings, the editor, and where splats and warps come from."""
         own = variant.part(VariantPart)
         settings = settings_of(study, variant, seed + SEED_STEP * (own.control == OTHER_SEED))
+        limits: Json = {}
+        if not self.whole:
+            by_hand = {"by_hand": own.by_hand} if own.by_hand is not None else {}
+            limits = {**self._budget_spec(study, variant, seed), **by_hand}
         return {
             "spp": study.spp,
             "method": own.method,
@@ -162,8 +170,7 @@ class MethodProbe(Probe[E]):
             "geometry": variant.geometry,
             "mask": own.mask,
             **splats_spec(study, variant, seed),
-            **self._budget_spec(study, variant, seed),
-            **({"by_hand": own.by_hand} if own.by_hand is not None else {}),
+            **limits,
             **({"control": own.control} if own.control not in (None, OTHER_SEED) else {}),
         }
 

@@ -7,7 +7,7 @@ method does. Nothing changes outside the thing's exact mask, and splats are not 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Annotated
 
@@ -23,8 +23,8 @@ from attnwarp_eval.study import pictures
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import EditTruth
 from attnwarp_eval.study.probe import Work, register
-from attnwarp_eval.study.record import Json, NoExtra
-from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, Whole, did_you_mean
+from attnwarp_eval.study.record import NoExtra
+from attnwarp_eval.study.schema import Part, Study, StudyError, Whole, did_you_mean
 from attnwarp_eval.study.shared.edits import LEAST_PIXELS, MethodProbe, editor_of
 from attnwarp_eval.study.shared.method_run import own_seconds, run_method
 from attnwarp_eval.study.shared.splats import splats_of
@@ -61,6 +61,7 @@ class CarryProbe(MethodProbe[NoExtra]):
     """One edit of a scene's thing by one method, in a few views."""
 
     name = "carry"
+    whole = True
     study_part = StudyPart
     metrics = Registry({"multiview.delta_e": METRICS["multiview.delta_e"]})
     study_keys = frozenset({"carry", "editing", "seeds", "size", "spp", "things", "views"})
@@ -86,15 +87,6 @@ class CarryProbe(MethodProbe[NoExtra]):
                 raise StudyError(
                     f"carry.edits: the study has no scene {name!r}{did_you_mean(name, names)}"
                 )
-
-    def reads(self, study: Study, variant: Variant) -> Set[str]:
-        """Keys of the method and the editor; it runs whole, and edits its source itself."""
-        return set(super().reads(study, variant)) - {"budget", "by_hand"}
-
-    def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """The method, the editor, and where splats and warps come from."""
-        spec = super().variant_spec(study, variant, seed)
-        return {key: value for key, value in spec.items() if key not in ("budget", "by_hand")}
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

@@ -13,7 +13,7 @@ from attnwarp_eval.study.probe_report import (
     ProbeReport,
     in_degrees,
     register_report,
-    side_by_side,
+    scenes_side_by_side,
 )
 from attnwarp_eval.study.probes.carry.measure import LEAST_CHANGE
 from attnwarp_eval.study.results import Results
@@ -52,15 +52,5 @@ class CarryReport(ProbeReport):
 
     def gallery(self, results: Results) -> Section | None:
         """Pictures of each scene."""
-        variants = results.study.probes.get(self.name, [])
-        scenes = dict.fromkeys(cell.scene for cell, _ in results.finished(self.name))
-        grids = [
-            grid
-            for scene in scenes
-            if (grid := side_by_side(results, self.name, variants, "after", scene, scene, BEFORE))
-        ]
+        grids = scenes_side_by_side(results, self.name, "after", {"before": "before"})
         return Section("Edited views side by side", grids=grids) if grids else None
-
-
-BEFORE = {"before": "before"}
-"""Row before those of the variants."""

@@ -6,7 +6,7 @@ Views of a record are named ``parts/view``. Figures end in ``.edit`` for the edi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Any
@@ -25,7 +25,7 @@ from attnwarp_eval.study.edit_truth import EditTruth
 from attnwarp_eval.study.editing_methods import Donor
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json
-from attnwarp_eval.study.schema import Study, Variant
+from attnwarp_eval.study.schema import Study
 from attnwarp_eval.study.shared.edits import (
     MethodProbe,
     VariantPart,
@@ -82,6 +82,7 @@ class IdealProbe(MethodProbe[IdealResult]):
     """One edit of a thing in parts by one method and the ideal editor."""
 
     name = "ideal"
+    whole = True
     study_part = ThingsPart
     metrics = metrics_of("parts.")
     study_keys = frozenset({"size", "views", "seeds", "spp", "editing", "things"})
@@ -107,15 +108,6 @@ class IdealProbe(MethodProbe[IdealResult]):
     def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
         """A thing of a scene that is not there would be measured nowhere."""
         check_things(study, [scene.name for scene in scenes])
-
-    def reads(self, study: Study, variant: Variant) -> Set[str]:
-        """Keys of the method and the editor; it runs whole, and edits its source itself."""
-        return set(super().reads(study, variant)) - {"budget", "by_hand"}
-
-    def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """The method, the editor, and where splats and warps come from."""
-        spec = super().variant_spec(study, variant, seed)
-        return {key: value for key, value in spec.items() if key not in ("budget", "by_hand")}
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

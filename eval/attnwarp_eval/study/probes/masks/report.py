@@ -16,7 +16,7 @@ from attnwarp_eval.study.probe_report import (
     ProbeReport,
     in_degrees,
     register_report,
-    side_by_side,
+    scenes_side_by_side,
 )
 from attnwarp_eval.study.results import Results
 
@@ -76,19 +76,9 @@ class MasksReport(ProbeReport):
 
     def gallery(self, results: Results) -> Section | None:
         """Masks of each scene, in the colours of right, lost and wrong."""
-        variants = results.study.probes.get(self.name, [])
-        scenes = dict.fromkeys(cell.scene for cell, _ in results.finished(self.name))
-        grids = [
-            grid
-            for scene in scenes
-            if (grid := side_by_side(results, self.name, variants, "lifted", scene, scene, FIRST))
-        ]
+        grids = scenes_side_by_side(results, self.name, "lifted", {"true view": "target"})
         legend = "; ".join(f"`{color}` {name}" for name, color in MARKS.items())
         return Section("Lifted masks", [f"{legend}."], grids=grids) if grids else None
-
-
-FIRST = {"true view": "target"}
-"""Row before those of the variants."""
 
 
 def _median(values: list[float]) -> str:
