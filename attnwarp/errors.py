@@ -46,6 +46,7 @@ EXTRAS = {
         ("accelerate", "warp"),
         "splats are rendered on the processor, and --low-memory is refused",
     ),
+    "colmap": Extra(("pycolmap",), "no reconstruction of edited pictures by COLMAP"),
 }  # fmt: skip
 """Every extra that a user may lack, by its name in pyproject.toml."""
 

@@ -63,6 +63,7 @@ from attnwarp_eval.metrics.multiview import (
     edit_fidelity,
 )
 from attnwarp_eval.metrics.occlusion import COUNTS, YawBin, by_yaw, confusion, mask_error, scores
+from attnwarp_eval.metrics.reconstruction import Reconstruction, reconstruct
 from attnwarp_eval.metrics.refit import refit_psnr
 from attnwarp_eval.metrics.registry import METRICS, at_size, metric
 from attnwarp_eval.metrics.warp import endpoint_error, feature_error
@@ -74,6 +75,7 @@ __all__ = [
     "EditPsnr",
     "Flow",
     "Keypoints",
+    "Reconstruction",
     "Similarity",
     "Tsed",
     "YawBin",
@@ -116,6 +118,7 @@ __all__ = [
     "perceptual",
     "perceptual_consistency",
     "psnr",
+    "reconstruct",
     "refit_psnr",
     "scores",
     "sift_features",

@@ -8,15 +8,18 @@ squares problem, and what is left of it is what no such scene can show.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
-from attnwarp.camera import Camera
-from attnwarp.gaussians import Gaussians
 from attnwarp_eval.metrics._pictures import picture
 from attnwarp_eval.metrics.image import psnr_of_mse
+
+if TYPE_CHECKING:
+    import torch
+
+    from attnwarp.camera import Camera
+    from attnwarp.gaussians import Gaussians
 
 ITERATIONS = 10
 """Steps of conjugate gradients. Of pictures that splats can show nothing is left but their
@@ -54,6 +57,8 @@ def refit_psnr(
         >>> round(one)  # the disc takes their mean, 0.4
         20
     """
+    import torch
+
     from attnwarp.render import render
 
     shapes = [(camera.height, camera.width, 3) for camera in cameras]

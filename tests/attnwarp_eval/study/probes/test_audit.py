@@ -18,15 +18,15 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import StudyError, cells_of, load_study
 from attnwarp_eval.study.flaws import CONDITIONS
 from attnwarp_eval.study.probe import probe
-from attnwarp_eval.study.probes.audit.measure import (
+from attnwarp_eval.study.probes.audit.report import ROWS, Pairs
+from attnwarp_eval.study.shared.right_views import (
     METAL,
     PAIRS,
     RIGHT,
     TRAPS,
     VARNISHED,
-    _varnished,
+    varnished,
 )
-from attnwarp_eval.study.probes.audit.report import ROWS, Pairs
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.truth import Geometry, appearance, two_view
 from attnwarp_eval.world import turned
@@ -208,7 +208,7 @@ def test_a_coat_reflects_4_percent_ahead_and_all_of_the_light_that_grazes_it():
 
     paint, metal = np.full((1, 3, 3), 0.2), np.full((1, 3, 3), 1.2)
     hits = SimpleNamespace(cosine=np.array([[1.0, 0.0, np.nan]]))
-    found = _varnished(paint, metal, hits, np.array([[True, True, False]]))
+    found = varnished(paint, metal, hits, np.array([[True, True, False]]))
     np.testing.assert_allclose(found[0, :, 0], [0.24, 1.2, 0.2])
 
 

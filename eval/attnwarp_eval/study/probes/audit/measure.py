@@ -2,7 +2,8 @@
 
 A pair is the source and a target turned by some yaw. Figures are named ``metric.condition``: the
 conditions are :data:`~attnwarp_eval.study.flaws.CONDITIONS`, in the target alone, and the right
-pairs of :data:`RIGHT`. A metric that needs the truth stands beside those that a person has.
+pairs of :data:`~attnwarp_eval.study.shared.right_views.PAIRS`. A metric that needs the truth stands
+beside those that a person has.
 """
 
 from __future__ import annotations
@@ -19,23 +20,17 @@ from attnwarp.camera import Camera, fundamental
 from attnwarp.gaussians import Gaussians
 from attnwarp.warp import Surface, WarpedView, render_surface, warp_view
 from attnwarp_eval import metrics
-from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.cost import in_turn
 from attnwarp_eval.metrics.arrays import Array, Mask, mean
 from attnwarp_eval.metrics.consistency import FlowMethod
 from attnwarp_eval.metrics.known_geometry import GRID
-from attnwarp_eval.scene.edits import changed as changed_object
 from attnwarp_eval.scene.edits import pick
-from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.scene.materials import MetalMaterial
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.scene.spec import ObjectChange
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.edit_truth import answers_of
-from attnwarp_eval.study.flaws import CONDITIONS, Edited
+from attnwarp_eval.study.flaws import CONDITIONS
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json
-from attnwarp_eval.study.schema import Part, Splats, Study, StudyError, check_distinct
+from attnwarp_eval.study.schema import Part, Splats, Study, check_distinct
 from attnwarp_eval.study.shared.encoders import (
     EncodersPart,
     MetricsProbe,
@@ -44,28 +39,14 @@ from attnwarp_eval.study.shared.encoders import (
     encoder_sources,
     loaded,
 )
-from attnwarp_eval.truth import appearance
-from attnwarp_eval.truth.edits import edit_mask, touched
-from attnwarp_eval.two_view import Hits, TwoView
-from attnwarp_eval.world import World, changed, splats, turned
-
-RIGHT = ("right", "right_other")
-"""Right pairs without highlights: one answer in both views, and another one in both."""
-
-VARNISHED, METAL = TRAPS = ("right_varnished", "right_metal")
-"""Right pairs that truly differ: the object's paint lies under a coat, which shows highlights, or
-the object is of rough metal without paint, which shows its surroundings everywhere."""
-
-PAIRS = (*RIGHT, *TRAPS)
-
-ROUGH = MetalMaterial(type="metal", metal="Al", roughness=0.3)
-
-ROUGH_SAMPLES = 2
-"""Samples of metal for each of paint: what it reflects of lamps is rare and bright, and the noise
-of as few would be taken for disagreement."""
-
-COAT = 0.04
-"""Share of light that a coat of refractive index 1.5 reflects where it is seen straight on."""
+from attnwarp_eval.study.shared.right_views import (
+    PAIRS,
+    edited_target,
+    true_pictures,
+    two_answers,
+)
+from attnwarp_eval.two_view import TwoView
+from attnwarp_eval.world import splats, turned
 
 REFIT_SIZE = 128
 """Side in px of the pictures that splats' colours are fitted to."""
@@ -118,7 +99,7 @@ class AuditProbe(MetricsProbe):
         files = dict(zip(study.scene_names, study.scenes, strict=True))
         order = list(scenes)
         for place, (name, scene) in enumerate(scenes.items()):
-            answers = _answers(scene, part.audit.edit)
+            answers = two_answers(scene, part.audit.edit, "audit.edit")
             other = order[(place + 1) % len(order)]
             for seed in study.seeds:
                 spec = {
@@ -150,7 +131,7 @@ class AuditProbe(MetricsProbe):
             cameras = {yaw: turned(world.scene, yaw) for yaw in spec["yaws"]}
             for camera in cameras.values():
                 world.add(camera)
-            pictures = _true_pictures(work, cameras)
+            pictures = true_pictures(work, cameras)
         with meter.stage("splats"):
             model = splats(work.cell.scene_file, spec["size"], spec["seed"], **spec["splats"])
             surface = render_surface(model, world.source)
@@ -165,7 +146,7 @@ class AuditProbe(MetricsProbe):
         for place, camera in enumerate(cameras.values()):
             with meter.stage("truth"):
                 truth = world.pair(camera.name, spec["size"])
-                edited = _edited(world, spec, pictures, camera, truth)
+                edited = edited_target(world, spec, pictures, camera, truth)
                 flawed = {
                     name: flaw.make(edited, size) for name, (flaw, size) in CONDITIONS.items()
                 }
@@ -201,104 +182,6 @@ class AuditProbe(MetricsProbe):
                     seconds = _rounds(pair, whole, spec)
             work.add(camera.name, figures)
         return Seconds(seconds)
-
-
-def _answers(scene: Scene, edit: str) -> list[list[str]]:
-    """Names and contents of an edit's first two answers."""
-    names = {one.name for one in scene.edits}
-    answers = answers_of(scene, edit) if edit in names else []
-    if len(answers) < 2:
-        raise StudyError(
-            f"audit.edit: scene {scene.name!r} has no edit {edit!r} with two answers; there are"
-            f" {', '.join(one.name for one in scene.edits if one.answers) or 'none'}"
-        )
-    return [[name, scene.edited(edit, answer).content_hash] for name, answer in answers[:2]]
-
-
-def _true_pictures(work: Work, cameras: Mapping[float, Camera]) -> dict[str, dict[str, Array]]:
-    """(H, W, 3) sRGB by state of the scene and view; "elsewhere" is another scene, where there is
-    one.
-    """
-    spec, world = work.spec, work.world
-    views = [world.source, *cameras.values()]
-    edit = spec["edit"]
-    for name, content in spec["answers"]:
-        if world.edited_hash(edit, name) != content:
-            raise changed(f"edit {edit!r} of scene {world.scene.name!r}")
-    first, second = (world.scene.edited(edit, name) for name, _ in spec["answers"])
-    states = {"before": world.scene, "right": first, "right_other": second}
-    states[METAL] = _metallic(first, touched(world.scene, edit, spec["answers"][0][0]))
-    if spec["other"] is not None:
-        other = load_scene(work.cell.sources["other"])
-        if other.content_hash != spec["other"]:
-            raise changed(f"scene {other.name!r}")
-        states["elsewhere"] = other.with_size(spec["size"], spec["size"])
-    # Scene by scene: Mitsuba caches the last one, and loading costs more than rendering.
-    light: dict[str, dict[str, Array]] = {
-        state: {
-            camera.name: appearance(
-                scene,
-                turned(scene, yaw) if state == "elsewhere" else camera,
-                spp=spec["spp"] * (ROUGH_SAMPLES if state == METAL else 1),
-                seed=0,
-            ).astype(np.float64)
-            for yaw, camera in zip((0.0, *cameras), views, strict=True)
-        }
-        for state, scene in states.items()
-    }
-    light[VARNISHED] = {
-        camera.name: _varnished(
-            light["right"][camera.name],
-            light[METAL][camera.name],
-            hits := world.geometry.trace(camera),
-            edit_mask(world.scene, edit, hits, spec["answers"][0][0]),
-        )
-        for camera in views
-    }
-    return {
-        state: {name: to_srgb(np.clip(one, 0, 1)) for name, one in pictures.items()}
-        for state, pictures in light.items()
-    }
-
-
-def _varnished(paint: Array, metal: Array, hits: Hits, mask: Mask) -> Array:
-    """(H, W, 3) linear light of an object's paint under a rough clear coat.
-
-    The coat reflects what rough metal does, by the share that Schlick's formula gives, and lets the
-    rest through to the paint.
-    """
-    share = np.where(mask, COAT + (1 - COAT) * (1 - np.nan_to_num(hits.cosine, nan=1)) ** 5, 0)
-    return paint + share[..., None] * (metal - paint)
-
-
-def _metallic(scene: Scene, objects: Sequence[int]) -> Scene:
-    """The scene whose objects are of rough metal."""
-    items = [
-        changed_object(item, ObjectChange(object=item.name, material=ROUGH))
-        if place in objects and not item.emission
-        else item
-        for place, item in enumerate(scene.spec.objects)
-    ]
-    return Scene(scene.spec.model_copy(update={"objects": tuple(items)}), scene.path)
-
-
-def _edited(
-    world: World,
-    spec: Json,
-    pictures: Mapping[str, Mapping[str, Array]],
-    camera: Camera,
-    truth: TwoView,
-) -> Edited:
-    return Edited(
-        truth,
-        pictures["right"][world.source.name],
-        pictures["before"][camera.name],
-        pictures["right"][camera.name],
-        pictures["right_other"][camera.name],
-        edit_mask(world.scene, spec["edit"], truth.hits, spec["answers"][0][0]),
-        pictures["elsewhere"][camera.name] if "elsewhere" in pictures else None,
-        spec["seed"],
-    )
 
 
 def _named(values: Mapping[str, float], condition: str) -> dict[str, float]:

@@ -18,10 +18,11 @@ from attnwarp_eval.statistics.auroc import Auroc, auroc
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study.flaws import CONDITIONS, FLAWS, Flaw
 from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
-from attnwarp_eval.study.probes.audit.measure import METAL, REFIT_SIZE, RIGHT, VARNISHED, Seconds
+from attnwarp_eval.study.probes.audit.measure import REFIT_SIZE, Seconds
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.shared.encoders import encoders_named
+from attnwarp_eval.study.shared.right_views import METAL, RIGHT, VARNISHED
 
 NEAR = 60.0
 """Largest yaw in degrees that the first table and the recommendation speak of."""

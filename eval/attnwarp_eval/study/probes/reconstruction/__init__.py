@@ -1,0 +1,1 @@
+"""COLMAP's reconstructions of right edits and of flawed ones: what its figures see."""

@@ -1,0 +1,99 @@
+"""COLMAP's figures: of a synthetic reconstruction against sums over its points, and of pictures of a
+corner of three textured walls.
+"""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from attnwarp import Camera
+from attnwarp.errors import InputError
+from attnwarp_eval import metrics
+
+pytest.importorskip("pycolmap")  # in this process it is never used: it breaks other packages
+
+BY_HAND = """
+import json, numpy as np, pycolmap
+from attnwarp_eval._colmap import summary
+pycolmap.set_random_seed(3)
+made = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(
+    num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=7, num_points3D=50))
+pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.7), made)
+made.update_point_3d_errors()
+lengths, errors = [], []
+for point in made.points3D.values():
+    own = []
+    for seen in point.track.elements:
+        image = made.images[seen.image_id]
+        pose, camera = image.cam_from_world(), made.cameras[image.camera_id]
+        place = camera.img_from_cam(pose * point.xyz)
+        own.append(np.linalg.norm(place - image.points2D[seen.point2D_idx].xy))
+    lengths.append(len(own)), errors.append(np.mean(own))
+print(json.dumps([summary(made), [7, len(lengths), np.mean(lengths), np.mean(errors)]]))
+"""
+
+
+def test_figures_of_a_reconstruction_are_sums_over_its_points():
+    done = subprocess.run([sys.executable, "-c", BY_HAND], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    found, wanted = json.loads(done.stdout.splitlines()[-1])
+    assert list(found.values()) == pytest.approx(wanted, rel=1e-6)
+    assert 0.3 < found["reprojection_error"] < 1.5
+
+
+def corner(seed, camera):
+    """(H, W, 3) picture of three walls that meet at the origin, each with a texture of its own."""
+    rng = np.random.default_rng(seed)
+    directions = camera.unproject(
+        np.stack(np.meshgrid(np.arange(256) + 0.5, np.arange(256) + 0.5), -1).reshape(-1, 2),
+        np.ones(256 * 256),
+    ) - np.asarray(camera.position)
+    reach, shown = np.full(len(directions), np.inf), np.zeros(len(directions))
+    for axis in range(3):
+        texture = gaussian_filter(rng.random((300, 300)), 1.5)
+        texture = (texture - texture.min()) / np.ptp(texture)
+        length = -camera.position[axis] / directions[:, axis]
+        place = camera.position + length[:, None] * directions
+        across = np.delete(place, axis, axis=1).T * 100
+        hit = (length > 0) & (length < reach) & (across >= 0).all(0) & (across < 299).all(0)
+        reach[hit] = length[hit]
+        shown[hit] = map_coordinates(texture, across[:, hit], order=1)
+    return np.repeat(np.clip(shown, 0, 1).reshape(256, 256, 1), 3, axis=2)
+
+
+@pytest.fixture(scope="module")
+def cameras():
+    places = [(3 + 0.5 * np.cos(t), 3 + 0.5 * np.sin(t), 2.5) for t in np.linspace(0, 5, 6)]
+    view = {"width": 256, "height": 256, "fov_y": 45, "up": (0, 0, 1)}
+    return [Camera.look_at(place, (0.7, 0.7, 0.7), **view) for place in places]
+
+
+def test_right_views_are_all_registered_and_those_of_another_scene_are_not(cameras):
+    right = [corner(0, camera) for camera in cameras]
+    found = metrics.reconstruct(right, cameras)
+    assert found.registered == found.views == 6
+    assert found.points > 100
+    assert 2 < found.track_length <= 6
+    assert found.reprojection_error < 1
+    assert metrics.reconstruct(right, cameras) == found
+    other = [corner(k % 2, camera) for k, camera in enumerate(cameras)]
+    assert metrics.reconstruct(other, cameras).registered <= 3
+
+
+def test_a_failure_is_counted(cameras):
+    figures = metrics.reconstruct([np.zeros((256, 256, 3))] * 2, cameras[:2]).figures()
+    assert figures["consistency.colmap_failed"] == 1
+    assert figures["consistency.colmap_registered"] == 0
+    assert np.isnan(figures["consistency.colmap_error"])
+
+
+def test_what_cannot_be_reconstructed_is_refused(cameras, monkeypatch):
+    with pytest.raises(ValueError, match="got 1 pictures and 6 cameras"):
+        metrics.reconstruct([np.zeros((256, 256, 3))], cameras)
+    monkeypatch.setattr("attnwarp_eval.metrics.reconstruction.find_spec", lambda name: None)
+    with pytest.raises(InputError, match="needs the package pycolmap"):
+        metrics.reconstruct([np.zeros((256, 256, 3))] * 2, cameras[:2])
