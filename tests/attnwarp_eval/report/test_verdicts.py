@@ -20,7 +20,7 @@ from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import read_results
 from attnwarp_eval.report.claims import load_claims
 from attnwarp_eval.report.judging import decided, found
-from attnwarp_eval.report.raw import read_raw, together
+from attnwarp_eval.report.raw import PARTS, read_parts, read_raw, together
 from attnwarp_eval.report.results import lines
 from attnwarp_eval.report.verdicts import filled, headlines, table, verdicts
 from attnwarp_eval.statistics.contrasts import contrast
@@ -183,6 +183,28 @@ def test_the_documents_say_what_the_committed_raw_results_give(name):
     text = path.read_text()
     assert "<!-- /" in text
     assert filled(text, verdicts(ROOT / "reports"), path.parent) == text
+
+
+@pytest.mark.slow
+def test_halves_of_the_committed_populations_contradict_each_other_in_no_verdict():
+    folders = {path.parent for path in (ROOT / "reports").rglob(PARTS)}
+    wholes = [whole for whole in map(read_parts, sorted(folders)) if whole.study.population]
+    halves = []
+    for odd in (0, 1):
+        one = []
+        for whole in wholes:
+            scenes = whole.study.scene_names[odd::2]
+            study = whole.study.model_copy(update={"scenes": whole.study.scenes[odd::2]})
+            own = [cell for cell in whole.cells if cell.scene in scenes]
+            one += found(dataclasses.replace(whole, study=study, cells=own), load_claims())
+        judged = decided(each for each in one if each.judges)
+        halves.append({each.claim.text: each.verdict for each in judged})
+    assert halves[0].keys() == halves[1].keys() and len(halves[0]) > 50
+    opposite = {"holds", "the opposite holds"}
+    pairs = {text: {verdict, halves[1][text]} for text, verdict in halves[0].items()}
+    assert [text for text, pair in pairs.items() if pair == opposite] == []
+    agreeing = [text for text, pair in pairs.items() if len(pair & opposite) == len(pair) == 1]
+    assert len(agreeing) > 10  # the halves do tell
 
 
 def test_raw_results_are_lines_of_json(folder, tmp_path):
