@@ -3,6 +3,7 @@
 import math
 
 import pytest
+import yaml
 from damage_files import mutate_bytes, mutate_text, survey
 
 from attnwarp_eval.scene.file import load_scene
@@ -87,6 +88,19 @@ def test_what_cannot_be_meant_is_refused_with_its_line(text, line, message):
     with pytest.raises(YamlError, match=message) as caught:
         read_yaml(text)
     assert caught.value.line == line and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", [SCENE, SCENE.replace("radius: 3", "radius:\t3"), *(mutate_text(SCENE, seed) for seed in range(12))])  # fmt: skip
+def test_a_text_means_the_same_without_libyaml(text, monkeypatch):
+    def told():
+        try:
+            return read_yaml(text)
+        except YamlError as error:
+            return str(error), error.line
+
+    quick = told()
+    monkeypatch.setattr(yaml, "__with_libyaml__", False)
+    assert told() == quick
 
 
 def test_aliases_that_repeat_little_mean_what_they_repeat():
