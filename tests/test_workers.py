@@ -20,6 +20,7 @@ def test_case(case):
 """
 
 
+@pytest.mark.slow
 def test_a_run_whose_worker_dies_ends_and_does_not_pass(tmp_path):
     """A dying worker that the other asks for tests may lose them, in place of failing one."""
     for number in range(4):

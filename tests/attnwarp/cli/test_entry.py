@@ -40,6 +40,7 @@ def test_a_path_that_no_shell_expanded_is_in_the_home_folder(tmp_path):
     assert not (tmp_path / "~").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [0.1, 0.3])
 @pytest.mark.parametrize(
     "command",
@@ -66,16 +67,20 @@ def test_an_early_interrupt_ends_in_at_most_one_line(command, seconds, tmp_path)
 
 
 @pytest.mark.parametrize(
-    "command",
+    ("command", "target"),
     [
-        ["attnwarp-eval", "run", "gate", "--out", "{}"],
-        ["attnwarp-eval", "scenes", "export", "tiny", "{}"],
-        ["attnwarp-eval", "stability", "--out", "{}"],
-        ["attnwarp-eval", "scenes", "render", "tiny", "--out", "{}"],
-        ["attnwarp", "convert", "splats.ply", "{}/a.splat"],
+        (["attnwarp-eval", "run", "gate", "--out", "{}"], "itself"),
+        (["attnwarp", "convert", "splats.ply", "{}/a.splat"], "nowhere/there"),
+        *(
+            pytest.param(command, target, marks=pytest.mark.door)
+            for command, target in (
+                (["attnwarp-eval", "scenes", "export", "tiny", "{}"], "itself"),
+                (["attnwarp-eval", "stability", "--out", "{}"], "nowhere/there"),
+                (["attnwarp-eval", "scenes", "render", "tiny", "--out", "{}"], "nowhere/there"),
+            )
+        ),
     ],
 )
-@pytest.mark.parametrize("target", ["itself", "nowhere/there"])
 def test_a_link_that_leads_nowhere_is_named_in_one_line(command, target, tmp_path):
     link = tmp_path / "out"
     link.symlink_to(link if target == "itself" else tmp_path / target)
