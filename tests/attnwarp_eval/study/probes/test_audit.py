@@ -188,6 +188,10 @@ def test_the_report_says_what_the_numbers_say(tmp_path):
     assert pairs.smallest(colours, flaws["hue"]) is None
     assert pairs.alarms(colours) == 1
     assert pairs.alarms(colours, METAL) == 0
+    # Flaws as large as highlights do not stand out against varnished pairs, and do against metal.
+    slid = flaws["slid"].key(4)
+    assert pairs.area(colours, [slid], pairs.near, [VARNISHED]).value == 0.5
+    assert pairs.area(colours, [slid], pairs.near, [METAL]).value == 1
     assert pairs.alarms(best) == 0
     assert pairs.undefined(rows["consistency.tsed_distance"], 120) == 1
     assert pairs.shown(rows["consistency.perceptual"], flaws["slid"]).value == 0.5

@@ -118,13 +118,19 @@ class Pairs:
         plain = self.plain(row, conditions, yaw)
         return {scene: [sign * value for value in own] for scene, own in plain.items()}
 
-    def area(self, row: Row, conditions: Sequence[str], yaws: Sequence[float]) -> Auroc:
-        """Mean AUROC of conditions at yaws, against the right pairs of the same yaw."""
-        key = (row.key, tuple(conditions), tuple(yaws))
+    def area(
+        self,
+        row: Row,
+        conditions: Sequence[str],
+        yaws: Sequence[float],
+        right: Sequence[str] = RIGHT,
+    ) -> Auroc:
+        """Mean AUROC of conditions at yaws, against right pairs of the same yaw."""
+        key = (row.key, tuple(conditions), tuple(yaws), tuple(right))
         if key not in self._kept:
             self._kept[key] = auroc(
                 [
-                    (self.values(row, [one], yaw), self.values(row, RIGHT, yaw))
+                    (self.values(row, [one], yaw), self.values(row, right, yaw))
                     for one in conditions
                     for yaw in yaws
                 ]
@@ -135,9 +141,9 @@ class Pairs:
         """AUROC of a flaw at the size that tables show, up to :data:`NEAR` degrees."""
         return self.area(row, [flaw.key(flaw.reference)], self.near)
 
-    def counted(self, row: Row, yaws: Sequence[float]) -> Auroc:
-        """Mean AUROC of the flaws that matter most."""
-        return self.area(row, [flaw.key(flaw.reference) for flaw in COUNTED], yaws)
+    def counted(self, row: Row, yaws: Sequence[float], right: Sequence[str] = RIGHT) -> Auroc:
+        """Mean AUROC of the flaws that matter most, against right pairs."""
+        return self.area(row, [flaw.key(flaw.reference) for flaw in COUNTED], yaws, right)
 
     def lowest(self, row: Row) -> float:
         """Lowest AUROC among the flaws that matter most; NaN where one is undefined."""
@@ -289,13 +295,14 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
                 area_text(pairs.shown(row, elsewhere), intervals=False),
                 percent(pairs.alarms(row)),
                 percent(pairs.alarms(row, METAL)),
+                area_text(pairs.counted(row, pairs.near, [METAL]), intervals=False),
                 percent(float(np.mean([pairs.undefined(row, yaw) for yaw in pairs.near]))),
                 number(1000 * seconds.mean) if seconds else "–",
             ]
         )
     columns = [
         "metric", "needs", "AUROC, five flaws", "lowest of five", "another scene",
-        "false alarms: varnish", "metal", "undefined", "ms a pair",
+        "false alarms: varnish", "metal", "AUROC against metal", "undefined", "ms a pair",
     ]  # fmt: skip
     what = "; ".join(flaw.at(flaw.reference) for flaw in COUNTED)
     text = [
@@ -356,8 +363,9 @@ def _advice(pairs: Pairs) -> list[str]:
         careful = [row for row in pairs.known() if pairs.alarms(row) <= MANY_ALARMS]
         other = max(careful, key=lambda row: pairs.counted(row, pairs.near).value, default=None)
         text.append(
-            f"**It is for matt edits**: it takes highlights of a varnished object for a flaw in"
-            f" {percent(alarms)} of pairs."
+            f"**A threshold of matt pairs does not serve glossy ones**: above it are"
+            f" {percent(alarms)} of right pairs whose object is varnished. Against these the five"
+            f" flaws have an AUROC of {area_text(pairs.counted(best, pairs.near, [VARNISHED]))}."
             + (
                 f" Of the metrics that do so in at most {percent(MANY_ALARMS)},"
                 f" {other.title!r} sees most: AUROC {area_text(pairs.counted(other, pairs.near))}."
