@@ -282,6 +282,24 @@ class Study(Part):
             check_distinct(getattr(self, key), key)
         return self
 
+    def check_scenes(self, names: Iterable[str], key: str, scenes: Iterable[Scene]) -> None:
+        """Refuse names that are those of no scene, of the chosen ones or of those left out.
+
+        Args:
+            names: under the key.
+            key: for the message.
+            scenes: that were chosen.
+
+        Raises:
+            StudyError: a name that is no scene's.
+        """
+        known = [*(scene.name for scene in scenes), *map(scene_name, self.left_out)]
+        for name in names:
+            if name not in known:
+                raise StudyError(
+                    f"{key}: the study has no scene {name!r}{did_you_mean(name, known)}"
+                )
+
     def check_variants(self, names: Iterable[str], key: str, probe: str = "") -> None:
         """Raise ValueError unless every name is a variant's, and ``probe`` measures it.
 

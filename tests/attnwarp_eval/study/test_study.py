@@ -247,6 +247,18 @@ def test_keys_may_name_scenes_that_are_left_out(tmp_path):
     assert (pictured["warp"], pictured["fit"]) == (("yaw030",), ("orbit_000_of_9",))
 
 
+def test_scenes_that_are_left_out_are_not_loaded_for_their_names(tmp_path, monkeypatch):
+    own = {"editing": {"edits": {"drawn-1": {"recolor": None}}}, "variants": {"again": {}}}
+    path = write(tmp_path, scenes=["bear", "elsewhere/drawn-1.yaml"], views=["yaw030"],
+                 probes={"editing-timing": ["again"]}, **own)  # fmt: skip
+    loaded = []
+    monkeypatch.setattr(
+        "attnwarp_eval.study.run.load_scene", lambda name: loaded.append(name) or load_scene(name)
+    )
+    plan(load_study(path, scenes=["bear"]), Store(tmp_path / "run"))
+    assert loaded == ["bear"]
+
+
 @pytest.mark.door
 def test_a_key_that_stands_twice_is_refused_with_its_line(tmp_path):
     path = tmp_path / "twice.yaml"

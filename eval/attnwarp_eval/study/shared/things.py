@@ -40,14 +40,3 @@ def thing_of(study: Study, scene: Scene) -> list[str]:
     if not named:
         raise StudyError(f"things.{scene.name}: names no object, expected at least one")
     return list(named)
-
-
-def check_things(study: Study, scenes: list[str]) -> None:
-    """Refuse things of scenes that the study lacks.
-
-    Raises:
-        StudyError: a name that is no scene's.
-    """
-    for name in study.part(ThingsPart).things:
-        if name not in scenes and name not in study.left_out:
-            raise StudyError(f"things: the study has no scene {name!r}{did_you_mean(name, scenes)}")

@@ -24,7 +24,7 @@ from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import EditTruth
 from attnwarp_eval.study.probe import Work, register
 from attnwarp_eval.study.record import NoExtra
-from attnwarp_eval.study.schema import Part, Study, StudyError, Whole, did_you_mean
+from attnwarp_eval.study.schema import Part, Study, Whole
 from attnwarp_eval.study.shared.edits import LEAST_PIXELS, MethodProbe, editor_of
 from attnwarp_eval.study.shared.method_run import own_seconds, run_method
 from attnwarp_eval.study.shared.splats import splats_of
@@ -81,12 +81,7 @@ class CarryProbe(MethodProbe[NoExtra]):
 
     def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
         """Refuse words for a scene that the study lacks: they would be tried nowhere."""
-        names = [*(scene.name for scene in scenes), *study.left_out]
-        for name in study.part(StudyPart).carry.edits:
-            if name not in names:
-                raise StudyError(
-                    f"carry.edits: the study has no scene {name!r}{did_you_mean(name, names)}"
-                )
+        study.check_scenes(study.part(StudyPart).carry.edits, "carry.edits", scenes)
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

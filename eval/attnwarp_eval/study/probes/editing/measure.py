@@ -27,7 +27,7 @@ from attnwarp_eval.study.editing_methods import EDITING_METHODS
 from attnwarp_eval.study.probe import Work, metrics_of, probe, register
 from attnwarp_eval.study.probes.editing.result import EditResult, Measurement
 from attnwarp_eval.study.record import Json, Record
-from attnwarp_eval.study.schema import Study, StudyError, Variant, did_you_mean
+from attnwarp_eval.study.schema import Study, Variant
 from attnwarp_eval.study.shared.edits import (
     EditingPart,
     MethodProbe,
@@ -94,12 +94,7 @@ class EditingProbe(MethodProbe[EditResult]):
 
     def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
         """A scene without an entry has all of its edits measured, so a misspelt one matters."""
-        names = [scene.name for scene in scenes]
-        for name in study.part(EditingPart).editing.edits:
-            if name not in names:
-                raise StudyError(
-                    f"editing.edits: the study has no scene {name!r}{did_you_mean(name, names)}"
-                )
+        study.check_scenes(study.part(EditingPart).editing.edits, "editing.edits", scenes)
 
     def check_variant(self, study: Study, variant: Variant) -> None:
         """Settings are refused even where nothing is edited."""

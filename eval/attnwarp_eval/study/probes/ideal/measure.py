@@ -33,7 +33,7 @@ from attnwarp_eval.study.shared.edits import (
 )
 from attnwarp_eval.study.shared.method_run import other_world, own_seconds, run_method
 from attnwarp_eval.study.shared.splats import splats_of
-from attnwarp_eval.study.shared.things import ThingsPart, check_things, thing_of
+from attnwarp_eval.study.shared.things import ThingsPart, thing_of
 from attnwarp_eval.two_view import HIDDEN
 from attnwarp_eval.world import World
 
@@ -107,7 +107,7 @@ class IdealProbe(MethodProbe[IdealResult]):
 
     def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
         """A thing of a scene that is not there would be measured nowhere."""
-        check_things(study, [scene.name for scene in scenes])
+        study.check_scenes(study.part(ThingsPart).things, "things", scenes)
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

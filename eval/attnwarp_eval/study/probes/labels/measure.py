@@ -17,7 +17,7 @@ from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Part, Study, Variant, Whole
-from attnwarp_eval.study.shared.things import check_things, thing_of
+from attnwarp_eval.study.shared.things import ThingsPart, thing_of
 from attnwarp_eval.study.shared.warps import WarpProbe, warped_views
 
 GRIDS = (8, 16, 32, 64)
@@ -75,7 +75,7 @@ class LabelTransport(WarpProbe):
 
     def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
         """A thing of a scene that is not there would be measured nowhere."""
-        check_things(study, [scene.name for scene in scenes])
+        study.check_scenes(study.part(ThingsPart).things, "things", scenes)
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
