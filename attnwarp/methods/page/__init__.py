@@ -335,15 +335,22 @@ class _Page:
             f"{share:.0%} of the edited scene's change lies outside the mask"
         )  # fmt: skip
         shown = "".join(
-            f'<figure><img alt="mask of {escape(name)}" src="{_data(mask, quality=80, exact=0)}">'
+            f'<figure><img alt="mask of {escape(name)}" src="{_data(lit)}">'
             f"<figcaption>{escape(name)}</figcaption></figure>"
             for name in self.shown[:2]
-            for mask in [self.folder.read_picture(f"segments/{name}.png")]
+            for lit in [self._lit(name)]
         )
         return (
-            f"{title}<p>{said}; the mask covers {covered:.0%} of the pictures.</p>"
+            f"{title}<p>{said}; the mask covers {covered:.0%} of the pictures. It is lit below:"
+            " what it lacks of a thing stays as it was, and what it has of another may change.</p>"
             f'<div class="pair">{shown}</div>'
         )
+
+    def _lit(self, name: str) -> Bytes:
+        """The photograph, dark outside the mask."""
+        mask = self.folder.read_picture(f"segments/{name}.png") / 255
+        lit: Bytes = to_bytes(to_float(self.photographs[name]) * (0.2 + 0.8 * mask))
+        return lit
 
     def orbit(self, turns: Sequence[Sequence[Bytes]]) -> str:
         """Both scenes from cameras around them."""

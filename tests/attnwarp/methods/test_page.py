@@ -45,11 +45,13 @@ class Page(HTMLParser):
 def edits(scene, editor, tmp_path_factory):
     """Folder of an edit by each kind of method, with its page."""
 
-    def made(method, images=scene[2], **changes):
+    def made(method, images=scene[2], segments=None, **changes):
         folder = tmp_path_factory.mktemp(method)
         model, cameras, pictures = scene
         settings = preset(method, **{**QUICK, **changes})
-        METHODS[method](model, cameras, pictures, editor, "red", settings, folder=folder)
+        METHODS[method](
+            model, cameras, pictures, editor, "red", settings, folder=folder, segments=segments
+        )
         path = pages.show_edit(workdir_of(folder), model, cameras, images, editor=editor)
         return folder, path.read_text()
 
@@ -86,6 +88,14 @@ def test_its_pictures_are_those_of_the_folder(warped, scene):
     assert found == 5 * 4 + 4 + 5  # the source has no mask
     negative = np.rint(255 * (1 - scene[2][0]))
     assert np.array_equal(pictures["v0, photograph"], negative)
+
+
+def test_a_mask_is_lit_on_the_photograph(edits, scene):
+    marked = np.zeros(scene[2][0].shape[:2], bool)
+    marked[10:20, 5:30] = True
+    _, text = edits("by_view", segments=[marked] * len(scene[1]))
+    lit = np.where(marked[..., None], 255, 51) * scene[2][0]
+    assert np.abs(Page(text).pictures["mask of v0"] - lit).max() <= 0.5
 
 
 def test_the_splats_on_the_page_are_the_edited_ones(warped, tmp_path):
