@@ -404,12 +404,15 @@ def _extended(
 ) -> tuple[dict[str, Any], _Lines]:
     """A study's own data over that of the one it extends.
 
-    Mappings are merged, all else is replaced; null takes away a key that the other has.
+    Mappings are merged, all else is replaced; null takes away a key that the other has. Scenes of
+    meshes replace drawn ones, and the reverse, since they have other keys.
     """
     replaced: list[Place] = []
 
     def over(old: Any, new: Any, place: Place) -> Any:
-        if not (isinstance(old, dict) and isinstance(new, dict)):
+        both = isinstance(old, dict) and isinstance(new, dict)
+        other_kind = both and place == ("scenes",) and "meshes" in old.keys() ^ new.keys()
+        if not both or (other_kind and new.keys() & {"meshes", "drawn"}):
             replaced.append(place)
             return new
         joined = old | {

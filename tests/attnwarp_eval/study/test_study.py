@@ -4,6 +4,7 @@ import os
 import pathlib
 
 import pytest
+import trimesh
 import yaml
 from typer.testing import CliRunner
 
@@ -402,6 +403,17 @@ def test_a_shipped_study_is_extended_by_its_name(tmp_path):
         "feature_sizes": [160],
     }
     assert load_study(str(path)).model_dump() == by_hand
+
+
+def test_scenes_of_meshes_replace_the_drawn_ones_of_the_study_that_is_extended(tmp_path):
+    trimesh.creation.box().export(tmp_path / "box.obj")
+    base = BASE.replace("[spheres]", "{drawn: 9, generator: 1, seed: 7, stratify: [thin]}")
+    meshes = "extends: base.yaml\nname: b\nscenes: {meshes: ., n: 1, seed: 3}\n"
+    other = load_study(extending(tmp_path, meshes, base))
+    assert other.scene_names == ["mesh-0"] and ", seed 3" in other.sampled
+    fewer = "extends: base.yaml\nname: b\nscenes: {drawn: 1}\n"
+    kept = load_study(extending(tmp_path, fewer, base))
+    assert kept.sampled.endswith("drawn by generator 1, seed 7, thin spread evenly")
 
 
 def test_paths_of_an_extended_study_count_from_its_own_folder(tmp_path):
