@@ -21,6 +21,9 @@ Array = npt.NDArray[np.float64]
 UPRIGHT_Z = (".stl", ".off")
 """Formats of machines and of geometry, which have z up; the others' files have y up."""
 
+LONGEST_EDGE = 0.03
+"""Edges of things, in units of the scene: a texture has its colours at vertices."""
+
 
 def mesh_files(folder: Path) -> list[Path]:
     """Meshes of a folder, by name.
@@ -109,7 +112,7 @@ class _MeshDraft(Draft):
         self.files[file] = path
         shape: dict[str, Any] = {
             "type": "mesh", "file": file, "up": up, "yaw": yaw, "scale": scale,
-            "position": [float(x) for x in offset],
+            "position": [float(x) for x in offset], "longest_edge": LONGEST_EDGE,
         }  # fmt: skip
         # A word as people write it, and a name of its own for each thing.
         word = "".join(c if c.isalnum() else " " for c in path.stem.lower()).strip() or "thing"

@@ -71,7 +71,7 @@ def warn_of_lost_texture(item: ObjectSpec, mesh: Mesh) -> None:
         warnings.warn(
             f"object {item.name!r}: its pictures miss the texture by an albedo of {mean:.2g} on"
             f" average, since meshes have it at their vertices alone ({len(mesh.faces)} triangles);"
-            " subdivide the mesh, or make the texture coarser",
+            " give the mesh a shorter longest_edge, or make the texture coarser",
             MeshNotice,
             stacklevel=2,
         )

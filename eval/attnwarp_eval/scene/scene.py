@@ -253,9 +253,12 @@ class Scene:
                 upright = (
                     np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) if spec.up == "y" else np.eye(3)
                 )
-                yield _placed(
-                    mesh, _turn_z(spec.yaw) @ upright, spec.scale, spec.position, object_id
-                )
+                turn = _turn_z(spec.yaw) @ upright
+                placed = _placed(mesh, turn, spec.scale, spec.position, object_id)
+                try:
+                    yield placed.divided(spec.longest_edge) if spec.longest_edge else placed
+                except ValueError as error:
+                    raise SceneError(f"object {item.name!r}: longest_edge: {error}") from error
             case TerrainSpec():
                 yield replace(spec.mesh(), object_id=object_id)
             case ScatterSpec():

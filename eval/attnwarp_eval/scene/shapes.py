@@ -6,6 +6,7 @@ Everything is float64 and in world coordinates.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,6 +21,9 @@ DEGENERATE_AREA = 1e-12
 """Triangles whose area is below this times their longest edge squared have no usable plane and are
 dropped.
 """
+
+MOST_DIVIDED = 5_000_000
+"""Triangles into which a mesh is divided at the most."""
 
 
 class MeshNotice(SceneNotice):
@@ -168,6 +172,45 @@ class Mesh:
             normals=None if self.normals is None else self.normals @ R.T,
         )
 
+    def divided(self, longest: float) -> Mesh:
+        """The same surface in triangles whose edges are at most ``longest``, for textures, which
+        have their colours at vertices.
+
+        Neighbours share the vertices between them, so no crack opens.
+
+        Raises:
+            ValueError: there would be more than :data:`MOST_DIVIDED` triangles.
+
+        Example:
+            >>> mesh = Mesh(np.eye(3), np.array([[0, 1, 2]])).divided(1.0)
+            >>> len(mesh.faces)
+            4
+        """
+        mesh = self
+        while len(mesh.faces) <= MOST_DIVIDED:
+            ends = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
+            count = len(mesh.vertices)
+            edges, of_face = np.unique(ends[..., 0] * count + ends[..., 1], return_inverse=True)
+            a, b = edges // count, edges % count
+            long = np.linalg.norm(mesh.vertices[a] - mesh.vertices[b], axis=1) > longest
+            if not long.any():
+                return mesh
+            a, b = a[long], b[long]
+            middle = np.where(long, count + np.cumsum(long) - 1, -1)[of_face.reshape(-1, 3)]
+
+            values = {
+                name: np.concatenate([array, (array[a] + array[b]) / 2])
+                for name in ("vertices", "normals", "tint")
+                if (array := getattr(mesh, name)) is not None
+            }
+            if "normals" in values:
+                values["normals"] /= np.linalg.norm(values["normals"], axis=1, keepdims=True)
+            mesh = replace(mesh, faces=np.concatenate(list(_halved(mesh.faces, middle))), **values)
+        raise ValueError(
+            f"got more than {MOST_DIVIDED} triangles with no edge longer than {longest:g}; let"
+            " edges be longer"
+        )
+
     def bounds(self) -> Array:
         """(2, 3) lower and upper corner of the axis-aligned bounding box."""
         used = np.zeros(len(self.vertices), bool)
@@ -238,3 +281,20 @@ class Mesh:
 
 
 Shape = Sphere | Rectangle | Box | Mesh
+
+
+def _halved(faces: Indices, middle: Indices) -> Iterator[Indices]:
+    """Parts of (F, 3) triangles whose edges 0-1, 1-2 and 2-0 have (F, 3) new vertices, or -1."""
+    split = middle >= 0
+    count = split.sum(axis=1)
+    yield faces[count == 0]
+    # Turned so that the only new vertex is on the first edge, or the only edge without one is last.
+    for n, first, parts in (
+        (1, split.argmax(axis=1), [(0, 3, 2), (3, 1, 2)]),
+        (2, split.argmin(axis=1) + 1, [(3, 1, 4), (0, 3, 4), (0, 4, 2)]),
+        (3, 0 * count, [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]),
+    ):
+        turn = (first[:, None] + np.arange(3)) % 3
+        six = np.hstack([np.take_along_axis(part, turn, axis=1) for part in (faces, middle)])
+        for part in parts:
+            yield six[count == n][:, part]

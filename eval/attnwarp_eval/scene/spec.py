@@ -66,7 +66,7 @@ class BoxSpec(Spec):
 
 class MeshSpec(Spec):
     """A mesh from a file, its path relative to the scene file. ``up`` names the file's upright
-    axis.
+    axis; edges longer than ``longest_edge`` are halved, so that textures show between vertices.
     """
 
     type: Literal["mesh"]
@@ -75,6 +75,7 @@ class MeshSpec(Spec):
     yaw: float = 0.0
     scale: Positive = 1.0
     up: Literal["y", "z"] = "z"
+    longest_edge: Positive | None = None
 
 
 ShapeSpec = Annotated[

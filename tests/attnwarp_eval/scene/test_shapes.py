@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+import trimesh
 from cache_writer import write_again_and_again
 
 from attnwarp_eval import cache
@@ -147,3 +148,20 @@ def test_two_processes_that_write_the_same_entry_never_show_half_of_one(monkeypa
             seen += 1
     assert [writer.exitcode for writer in writers] == [0, 0] and seen > 0
     assert [p.name for p in (tmp_path / "k").iterdir()] == ["same.npz"]
+
+
+def test_a_divided_mesh_is_the_same_closed_surface_in_small_triangles():
+    """Oracle: trimesh, on a shape whose triangles have one, two and three long edges."""
+    whole = trimesh.creation.capsule(height=2.0, radius=0.2, count=(6, 6))
+    given = Mesh(whole.vertices, whole.faces, tint=np.abs(whole.vertices))
+    divided = given.divided(0.15)
+    other = trimesh.Trimesh(divided.vertices, divided.faces, process=False)
+    assert other.is_watertight and other.is_winding_consistent
+    assert 0.07 < other.edges_unique_length.max() <= 0.15
+    assert other.volume == pytest.approx(whole.volume)
+    assert other.area == pytest.approx(whole.area)
+    assert np.all(np.einsum("ij,ij->i", other.face_normals, other.triangles_center) > 0)
+    assert np.array_equal(divided.vertices[: len(whole.vertices)], whole.vertices)
+    assert divided.tint.shape == divided.vertices.shape
+    with pytest.raises(ValueError, match="more than 5000000 triangles"):
+        given.divided(1e-4)
