@@ -15,7 +15,7 @@ from attnwarp.process import cache_dir
 from attnwarp_eval.cache import content_key
 from attnwarp_eval.drawn.axes import check_axes, spread
 from attnwarp_eval.drawn.files import write
-from attnwarp_eval.drawn.meshes import draw_meshes, mesh_files
+from attnwarp_eval.drawn.meshes import LONGEST_EDGE, draw_meshes, mesh_files
 from attnwarp_eval.drawn.scenes import Drawn, draw
 from attnwarp_eval.scene.base import Spec
 from attnwarp_eval.scene.explain import explain
@@ -177,7 +177,8 @@ class MeshScenes(_Scenes):
         return f"{self.n} scenes of meshes of {Path(self.meshes).name} drawn"
 
     def _decided_by(self) -> Any:
-        return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in self._paths}
+        files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in self._paths}
+        return LONGEST_EDGE, files
 
     def scene(self, number: int) -> Drawn:
         """Draw one of them."""
