@@ -200,6 +200,29 @@ def test_a_picture_is_rendered_once_and_kept_for_what_it_depends_on(monkeypatch,
     assert len(calls) == 6 and not np.array_equal(coarse, first)
 
 
+def test_textures_that_the_last_scene_had_are_not_made_again_and_no_picture_shows_it(monkeypatch):
+    made = []
+    real = build._colors
+    monkeypatch.setattr(build, "_colors", lambda of, at: made.append(of.type) or real(of, at))
+    floor = FLOOR | {"texture": {"type": "checker", "colors": ["#204080", "#c0a060"], "size": 0.3}}
+
+    def picture(color):
+        ball = {
+            "name": "ball",
+            "shape": {"type": "sphere", "center": [0, 0, 1.0], "radius": 0.5},
+            "texture": {"type": "stripes", "colors": [color, "#ffffff"], "size": 0.1},
+        }
+        scene = world([SUN, SKY], [floor, ball]).with_size(24, 24)
+        return mitsuba.render_plan(scene, scene.source, plan(scene, 2), 0)
+
+    mitsuba.forget()
+    red, blue = picture("#ff0000"), picture("#0000ff")
+    assert made.count("checker") == 1 and made.count("stripes") == 2
+    mitsuba.forget()
+    assert np.array_equal(picture("#0000ff"), blue) and not np.array_equal(red, blue)
+    assert made.count("checker") == 2
+
+
 def test_the_plan_follows_from_the_scene_and_says_why():
     direct = plan(world([SUN, SKY]), 8)
     assert [(p.integrator, p.lights, p.spp) for p in direct.passes] == [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import math
 import sys
 import tempfile
@@ -290,6 +291,7 @@ def forget() -> None:
     Dr.Jit keeps every freed array for the next one of its size, and pictures differ in size.
     """
     _loaded.clear()
+    _baked.clear()
     if "drjit" in sys.modules:
         sys.modules["drjit"].flush_malloc_cache()
 
@@ -345,19 +347,19 @@ def _shapes(
     scene: Scene, center: Array, texel: float, folder: Path
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     mi = library()
+    baked: dict[Any, npt.NDArray[np.float32]] = {}
     warn_of_strays(scene, scene.shapes())
     for index, shape in enumerate(_faces(scene)):
         item = scene.spec.objects[shape.object_id]
         texture = item.texture
 
         def bake(points: Array, texture: Any = texture) -> dict[str, Any]:
-            color = np.empty(points.shape, dtype=np.float32)
             if isinstance(texture, Plain) and not texture.variation:
+                color = np.empty(points.shape, dtype=np.float32)
                 color[:] = albedo(texture, points[0, :1])  # one colour for millions of texels
             else:
-                texels, colors = points.reshape(-1, 3), color.reshape(-1, 3)
-                for some in range(0, len(texels), AT_ONCE):
-                    colors[some : some + AT_ONCE] = albedo(texture, texels[some : some + AT_ONCE])
+                key = (texture.model_dump_json(), points.shape, hashlib.sha256(points).digest())
+                color = baked[key] = _baked[key] if key in _baked else _colors(texture, points)
             bitmap = mi.Bitmap(color)
             return {
                 "type": "bitmap",
@@ -409,6 +411,21 @@ def _shapes(
             form = {"type": "ply", "filename": str(file), "face_normals": shape.normals is None}
             reflectance = {"type": "mesh_attribute", "name": "vertex_color"}
         yield f"shape_{index:06d}", form | {"bsdf": _bsdf(item, reflectance)}
+    _baked.clear()
+    _baked.update(baked)
+
+
+_baked: dict[Any, npt.NDArray[np.float32]] = {}
+"""Texels of the last scene: an edit of it, and each of its answers, has nearly all of them."""
+
+
+def _colors(texture: Any, points: Array) -> npt.NDArray[np.float32]:
+    """Albedo of a texture at (H, W, 3) points, a part at a time."""
+    color = np.empty(points.shape, dtype=np.float32)
+    texels, colors = points.reshape(-1, 3), color.reshape(-1, 3)
+    for some in range(0, len(texels), AT_ONCE):
+        colors[some : some + AT_ONCE] = albedo(texture, texels[some : some + AT_ONCE])
+    return color
 
 
 def _bsdf(item: ObjectSpec, reflectance: dict[str, Any]) -> dict[str, Any]:
