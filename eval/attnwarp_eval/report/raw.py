@@ -61,6 +61,9 @@ def _lines(store: Store) -> Iterator[str]:
     study = dict(stored["study"])
     if study.get("population"):
         study["scenes"] = [Path(name).name for name in study["scenes"]]
+        if "meshes" in study["population"]:  # the folder is of this machine
+            name = Path(study["population"]["meshes"]).name
+            study["population"] = {**study["population"], "meshes": name}
     notices = {name: entry.get("notices", []) for name, entry in stored["scenes"].items()}
     # Not sorted: tables follow the order in which a study names its variants.
     yield json.dumps({"raw": FORMAT, "study": study, "notices": notices}, separators=(",", ":"))
