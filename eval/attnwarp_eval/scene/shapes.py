@@ -173,8 +173,8 @@ class Mesh:
         )
 
     def divided(self, longest: float) -> Mesh:
-        """The same surface in triangles whose edges are at most ``longest``, for textures, which
-        have their colours at vertices.
+        """Halve edges until none is longer than ``longest``, for textures, which have their colours
+        at vertices. The surface stays as it is.
 
         Neighbours share the vertices between them, so no crack opens.
 
