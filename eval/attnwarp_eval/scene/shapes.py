@@ -8,6 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -198,7 +199,7 @@ class Mesh:
             a, b = a[long], b[long]
             middle = np.where(long, count + np.cumsum(long) - 1, -1)[of_face.reshape(-1, 3)]
 
-            values = {
+            values: dict[str, Any] = {
                 name: np.concatenate([array, (array[a] + array[b]) / 2])
                 for name in ("vertices", "normals", "tint")
                 if (array := getattr(mesh, name)) is not None

@@ -358,7 +358,8 @@ def _shapes(
                 color = np.empty(points.shape, dtype=np.float32)
                 color[:] = albedo(texture, points[0, :1])  # one colour for millions of texels
             else:
-                key = (texture.model_dump_json(), points.shape, hashlib.sha256(points).digest())
+                places = hashlib.sha256(points.data).digest()
+                key = (texture.model_dump_json(), points.shape, places)
                 color = baked[key] = _baked[key] if key in _baked else _colors(texture, points)
             bitmap = mi.Bitmap(color)
             return {
