@@ -67,6 +67,18 @@ def write_report_of_parts(folder: Path, *, timings: bool = True) -> list[Path]:
 
     Raises:
         InputError: raw results that cannot be read, or are of no one study.
+
+    Example:
+        >>> from attnwarp_eval.report.raw import write_raw
+        >>> from attnwarp_eval.study import Store, parse_study
+        >>> from attnwarp_eval.study.run import expected, plan
+        >>> content = dict(name="my", scenes=["spheres"], variants={"a": {}})
+        >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
+        >>> store = Store("run")
+        >>> store.write_study(expected(plan(study, store)))
+        >>> folder = write_raw(store, Path("reports")).parent
+        >>> [path.name for path in write_report_of_parts(folder)]
+        ['report.md', 'report.html']
     """
     results = read_parts(folder)
     report = build(results, folder, timings=timings, pictures=False)

@@ -600,5 +600,5 @@ def test_a_texture_finer_than_its_mesh_is_told_where_pictures_are_made(tmp_path)
     checker = "type: checker, colors: ['#ffffff', '#000000'], size: 0.5"
     path.write_text(text.replace("type: plain, color: '#c04020'", checker))
     # Every corner is white, capped at 0.9, and half of the square is black: 0.45.
-    with pytest.warns(MeshNotice, match=r"albedo of 0.4[3-7] on .* \(2 triangles\); subdivide"):
+    with pytest.warns(MeshNotice, match=r"albedo of 0.4[3-7] on .* \(2 triangles\); give"):
         load_shapes(load_scene(path), 1.0)

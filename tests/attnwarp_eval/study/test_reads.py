@@ -170,6 +170,7 @@ VARIANT = {
 
 OWN = {
     "audit": {"audit": {"edit": "some_colour"}},
+    "reconstruction": {"reconstruction": {"edit": "some_colour"}},
     "ideal": {"editing": {"editor": {"ideal": {"parts": 6}}}},
     "carry": {"carry": {"edits": {"ball": "make the ball red"}}},
 }
