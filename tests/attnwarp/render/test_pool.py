@@ -58,8 +58,14 @@ MIB = 1 << 20
 
 
 @pytest.fixture
-def traced() -> Iterator[Callable[[], tuple[int, int]]]:
-    """Python's own count of allocated bytes: those held, and their peak since the call before."""
+def traced(monkeypatch) -> Iterator[Callable[[], tuple[int, int]]]:
+    """Python's own count of allocated bytes: those held, and their peak since the call before.
+
+    It begins with a window of its own: a need is forgotten by the arrays taken since, and those of
+    other tests would decide where.
+    """
+    monkeypatch.setattr(_pool, "_taken", 0)
+    monkeypatch.setattr(_pool, "_need", [0, 0])
     _pool.clear()
     gc.collect()
     tracemalloc.start()
