@@ -127,7 +127,7 @@ def test_an_editor_with_a_favourite_is_not_ideal(records, tmp_path, monkeypatch)
         study, [written_runs.outcome("ideal", "spheres", ["full"], data, "one")]
     )
     assert report_of("ideal").problems(made) == [
-        "spheres: not ideal: alone, answers come in 90 %, 5 %, 5 % of cases, expected 33 % of each"
+        "spheres: not ideal in full: alone, answers come in 90 %, 5 %, 5 % of cases, expected 33 % of each"
     ]
     sound = written_runs.outcome("ideal", "spheres", ["full"], record.to_json(), "one")
     assert report_of("ideal").problems(written_runs.results(study, [sound])) == []
@@ -147,7 +147,7 @@ def test_a_run_whose_editor_is_not_ideal_ends_with_3(tmp_path, monkeypatch):
         app, ["run", str(tmp_path / "parts.yaml"), "--out", str(tmp_path / "run")]
     )
     assert result.exit_code == 3, result.output
-    assert "not ideal: alone, answers come in 98 %, 1 %, 1 % of cases" in result.output
+    assert "not ideal in full: alone, answers come in 98 %, 1 %, 1 % of cases" in result.output
 
 
 def test_the_report_says_what_the_editor_is(records, tmp_path):

@@ -40,12 +40,14 @@ class IdealReport(ProbeReport):
 
     def problems(self, results: Results) -> list[str]:
         """Editors that are not ideal: they have favourite answers, or agree without features."""
-        faults = {
-            f"{cell.scene}: not ideal: {record.extra.fault}"
-            for cell, record in results.finished(self.name)
-            if record.extra.fault is not None
-        }
-        return sorted(faults)
+        variants: dict[tuple[str, str], list[str]] = {}
+        for cell, record in results.finished(self.name):
+            if record.extra.fault is not None:
+                variants.setdefault((cell.scene, record.extra.fault), []).extend(cell.variants)
+        return [
+            f"{scene}: not ideal in {', '.join(names)}: {fault}"
+            for (scene, fault), names in sorted(variants.items())
+        ]
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """The editor by scene: share of signal, when answers settle, and what it is alone."""
@@ -76,7 +78,8 @@ class IdealReport(ProbeReport):
                 "An editor that repairs whatever it can tell to be wrong. Damage by wrong features"
                 " is a lower bound for a real one, and no difference means: below a part's size."
                 " Alone, with fresh noise, answers come alike often and agree by chance."
-            )
+            ),
+            *self.problems(results),
         ]
         yield (
             Place.INSTRUMENT,
