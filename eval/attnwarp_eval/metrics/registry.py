@@ -21,7 +21,7 @@ class Metric:
             (``depth.bias.edge``) or a feature size (``warp.epe_median.64``).
         unit: "px" (of the image), "layer px", "scene" (scene units), "deg", "dB", "dE00" (CIEDE2000), "share" (of 1),
             "ratio", "cosine" (of embeddings, -1 to 1), "decades" (of 10), "own" (the unit of a hard case's tolerance),
-            "pixels" or "views" (counts).
+            "rows" (through a network), "pixels" or "views" (counts).
         direction: which values are better; "zero" for signed figures that are best at 0, "none" for counts that
             describe.
         atol, rtol: a change of at most ``atol + rtol * |value|`` between two runs is no change.
@@ -45,7 +45,7 @@ class Metric:
 
     @property
     def scale(self) -> Literal["ratio", "share", "plain"]:
-        """Scale on which two variants are compared: errors above 0 as ratios, shares as shares.
+        """Scale on which two variants are compared: errors above 0 and costs as ratios, shares as shares.
 
         Example:
             >>> [METRICS[name].scale for name in ("warp.epe_median", "occlusion.recall", "fit.psnr")]
@@ -53,8 +53,8 @@ class Metric:
         """
         if self.unit == "share":
             return "share"
-        errors = ("px", "layer px", "scene", "deg", "ratio")
-        return "ratio" if self.direction == "lower" and self.unit in errors else "plain"
+        ratios = ("px", "layer px", "scene", "deg", "ratio", "rows")
+        return "ratio" if self.direction == "lower" and self.unit in ratios else "plain"
 
 
 class Registry(dict[str, Metric]):
@@ -136,6 +136,8 @@ _SPECS = (
     Metric("embedding.direction_consistency", "cosine", "higher", 2e-3, 0, "changes of neighbouring views against each other"),
     Metric("embedding.match_similarity", "cosine", "higher", 1e-3, 0, "patches after the edit that matched before it"),
     Metric("embedding.undefined", "views", "lower", 0, 0, "views whose embedding or change has no direction"),
+    # A counter of a cell's cost, not of a view.
+    Metric("cost.network_rows", "rows", "lower", 0, 0, "rows through the editor's network, inversions included"),
     Metric("perceptual.distance", "ratio", "lower", 1e-4, 1e-2, "perceptual distance of edited picture and render"),
     # Image metrics, consistency and fidelity: attnwarp_eval.metrics, docs/measuring/metrics.md.
     Metric("image.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of sRGB values"),

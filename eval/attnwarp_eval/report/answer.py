@@ -28,6 +28,7 @@ _UNITS = {
     "dE00": "dE00",
     "deg": "degrees",
     "pixels": "pixels",
+    "rows": "rows",
     "views": "views",
 }
 """Unit of a metric -> the word behind its figure, where the figure is not changed."""

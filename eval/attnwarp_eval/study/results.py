@@ -78,6 +78,11 @@ def _value(figures: Mapping[str, float], metric: str) -> float:
     return figures.get(metric, math.nan)
 
 
+COST = "cost."
+"""Prefix of figures that are counters of a cell's cost: ``cost.network_rows`` is
+``network_rows``."""
+
+
 def _count(table: ByView) -> int:
     return sum(map(len, table.values()))
 
@@ -152,7 +157,8 @@ class Results:
         self, probe: str, variant: str, metric: str, yaw: tuple[float, float] | None = None
     ) -> dict[str, dict[str, float]]:
         """Scene -> view (and seed) -> value; NaN where undefined, as is every figure of an edit
-        whose source was not done: such an edit takes part in no comparison.
+        whose source was not done: such an edit takes part in no comparison. A figure of cost stands
+        once a cell, at its first view, done or not.
 
         Args:
             probe, variant: whose records.
@@ -161,9 +167,14 @@ class Results:
         """
         table: dict[str, dict[str, float]] = {}
         for scene, seed, record in self.records(probe, variant):
-            for view in record.views:
+            cost = metric.startswith(COST)
+            for view in record.views[:1] if cost else record.views:
                 if yaw is None or yaw[0] <= view.yaw <= yaw[1]:
-                    value = _value(view.metrics, metric) if record.comparable else math.nan
+                    value = math.nan
+                    if cost:
+                        value = _value(record.cost.counters, metric.removeprefix(COST))
+                    elif record.comparable:
+                        value = _value(view.metrics, metric)
                     table.setdefault(scene, {})[f"{view.name}/{seed}"] = float(value)
         return table
 

@@ -185,6 +185,19 @@ def test_the_documents_say_what_the_committed_raw_results_give(name):
     assert filled(text, verdicts(ROOT / "reports"), path.parent) == text
 
 
+def test_a_claim_on_cost_compares_rows_counted_by_hand_over_all_edits():
+    results = read_parts(ROOT / "reports" / "comparison")
+    assert results.study.name == "comparison" and len(results.study.views) + 1 == 7
+    claims = [c for c in load_claims() if c.metric == "cost.network_rows" and "IGS2GS" in c.text]
+    (judged,) = decided(found(results, claims))
+    # Seven views, two guidance branches, eight steps; IGS2GS edits every view in 150 / 50 rounds.
+    rows = {"IGS2GS": 3 * 7 * 2 * 8, "attention warping": 7 * 2 * 8}
+    assert {name: side.mean for name, side in judged.sides.items()} == rows
+    # Edits whose source failed cost as much: two edits in each of 24 scenes.
+    assert judged.contrast.scenes == 24 and judged.agreement == (48, 48)
+    assert judged.contrast.shown()[0] == pytest.approx(1 / 3) and judged.verdict == "holds"
+
+
 @pytest.mark.slow
 def test_halves_of_the_committed_populations_contradict_each_other_in_no_verdict():
     folders = {path.parent for path in (ROOT / "reports").rglob(PARTS)}
