@@ -38,9 +38,6 @@ from attnwarp_eval.study.study import parse_study
 SCENES = ["spheres", "opposed", "fence", "mirror", "glass", "lens", "stack", "slats"]
 FIGURES = ("depth.abs_rel", "depth.bias_relative", "depth.coverage")
 
-LIMIT_SECONDS, LIMIT_MB = 120, 2048
-"""Limits of each step at 100,000 cells."""
-
 
 class VariantPart(Part):
     """Key that tells the variants apart, and the seconds that their cells wait, as if they

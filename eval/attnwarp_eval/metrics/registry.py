@@ -217,8 +217,6 @@ _SPECS = (
     Metric("multiview.share", "share", "none", 1e-4, 0, "share of the pixels asked about that was compared"),
     Metric("multiview.pixels", "pixels", "none", 0, 0, "pixels compared"),
     Metric("multiview.same_answer", "share", "higher", 1e-4, 0, "views whose nearest answer is the source's"),
-    Metric("multiview.views", "views", "none", 0, 0, "views that have a nearest answer"),
-    Metric("multiview.views_undefined", "views", "none", 0, 0, "views that show nothing of the edited object"),
     Metric("variability.within", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 of a view and its neighbour at the same points, in one seed"),
     Metric("variability.within_floor", "dE00", "none", 1e-3, 1e-2, "the same of the views before the edit"),
     Metric("variability.between", "dE00", "none", 1e-3, 1e-2, "mean CIEDE2000 of a view in one seed and in another"),

@@ -755,7 +755,7 @@ def test_views_of_a_seed_that_agree_less_are_a_regression():
 
 def test_a_probe_of_which_nothing_was_compared_is_too_little():
     # A count has no better direction; seconds of the machine decide what a limited method gives.
-    for figures, seconds in (({"multiview.views": 3.0}, None), (EDITED, 5.0)):
+    for figures, seconds in (({"multiview.pixels": 3.0}, None), (EDITED, 5.0)):
         side = edited(figures, seconds=seconds)
         result = compare(side, side)
         assert result.rows and not result.regressed
