@@ -4,7 +4,7 @@ flaw.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -16,11 +16,13 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.materials import MetalMaterial
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import ObjectChange
+from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import answers_of
 from attnwarp_eval.study.flaws import Edited
 from attnwarp_eval.study.probe import Work
 from attnwarp_eval.study.record import Json
-from attnwarp_eval.study.schema import StudyError
+from attnwarp_eval.study.schema import Study, StudyError
+from attnwarp_eval.study.shared.encoders import MetricsProbe
 from attnwarp_eval.truth import appearance
 from attnwarp_eval.truth.edits import edit_mask, touched
 from attnwarp_eval.two_view import Hits, TwoView
@@ -45,7 +47,46 @@ COAT = 0.04
 """Share of light that a coat of refractive index 1.5 reflects where it is seen straight on."""
 
 
-def two_answers(scene: Scene, edit: str, key: str) -> list[list[str]]:
+def cells_of_edit(
+    probe: MetricsProbe, study: Study, scenes: Mapping[str, Scene], edit: str, own: Json,
+    sources: Mapping[str, str] | None = None,
+) -> Iterator[Cell]:  # fmt: skip
+    """One cell for each scene and seed. The next scene gives the pictures of another scene.
+
+    Args:
+        probe: its name is the study's key under which ``edit`` stands.
+        edit: one with at least two answers.
+        own: what else decides the probe's numbers.
+        sources: of the cells, beside the other scene's file.
+
+    Raises:
+        StudyError: a scene has no such edit.
+    """
+    files = dict(zip(study.scene_names, study.scenes, strict=True))
+    order = list(scenes)
+    for place, (name, scene) in enumerate(scenes.items()):
+        answers = _two_answers(scene, edit, f"{probe.name}.edit")
+        other = order[(place + 1) % len(order)]
+        for seed in study.seeds:
+            spec = {
+                "probe": probe.name,
+                "protocol": probe.protocol,
+                "scene": scene.content_hash,
+                "other": scenes[other].content_hash if other != name else None,
+                "size": study.size,
+                "seed": seed,
+                "spp": study.spp,
+                "edit": edit,
+                "answers": answers,
+                **own,
+            }
+            yield Cell(
+                spec, name, "metrics", probe.name, seed, ("metrics",),
+                sources={**(sources or {}), "other": files[other]},
+            )  # fmt: skip
+
+
+def _two_answers(scene: Scene, edit: str, key: str) -> list[list[str]]:
     """Names and contents of an edit's first two answers.
 
     Raises:
@@ -61,16 +102,18 @@ def two_answers(scene: Scene, edit: str, key: str) -> list[list[str]]:
     return [[name, scene.edited(edit, answer).content_hash] for name, answer in answers[:2]]
 
 
-def true_pictures(work: Work, cameras: Mapping[float, Camera]) -> dict[str, dict[str, Array]]:
-    """(H, W, 3) sRGB by state of the scene and name of the view.
+def true_pictures(work: Work) -> tuple[list[Camera], dict[str, dict[str, Array]]]:
+    """Cameras of the cell's yaws, which are added to its world, and pictures from them.
 
-    States are "before" the edit, those of :data:`PAIRS`, and "elsewhere", another scene, where the
-    cell's spec names one.
-
-    Args:
-        cameras: by degrees from the source, which is rendered too.
+    Returns:
+        The cameras, and (H, W, 3) sRGB by state of the scene and name of the view, the source's
+        too. States are "before" the edit, those of :data:`PAIRS`, and "elsewhere", another scene,
+        where the cell's spec names one.
     """
     spec, world = work.spec, work.world
+    cameras = {yaw: turned(world.scene, yaw) for yaw in spec["yaws"]}
+    for camera in cameras.values():
+        world.add(camera)
     views = [world.source, *cameras.values()]
     edit = spec["edit"]
     for name, content in spec["answers"]:
@@ -106,7 +149,7 @@ def true_pictures(work: Work, cameras: Mapping[float, Camera]) -> dict[str, dict
         )
         for camera in views
     }
-    return {
+    return views[1:], {
         state: {name: to_srgb(np.clip(one, 0, 1)) for name, one in pictures.items()}
         for state, pictures in light.items()
     }

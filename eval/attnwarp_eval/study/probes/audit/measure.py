@@ -41,12 +41,12 @@ from attnwarp_eval.study.shared.encoders import (
 )
 from attnwarp_eval.study.shared.right_views import (
     PAIRS,
+    cells_of_edit,
     edited_target,
     true_pictures,
-    two_answers,
 )
 from attnwarp_eval.two_view import TwoView
-from attnwarp_eval.world import splats, turned
+from attnwarp_eval.world import splats
 
 REFIT_SIZE = 128
 """Side in px of the pictures that splats' colours are fitted to."""
@@ -93,34 +93,15 @@ class AuditProbe(MetricsProbe):
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
-        """One for each scene and seed. The next scene gives the pictures of another scene."""
+        """One for each scene and seed."""
         part = study.part(StudyPart)
-        identities = encoder_identities(part)
-        files = dict(zip(study.scene_names, study.scenes, strict=True))
-        order = list(scenes)
-        for place, (name, scene) in enumerate(scenes.items()):
-            answers = two_answers(scene, part.audit.edit, "audit.edit")
-            other = order[(place + 1) % len(order)]
-            for seed in study.seeds:
-                spec = {
-                    "probe": self.name,
-                    "protocol": self.protocol,
-                    "scene": scene.content_hash,
-                    "other": scenes[other].content_hash if other != name else None,
-                    "size": study.size,
-                    "seed": seed,
-                    "spp": study.spp,
-                    "rounds": study.timing_rounds,
-                    "splats": part.audit.splats.model_dump(),
-                    "encoders": identities,
-                    "edit": part.audit.edit,
-                    "answers": answers,
-                    "yaws": part.audit.yaws,
-                }
-                yield Cell(
-                    spec, name, "metrics", self.name, seed, ("metrics",),
-                    sources={**encoder_sources(part), "other": files[other]},
-                )  # fmt: skip
+        own = {
+            "rounds": study.timing_rounds,
+            "splats": part.audit.splats.model_dump(),
+            "encoders": encoder_identities(part),
+            "yaws": part.audit.yaws,
+        }
+        yield from cells_of_edit(self, study, scenes, part.audit.edit, own, encoder_sources(part))
 
     def compute(self, work: Work) -> Seconds:
         """Every metric on every condition at every yaw."""
@@ -128,10 +109,7 @@ class AuditProbe(MetricsProbe):
         with meter.stage("setup"):
             encoders = loaded(work.cell.sources, spec["encoders"])
         with meter.stage("truth"):
-            cameras = {yaw: turned(world.scene, yaw) for yaw in spec["yaws"]}
-            for camera in cameras.values():
-                world.add(camera)
-            pictures = true_pictures(work, cameras)
+            cameras, pictures = true_pictures(work)
         with meter.stage("splats"):
             model = splats(work.cell.scene_file, spec["size"], spec["seed"], **spec["splats"])
             surface = render_surface(model, world.source)
@@ -143,7 +121,7 @@ class AuditProbe(MetricsProbe):
             for state, views in pictures.items()
         }
         seconds: dict[str, list[float]] = {}
-        for place, camera in enumerate(cameras.values()):
+        for place, camera in enumerate(cameras):
             with meter.stage("truth"):
                 truth = world.pair(camera.name, spec["size"])
                 edited = edited_target(world, spec, pictures, camera, truth)

@@ -23,11 +23,10 @@ from attnwarp_eval.study.schema import Part, Study, check_distinct
 from attnwarp_eval.study.shared.encoders import MetricsProbe, Seconds
 from attnwarp_eval.study.shared.right_views import (
     PAIRS,
+    cells_of_edit,
     edited_target,
     true_pictures,
-    two_answers,
 )
-from attnwarp_eval.world import turned
 
 FLAWED = {
     flaw.key(flaw.reference): flaw for flaw in FLAWS if flaw.counts or flaw.name == "elsewhere"
@@ -78,43 +77,19 @@ class ReconstructionProbe(MetricsProbe):
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
-        """One for each scene and seed. The next scene gives the pictures of another scene."""
+        """One for each scene and seed."""
         part = study.part(StudyPart).reconstruction
-        files = dict(zip(study.scene_names, study.scenes, strict=True))
-        order = list(scenes)
-        for place, (name, scene) in enumerate(scenes.items()):
-            answers = two_answers(scene, part.edit, "reconstruction.edit")
-            other = order[(place + 1) % len(order)]
-            for seed in study.seeds:
-                spec = {
-                    "probe": self.name,
-                    "protocol": self.protocol,
-                    "scene": scene.content_hash,
-                    "other": scenes[other].content_hash if other != name else None,
-                    "size": study.size,
-                    "seed": seed,
-                    "spp": study.spp,
-                    "edit": part.edit,
-                    "answers": answers,
-                    "yaws": part.yaws,
-                }
-                yield Cell(
-                    spec, name, "metrics", self.name, seed, ("metrics",),
-                    sources={"other": files[other]},
-                )  # fmt: skip
+        yield from cells_of_edit(self, study, scenes, part.edit, {"yaws": part.yaws})
 
     def compute(self, work: Work) -> Seconds:
         """Reconstruct every set. Its figures stand under the last view's name."""
         spec, world, meter = work.spec, work.world, work.meter
         with meter.stage("truth"):
-            cameras = {yaw: turned(world.scene, yaw) for yaw in spec["yaws"]}
-            for camera in cameras.values():
-                world.add(camera)
-            pictures = true_pictures(work, cameras)
-        views = [world.source, *cameras.values()]
+            cameras, pictures = true_pictures(work)
+        views = [world.source, *cameras]
         flawed: dict[str, dict[str, Array | None]] = {name: {} for name in FLAWED}
         with meter.stage("flaws"):
-            for camera in list(cameras.values())[::2]:
+            for camera in cameras[::2]:
                 truth = world.pair(camera.name, spec["size"])
                 edited = edited_target(world, spec, pictures, camera, truth)
                 for name, flaw in FLAWED.items():
