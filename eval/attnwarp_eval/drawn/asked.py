@@ -6,12 +6,13 @@ Every drawn scene has the same edits by name, so a study names them once for a w
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.drawn.assemblies import PART_NOUNS
+from attnwarp_eval.drawn.draft import Draft, Thing, index
 from attnwarp_eval.drawn.worlds import (
     COLORS,
     FINISHES,
@@ -26,9 +27,6 @@ from attnwarp_eval.drawn.worlds import (
 )
 from attnwarp_eval.scene import solids
 from attnwarp_eval.scene.bodies import BodySpec
-
-if TYPE_CHECKING:
-    from attnwarp_eval.drawn.scenes import Draft, Thing
 
 Array = npt.NDArray[np.float64]
 Entry = dict[str, Any]
@@ -141,7 +139,7 @@ def _colour(draft: Draft) -> Entry:
 def _material(draft: Draft) -> Entry:
     rng, thing = draft.stream("edit material"), draft.things[0]
     kinds = [name for name in STATUES if name != FINISHES[thing.look.finish]]
-    finish = kinds[draft.index(rng, len(kinds))]
+    finish = kinds[index(rng, len(kinds))]
     look = Look(FINISHES.index(finish), -1, -1, draft.ground, draft.time, int(rng.random() * 2**31))
     return _edit(
         draft, "material", f"turn the {thing.kind} into a {finish} statue",
@@ -155,7 +153,7 @@ def _part(draft: Draft) -> Entry:
     rng, thing = draft.stream("edit part"), draft.things[0]
     item = max(_body(thing), key=_size)
     name = item["name"].removeprefix(f"{thing.kind}_").replace("_", " ")
-    color = BRIGHT[draft.index(rng, len(BRIGHT))]
+    color = BRIGHT[index(rng, len(BRIGHT))]
     word = PART_NOUNS.get(name, (name,))[0]
     return _edit(
         draft, "part", f"make the {word} {color}",
@@ -173,7 +171,7 @@ def _size(item: Entry) -> float:
 def _ground(draft: Draft) -> Entry:
     rng = draft.stream("edit ground")
     others = [k for k in range(len(GROUNDS)) if k != draft.ground]
-    other = others[draft.index(rng, len(others))]
+    other = others[index(rng, len(others))]
     look = Look(0, 0, -1, other, draft.time, int(rng.random() * 2**31))
     return _edit(
         draft, "ground", f"make the ground {GROUNDS[other]}",
@@ -186,7 +184,7 @@ def _light(draft: Draft) -> Entry:
     """Another time of day, of an even sky where smooth things would bend a sun into caustics."""
     rng = draft.stream("edit light")
     others = [k for k, name in enumerate(TIMES) if k != draft.time]
-    other = others[draft.index(rng, len(others))]
+    other = others[index(rng, len(others))]
     look = Look(0, 0, -1, draft.ground, other, int(rng.random() * 2**31))
     lights = look.lights if not draft.smooth else [x for x in look.lights if x["type"] == "sky"]
     return _edit(
@@ -204,7 +202,7 @@ def _hour(time: int) -> str:
 
 def _several(draft: Draft) -> Entry:
     rng, others = draft.stream("edit several"), draft.things[1:]
-    color = BRIGHT[draft.index(rng, len(BRIGHT))]
+    color = BRIGHT[index(rng, len(BRIGHT))]
     words = " and ".join(f"the {one.kind}" for one in others)
     changes = [c for one in others for c in _over(one.objects, _plain(rng, color))]
     return _edit(
@@ -232,7 +230,7 @@ def _parts(draft: Draft) -> Entry:
     rng, thing = draft.stream("edit parts"), draft.things[0]
     centers = [[round(float(x), 3) for x in row] for row in part_centers(thing, rng)]
     hues = [shade(color, rng) for color in PART_COLORS]
-    first = [draft.index(rng, len(hues)) for _ in centers]
+    first = [index(rng, len(hues)) for _ in centers]
     word = thing.kind
     answers = []
     for k in range(len(hues)):

@@ -21,8 +21,6 @@ from attnwarp_eval.truth import Geometry, two_view
 from attnwarp_eval.truth.shading import object_albedo
 from attnwarp_eval.two_view import HIDDEN, Hits
 
-Array = npt.NDArray[np.float64]
-
 FEWEST, MOST = 2, 6
 """Things that stand in a drawn scene."""
 
@@ -49,16 +47,6 @@ class Axes:
 
 
 NAMES = tuple(Axes.__dataclass_fields__)
-
-MEASURES = {
-    "occlusion": "share of the pixels at 60 degrees, inside the source's picture, that it hides",
-    "thin": "share of the pixels of things and fences within 1.5 % of the height of another object",
-    "grazing": "share of the source's pixels whose surface is turned away by more than 75 degrees",
-    "texture": "mean step of the albedo between pixels of one object, in the source",
-    "highlights": "share of the things' pixels in the source that are not diffuse",
-    "things": "number of things",
-}
-"""Quantity of each axis, in words."""
 
 
 def drawn_axes(rng: np.random.Generator, fixed: Mapping[str, float]) -> Axes:
@@ -122,7 +110,10 @@ def spread(name: str, count: int, seed: int) -> list[float]:
 
 
 def measured(scene: Scene, groups: Mapping[str, str], *, size: int = 96) -> dict[str, float]:
-    """The quantity of each axis (:data:`MEASURES`), from exact geometry and albedo.
+    """The quantity of each axis, from exact geometry and albedo.
+
+    docs/truth/drawn-scenes.md says what they are. "thin" counts the pixels of things and fences
+    within 1.5 % of the height of another object, "texture" steps between pixels of one object.
 
     Args:
         scene: with a target ``yaw060``.

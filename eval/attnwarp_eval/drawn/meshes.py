@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.errors import InputError
-from attnwarp_eval.drawn.scenes import SATURATED, Draft, Drawn, Thing
+from attnwarp_eval.drawn.draft import SATURATED, Thing, index, marks
+from attnwarp_eval.drawn.scenes import Drawn, SceneDraft
 from attnwarp_eval.drawn.worlds import COLORS, Look
 from attnwarp_eval.scene.meshes import MESH_SUFFIXES, read_mesh
 
@@ -61,7 +62,7 @@ def draw_meshes(
 
 
 @dataclass
-class _MeshDraft(Draft):
+class _MeshDraft(SceneDraft):
     """A scene of meshes while it is drawn."""
 
     meshes: list[Path] = field(default_factory=list)
@@ -79,15 +80,14 @@ class _MeshDraft(Draft):
     def choose_things(self) -> None:
         """Two or three meshes, the first the largest."""
         rng = self.stream("meshes")
-        count = 2 + self.index(rng, 2)
+        count = 2 + index(rng, 2)
         shiny, patterned = (
-            self.marks(rng, count, share)
-            for share in (0.7 * self.axes.highlights, self.axes.texture)
+            marks(rng, count, share) for share in (0.7 * self.axes.highlights, self.axes.texture)
         )
         left: list[Path] = []
         for k in range(count):
             left = left or list(self.meshes)
-            path = left.pop(self.index(rng, len(left)))
+            path = left.pop(index(rng, len(left)))
             own = self.stream(f"mesh {k}")
             look = self.look_of(own, path.stem, shiny[k], patterned[k])
             size = 1.15 if k == 0 else 0.5 + 0.5 * self.axes.occlusion

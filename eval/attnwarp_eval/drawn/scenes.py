@@ -12,23 +12,31 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.drawn import asked
 from attnwarp_eval.drawn.assemblies import KINDS, USUAL, Assembly
-from attnwarp_eval.drawn.axes import Axes, drawn_axes, to_words
+from attnwarp_eval.drawn.axes import Axes, to_words
+from attnwarp_eval.drawn.draft import (
+    GENERATOR,
+    SATURATED,
+    Draft,
+    Thing,
+    between,
+    index,
+    marks,
+    unseen_colors,
+)
 from attnwarp_eval.drawn.objects import body, plain_numbers
 from attnwarp_eval.drawn.worlds import (
     COLORS,
     FINISHES,
-    GROUNDS,
     OBJECTS,
     TIMES,
     Look,
-    held_out,
     shade,
 )
 from attnwarp_eval.scene.bodies import BodySpec
@@ -37,55 +45,14 @@ from attnwarp_eval.scene.transport import likely_bounces
 
 Array = npt.NDArray[np.float64]
 
-GENERATOR = 1
-"""Raise it when the same seed and number would give another scene."""
-
 FIRST_SHAPE = 2**40
 """Shapes of drawn scenes count from here; those that training draws lie far below."""
 
 YAWS = (10, 30, 45, 60, 90, 120, 150, 180)
 """Degrees from the source to the targets, counter-clockwise."""
 
-SATURATED = ("red", "orange", "yellow", "green", "blue", "purple", "pink")
-
 SUBJECTS = tuple(kind for kind in KINDS if kind in OBJECTS)
 """Things with named parts that have a colour which training never shows them in."""
-
-
-def unseen_colors(kind: str) -> list[int]:
-    """Colours that training never shows a thing of this kind in.
-
-    Example:
-        >>> [COLORS[c] for c in unseen_colors("rabbit")]
-        ['yellow']
-    """
-    return [c for c in range(len(COLORS)) if held_out(OBJECTS.index(kind), c)]
-
-
-@dataclass(frozen=True)
-class Thing:
-    """One thing of a drawn scene.
-
-    Attributes:
-        kind: a word of :data:`~attnwarp_eval.drawn.worlds.OBJECTS`.
-        instance: number of its shape.
-        look: finish and colours; of the first thing, of its first part.
-        objects: as the scene's file has them.
-        reach: radius of the circle on the ground that holds it, and its height.
-        points: (N, 3) points on a mesh, turned and scaled, before it is moved to its place.
-    """
-
-    kind: str
-    instance: int
-    look: Look
-    objects: list[dict[str, Any]]
-    reach: tuple[float, float]
-    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
-
-    @property
-    def names(self) -> list[str]:
-        """Names of its objects."""
-        return [item["name"] for item in self.objects]
 
 
 @dataclass(frozen=True)
@@ -124,27 +91,15 @@ def draw(number: int, seed: int, axes: Mapping[str, float] | None = None) -> Dra
         >>> draw(3, seed=7, axes={"things": 4}).spec == scene.spec
         True
     """
-    return Draft(number, seed, axes or {}).finished()
+    return SceneDraft(number, seed, axes or {}).finished()
 
 
-@dataclass
-class Draft:
-    """A scene while it is drawn."""
-
-    number: int
-    seed: int
-    fixed: Mapping[str, float]
-    things: list[Thing] = field(default_factory=list)
-    places: list[tuple[float, float, float]] = field(default_factory=list)
-    fences: list[dict[str, Any]] = field(default_factory=list)
-    extras: list[dict[str, Any]] = field(default_factory=list)
-    files: dict[str, Path] = field(default_factory=dict)
-    word: ClassVar[str] = "drawn"
+class SceneDraft(Draft):
+    """A scene while everything in it is drawn in turn."""
 
     def finished(self) -> Drawn:
         """The scene, after everything has been drawn in turn."""
-        self.axes = drawn_axes(self.stream("axes"), self.fixed)
-        self._choose_surroundings()
+        self.begin()
         self.choose_things()
         self._place_things()
         self._place_extras()
@@ -173,55 +128,17 @@ class Draft:
         spec = SceneSpec.model_validate(data)
         return Drawn(spec, data, self.axes, tuple(self.things), groups, self.files)
 
-    def stream(self, what: str) -> np.random.Generator:
-        """Random numbers for one aspect, which no other aspect's draws move."""
-        return np.random.default_rng([GENERATOR, self.seed, self.number, *what.encode()])
-
-    def index(self, rng: np.random.Generator, count: int) -> int:
-        """An index below ``count``."""
-        return _index(rng, count)
-
-    def marks(self, rng: np.random.Generator, count: int, share: float) -> list[bool]:
-        """That share of ``count`` things, marked in an order of chance."""
-        return _marks(rng, count, share)
-
-    def colors_of(self, kind: str) -> list[int]:
-        """Colours that training never shows a thing of this kind in, of which its own is one."""
-        return unseen_colors(kind)
-
-    def other_color(self, rng: np.random.Generator, color: int) -> int:
-        """The accent of the scene, or a bright colour where that is ``color``."""
-        second = COLORS.index(self.accent)
-        while second == color:
-            second = COLORS.index(SATURATED[_index(rng, len(SATURATED))])
-        return second
-
     # What is there ----------------------------------------------------------------------------
-
-    def _choose_surroundings(self) -> None:
-        rng = self.stream("around")
-        self.accent = SATURATED[_index(rng, len(SATURATED))]
-        self.ground = _index(rng, len(GROUNDS))
-        smooth, fog = rng.random() < 0.25, rng.random() < 0.08
-        time = _choice(rng, TIMES, (0.4, 0.2, 0.15, 0.25))
-        # Light of a sun that glass or a mirror bends is a caustic, which would double the cost of
-        # every picture. Smooth things stand under an even sky.
-        self.smooth, self.time = smooth, TIMES.index("cloudy" if smooth else time)
-        self.look = Look(0, 0, -1, self.ground, self.time, int(rng.integers(2**31)))
-        self.lights = [dict(light) for light in self.look.lights]
-        self.fog = None
-        if fog and not smooth:
-            self.fog = {"sigma_t": _between(rng, 0.02, 0.06), "albedo": 0.95, "g": 0.4}
 
     def choose_things(self) -> None:
         """Draw what stands there."""
         rng = self.stream("things")
         count = self.axes.things
-        shiny = _marks(rng, count, 0.7 * self.axes.highlights)
-        patterned = _marks(rng, count, self.axes.texture)
-        kinds = [SUBJECTS[_index(rng, len(SUBJECTS))]]
+        shiny = marks(rng, count, 0.7 * self.axes.highlights)
+        patterned = marks(rng, count, self.axes.texture)
+        kinds = [SUBJECTS[index(rng, len(SUBJECTS))]]
         while len(kinds) < count:
-            kind = OBJECTS[_index(rng, len(OBJECTS))]
+            kind = OBJECTS[index(rng, len(OBJECTS))]
             # A second thing of one colour half of the time: kinds share the colours kept for them.
             twin = len(kinds) == 1 and rng.random() < 0.5
             if kind in kinds or (
@@ -234,43 +151,10 @@ class Draft:
             look = self.look_of(own, kind, shiny[k], patterned[k])
             instance = FIRST_SHAPE + int(own.integers(2**32))
             size = 1.0 if k == 0 else 0.4 + 0.7 * self.axes.occlusion
-            scale = round(size * _between(own, 0.95, 1.2), 3)
-            yaw = round(_between(own, 0, 360), 1)
+            scale = round(size * between(own, 0.95, 1.2), 3)
+            yaw = round(between(own, 0, 360), 1)
             make = self._assembly if k == 0 else self._single
             self.things.append(make(own, kind, instance, look, scale, yaw))
-
-    def look_of(self, rng: np.random.Generator, kind: str, shiny: bool, patterned: bool) -> Look:
-        """A look that training never shows this kind in, or one without a colour."""
-        colors = self.colors_of(kind)
-        color = colors[_index(rng, len(colors))]
-        second = self.other_color(rng, color)
-        if shiny:
-            finish = ("golden", "silver", "bronze")[_index(rng, 3)]
-            if kind in ("ball", "cube") and rng.random() < 0.7:
-                finish = "shiny"
-        elif patterned:
-            finish = ("striped", "checked", "wooden", "marble")[_pick(rng, (3, 3, 1, 1))]
-        else:
-            finish = "stone" if rng.random() < 0.15 else "plain"
-        colored = finish in ("plain", "shiny", "striped", "checked")
-        return Look(
-            FINISHES.index(finish), color if colored else -1,
-            second if finish in ("striped", "checked") else -1,
-            self.ground, self.time, int(rng.integers(2**31)),
-        )  # fmt: skip
-
-    def surface(self, look: Look) -> dict[str, Any]:
-        """A surface as a file has it, its pattern finer where the texture's axis is higher."""
-        surface = {key: dict(value) for key, value in look.surface.items()}
-        texture, material = surface.get("texture"), surface.get("material")
-        if material and material["type"] == "metal":
-            # Smoother metal throws specks of the sun that few samples a pixel make noise of.
-            material["roughness"] = round(0.2 + material["roughness"], 3)
-        if texture and look.second >= 0:
-            texture["size"] = round(texture["size"] * (1.5 - 0.8 * self.axes.texture), 3)
-        if texture:
-            texture["variation"] = round(texture["variation"] * (0.3 + self.axes.texture), 3)
-        return surface
 
     def _single(
         self,
@@ -293,12 +177,12 @@ class Draft:
     def _exact(self, kind: str, instance: int, look: Look, scale: float, yaw: float) -> Thing:
         """A ball or a cube as an exact shape, which alone can be plastic."""
         rng = np.random.default_rng([instance, *b"exact"])
-        r = round(scale * _between(rng, 0.36, 0.46), 3)
+        r = round(scale * between(rng, 0.36, 0.46), 3)
         if kind == "ball":
             shape: dict[str, Any] = {"type": "sphere", "center": [0, 0, r], "radius": r}
             reach = r
         else:
-            h = round(2 * r * _between(rng, 0.8, 1.1), 3)
+            h = round(2 * r * between(rng, 0.8, 1.1), 3)
             shape = {"type": "box", "center": [0, 0, h / 2], "size": [2 * r, 2 * r, h], "yaw": yaw}
             reach = 1.42 * r
         thing = {"name": kind, "shape": shape, **self.surface(look)}
@@ -323,7 +207,7 @@ class Draft:
             own = look
             if k and not look.statue:
                 words = USUAL.get(name, ()) if rng.random() < 0.5 else SATURATED
-                color = COLORS.index((words or SATURATED)[_index(rng, len(words or SATURATED))])
+                color = COLORS.index((words or SATURATED)[index(rng, len(words or SATURATED))])
                 finish = FINISHES.index("plain")
                 own = Look(finish, color, -1, look.ground, look.time, int(rng.integers(2**31)))
             label = f"{kind}_{name}".replace(" ", "_")
@@ -337,9 +221,9 @@ class Draft:
         rng = self.stream("places")
         for k, thing in enumerate(self.things):
             if k == 0:
-                place = (_between(rng, -0.1, 0.1), _between(rng, -0.1, 0.1))
+                place = (between(rng, -0.1, 0.1), between(rng, -0.1, 0.1))
             else:
-                gap = 0.02 + (1 - self.axes.occlusion) * _between(rng, 0.3, 0.9)
+                gap = 0.02 + (1 - self.axes.occlusion) * between(rng, 0.3, 0.9)
                 # What is tall stays out of the way between the source and the first thing.
                 tall = thing.reach[1] > 0.4 * self.things[0].reach[1]
                 place = self._free(rng, thing.reach[0], gap, clear=40.0 if tall else 0.0)
@@ -365,11 +249,11 @@ class Draft:
         """A mirror, glass, or a lamp at night."""
         rng = self.stream("extras")
         if self.smooth:
-            kind = ("mirror ball", "mirror", "glass ball", "pane")[_index(rng, 4)]
-            r = round(_between(rng, 0.2, 0.34), 3)
+            kind = ("mirror ball", "mirror", "glass ball", "pane")[index(rng, 4)]
+            r = round(between(rng, 0.2, 0.34), 3)
             # A mirror hides what stands behind it from half of the views: small, and not near.
             wide = {"mirror": 0.4, "pane": 0.6}.get(kind, r)
-            gap = _between(rng, 0.5, 0.9) if kind == "mirror" else _between(rng, 0.05, 0.4)
+            gap = between(rng, 0.5, 0.9) if kind == "mirror" else between(rng, 0.05, 0.4)
             x, y = self._free(rng, wide, gap, clear=50.0)
             self.places.append((x, y, wide))
             ball = {"type": "sphere", "center": [x, y, r], "radius": r}
@@ -387,11 +271,11 @@ class Draft:
             }[kind]
             self.extras.append({"name": name, "shape": shape, "material": material})
         if TIMES[self.time] == "night" and rng.random() < 0.7:
-            r = round(_between(rng, 0.1, 0.16), 3)
-            x, y = self._free(rng, r, _between(rng, 0.1, 0.5), clear=50.0)
+            r = round(between(rng, 0.1, 0.16), 3)
+            x, y = self._free(rng, r, between(rng, 0.1, 0.5), clear=50.0)
             self.places.append((x, y, r))
-            z = _between(rng, 0.9, 1.5)
-            light = {"radiance": _between(rng, 12, 22), "color": "#ffd9a0"}
+            z = between(rng, 0.9, 1.5)
+            light = {"radiance": between(rng, 12, 22), "color": "#ffd9a0"}
             lamp = {"type": "sphere", "center": [x, y, z], "radius": r}
             post = {"type": "box", "center": [x, y, (z - r) / 2], "size": [0.05, 0.05, z - r]}
             dark = {"type": "plain", "color": "#4a4440", "variation": 0.1}
@@ -404,10 +288,10 @@ class Draft:
             count = 5 + int(9 * thin)
             width, step = 0.055 - 0.035 * thin, 0.16 - 0.05 * thin
             half = 0.5 * step * (count - 1) + width
-            high = _between(rng, 0.45, 0.9)
+            high = between(rng, 0.45, 0.9)
             for attempt in range(60):
-                angle = math.radians(_between(rng, 0, 360))
-                far = self.places[0][2] + _between(rng, 0.15, 0.5) + 0.04 * attempt
+                angle = math.radians(between(rng, 0, 360))
+                far = self.places[0][2] + between(rng, 0.15, 0.5) + 0.04 * attempt
                 middle = (far * math.cos(angle), far * math.sin(angle))
                 along = (-math.sin(angle), math.cos(angle))
                 if all(_clear(middle, along, half, p) for p in self.places):
@@ -421,7 +305,7 @@ class Draft:
                 middle[1] - uy * step * (count - 1) / 2,
             ]
             texture = {
-                "type": "plain", "color": _hue(rng, SATURATED[_index(rng, len(SATURATED))]),
+                "type": "plain", "color": _hue(rng, SATURATED[index(rng, len(SATURATED))]),
                 "variation": 0.2, "grain": 0.05,
             }  # fmt: skip
             pickets = {
@@ -441,13 +325,13 @@ class Draft:
         rng = self.stream("cameras")
         self.extent = max(math.hypot(x, y) + r for x, y, r in self.places)
         height = self.things[0].reach[1]
-        self.radius = max(2.6, 1.15 * self.extent + 0.7) * _between(rng, 1.0, 1.15)
-        look = [_between(rng, -0.05, 0.05), _between(rng, -0.05, 0.05), round(0.42 * height, 2)]
+        self.radius = max(2.6, 1.15 * self.extent + 0.7) * between(rng, 1.0, 1.15)
+        look = [between(rng, -0.05, 0.05), between(rng, -0.05, 0.05), round(0.42 * height, 2)]
         fov = math.degrees(2 * math.atan(1.1 * max(height, 1.0) / self.radius))
         tilt = 30 - 23 * self.axes.grazing
         views = []
         for yaw in (0, *YAWS):
-            angle = math.radians(max(4.0, tilt + _between(rng, -3, 3)))
+            angle = math.radians(max(4.0, tilt + between(rng, -3, 3)))
             high = look[2] + self.radius * math.tan(angle)
             view = {"yaw": yaw, "height": round(high, 2)}
             views.append(view if yaw else {"name": "source", **view})
@@ -461,12 +345,12 @@ class Draft:
         texture = dict(self.look.floor)
         if rng.random() < self.axes.texture * 0.6:
             colors = [_hue(rng, self.accent), _hue(rng, "white")]
-            size = round(_between(rng, 0.3, 0.6) * (1.4 - 0.7 * self.axes.texture), 2)
+            size = round(between(rng, 0.3, 0.6) * (1.4 - 0.7 * self.axes.texture), 2)
             texture = {
                 "type": "checker", "colors": colors, "size": size, "variation": 0.1, "grain": 0.05,
             }  # fmt: skip
             if rng.random() < 0.5:
-                angle = _between(rng, 0, math.pi)
+                angle = between(rng, 0, math.pi)
                 way = [round(math.cos(angle), 2), round(math.sin(angle), 2), 0.0]
                 texture |= {"type": "stripes", "direction": way}
         texture["variation"] = round(texture["variation"] * (0.4 + 0.6 * self.axes.texture), 3)
@@ -476,9 +360,9 @@ class Draft:
     def _walls(self) -> Iterator[dict[str, Any]]:
         """Walls behind the cameras, where they leave the things in the sun."""
         rng = self.stream("walls")
-        far = self.radius + _between(rng, 0.8, 2.2)
+        far = self.radius + between(rng, 0.8, 2.2)
         for k in range(4):
-            wanted, high = rng.random() < 0.6, _between(rng, 1.0, 2.8)
+            wanted, high = rng.random() < 0.6, between(rng, 1.0, 2.8)
             texture = self._wall(rng)
             angle = math.pi / 2 * k
             for light in self.lights:
@@ -497,12 +381,12 @@ class Draft:
             yield {"name": f"wall{k}", "shape": shape, "texture": texture}
 
     def _wall(self, rng: np.random.Generator) -> dict[str, Any]:
-        kind = ("bricks", "checker", "stripes", "noise")[_index(rng, 4)]
-        color = SATURATED[_index(rng, len(SATURATED))]
+        kind = ("bricks", "checker", "stripes", "noise")[index(rng, 4)]
+        color = SATURATED[index(rng, len(SATURATED))]
         if rng.random() > 0.3 + self.axes.texture:
             kind = "plain"
         first, second = _hue(rng, color), _hue(rng, "white" if rng.random() < 0.5 else "grey")
-        size = round(_between(rng, 0.3, 0.6), 2)
+        size = round(between(rng, 0.3, 0.6), 2)
         match kind:
             case "bricks":
                 return {"type": "bricks", "colors": [first, _hue(rng, color)], "mortar": second,
@@ -516,7 +400,7 @@ class Draft:
                 }
             case "stripes":
                 return {"type": "stripes", "colors": [first, second], "size": size,
-                        "direction": [1, 1, round(_between(rng, -0.5, 0.5), 2)]}  # fmt: skip
+                        "direction": [1, 1, round(between(rng, -0.5, 0.5), 2)]}  # fmt: skip
             case "noise":
                 return {"type": "noise", "colors": ["#24391a", "#46652c", "#7fa04e"], "size": size,
                         "octaves": 5, "variation": 0.4}  # fmt: skip
@@ -546,36 +430,6 @@ def _own_bounces(spec: SceneSpec, edit: Any, answer: Any, own: Any, entry: dict[
     number = likely_bounces(apply(spec, edit, answer))
     if number != own:
         entry["bounces"] = number
-
-
-# Draws that do not depend on NumPy's own algorithms for them ---------------------------------------
-
-
-def _index(rng: np.random.Generator, count: int) -> int:
-    return min(int(rng.random() * count), count - 1)
-
-
-def _between(rng: np.random.Generator, low: float, high: float) -> float:
-    return round(low + (high - low) * float(rng.random()), 4)
-
-
-def _pick(rng: np.random.Generator, weights: Sequence[float]) -> int:
-    at = rng.random() * sum(weights)
-    for k, weight in enumerate(weights):
-        at -= weight
-        if at < 0:
-            return k
-    return len(weights) - 1
-
-
-def _choice(rng: np.random.Generator, words: Sequence[str], weights: Sequence[float]) -> str:
-    return words[_pick(rng, weights)]
-
-
-def _marks(rng: np.random.Generator, count: int, share: float) -> list[bool]:
-    """That share of ``count`` things, marked in an order of chance."""
-    order = sorted(range(count), key=lambda k: (rng.random(), k))
-    return [order.index(k) < round(share * count) for k in range(count)]
 
 
 def _hue(rng: np.random.Generator, color: str) -> str:
