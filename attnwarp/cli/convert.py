@@ -16,7 +16,7 @@ from attnwarp.cli.options import (
     Reading,
     ScreenFilterOption,
     SplatKindOption,
-    reading_options,
+    options_of,
 )
 from attnwarp.cli.shell import check_out, clear_errors
 from attnwarp.reporting import reporter
@@ -155,7 +155,7 @@ def _check_start(path: Path) -> None:
             )
 
 
-@reading_options()
+@options_of(Reading)
 def undistort(
     data: DataArgument,
     out: Annotated[Path, typer.Argument(help="Folder for transforms.json and images/.")],

@@ -11,22 +11,6 @@ from typing import Annotated, Any
 import typer
 
 from attnwarp.cli.bundled_scene import SIZE, capture, exact_masks, is_scene
-from attnwarp.cli.edit_image import (
-    MOST_PIXELS,
-    SEGMENTER,
-    AtOption,
-    BoxOption,
-    ControlOption,
-    EditorOption,
-    InstructionOption,
-    MaskOption,
-    SegmenterOption,
-    ThreadsOption,
-    TuneOutsideOption,
-    TurntableOption,
-    WhereOption,
-    check_segmenter,
-)
 from attnwarp.cli.files import (
     check_inputs_stay,
     check_seen,
@@ -35,17 +19,17 @@ from attnwarp.cli.files import (
     warn_of_misfit,
 )
 from attnwarp.cli.options import (
+    MOST_PIXELS,
     AntialiasedOption,
     DataArgument,
-    DeviceOption,
-    DtypeOption,
+    Editing,
+    EditorOption,
+    InstructionOption,
     Kind,
-    LowMemoryOption,
-    MaxSizeOption,
     Reading,
     ScreenFilterOption,
     Store,
-    reading_options,
+    options_of,
 )
 from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
 from attnwarp.editing.small import check_words, guide_of
@@ -59,7 +43,7 @@ FIT_ITERATIONS, FIT_SPLATS = 3_000, 30_000
 """Limits of the fit that begins an edit without splats."""
 
 
-@reading_options()
+@options_of(Editing, Reading)
 def edit(
     data: DataArgument,
     instruction: InstructionOption,
@@ -82,21 +66,9 @@ def edit(
             " (see docs/method/algorithm.md).",
         ),
     ] = "corrected",
-    source: Annotated[
-        str | None, typer.Option(metavar="VIEW", help="Name or number; the first if left out.")
-    ] = None,
     source_picture: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The source view, edited elsewhere.")
     ] = None,
-    masks: Annotated[
-        Path | None, typer.Option(help="Folder of PNG masks, NAME.png; white is edited.")
-    ] = None,
-    mask: MaskOption = None,
-    box: BoxOption = None,
-    at: AtOption = None,
-    words: WhereOption = None,
-    segmenter: SegmenterOption = None,
-    tune_outside: TuneOutsideOption = False,
     stages: Annotated[int | None, typer.Option(min=1, help="Of editing and tuning (3).")] = None,
     views_per_stage: Annotated[
         int | None, typer.Option(min=1, help="New views a stage edits.")
@@ -133,15 +105,9 @@ def edit(
     ] = None,
     antialiased: AntialiasedOption = None,
     screen_filter: ScreenFilterOption = None,
-    max_size: MaxSizeOption = None,
     store: Annotated[Store, typer.Option(help="Where recorded features are kept.")] = Store.cpu,
-    device: DeviceOption = "auto",
-    dtype: DtypeOption = "auto",
-    low_memory: LowMemoryOption = False,
-    threads: ThreadsOption = None,
-    control: ControlOption = None,
-    turntable: TurntableOption = None,
     *,
+    editing: Editing,
     reading: Reading,
 ) -> None:
     """Edit a scene: one view by an instruction, the others along with it, the splats on all.
@@ -172,26 +138,22 @@ def edit(
             of_fit={"--fit-iterations": fit_iterations, "--max-splats": max_splats},
             of_file={"--antialiased": antialiased, "--screen-filter": screen_filter},
         )
-        check_segmenter(segmenter, words)
         check_out(out)
         results = ("edited.ply", "edited-3dgs.ply")
-        check_inputs_stay((out / name for name in results), (source_picture, ply, mask))
+        check_inputs_stay((out / name for name in results), (source_picture, ply, editing.mask))
         check_words(instruction)
         guide_of(editor)  # refuses what is no editor
         from attnwarp import methods
-        from attnwarp.methods.marks import Marks, numbers
+        from attnwarp.methods.marks import Marks
 
-        marks = Marks(
-            masks, mask, numbers(box, "X0,Y0,X1,Y1", "--box"), numbers(at, "X,Y", "--at"), words,
-            segmenter or SEGMENTER,
-        )  # fmt: skip
-
+        edit_options = editing.checked()
         settings = methods.preset("attention_warping", preset, **changes)
-        use_threads(threads)
+        use_threads(editing.threads)
         if bundled:
             data = capture(str(data), out / "scene", report)
-            if masks is None and not marks.of_source:
-                marks = replace(marks, masks=exact_masks(data, instruction, report))
+            if editing.masks is None and not edit_options.marks.of_source:
+                marks = Marks(exact_masks(data, instruction, report))
+                edit_options = replace(edit_options, marks=marks)
         dataset = read_views(data, reading)
         splats = None if ply is None else read_splats(ply, kind, antialiased, screen_filter)
         if ply is not None and splats is not None:
@@ -200,19 +162,13 @@ def edit(
         from attnwarp.methods.command import FitPlan, edit_dataset
 
         result, page = edit_dataset(
-            dataset, splats, editor, instruction, settings, out,
+            dataset, splats, editor, instruction, settings, out, edit_options,
             fit_plan=FitPlan(
                 fit_iterations or FIT_ITERATIONS,
                 (kind or Kind.two).value[:2],
                 max_splats or FIT_SPLATS,
             ),
-            source=source,
-            source_picture=source_picture, marks=marks,
-            tune_outside=tune_outside, max_size=max_size,
-            store=store.value,
-            device=device, dtype=dtype, low_memory=low_memory, threads=threads,
-            control=control, turntable=turntable,
-            report=report,
+            source_picture=source_picture, store=store.value, report=report,
         )  # fmt: skip
         seconds = sum(result.seconds.values())
         views = len(result.edited)

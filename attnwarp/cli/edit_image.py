@@ -10,7 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from attnwarp.cli.options import DeviceOption, DtypeOption, LowMemoryOption
+from attnwarp.cli.options import (
+    MOST_PIXELS,
+    SEGMENTER,
+    AtOption,
+    BoxOption,
+    DeviceOption,
+    DtypeOption,
+    InstructionOption,
+    LowMemoryOption,
+    SegmenterOption,
+    ThreadsOption,
+    WhereOption,
+    check_segmenter,
+)
 from attnwarp.editing.small import bundled, check_words, guide_of
 from attnwarp.errors import InputWarning
 from attnwarp.reporting import reporter
@@ -20,72 +33,15 @@ if TYPE_CHECKING:
 
 TILE_COLUMNS = 5
 
-MOST_PIXELS = 4096
-"""Longest side that an edit works at; more is a typing error that would take all the memory."""
-
 MOST_STRETCH = 0.03
 """Change of a picture's shape that is not worth a word."""
 
-SEGMENTER = "clip-parts"
-"""Segmenter of ``--where`` if ``--segmenter`` is left out."""
-
-InstructionOption = Annotated[str, typer.Option(help='What to change, such as "make it red".')]
-EditorOption = Annotated[
-    str,
-    typer.Option(
-        metavar="NAME|FOLDER|BASE,CONTROLNET",
-        help="A bundled editor, or a folder or two in diffusers' format.",
-    ),
-]
 PictureEditorOption = Annotated[
     str,
     typer.Option(
         metavar="NAME|FOLDER",
         help="A bundled editor that takes pictures, or a folder in diffusers' format.",
     ),
-]
-WhereOption = Annotated[
-    str | None,
-    typer.Option(
-        "--where", metavar="WORDS", help='What is edited, such as "bear"; the rest stays.'
-    ),
-]
-MaskOption = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Mask of the source view, lifted into all; white is edited."),
-]
-BoxOption = Annotated[
-    str | None,
-    typer.Option(metavar="X0,Y0,X1,Y1", help="Box around it, px of the (source) picture."),
-]
-AtOption = Annotated[
-    str | None,
-    typer.Option(metavar="X,Y", help="Point on it, px of the (source) picture."),
-]
-TuneOutsideOption = Annotated[
-    bool,
-    typer.Option("--tune-outside", help="Tune splats that no mask marks, too; else they stay."),
-]
-SegmenterOption = Annotated[
-    str | None,
-    typer.Option(
-        help="What --where asks: clip-parts if left out, or DINO_FOLDER,SAM_FOLDER (transformers)."
-    ),
-]
-ControlOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--control/--no-control",
-        help="Edit the page's views each alone too, for comparison; on with a bundled editor.",
-    ),
-]
-TurntableOption = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Film of the scene turning, before and after: .gif or .mp4."),
-]
-ThreadsOption = Annotated[
-    int | None,
-    typer.Option(min=1, help="CPU threads; if left out, one for a small editor, else all cores."),
 ]
 
 
@@ -214,12 +170,6 @@ def edit_image(
     if sheet is not None:
         _write(sheet, _sheet(tiles))
     typer.echo(out)
-
-
-def check_segmenter(segmenter: str | None, words: str | None) -> None:
-    """Refuse ``--segmenter`` without ``--where``."""
-    if segmenter is not None and words is None:
-        raise ValueError("--segmenter: needs --where, the words that it looks for")
 
 
 def _read(path: Path) -> Image:

@@ -24,7 +24,7 @@ from attnwarp.cli.options import (
     MaxSizeOption,
     Reading,
     RenderThreadsOption,
-    reading_options,
+    options_of,
 )
 from attnwarp.cli.shell import STOPPED, assignments, check_out, clear_errors, use_threads
 from attnwarp.process import asked_to_stop
@@ -44,7 +44,7 @@ RESULTS = ("splats.ply", "checkpoint.pt", "history.jsonl", "settings.json")
 """Files of a fit beside ``held_out``."""
 
 
-@reading_options()
+@options_of(Reading)
 def fit(
     data: DataArgument,
     out: Annotated[Path, typer.Option(help="Folder for the result; a fit in it is resumed.")],

@@ -8,12 +8,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from attnwarp import __version__
 from attnwarp.cli.shell import begin
+
+if TYPE_CHECKING:
+    from attnwarp.methods.command import EditOptions
 
 
 class Kind(StrEnum):
@@ -52,6 +55,51 @@ class Coordinates(StrEnum):
     world = "world"
     relative = "relative"
 
+
+MOST_PIXELS = 4096
+"""Longest side that an edit works at; more is a typing error that would take all the memory."""
+
+SEGMENTER = "clip-parts"
+"""Segmenter of ``--where`` if ``--segmenter`` is left out."""
+
+InstructionOption = Annotated[str, typer.Option(help='What to change, such as "make it red".')]
+
+EditorOption = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME|FOLDER|BASE,CONTROLNET",
+        help="A bundled editor, or a folder or two in diffusers' format.",
+    ),
+]
+
+WhereOption = Annotated[
+    str | None,
+    typer.Option(
+        "--where", metavar="WORDS", help='What is edited, such as "bear"; the rest stays.'
+    ),
+]
+
+BoxOption = Annotated[
+    str | None,
+    typer.Option(metavar="X0,Y0,X1,Y1", help="Box around it, px of the (source) picture."),
+]
+
+AtOption = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y", help="Point on it, px of the (source) picture."),
+]
+
+SegmenterOption = Annotated[
+    str | None,
+    typer.Option(
+        help="What --where asks: clip-parts if left out, or DINO_FOLDER,SAM_FOLDER (transformers)."
+    ),
+]
+
+ThreadsOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="CPU threads; if left out, one for a small editor, else all cores."),
+]
 
 DeviceOption = Annotated[
     str, typer.Option(help="cpu, cuda, or auto: a GPU where there is one.", metavar="DEVICE")
@@ -140,25 +188,112 @@ class Reading:
     ] = None
 
 
-def reading_options(*, without: str | None = None) -> Callable[[Callable[..., None]], Any]:
-    """Give a command an option for each field of `Reading`, in place of its argument ``reading``.
+def check_segmenter(segmenter: str | None, words: str | None) -> None:
+    """Refuse ``--segmenter`` without ``--where``."""
+    if segmenter is not None and words is None:
+        raise ValueError("--segmenter: needs --where, the words that it looks for")
+
+
+@dataclass(frozen=True)
+class Editing:
+    """Options of editing a scene by any method."""
+
+    source: Annotated[
+        str | None,
+        typer.Option(
+            metavar="VIEW",
+            help="Name or number of the source view, which is marked; the first if left out.",
+        ),
+    ] = None
+    masks: Annotated[
+        Path | None, typer.Option(help="Folder of PNG masks, NAME.png; white is edited.")
+    ] = None
+    mask: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Mask of the source view, lifted into all; white is edited."
+        ),
+    ] = None
+    box: BoxOption = None
+    at: AtOption = None
+    words: WhereOption = None
+    segmenter: SegmenterOption = None
+    tune_outside: Annotated[
+        bool,
+        typer.Option("--tune-outside", help="Tune splats that no mask marks, too; else they stay."),
+    ] = False
+    max_size: MaxSizeOption = None
+    device: DeviceOption = "auto"
+    dtype: DtypeOption = "auto"
+    low_memory: LowMemoryOption = False
+    threads: ThreadsOption = None
+    control: Annotated[
+        bool | None,
+        typer.Option(
+            "--control/--no-control",
+            help="Edit the page's views each alone too, for comparison; on with a bundled editor.",
+        ),
+    ] = None
+    turntable: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Film of the scene turning, before and after: .gif or .mp4."
+        ),
+    ] = None
+
+    def checked(self) -> EditOptions:
+        """The options as an edit takes them.
+
+        Raises:
+            InputError, ValueError: two ways to mark what is edited, or one that says nothing.
+        """
+        check_segmenter(self.segmenter, self.words)
+        from attnwarp.methods.command import EditOptions
+        from attnwarp.methods.marks import Marks, numbers
+
+        marks = Marks(
+            self.masks, self.mask, numbers(self.box, "X0,Y0,X1,Y1", "--box"),
+            numbers(self.at, "X,Y", "--at"), self.words, self.segmenter or SEGMENTER,
+        )  # fmt: skip
+        return EditOptions(
+            marks, self.tune_outside, self.source, self.max_size, self.device, self.dtype,
+            self.low_memory, self.threads, self.control, self.turntable,
+        )  # fmt: skip
+
+
+def options_of(
+    *groups: type[Any], without: str | None = None
+) -> Callable[[Callable[..., None]], Any]:
+    """Give a command an option for each field of dataclasses, in place of an argument for each.
 
     Typer reads a command's options from its signature, so the fields are put there.
 
     Args:
+        groups: `Reading` for the argument ``reading``, `Editing` for ``editing``.
         without: a field that is no option of this command and keeps its default.
     """
-    fields = inspect.signature(Reading, eval_str=True).parameters
-    options = [field for name, field in fields.items() if name != without]
+    fields = {
+        group: [
+            field
+            for name, field in inspect.signature(group, eval_str=True).parameters.items()
+            if name != without
+        ]
+        for group in groups
+    }
+    names = {group: group.__name__.lower() for group in groups}
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
         def run(**values: Any) -> None:
-            reading = Reading(**{option.name: values.pop(option.name) for option in options})
-            command(**values, reading=reading)
+            made = {
+                names[group]: group(**{option.name: values.pop(option.name) for option in options})
+                for group, options in fields.items()
+            }
+            command(**values, **made)
 
         signature = inspect.signature(command, eval_str=True)
-        own = [p for p in signature.parameters.values() if p.name != "reading"]
+        own = [p for p in signature.parameters.values() if p.name not in names.values()]
+        options = [option for group in groups for option in fields[group]]
         run.__signature__ = signature.replace(parameters=[*own, *options])  # type: ignore[attr-defined]
         return run
 

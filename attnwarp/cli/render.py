@@ -17,14 +17,14 @@ from attnwarp.cli.options import (
     RenderThreadsOption,
     ScreenFilterOption,
     SplatKindOption,
-    reading_options,
+    options_of,
 )
 from attnwarp.cli.shell import check_out, clear_errors, use_threads
 from attnwarp.errors import InputWarning
 from attnwarp.reporting import reporter
 
 
-@reading_options(without="missing_images")
+@options_of(Reading, without="missing_images")
 def render(
     model: Annotated[Path, typer.Argument(help="Splats: a PLY file.")],
     cameras: Annotated[

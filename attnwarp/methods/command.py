@@ -73,6 +73,35 @@ class FitPlan:
     max_splats: int = 30_000
 
 
+@dataclass(frozen=True)
+class EditOptions:
+    """Options of an edit by any method.
+
+    Args:
+        marks: what is edited.
+        tune_outside: tune splats that are not marked, too.
+        source: name or number of the source view, which marks are of; the first if None.
+        max_size: larger pictures are averaged down to it.
+        device: of the editor and the splats, "auto", "cpu" or "cuda".
+        dtype: of the editor; see :func:`attnwarp.devices.type_of`.
+        low_memory: see :func:`attnwarp.editing.memory.save_memory`.
+        threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
+        control: also edit the page's views each alone; None does so with a bundled editor.
+        turntable: file of the scene's turn, GIF or MP4.
+    """
+
+    marks: Marks
+    tune_outside: bool
+    source: str | None
+    max_size: int | None
+    device: str
+    dtype: str
+    low_memory: bool
+    threads: int | None
+    control: bool | None
+    turntable: Path | None
+
+
 def edit_dataset(
     dataset: Dataset,
     splats: Gaussians | None,
@@ -80,20 +109,11 @@ def edit_dataset(
     instruction: str,
     settings: AttentionWarpingSettings,
     out: Path,
+    options: EditOptions,
     *,
     fit_plan: FitPlan,
-    source: str | None,
     source_picture: Path | None,
-    marks: Marks,
-    tune_outside: bool = False,
-    max_size: int | None,
     store: Any,
-    device: str,
-    dtype: str = "auto",
-    low_memory: bool = False,
-    threads: int | None,
-    control: bool | None = None,
-    turntable: Path | None = None,
     report: Reporter,
 ) -> tuple[Result, Path]:
     """Fit where no splats are given, edit, and write the page and a PLY for other viewers.
@@ -105,19 +125,10 @@ def edit_dataset(
         instruction: in words.
         settings: of the edit. Without a size, the editor's own is taken.
         out: folder of all results.
+        options: of the edit.
         fit_plan: of the fit.
-        source: name or number of the source view; the first if None.
         source_picture: file of the source view edited elsewhere.
-        marks: what is edited.
-        tune_outside: tune splats that are not marked, too.
-        max_size: larger pictures are averaged down to it.
         store: see :func:`attnwarp.methods.attention_warping`.
-        device: of the editor and the splats, "auto", "cpu" or "cuda".
-        dtype: of the editor; see :func:`attnwarp.devices.type_of`.
-        low_memory: see :func:`attnwarp.editing.memory.save_memory`.
-        threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
-        control: also edit the page's views each alone; None does so with a bundled editor.
-        turntable: file of the scene's turn, GIF or MP4.
         report: receives how the work stands.
 
     Returns:
@@ -127,11 +138,11 @@ def edit_dataset(
         InputError: no such view, mask, editor or segmenter; marks where nothing is found; files of
             something else where results go.
     """
-    check_film(turntable)
+    check_film(options.turntable)
     workdir_of(out).check_unclaimed()  # again in the edit, but here before a fit
-    device = choose(device, report)
-    views = load_views(dataset, max_size=max_size)
-    index = view_of(views.cameras, source, dataset)
+    device = choose(options.device, report)
+    views = load_views(dataset, max_size=options.max_size)
+    index = view_of(views.cameras, options.source, dataset)
     images = images_of(views)
     # Views are the cameras with a picture.
     pictures = [path for path in dataset.image_paths if path is not None]
@@ -142,8 +153,10 @@ def edit_dataset(
         h, w, _ = by_hand.shape
         # Again in the edit, but here before an editor is loaded and a fit spends its minutes.
         check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
-    segments = marked(marks, editor_name, dataset, views, images, index, out, device, report)
-    editor = _editor(editor_name, device, dtype, low_memory, report)
+    segments = marked(
+        options.marks, editor_name, dataset, views, images, index, out, device, report
+    )
+    editor = _editor(editor_name, device, options, report)
     check_instruction(editor_name, editor, instruction)
     if settings.size is None:
         settings = replace(settings, size=own_size(editor))
@@ -153,9 +166,7 @@ def edit_dataset(
         Features(editor, settings, "cpu")
         perceptual_net(settings)
         splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, device, report)
-    torch.set_num_threads(thread_count(editor, threads))
-    splats = splats.to(device=device)
-    compile_kernels(splats.kind, report, device)
+    splats = _ready(splats, editor, device, options, report)
     result = attention_warping(
         splats,
         views.cameras,
@@ -166,7 +177,7 @@ def edit_dataset(
         source=index,
         source_picture=by_hand,
         segments=segments(splats),
-        tune_outside=tune_outside,
+        tune_outside=options.tune_outside,
         folder=out,
         store=store,
         report=report,
@@ -175,16 +186,7 @@ def edit_dataset(
     if result.gaussians.kind == "2d":
         # Other programs take no splats of two scales.
         write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
-    page = show_edit(
-        workdir_of(out), splats, views.cameras, images, turntable=turntable, report=report,
-        editor=editor if _has_control(control, editor_name) else None,
-    )  # fmt: skip
-    return result, page
-
-
-def _has_control(control: bool | None, editor: str) -> bool:
-    """True if the page's views are edited alone too: a bundled editor takes seconds."""
-    return editor in bundled() if control is None else control
+    return result, _page(out, splats, views, images, editor_name, editor, options, report)
 
 
 def run_baseline(
@@ -195,18 +197,9 @@ def run_baseline(
     instruction: str,
     settings: MethodSettings,
     out: Path,
+    options: EditOptions,
     *,
     budget: Budget,
-    marks: Marks,
-    tune_outside: bool = False,
-    source: str | None,
-    max_size: int | None,
-    device: str,
-    dtype: str = "auto",
-    low_memory: bool = False,
-    threads: int | None,
-    control: bool | None = None,
-    turntable: Path | None = None,
     report: Reporter,
 ) -> tuple[Result, Path]:
     """Run a method on the views of a data set, and write the page.
@@ -219,17 +212,8 @@ def run_baseline(
         instruction: in words.
         settings: of the method. Without a size, the editor's own is taken.
         out: folder of all results.
+        options: of the edit.
         budget: limits of the run.
-        marks: what is edited.
-        tune_outside: tune splats that are not marked, too.
-        source: name or number of the view that is marked; the first if None.
-        max_size: larger pictures are averaged down to it.
-        device: of the editor and the splats, "auto", "cpu" or "cuda".
-        dtype: of the editor; see :func:`attnwarp.devices.type_of`.
-        low_memory: see :func:`attnwarp.editing.memory.save_memory`.
-        threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
-        control: also edit the page's views each alone; None does so with a bundled editor.
-        turntable: file of the scene's turn, GIF or MP4.
         report: receives how the work stands.
 
     Returns:
@@ -238,19 +222,19 @@ def run_baseline(
     Raises:
         InputError: no such editor; a folder of another run; a film of another format.
     """
-    check_film(turntable)
-    device = choose(device, report)
-    views = load_views(dataset, max_size=max_size)
+    check_film(options.turntable)
+    device = choose(options.device, report)
+    views = load_views(dataset, max_size=options.max_size)
     images = images_of(views)
-    index = view_of(views.cameras, source, dataset)
-    segments = marked(marks, editor_name, dataset, views, images, index, out, device, report)
-    editor = _editor(editor_name, device, dtype, low_memory, report)
+    index = view_of(views.cameras, options.source, dataset)
+    segments = marked(
+        options.marks, editor_name, dataset, views, images, index, out, device, report
+    )
+    editor = _editor(editor_name, device, options, report)
     check_instruction(editor_name, editor, instruction)
-    torch.set_num_threads(thread_count(editor, threads))
     if settings.size is None:
         settings = settings.changed(size=own_size(editor))
-    splats = splats.to(device=device)
-    compile_kernels(splats.kind, report, device)
+    splats = _ready(splats, editor, device, options, report)
     result = METHODS[method](
         splats,
         views.cameras,
@@ -260,24 +244,44 @@ def run_baseline(
         settings,
         folder=out,
         segments=segments(splats),
-        tune_outside=tune_outside,
+        tune_outside=options.tune_outside,
         budget=budget,
         report=report,
     )
     _report_memory(device, report)
-    page = show_edit(
-        workdir_of(out), splats, views.cameras, images, turntable=turntable, report=report,
-        editor=editor if _has_control(control, editor_name) else None,
+    return result, _page(out, splats, views, images, editor_name, editor, options, report)
+
+
+def _ready(
+    splats: Gaussians, editor: Any, device: str, options: EditOptions, report: Reporter
+) -> Gaussians:
+    """Splats on their device, with threads for the editor and kernels compiled."""
+    torch.set_num_threads(thread_count(editor, options.threads))
+    splats = splats.to(device=device)
+    compile_kernels(splats.kind, report, device)
+    return splats
+
+
+def _page(
+    out: Path, splats: Gaussians, views: Views, images: Sequence[npt.NDArray[Any]],
+    editor_name: str, editor: Any, options: EditOptions, report: Reporter,
+) -> Path:  # fmt: skip
+    """The page of an edit; its views are edited alone too where a bundled editor takes seconds."""
+    control = editor_name in bundled() if options.control is None else options.control
+    return show_edit(
+        workdir_of(out), splats, views.cameras, images, turntable=options.turntable, report=report,
+        editor=editor if control else None,
     )  # fmt: skip
-    return result, page
 
 
-def _editor(name: str, device: str, dtype: str, low_memory: bool, report: Reporter) -> Any:
+def _editor(name: str, device: str, options: EditOptions, report: Reporter) -> Any:
     """The editor; on a GPU with a line about the memory of its weights."""
-    editor = load_editor(name, device=device, dtype=type_of(dtype, device), low_memory=low_memory)
+    editor = load_editor(
+        name, device=device, dtype=type_of(options.dtype, device), low_memory=options.low_memory
+    )
     if device != "cpu":
         kind = str(editor.unet.dtype).removeprefix("torch.")
-        place = "main memory" if low_memory else "the GPU"
+        place = "main memory" if options.low_memory else "the GPU"
         report.log(
             f"weights of the editor, {kind}: {weight_bytes(editor) / 2**30:.2f} GiB of {place}"
         )
