@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +12,6 @@ import torch
 
 from attnwarp.devices import device_of
 from attnwarp.encoders._weights import check_archive, reason_of
-from attnwarp.encoders.pretrained import check_config
 from attnwarp.errors import InputError, install_command
 from attnwarp.io.text import read_text
 
@@ -110,13 +108,11 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
     """A network of diffusers or transformers from its folder.
 
     Raises:
-        InputError: files that cannot be read, lack tensors, or hold values that are not finite; a
-            configuration with a value of another type, or an epsilon out of range.
+        InputError: files that cannot be read, lack tensors, or hold values that are not finite.
     """
     from transformers import PreTrainedModel
     from transformers.utils import logging
 
-    check_config(folder / "config.json", _defaults(kind))
     # Its bar of a second's loading would stand among a command's own lines.
     bars = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()
@@ -148,16 +144,6 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
             f"{f' and {len(damaged) - 1} more' if len(damaged) > 1 else ''}; fetch the model again"
         )
     return network.to(device)
-
-
-def _defaults(kind: Any) -> dict[str, Any]:
-    """The default values of a network's configuration."""
-    if hasattr(kind, "config_class"):
-        return dict(kind.config_class().to_dict())
-    parameters = inspect.signature(kind.__init__).parameters.values()
-    given = {p.name: p.default for p in parameters if p.default is not p.empty}
-    # diffusers takes fractions where a default is whole, such as mid_block_scale_factor.
-    return {key: float(v) if type(v) is int else v for key, v in given.items()}
 
 
 def config_of(folder: str | Path, name: str) -> dict[str, Any]:

@@ -10,8 +10,7 @@ Three mistakes give plausible figures in transformers and are refused here:
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import groupby
@@ -22,7 +21,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from attnwarp import check
 from attnwarp.devices import device_of
 from attnwarp.encoders._weights import check_archive, full_float32, reason_of, sha256_of
 from attnwarp.encoders.base import EncoderInfo, Image, Kind, checked_image, checked_texts
@@ -31,11 +29,6 @@ from attnwarp.errors import InputError, optional_imports
 
 BATCH = 8
 """Pictures in a batch: enough to use all cores, few enough to fit in memory beside ViT-L's weights.
-"""
-
-MOST_EPSILON = 1e-3
-"""Largest epsilon of a normalisation: published networks have 1e-12 to 1e-5, and their variances
-are about 1.
 """
 
 _ASK = {
@@ -292,53 +285,6 @@ def _config(folder: Path, name: str, kind: Kind, types: tuple[str, ...]) -> dict
     return config
 
 
-def check_config(path: Path, defaults: Mapping[str, Any]) -> None:
-    """Refuse values of a config.json that are of another type than a network's defaults, or that
-    no network computes with: transformers takes true for 1, and an epsilon of any size.
-
-    Args:
-        path: of the file, which is JSON.
-        defaults: of the network's class, as its configuration's ``to_dict`` gives them.
-
-    Raises:
-        InputError: such a value; the message names the file and the key.
-    """
-
-    def check_level(level: dict[str, Any], known: Mapping[str, Any], place: str) -> None:
-        for key, value in level.items():
-            default = known.get(key)
-            if isinstance(default, dict) and isinstance(value, dict):
-                check_level(value, default, f"{place}{key}.")
-            expected = _expected(key, default)
-            if value is None or expected is None or isinstance(value, list | dict):
-                continue
-            wanted, right = expected
-            if not right(value):
-                raise InputError(
-                    f"{path}: {place}{key} is {value!r:.40}, expected {wanted}; fetch it again"
-                )
-
-    check_level(read_json(path), defaults, "")
-
-
-def _expected(key: str, default: Any) -> tuple[str, Callable[[Any], bool]] | None:
-    """Requirement on a value, in words and as a test; None where anything goes."""
-    if isinstance(default, bool):
-        return "true or false", lambda value: isinstance(value, bool)
-    if key == "eps" or key.endswith("_eps"):
-        return (
-            f"a number above 0, up to {MOST_EPSILON:g}",
-            lambda value: check.is_number(value) and 0 < value <= MOST_EPSILON,
-        )
-    if isinstance(default, int):
-        return "a whole number", lambda value: check.is_number(value, whole=True)
-    if isinstance(default, float):
-        return "a finite number", lambda value: check.is_number(value) and abs(value) < math.inf
-    if isinstance(default, str):
-        return "text", lambda value: isinstance(value, str)
-    return None
-
-
 def _how(kind: Kind, folder: Path) -> str:
     return (
         f"Place these files there: {_FILES[kind]}. They are published on the Hugging Face hub, for"
@@ -371,7 +317,6 @@ def _load(
     model_class: Any, folder: Path, name: str, kind: Kind, device: torch.device
 ) -> tuple[Any, list[Path]]:
     files = _weight_files(folder, name, kind)
-    check_config(folder / "config.json", model_class.config_class().to_dict())
     for file in files:
         check_archive(file)
     try:
