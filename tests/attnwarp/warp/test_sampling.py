@@ -37,29 +37,6 @@ def test_features_of_any_size_are_read_at_u_times_s(size):
     assert np.abs(layer.xy.numpy() * [512 / w, 512 / h] - exact)[answered].max() < 1e-6
 
 
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float16, 5e-4), (torch.bfloat16, 4e-3)])
-def test_half_precision_features_are_blended_in_float32(dtype, bound):
-    # Hard case 29, against the same stored values in float64. At 512 px a half-precision grid would
-    # be off by taps.
-    source, target = orbit(0, size=512, height=1), orbit(25, size=512, height=1)
-    c = correspond(source, target, plane_depth(target, (1, 0, 0), 0.0))
-    features = torch.rand(3, 512, 512, generator=torch.Generator().manual_seed(1)).to(dtype)
-    warped, _ = sample(features, c)
-    exact, _ = sample(features.double(), c)
-    assert warped.dtype == dtype
-    assert (warped.double() - exact).abs().max() < bound
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_a_half_precision_grid_is_refused(dtype):
-    # Hard case 30.
-    with pytest.raises(ValueError, match=r"xy: got torch\.\w*float16, expected float32 or float64"):
-        sample_at(torch.ones(1, 4, 4), torch.ones(4, 4, 2, dtype=dtype))
-    c = correspond(orbit(0), orbit(10), np.full((64, 64), 4.0))
-    with pytest.raises(ValueError, match="expected float64"):
-        Correspondence(c.source, c.target, c.xy.to(dtype), c.points, c.target_depth)
-
-
 def test_nan_in_a_grid_is_masked_before_sampling():
     # Hard case 36.
     xy = torch.tensor(
