@@ -784,33 +784,6 @@ def test_a_fit_writes_a_third_scale_for_other_viewers(data, tmp_path):
 # -------- pipes, disks, signals, packages
 
 
-def test_a_closed_pipe_is_no_regression_and_no_traceback(tmp_path):
-    write_ply(tmp_path / "a.ply", spread())
-    for arguments in (["--help"], ["convert", tmp_path / "a.ply", tmp_path / "b.ply"]):
-        receiving, sending = os.pipe()
-        os.close(receiving)
-        done = subprocess.run(
-            [*ATTNWARP, *map(str, arguments)], stdout=sending, stderr=subprocess.PIPE, text=True,
-            timeout=60, check=False,
-        )  # fmt: skip
-        os.close(sending)
-        assert (done.returncode, done.stderr) == (141, ""), done.stderr
-    assert len(read_ply(tmp_path / "b.ply")) == 20
-
-
-@pytest.mark.door
-def test_output_to_a_full_disk_is_one_line(tmp_path):
-    write_ply(tmp_path / "a.ply", spread())
-    for arguments in (["--help"], ["convert", tmp_path / "a.ply", tmp_path / "b.ply"]):
-        with Path("/dev/full").open("w") as full:
-            done = subprocess.run(
-                [*ATTNWARP, *map(str, arguments)], stdout=full, stderr=subprocess.PIPE, text=True,
-                timeout=60, check=False,
-            )  # fmt: skip
-        assert done.returncode == 2, done.stderr
-        assert done.stderr.count("\n") == 1 and "No space left on device" in done.stderr
-
-
 def test_a_polite_kill_says_what_is_kept(data, tmp_path, monkeypatch):
     """In the middle of a render: after the first of the pictures was written."""
     from attnwarp.io import images

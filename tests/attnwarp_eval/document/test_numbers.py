@@ -16,7 +16,11 @@ from attnwarp_eval.document.numbers import number
         (12345.6, "12346"),
         (0.0000123, "1.23e-05"),
         (0, "0"),
+        (0.012345, "0.0123"),
+        (-2.5, "-2.50"),
+        (1e-9, "1e-09"),
         (float("nan"), "–"),
+        (None, "–"),
     ],
 )
 def test_a_number_has_three_digits_and_no_exponent_where_it_is_whole(value, text):

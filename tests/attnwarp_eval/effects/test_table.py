@@ -69,42 +69,6 @@ def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, 
     assert made[3:] == ["glass"] and (tmp_path / "mirror.jpg").read_bytes() == picture
 
 
-@pytest.mark.slow
-def test_a_table_that_was_interrupted_goes_on_with_the_same_entries(small, monkeypatch, tmp_path):
-    real, made = effects.measure_entry, []
-
-    def interrupted(scene, *more):
-        made.append(scene.name)
-        if made in (["spheres", "glass"], ["spheres", "glass", "glass", "glass"]):
-            raise KeyboardInterrupt
-        return real(scene, *more)
-
-    monkeypatch.setattr(effects, "measure_entry", interrupted)
-    quick = Settings(prove=False, rounds=2, pictures=False)
-    with pytest.raises(KeyboardInterrupt):
-        collect(["spheres", "glass"], tmp_path, quick)
-    (first,) = json.loads((tmp_path / "effects.json").read_text())["scenes"]
-    entries = collect(["spheres", "glass"], tmp_path, quick)
-    # Seconds are among the entry's figures: measured again they would differ.
-    assert entries[0] == first and made == ["spheres", "glass", "glass"]
-    written = {path: path.read_bytes() for path in tmp_path.glob("effects.*")}
-    assert {path.suffix for path in written} == {".json", ".md", ".html"}
-    (tmp_path / "effects.json").write_text('{"scenes": []}')
-    collect(["spheres", "glass"], tmp_path, quick)
-    assert {path: path.read_bytes() for path in written} == written and len(made) == 3
-    (cell,) = (
-        c for c in (tmp_path / "cells").rglob("*.json") if '"name": "glass"' in c.read_text()
-    )
-    cell.write_bytes(cell.read_bytes()[:-9])
-    # Interrupted again: the complete table stays until all of its rows are made.
-    with pytest.raises(KeyboardInterrupt):
-        collect(["spheres", "glass"], tmp_path, quick)
-    assert {path: path.read_bytes() for path in written} == written
-    assert collect(["spheres", "glass"], tmp_path, quick)[0] == first
-    assert made[3:] == ["glass", "glass"]
-    assert (tmp_path / "effects.json").read_bytes() != written[tmp_path / "effects.json"]
-
-
 def test_entries_that_were_timed_otherwise_are_refused_in_one_table():
     planned = {"integrator": "direct", "sensor": {"type": "perspective"}}
     cost = {"size": 48, "spp": 16, "rounds": 7, "faster": 2.0, "at_equal_noise": 2.0}

@@ -87,40 +87,6 @@ def test_the_study_tells_views_that_agree_from_views_that_do_not(tmp_path):
         )
 
 
-@pytest.mark.slow
-def test_a_study_that_was_interrupted_goes_on_and_ends_as_one_that_was_not(tmp_path, monkeypatch):
-    real, measured = flow.measure_pair, []
-
-    def interrupted(name, edit, yaw, *more):
-        if yaw == 20:
-            raise KeyboardInterrupt
-        return real(name, edit, yaw, *more)
-
-    def counted(name, edit, yaw, *more):
-        measured.append(yaw)
-        return real(name, edit, yaw, *more)
-
-    monkeypatch.setattr(flow, "measure_pair", interrupted)
-    first = run(tmp_path / "a", "--yaws", "5,20")
-    assert first.exit_code == 130 and "finished pairs are kept" in first.stderr
-    assert not (tmp_path / "a" / "report.md").exists()
-    monkeypatch.setattr(flow, "measure_pair", counted)
-    assert run(tmp_path / "a", "--yaws", "5,20").exit_code == 0 and measured == [20]
-    assert run(tmp_path / "b", "--yaws", "5,20").exit_code == 0 and measured == [20, 5, 20]
-    names = ("flow.json", "report.md", "report.html", "figures/flow.svg", "bear-20-slip.png")
-    for name in names:
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-    # A picture that is gone is drawn again; a cell that was changed is measured again.
-    (tmp_path / "a" / "bear-5-slip.png").unlink()
-    cell = next(
-        c for c in (tmp_path / "a" / "cells").rglob("*.json") if '"yaw": 20.0' in c.read_text()
-    )
-    cell.write_text(cell.read_text().replace("consistency", "consistence", 1))
-    assert run(tmp_path / "a", "--yaws", "5,20").exit_code == 0
-    assert measured == [20, 5, 20, 5, 20] and (tmp_path / "a" / "bear-5-slip.png").is_file()
-    assert (tmp_path / "a" / "flow.json").read_bytes() == (tmp_path / "b/flow.json").read_bytes()
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -131,22 +131,6 @@ def power(scenes, effect, level=0.95):
     return stats.nct.sf(beyond, scenes - 1, effect * math.sqrt(scenes))
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (0.0, "0"),
-        (1234.6, "1235"),
-        (0.012345, "0.0123"),
-        (-2.5, "-2.50"),
-        (float("nan"), "–"),
-        (None, "–"),
-        (1e-9, "1e-09"),
-    ],
-)
-def test_numbers_have_three_significant_digits(value, text):
-    assert number(value) == text
-
-
 def test_a_mean_says_what_was_undefined_and_which_scenes_are_missing():
     value = interval({"a": [1.0, float("nan")], "b": [3.0]})
     # Two scene means 1 and 3: half width is t(0.975, 1 degree of freedom) * 1 = 12.7.
