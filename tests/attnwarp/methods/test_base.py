@@ -28,8 +28,6 @@ from attnwarp.methods import (
     preset,
 )
 from attnwarp.methods import base as run_module
-from attnwarp.methods.pictures import to_bytes
-from attnwarp.methods.tuning import Tuning
 
 
 @pytest.fixture(scope="module")
@@ -308,30 +306,6 @@ def test_a_budget_of_another_type_is_named(run):
         run("by_view", budget={"seconds": 3})
 
 
-@pytest.mark.door
-def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(run, tmp_path):
-    refusals = []
-
-    def again(*_):
-        with pytest.raises(InputError, match="another run writes to this folder") as caught:
-            run("by_view", settings, folder=tmp_path)
-        refusals.append(caught)
-
-    settings = ByViewSettings(steps=2, iterations=0)
-    run("by_view", settings, folder=tmp_path, report=Watched(again))
-    assert refusals
-
-
-def test_segments_leave_the_original_outside(run, scene):
-    left = np.zeros((32, 32), dtype=bool)
-    left[:, :16] = True
-    alone = ByViewSettings(steps=1, iterations=0)
-    whole, half = run("by_view", alone), run("by_view", alone, segments=[left] * 3)
-    for view in range(3):
-        assert np.array_equal(half.edited[view][:, :16], whole.edited[view][:, :16])
-        assert np.array_equal(half.edited[view][:, 16:], to_bytes(scene[2][view])[:, 16:])
-
-
 def test_splats_that_no_segment_marks_keep_their_bytes(run, scene, tmp_path):
     left = np.zeros((32, 32), dtype=bool)
     left[:, :16] = True
@@ -345,23 +319,6 @@ def test_splats_that_no_segment_marks_keep_their_bytes(run, scene, tmp_path):
         assert moved[x > 0.6].all() if outside else not moved[x > 0.6].any()
         marked = json.loads((tmp_path / folder / "manifest.json").read_text())
         assert ("tuned" in marked) == (not outside)
-
-
-def test_splats_are_tuned_on_pictures_that_a_small_edit_changes_in_the_segments_alone(
-    run, scene, monkeypatch
-):
-    tuned = []
-    monkeypatch.setattr(
-        Tuning, "advance", lambda fit, begin, end, views, *_, **__: tuned.extend(views)
-    )
-    left = np.zeros((32, 32), dtype=bool)
-    left[:, :15] = True  # ends within a pixel of the edit
-    run("by_view", ByViewSettings(steps=1, iterations=1, size=16), segments=[left] * 3)
-    assert len(tuned) == 3
-    for view in tuned:
-        before = scene[2][view.number]
-        assert np.array_equal(view.picture[:, 15:], before[:, 15:])
-        assert np.abs(view.picture - before)[:, :15].max() > 0.1
 
 
 @pytest.mark.parametrize("held", [0, 1, 8])

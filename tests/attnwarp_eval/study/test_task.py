@@ -6,7 +6,7 @@ import pytest
 from edit_folders import Watched
 
 from attnwarp_eval.canonical_json import digest
-from attnwarp_eval.study.store import Store, StoreError
+from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.task import Task, results
 
 
@@ -72,8 +72,3 @@ def test_a_damaged_record_is_computed_again(tmp_path, damage):
     assert list(results(store, squares(computed)(store), 3)) == [4, 9, 16]
     assert computed == [2, 3, 4, 3] and path.read_text() == whole
     assert json.loads(whole)["y"] == 9 and (tmp_path / "3.png").read_bytes() == bytes(3)
-
-
-def test_a_second_run_on_the_folder_is_refused(tmp_path):
-    with Store(tmp_path).lock(), pytest.raises(StoreError, match="another run is writing"):
-        next(results(Store(tmp_path), squares([])(Store(tmp_path)), 3))
