@@ -18,42 +18,11 @@ from attnwarp_eval.scene.meshes.surface import (
     whole,
 )
 
-UNUSED = frozenset(
-    [
-        "vn",
-        "vt",
-        "vp",
-        "g",
-        "o",
-        "s",
-        "mg",
-        "usemtl",
-        "mtllib",
-        "maplib",
-        "usemap",
-        "lod",
-        "bevel",
-        "c_interp",
-        "d_interp",
-        "shadow_obj",
-        "trace_obj",
-        "ctech",
-        "stech",
-        "deg",
-        "cstype",
-        "bmat",
-        "step",
-        "parm",
-        "trim",
-        "hole",
-        "scrv",
-        "sp",
-        "end",
-        "con",
-        "call",
-        "csh",
-    ]
-)
+UNUSED = frozenset([
+    "vn", "vt", "vp", "g", "o", "s", "mg", "usemtl", "mtllib", "maplib", "usemap", "lod", "bevel",
+    "c_interp", "d_interp", "shadow_obj", "trace_obj", "ctech", "stech", "deg", "cstype", "bmat",
+    "step", "parm", "trim", "hole", "scrv", "sp", "end", "con", "call", "csh",
+])  # fmt: skip
 """Keywords that move no polygon."""
 
 NOT_SURFACES = {"l": "lines", "p": "points", "curv": "curves", "curv2": "curves",
