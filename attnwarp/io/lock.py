@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -26,8 +27,6 @@ def locked(path: Path, *, wait: bool) -> Iterator[None]:
         BlockingIOError: another holds it, and ``wait`` is False.
         OSError: it cannot be written.
     """
-    import fcntl  # not on Windows
-
     file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -40,8 +39,8 @@ def locked(path: Path, *, wait: bool) -> Iterator[None]:
 def alone_in(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Hold a folder against other runs that would write to it; it is made if need be.
 
-    The folder itself is locked, so that no file is left in it. Without effect on Windows, and where
-    the file system has no such locks.
+    The folder itself is locked, so that no file is left in it. Without effect where the file system
+    has no such locks.
 
     Args:
         folder: of the results. If nothing was written to it and it was made here, it is removed.
@@ -74,10 +73,6 @@ def alone_in(folder: str | os.PathLike[str]) -> Iterator[None]:
 
 def _held(folder: Path) -> int | None:
     """The number of the open folder, locked; None where that cannot be."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return None
     try:
         file = os.open(folder, os.O_RDONLY)
     except PermissionError:  # it can be written to, and not listed
