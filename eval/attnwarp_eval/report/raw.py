@@ -105,15 +105,7 @@ def read_raw(path: Path) -> Results:
 
 
 def _outcome(cell: dict[str, Any], record: dict[str, Any] | None) -> Outcome:
-    return Outcome(
-        cell["id"],
-        cell["title"],
-        cell["scene"],
-        tuple(cell["variants"]),
-        cell["probe"],
-        cell["seed"],
-        None if record is None else probe(cell["probe"]).read(record),
-    )
+    return Outcome.of(cell, None if record is None else probe(cell["probe"]).read(record))
 
 
 def read_parts(folder: Path) -> Results:

@@ -52,17 +52,7 @@ def read_results(store: Store) -> Results:
                         id=cell["id"],
                     )
                 )
-        cells.append(
-            Outcome(
-                cell["id"],
-                cell["title"],
-                cell["scene"],
-                tuple(cell["variants"]),
-                cell["probe"],
-                cell["seed"],
-                record,
-            )
-        )
+        cells.append(Outcome.of(cell, record))
     return Results(stored.study, cells, failures, stored.notices)
 
 

@@ -33,6 +33,14 @@ class Outcome:
     seed: int
     record: Record[Any] | None
 
+    @classmethod
+    def of(cls, cell: Mapping[str, Any], record: Record[Any] | None) -> Outcome:
+        """The outcome of a cell as ``study.json`` lists it."""
+        return cls(
+            cell["id"], cell["title"], cell["scene"], tuple(cell["variants"]), cell["probe"],
+            cell["seed"], record,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Shared:
