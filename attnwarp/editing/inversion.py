@@ -21,14 +21,6 @@ from attnwarp.editing.schedule import Schedule, following
 Predict = Callable[[Tensor, int], Tensor]
 """A network's output for latents at a step, such as ``Task.predict``."""
 
-EDIT_FRIENDLY_STEPS, EDIT_FRIENDLY_SKIP = 100, 36
-"""Steps of Stable Diffusion in the paper of :func:`edit_friendly_invert`, and how many of them, the
-noisiest, are left out: ``editor.timesteps(EDIT_FRIENDLY_STEPS)[EDIT_FRIENDLY_SKIP:]``."""
-
-EDIT_FRIENDLY_SOURCE_GUIDANCE, EDIT_FRIENDLY_TARGET_GUIDANCE = 3.5, 15.0
-"""Text guidance there: of the inversion with a prompt for the picture, and of the replay with one
-for its edit. A replay with the inversion's own prompt and guidance gives the picture back."""
-
 
 def ddim_invert(
     schedule: Schedule,
@@ -167,8 +159,9 @@ def edit_friendly_invert(
         schedule: of the model; any prediction.
         predict: the network's output.
         latents: (B, C, h, w) scaled latents of the picture.
-        timesteps: falling. To skip the noisiest, leave them out; :data:`EDIT_FRIENDLY_SKIP` and the
-            constants beside it are the paper's.
+        timesteps: falling. To skip the noisiest, leave them out: the paper takes
+            ``editor.timesteps(100)[36:]`` of Stable Diffusion, text guidance 3.5 with a prompt for
+            the picture, and 15 in the replay with one for its edit.
         noises: (steps, B, C, h, w) white noise of the steps, in the order of ``timesteps``; drawn
             from ``seed`` if left out.
         seed: of the drawn noises.

@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 Kind = Literal["clip", "dino", "perceptual"]
 
-Array = npt.NDArray[Any]
 Image = npt.NDArray[Any]
 """(H, W, 3) sRGB, floating, in [0, 1]."""
 

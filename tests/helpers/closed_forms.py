@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from attnwarp import Camera, Gaussians
-from attnwarp_eval.stability.closed_forms import faces, orbit, plane_depth, sphere
+from attnwarp_eval.stability.closed_forms import orbit, plane_depth, sphere
 
 __all__ = [
     "apply",
@@ -18,6 +18,13 @@ __all__ = [
     "skewed",
     "sphere",
 ]
+
+
+def faces(camera, points, normals):
+    """(...) bool: a point of a convex body is seen exactly where its outward normal looks at the
+    camera.
+    """
+    return ((camera.position - points) * normals).sum(-1) > 0
 
 
 def rolled(camera, degrees):

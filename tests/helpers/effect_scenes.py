@@ -1,7 +1,9 @@
 """Small scenes that each call for one effect, shared by the tests of planning and of proof."""
 
+from dataclasses import replace
+
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.scene.spec import SceneSpec
+from attnwarp_eval.scene.spec import SceneSpec, SkySpec
 
 PLAIN = {"type": "plain", "color": "#c0b090"}
 FLOOR = {
@@ -68,3 +70,42 @@ SCENES = {
     ),
 }
 """Effect -> a scene that needs it. "diffuse" needs none that a plan could leave out but its sky."""
+
+
+DROPPABLE = (
+    "interreflection", "specular", "refraction", "medium", "subsurface", "caustics", "environment",
+    "depth_of_field",
+)  # fmt: skip
+"""Effects that a plan can leave out. The others come free with any picture: what shades a point has
+its texture.
+"""
+
+
+def without(scene, ours, effect):
+    """A plan with one of :data:`DROPPABLE` left out: what a careless planner would do, for negative
+    controls.
+    """
+    passes = ours.passes
+    match effect:
+        case "interreflection" | "specular" | "refraction":
+            passes = tuple(replace(step, max_depth=2) for step in passes)
+        case "medium" | "subsurface":
+            passes = tuple(
+                replace(s, integrator="path" if s.integrator == "volpath" else s.integrator)
+                for s in passes
+            )
+            return replace(ours, passes=passes, media=False)
+        case "caustics":
+            remaining = (step for step in passes if step.integrator != "ptracer" and step.sign > 0)
+            passes = tuple(replace(step, first="any") for step in remaining)
+        case "environment":
+            skies = [k for k, light in enumerate(scene.spec.lights) if isinstance(light, SkySpec)]
+            passes = tuple(
+                replace(step, lights=tuple(k for k in step.lights if k not in skies))
+                for step in passes
+            )
+            passes = tuple(step for step in passes if step.lights or step.lamps)
+        case "depth_of_field":
+            return replace(ours, lens=None)
+    assert passes != ours.passes, f"{effect} is not in this plan ({ours.integrator})"
+    return replace(ours, passes=passes)

@@ -37,8 +37,6 @@ PROTOCOL = 1
 SCENES = {"bear": "some_colour", "dinosaur": "some_colour", "person": "some_jacket"}
 """Scenes, and an edit of each with several right answers."""
 
-YAWS = (2.0, 5.0, 10.0, 20.0, 30.0, 60.0)
-
 SLIP = 2
 """Pixels by which the target is moved sideways for the pair "slip": an edit whose details are a
 little out of place.

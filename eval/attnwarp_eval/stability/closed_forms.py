@@ -54,11 +54,3 @@ def sphere(camera: Camera, radius: float = 1.0) -> tuple[Array, Array]:
     half = radius**2 - ((camera.position - along[..., None] * unit) ** 2).sum(-1)
     t = np.where(half > 0, -along - np.sqrt(np.maximum(half, 0)), np.nan)
     return t / length, (camera.position + t[..., None] * unit) / radius
-
-
-def faces(camera: Camera, points: Array, normals: Array) -> npt.NDArray[np.bool_]:
-    """(...) bool: a point of a convex body is seen exactly where its outward normal looks at the
-    camera.
-    """
-    seen: npt.NDArray[np.bool_] = ((camera.position - points) * normals).sum(-1) > 0
-    return seen

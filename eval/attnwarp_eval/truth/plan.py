@@ -8,9 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-from attnwarp_eval.scene.materials import Effect
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.scene.spec import SkySpec
 from attnwarp_eval.truth.passes import (
     ROULETTE,
     Bounces,
@@ -19,20 +17,6 @@ from attnwarp_eval.truth.passes import (
     convex,
     plan_passes,
 )
-
-DROPPABLE: tuple[Effect, ...] = (
-    "interreflection",
-    "specular",
-    "refraction",
-    "medium",
-    "subsurface",
-    "caustics",
-    "environment",
-    "depth_of_field",
-)
-"""Effects that a plan can leave out. The others come free with any picture: what shades a point has
-its texture.
-"""
 
 
 def plan(
@@ -126,44 +110,3 @@ def everything_on(scene: Scene, spp: int | None = None, *, capped: bool = True) 
     else:
         passes = (Pass(everything, "volpath", depth, 1, 1, spp, lamps),)
     return replace(ours, passes=passes, reasons=("everything on",), media=True)
-
-
-def without(scene: Scene, ours: Plan, effect: Effect) -> Plan:
-    """``ours`` with one effect left out: what a careless planner would do, for negative controls.
-
-    Raises:
-        ValueError: an effect that no plan can leave out, or that is not in this one.
-    """
-    if effect not in DROPPABLE:
-        raise ValueError(
-            f"effect: got {effect!r}, expected one that a plan can leave out:"
-            f" {', '.join(DROPPABLE)}"
-        )
-    passes = ours.passes
-    match effect:
-        case "interreflection" | "specular" | "refraction":
-            passes = tuple(replace(step, max_depth=2) for step in passes)
-        case "medium" | "subsurface":
-            passes = tuple(
-                replace(s, integrator="path" if s.integrator == "volpath" else s.integrator)
-                for s in passes
-            )
-            return replace(ours, passes=passes, media=False)
-        case "caustics":
-            remaining = (step for step in passes if step.integrator != "ptracer" and step.sign > 0)
-            passes = tuple(replace(step, first="any") for step in remaining)
-        case "environment":
-            skies = [k for k, light in enumerate(scene.spec.lights) if isinstance(light, SkySpec)]
-            passes = tuple(
-                replace(step, lights=tuple(k for k in step.lights if k not in skies))
-                for step in passes
-            )
-            passes = tuple(step for step in passes if step.lights or step.lamps)
-        case "depth_of_field":
-            return replace(ours, lens=None)
-    if passes == ours.passes:
-        raise ValueError(
-            f"effect: {effect!r} is not in this plan ({ours.integrator}), so it cannot be left out"
-            " of it"
-        )
-    return replace(ours, passes=passes)

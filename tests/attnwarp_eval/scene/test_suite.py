@@ -5,13 +5,14 @@ import functools
 
 import numpy as np
 import pytest
+from effect_scenes import without
 
 from attnwarp.camera import Camera
 from attnwarp_eval.scene import solids
 from attnwarp_eval.scene.file import list_scenes, load_scene
 from attnwarp_eval.scene.textures import albedo
 from attnwarp_eval.truth import AMBIGUOUS, HIDDEN, VISIBLE, Geometry, render_plan, two_view
-from attnwarp_eval.truth.plan import plan, without
+from attnwarp_eval.truth.plan import plan
 
 pytestmark = pytest.mark.usefixtures("coarse_textures")
 

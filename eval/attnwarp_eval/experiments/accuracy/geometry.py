@@ -17,7 +17,6 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.shapes import Box, Mesh
 
 Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 WRONG = 1e-3
 """Relative errors of depth above this are those of another surface; they are counted apart."""
