@@ -1,5 +1,5 @@
-"""Metrics of depth, warps, masks and edited views: pure functions, arrays in and figures out, no
-I/O.
+"""Metrics of depth, surfaces, warps, masks and edited views: pure functions, arrays in and figures
+out, no I/O.
 
 :data:`attnwarp_eval.metrics.registry.METRICS` has each figure's unit, direction and tolerance.
 docs/measuring/metrics.md tells which one to use. A figure with nothing to measure is NaN, never 0,
@@ -66,6 +66,7 @@ from attnwarp_eval.metrics.occlusion import COUNTS, YawBin, by_yaw, confusion, m
 from attnwarp_eval.metrics.reconstruction import Reconstruction, reconstruct
 from attnwarp_eval.metrics.refit import refit_psnr
 from attnwarp_eval.metrics.registry import METRICS, at_size, metric
+from attnwarp_eval.metrics.surface import surface_error
 from attnwarp_eval.metrics.warp import endpoint_error, feature_error
 
 __all__ = [
@@ -125,6 +126,7 @@ __all__ = [
     "sift_matches",
     "ssim",
     "ssim_map",
+    "surface_error",
     "tsed",
     "tsed_of_views",
     "view_dependent",

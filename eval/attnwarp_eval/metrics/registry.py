@@ -21,7 +21,7 @@ class Metric:
             (``depth.bias.edge``) or a feature size (``warp.epe_median.64``).
         unit: "px" (of the image), "layer px", "scene" (scene units), "deg", "dB", "dE00" (CIEDE2000), "share" (of 1),
             "ratio", "cosine" (of embeddings, -1 to 1), "decades" (of 10), "own" (the unit of a hard case's tolerance),
-            "rows" (through a network), "pixels" or "views" (counts).
+            "rows" (through a network), "pixels", "views" or "points" (counts).
         direction: which values are better; "zero" for signed figures that are best at 0, "none" for counts that
             describe.
         atol, rtol: a change of at most ``atol + rtol * |value|`` between two runs is no change.
@@ -40,7 +40,7 @@ class Metric:
     @property
     def is_count(self) -> bool:
         """True if it only describes how much was measured, and is no figure of quality."""
-        return self.unit in ("pixels", "views") and self.direction == "none"
+        return self.unit in ("pixels", "views", "points") and self.direction == "none"
 
 
     @property
@@ -128,6 +128,16 @@ _SPECS = (
     Metric("depth.coverage", "share", "higher", 1e-4, 0, "pixels with a surface that have a depth"),
     Metric("depth.pixels", "pixels", "none", 0, 0, "pixels with a surface"),
     Metric("depth.phantom", "pixels", "none", 0, 0, "pixels with a depth and no surface"),
+    Metric("surface.accuracy", "scene", "lower", 1e-5, 1e-2, "mean distance of the mesh to the true surface, as far as DTU counts it"),
+    Metric("surface.completeness", "scene", "lower", 1e-5, 1e-2, "mean distance of the true surface to the mesh, as far as DTU counts it"),
+    Metric("surface.chamfer", "scene", "lower", 1e-5, 1e-2, "chamfer distance by DTU: mean of both"),
+    Metric("surface.chamfer_uncut", "scene", "lower", 1e-5, 1e-2, "chamfer distance of all points, however far"),
+    Metric("surface.precision", "share", "higher", 1e-3, 0, "of the mesh, within the threshold of the true surface"),
+    Metric("surface.recall", "share", "higher", 1e-3, 0, "of the true surface, within the threshold of the mesh"),
+    Metric("surface.f_score", "share", "higher", 1e-3, 0, "harmonic mean of both"),
+    Metric("surface.normal_consistency", "cosine", "higher", 1e-3, 0, "mean absolute cosine of the normals of nearest points, both ways"),
+    Metric("surface.points", "points", "none", 0, 5e-2, "points of the mesh that were compared"),
+    Metric("surface.true_points", "points", "none", 0, 5e-2, "points of the true surface that were compared"),
     # Float32 networks on other processors agree to 1e-6; the rest of atol is for pictures that differ by rounding.
     Metric("embedding.clip_similarity", "cosine", "higher", 1e-3, 0, "CLIP: render against the target prompt"),
     Metric("embedding.clip_directional", "cosine", "higher", 2e-3, 0, "CLIP: change of the view against the prompt's"),
