@@ -5,7 +5,8 @@ How a report shows one is in :mod:`attnwarp_eval.study.probe_report`.
 
 >>> [probe.name for probe in probes()]
 ['audit', 'calibration', 'carry', 'depth', 'editing', 'editing-timing', 'fit', 'ideal', 'labels',
- 'masks', 'reconstruction', 'sensitivity', 'stability', 'timing', 'variability', 'warp']
+ 'masks', 'reconstruction', 'sensitivity', 'stability', 'surfaces', 'timing', 'variability',
+ 'warp']
 >>> probe("depth").metric("depth.abs_rel").direction
 'lower'
 """

@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence, Set
 from typing import Any
 
+from attnwarp import Gaussians
 from attnwarp.warp import WarpedView, WarpSettings, parts_read, render_surface, warp_view
+from attnwarp_eval import metrics
+from attnwarp_eval.ideal.parts import token_parts
+from attnwarp_eval.metrics.labels import Labels
 from attnwarp_eval.study.probe import Probe, Work
 from attnwarp_eval.study.reads import warp_reads
 from attnwarp_eval.study.record import Json, NoExtra
@@ -41,20 +45,24 @@ class WarpProbe(Probe[NoExtra]):
         return surface_meaning(study, variant)
 
 
-def warped_views(work: Work, grids: Sequence[int]) -> Iterator[tuple[str, TwoView, WarpedView]]:
+def warped_views(
+    work: Work, grids: Sequence[int], model: Gaussians | None = None
+) -> Iterator[tuple[str, TwoView, WarpedView]]:
     """Each target of a cell with its truth and its warp, which counts as the cell's work.
 
     Args:
         work: of the cell, whose spec has ``settings`` and the source of depth.
         grids: sides of the feature grids that are warped too.
+        model: the cell's splats, where they are at hand.
     """
     spec, world, meter = work.spec, work.world, work.meter
     size, spp = spec["size"], spec["spp"]
     settings = WarpSettings.from_dict(spec["settings"])
-    model = source_surface = None
+    source_surface = None
     if spec.get("geometry") != "truth":
-        with meter.stage("splats"):
-            model = splats_of(work)
+        if model is None:
+            with meter.stage("splats"):
+                model = splats_of(work)
         # One source serves every target, so its render is no part of what a target costs.
         with meter.stage("source"):
             source_surface = render_surface(model, world.source, settings)
@@ -85,3 +93,22 @@ def warped_views(work: Work, grids: Sequence[int]) -> Iterator[tuple[str, TwoVie
                 view.at((grid, grid))
         meter.count(**view.target.counters)
         yield name, truth, view
+
+
+def label_figures(
+    work: Work, truth: TwoView, view: WarpedView, labels: tuple[Labels, Labels], grid: int
+) -> dict[str, float]:
+    """Figures of the part labels that a warp carries.
+
+    Args:
+        work: the cell.
+        truth: of the pair, (H, W).
+        view: the warp.
+        labels: (H, W) part of each pixel of the source and of the target.
+        grid: side of the token grid, a divisor of the image's.
+    """
+    source, target = (token_parts(of, (grid, grid)) for of in labels)
+    with work.meter.stage("carry"):
+        carried = metrics.carried_labels(view.at((grid, grid)), source)
+    with work.meter.stage("checks"):
+        return metrics.label_transport(carried, target, labels[1], truth.visible, truth.unseen)

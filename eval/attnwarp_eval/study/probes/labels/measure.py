@@ -8,9 +8,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from attnwarp_eval import metrics
 from attnwarp_eval.ideal.editor import FACTOR
-from attnwarp_eval.ideal.parts import token_parts
 from attnwarp_eval.ideal.thing import labels_of
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
@@ -18,7 +16,7 @@ from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Part, Study, Variant, Whole
 from attnwarp_eval.study.shared.things import ThingsPart, thing_of
-from attnwarp_eval.study.shared.warps import WarpProbe, warped_views
+from attnwarp_eval.study.shared.warps import WarpProbe, label_figures, warped_views
 
 GRIDS = (8, 16, 32, 64)
 """Sides of the token grids that are measured where a study names none."""
@@ -109,15 +107,8 @@ class LabelTransport(WarpProbe):
             figures: dict[str, float] = {}
             for count in spec["parts"]:
                 for grid in grids:
-                    source, target = (
-                        token_parts(labels[count][one], (grid, grid)) for one in (names[0], name)
-                    )
-                    with meter.stage("carry"):
-                        carried = metrics.carried_labels(view.at((grid, grid)), source)
-                    with meter.stage("checks"):
-                        one = metrics.label_transport(
-                            carried, target, labels[count][name], truth.visible, truth.unseen
-                        )
+                    pair = labels[count][names[0]], labels[count][name]
+                    one = label_figures(work, truth, view, pair, grid)
                     if (count, grid) == (spec["parts"][0], near):
                         figures |= one
                     figures |= {f"{key}.{grid}.{count}": value for key, value in one.items()}

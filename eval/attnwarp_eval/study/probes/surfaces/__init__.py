@@ -1,0 +1,1 @@
+"""Surfaces of fits against true ones, beside depth, pictures and warps."""
