@@ -8,7 +8,6 @@ import pytest
 from attnwarp_eval.scene.file import list_scenes, load_scene
 from attnwarp_eval.scene.meshes import read_mesh
 from attnwarp_eval.scene.scene import Scene, SceneError
-from attnwarp_eval.scene.shapes import MeshNotice
 from attnwarp_eval.truth import Geometry, two_view
 
 SMALL = """\
@@ -281,21 +280,6 @@ def test_an_own_mesh_is_read_relative_to_the_file_and_its_bytes_are_part_of_the_
     before = first.content_hash
     mesh.write_text(octahedron("# another byte\n"))
     assert load_scene(path).content_hash != before
-
-
-def test_an_own_mesh_with_a_hole_doubled_faces_and_a_degenerate_triangle_works(tmp_path):
-    (tmp_path / "scans").mkdir()
-    lines = octahedron("f 2 3 5\nf 1 3 5\nf 2 2 5\n").splitlines()
-    (tmp_path / "scans" / "ball.obj").write_text(
-        "\n".join(line for line in lines if line != "f 1 4 6") + "\n"
-    )
-    with pytest.warns(
-        MeshNotice,
-        match="ball.obj: 10 polygons in, 9 triangles out; left out: 1 triangles without area",
-    ):
-        scene = load_scene(write(tmp_path, OWN))
-    with pytest.warns(MeshNotice):
-        assert (Geometry(scene).trace(scene.source).object_id == 1).any()
 
 
 @pytest.mark.parametrize(

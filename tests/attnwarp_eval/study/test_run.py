@@ -300,27 +300,6 @@ def test_the_instrument_is_calibrated_in_every_run(finished):
 
 
 @pytest.mark.slow
-def test_a_run_killed_half_way_goes_on_and_gives_the_same_bytes(undisturbed, folder):
-    run = folder / "killed"
-    process = start("run", "study.yaml", "--out", run, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 300
-    while len(list((run / "cells").rglob("*.json"))) < 2 and time.monotonic() < deadline:
-        time.sleep(0.02)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    before = {p.name: p.stat().st_mtime_ns for p in (run / "cells").rglob("*.json")}
-    assert 2 <= len(before) < CELLS
-    partial = call("verify", run)
-    assert partial.exit_code == 3
-    assert "missing" in partial.stdout
-    again = call("run", "study.yaml", "--out", run)
-    assert again.exit_code == 0, again.stderr
-    assert f"{len(before)} already done" in again.stderr
-    assert {name: Store(run).path(name[:-5]).stat().st_mtime_ns for name in before} == before
-    assert without_timings(run) == undisturbed
-
-
-@pytest.mark.slow
 def test_a_run_that_takes_the_place_of_anothers_report_says_so(finished, folder):
     run = folder / "reused"
     shutil.copytree(finished, run)
