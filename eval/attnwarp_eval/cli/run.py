@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from attnwarp.cli.options import options_of
 from attnwarp.cli.shell import fail, log, warn
 from attnwarp.reporting import reporter
 from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, names, resumable, scheduler_lost
@@ -21,6 +22,46 @@ if TYPE_CHECKING:
     from attnwarp_eval.study.store import Store
 
 
+@dataclass(frozen=True)
+class Capture:
+    """Options of a study's editing methods on a capture, where no truth is known."""
+
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help=(
+                "Run the study's editing methods on this capture (transforms.json, COLMAP,"
+                " BlendedMVS) instead of on scenes; --size is then the longest side."
+            )
+        ),
+    ] = None
+    ply: Annotated[Path | None, typer.Option(help="With --data: its splats.")] = None
+    instruction: Annotated[str | None, typer.Option(help="With --data: the edit.")] = None
+    target_prompt: Annotated[
+        str | None, typer.Option(help="With --data: what the edited scene shows.")
+    ] = None
+    source_prompt: Annotated[
+        str | None, typer.Option(help="With --data: what the scene shows before.")
+    ] = None
+    scale: Annotated[int, typer.Option(help="With --data: 2, 4 or 8 reads images_2 and so on.")] = 1
+    editor: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|FOLDER",
+            help="With --data: in place of the study's editors that take a picture.",
+        ),
+    ] = None
+    depth_editor: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|FOLDER|BASE,CONTROLNET",
+            help="With --data: in place of the study's editors that take depth maps.",
+        ),
+    ] = None
+    device: Annotated[str, typer.Option(help="With --data: of the editors, cpu or cuda.")] = "cpu"
+
+
+@options_of(Capture)
 def run(
     study: Annotated[
         str, typer.Argument(help="A study that ships (quick) or the path of a study's YAML.")
@@ -60,41 +101,8 @@ def run(
             help="Run a pilot on 8 scenes of another seed; say how many scenes each claim needs.",
         ),
     ] = False,
-    data: Annotated[
-        Path | None,
-        typer.Option(
-            help=(
-                "Run the study's editing methods on this capture (transforms.json, COLMAP,"
-                " BlendedMVS) instead of on scenes; --size is then the longest side."
-            )
-        ),
-    ] = None,
-    ply: Annotated[Path | None, typer.Option(help="With --data: its splats.")] = None,
-    instruction: Annotated[str | None, typer.Option(help="With --data: the edit.")] = None,
-    target_prompt: Annotated[
-        str | None, typer.Option(help="With --data: what the edited scene shows.")
-    ] = None,
-    source_prompt: Annotated[
-        str | None, typer.Option(help="With --data: what the scene shows before.")
-    ] = None,
-    scale: Annotated[
-        int, typer.Option(help="With --data: 2, 4 or 8 reads images_2 and so on.")
-    ] = 1,
-    editor: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|FOLDER",
-            help="With --data: in place of the study's editors that take a picture.",
-        ),
-    ] = None,
-    depth_editor: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|FOLDER|BASE,CONTROLNET",
-            help="With --data: in place of the study's editors that take depth maps.",
-        ),
-    ] = None,
-    device: Annotated[str, typer.Option(help="With --data: of the editors, cpu or cuda.")] = "cpu",
+    *,
+    capture: Capture,
 ) -> None:
     """Run a study and write its report.
 
@@ -108,16 +116,11 @@ def run(
     drawn = _whole_numbers(seeds, "--seeds")
     if scheduler is not None and jobs > 1:
         raise fail("--jobs starts workers here, --scheduler uses others; give one of the two")
-    with_data = {
-        "--ply": ply is not None,
-        "--instruction": instruction is not None,
-        "--target-prompt": target_prompt is not None,
-        "--source-prompt": source_prompt is not None,
-        "--scale": scale != 1,
-        "--editor": editor is not None,
-        "--depth-editor": depth_editor is not None,
-        "--device": device != "cpu",
-    }
+    with_data = [
+        f"--{field.name.replace('_', '-')}"
+        for field in fields(capture)
+        if getattr(capture, field.name) != field.default
+    ]
     without_data = {
         "--scenes": scenes is not None,
         "--dry-run": dry_run,
@@ -126,16 +129,14 @@ def run(
         "--scheduler": scheduler is not None,
         "--fail-fast": not keep_going,
     }
-    for option in (option for option, given in with_data.items() if given and data is None):
-        raise fail(f"{option}: needs --data; on scenes, the study itself says what is edited, how")
-    for option in (option for option, given in without_data.items() if given and data is not None):
-        raise fail(f"{option}: has no meaning with --data, a capture edited here; leave it out")
-    if data is not None:
-        words = (instruction, target_prompt, source_prompt)
-        editors = (editor, depth_editor, device)
-        _run_on_capture(
-            lambda: load_study(study, seeds=drawn), data, ply, words, editors, out, size, scale
+    if with_data and capture.data is None:
+        raise fail(
+            f"{with_data[0]}: needs --data; on scenes, the study itself says what is edited, how"
         )
+    for option in (option for option, given in without_data.items() if given and with_data):
+        raise fail(f"{option}: has no meaning with --data, a capture edited here; leave it out")
+    if capture.data is not None:
+        _run_on_capture(lambda: load_study(study, seeds=drawn), capture, capture.data, out, size)
     elif dry_run:
         _print_plan(load, out)
     elif plan:
@@ -145,14 +146,7 @@ def run(
 
 
 def _run_on_capture(
-    load: Callable[[], Study],
-    data: Path,
-    ply: Path | None,
-    words: tuple[str | None, str | None, str | None],
-    editors: tuple[str | None, str | None, str],
-    out: Path | None,
-    size: int | None,
-    scale: int,
+    load: Callable[[], Study], capture: Capture, data: Path, out: Path | None, size: int | None
 ) -> None:
     """Run a study's methods where no truth is known."""
     from attnwarp.errors import InputError
@@ -161,29 +155,24 @@ def _run_on_capture(
     from attnwarp_eval.experiments import captured
 
     with clear_errors():
-        if ply is None:
+        if capture.ply is None:
             raise InputError(
                 f"--data {data}: needs --ply; make it with: attnwarp fit {data} --out fit"
             )
-        if words[0] is None:
+        if capture.instruction is None:
             raise InputError(f"--data {data}: needs --instruction, such as 'make it snow'")
         loaded = load()
-        by_guide = captured.Editors(*editors)
+        editors = captured.Editors(capture.editor, capture.depth_editor, capture.device)
+        words = captured.Words(capture.instruction, capture.target_prompt, capture.source_prompt)
         folder = out or Path("runs") / f"{loaded.name}-{data.resolve().name}"
         try:
-            dataset = read_dataset(data, points=False, scale=scale)
+            dataset = read_dataset(data, points=False, scale=capture.scale)
         except (FileNotFoundError, ValueError) as error:
             raise InputError(f"--data: {error}") from None
         views = load_views(dataset, max_size=size, damaged="error")
         with reporter(every=True) as report, resumable(lambda: "finished edits are kept"):
             result = captured.compare(
-                loaded,
-                views,
-                read_ply(ply),
-                captured.Words(words[0], words[1], words[2]),
-                folder,
-                report,
-                editors=by_guide,
+                loaded, views, read_ply(capture.ply), words, folder, report, editors=editors
             )
     for what, why in result.left_out.items():
         typer.echo(f"left out: {what}: {why}", err=True)
