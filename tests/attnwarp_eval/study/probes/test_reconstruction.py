@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import written_runs
 import yaml
-from ball_scene import ball_scene
+from ball_scene import any_colour, ball_scene
 from torch_threads import on_one_thread
 
 from attnwarp_eval import metrics
@@ -26,16 +26,8 @@ from attnwarp_eval.world import turned
 
 one_thread = pytest.fixture(on_one_thread, scope="module", autouse=True)
 
-EDIT = {
-    "name": "any",
-    "instruction": "Paint the ball",
-    "source": "a blue ball",
-    "target": "a bright ball",
-    "answers": [
-        {"name": n, "target": f"a {n} ball", "changes": [{"object": "ball", "paint": c}]}
-        for n, c in (("red", "#d02020"), ("yellow", "#e0d020"))
-    ],
-}
+BRIGHT = {"red": "#d02020", "yellow": "#e0d020"}
+EDIT = any_colour("any", "Paint the ball", "a blue ball", "a bright ball", BRIGHT)
 
 
 def cells(tmp_path, **changes):

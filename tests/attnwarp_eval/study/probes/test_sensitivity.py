@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from ball_scene import ball_scene
+from ball_scene import any_colour, ball_scene
 
 from attnwarp.encoders import EncoderInfo
 from attnwarp.errors import InputError
@@ -47,21 +47,13 @@ SCENE = ball_scene(
             "target": "an orange box",
             "changes": [{"object": "box", "paint": "#e08020"}],
         },
-        {
-            "name": "any",
-            "instruction": "Paint the ball",
-            "source": "a blue ball",
-            "target": "a bright ball",
-            "answers": [
-                {"name": n, "target": f"a {n} ball", "changes": [{"object": "ball", "paint": c}]}
-                for n, c in (
-                    ("red", "#d02020"),
-                    ("yellow", "#e0d020"),
-                    ("white", "#f0f0f0"),
-                    ("pink", "#f080b0"),
-                )
-            ],
-        },
+        any_colour(
+            "any",
+            "Paint the ball",
+            "a blue ball",
+            "a bright ball",
+            {"red": "#d02020", "yellow": "#e0d020", "white": "#f0f0f0", "pink": "#f080b0"},
+        ),
         {
             "name": "dusk",
             "instruction": "Make it dusk",
