@@ -165,15 +165,8 @@ def failures(name, folder, seeds):
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries
 @pytest.mark.parametrize("name", FORMATS)
+@damage_files.seeds_of(FAST, SLOW)
 def test_a_damaged_study_run_or_derived_file_is_refused_in_one_line_or_means_the_same(
-    tmp_path, name
+    tmp_path, name, seeds
 ):
-    assert not (failed := failures(name, tmp_path, range(FAST))), "\n".join(failed)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.parametrize("name", FORMATS)
-def test_many_damaged_studies_runs_and_derived_files_are_refused_or_mean_the_same(tmp_path, name):
-    failed = failures(name, tmp_path, range(FAST, FAST + SLOW))
-    assert not failed, "\n".join(failed)
+    assert not (failed := failures(name, tmp_path, seeds)), "\n".join(failed)

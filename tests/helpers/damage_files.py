@@ -25,11 +25,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 SECONDS = 10.0
 """Longest time for one input."""
 
 MEMORY = 1 << 30
 """Largest growth of the address space for one input, in bytes."""
+
+
+def seeds_of(few, many):
+    """Parametrise a test by ``seeds``: a few, and many more that are slow."""
+    more = pytest.param(range(few, few + many), marks=pytest.mark.slow)
+    return pytest.mark.parametrize("seeds", [range(few), more], ids=["few", "many"])
+
 
 NUMBERS = (
     "0", "-0.0", "-1", "1", "255", "256", "65536", "-2147483649", "4294967296", "1e-320", "1e39",

@@ -73,8 +73,9 @@ def failures(folder, name, seeds):
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries
 @pytest.mark.parametrize("name", FILES)
-def test_a_damaged_model_is_refused_in_one_line_or_is_that_of_its_files(folder, name):
-    assert not (failed := failures(folder, name, range(FAST))), "\n".join(failed)
+@damage_files.seeds_of(FAST, SLOW)
+def test_a_damaged_model_is_refused_in_one_line_or_is_that_of_its_files(folder, name, seeds):
+    assert not (failed := failures(folder, name, seeds)), "\n".join(failed)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
@@ -84,11 +85,3 @@ def test_weights_that_are_not_finite_are_refused_by_name(value, tmp_path):
     pipe.save_pretrained(tmp_path)
     with pytest.raises(InputError, match=r"unet: its weights have NaN or inf.* in conv_in\.weight"):
         load_parts(tmp_path, dtype=torch.float32)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.parametrize("name", FILES)
-def test_many_damaged_models_are_refused_or_are_those_of_their_files(folder, name):
-    failed = failures(folder, name, range(FAST, FAST + SLOW))
-    assert not failed, "\n".join(failed)

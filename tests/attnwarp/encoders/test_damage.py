@@ -108,13 +108,6 @@ def failures(name, folder, seeds):
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries
 @pytest.mark.parametrize("name", READERS)
-def test_damaged_weights_are_refused_in_one_line_or_are_those_of_the_file(tmp_path, name):
-    assert not (failed := failures(name, tmp_path, range(FAST))), "\n".join(failed)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.parametrize("name", READERS)
-def test_much_damage_to_weights_is_refused_or_leaves_those_of_the_file(tmp_path, name):
-    failed = failures(name, tmp_path, range(FAST, FAST + SLOW))
-    assert not failed, "\n".join(failed)
+@damage_files.seeds_of(FAST, SLOW)
+def test_damaged_weights_are_refused_in_one_line_or_are_those_of_the_file(tmp_path, name, seeds):
+    assert not (failed := failures(name, tmp_path, seeds)), "\n".join(failed)

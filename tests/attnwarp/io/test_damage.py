@@ -246,13 +246,6 @@ def failures(name, folder, seeds):
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries
 @pytest.mark.parametrize("name", FORMATS)
-def test_damage_ends_in_a_right_result_or_in_one_line(tmp_path, name):
-    assert not (failed := failures(name, tmp_path, range(FAST))), "\n".join(failed)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.parametrize("name", FORMATS)
-def test_much_damage_ends_in_a_right_result_or_in_one_line(tmp_path, name):
-    failed = failures(name, tmp_path, range(FAST, FAST + SLOW))
-    assert not failed, "\n".join(failed)
+@damage_files.seeds_of(FAST, SLOW)
+def test_damage_ends_in_a_right_result_or_in_one_line(tmp_path, name, seeds):
+    assert not (failed := failures(name, tmp_path, seeds)), "\n".join(failed)
