@@ -68,6 +68,13 @@ def metrics(
         Path | None,
         typer.Option(help="Splats before the edit, for --consistency at rendered depth."),
     ] = None,
+    colmap: Annotated[
+        bool,
+        typer.Option(
+            "--colmap",
+            help="With --consistency, COLMAP's reconstruction of all views too (attnwarp[colmap]).",
+        ),
+    ] = False,
     background: Annotated[
         str, typer.Option(help="Behind transparent pixels: black, white, or r,g,b in [0, 1].")
     ] = "black",
@@ -93,7 +100,7 @@ def metrics(
 
         inputs = measure.Inputs(
             renders, edited, originals, source_edit, prompt, source_prompt, mask, consistency, ply,
-            _color(background),
+            _color(background), colmap,
         )  # fmt: skip
         one_view = {
             "--edited": edited, "--source-edit": source_edit, "--prompt": prompt,
@@ -105,8 +112,9 @@ def metrics(
                 f"{unread[0]}: figures of single views do not go with --consistency; leave it out"
                 " here, or --consistency"
             )
-        if consistency is None and ply is not None:
-            raise InputError("--ply: needs --consistency DATA, cameras with pictures")
+        for option, given in {"--ply": ply is not None, "--colmap": colmap}.items():
+            if consistency is None and given:
+                raise InputError(f"{option}: needs --consistency DATA, cameras with pictures")
         if (out / "study.json").exists():
             raise InputError(
                 f"--out: {out} is the run of a study, to which these figures would be strange;"

@@ -1,9 +1,9 @@
 """Do neighbouring views of a person's own edit agree? Pictures with poses, and no truth.
 
 The metrics are pure functions of :mod:`attnwarp_eval.metrics`; this module reads the files, and
-compares each view with the next in the order of their names. Keypoints are found at full size; all
-else is computed on pictures whose longest side is :data:`LONGEST` px, and colours at every second
-row and column of them, as in the study ``audit``.
+compares each view with the next in the order of their names. COLMAP reconstructs all of them.
+Keypoints are found at full size; all else is computed on pictures whose longest side is
+:data:`LONGEST` px, and colours at every second row and column of them, as in the study ``audit``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.metrics.epipolar import LEAST_MATCHES, LIMITS
 from attnwarp_eval.metrics.known_geometry import GRID
-from attnwarp_eval.study.record import with_nan
+from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.task import Task, results
 from attnwarp_eval.user_images.measure import (
@@ -67,15 +67,33 @@ _FEATURES = Figure("consistency.features", "Features at rendered depth", ("ply",
 _PERCEPTUAL = Figure(
     "consistency.perceptual", "Perceptual distance at rendered depth", ("ply",), "perceptual"
 )
+_COLMAP = tuple(
+    Figure(f"consistency.colmap_{name}", f"COLMAP {title}", ("colmap",))
+    for name, title in (
+        ("registered", "registered views"),
+        ("points", "points"),
+        ("track_length", "track length"),
+        ("error", "reprojection error"),
+        ("failed", "failed"),
+    )
+)
+"""Figures of all views together."""
 
 FIGURES = (
     *_TSED, _DISTANCE, _FLOW, _DIRECTION, _MATCHES, _EDIT, _RENDERED, _FEATURES, _PERCEPTUAL,
+    *_COLMAP,
 )  # fmt: skip
 
-_OPTIONS = {"poses": "--consistency", "ply": "--ply", "originals": "--originals and --renders"}
+_OPTIONS = {
+    "poses": "--consistency", "ply": "--ply", "originals": "--originals and --renders",
+    "colmap": "--colmap",
+}  # fmt: skip
 
-_FOUND_BY: Mapping[Figure, str] = {**dict.fromkeys((*_TSED, _DISTANCE, _FLOW), "cv2")}
-"""Packages that figures need beside the encoders'."""
+_FOUND_BY: Mapping[Figure, tuple[str, str]] = {
+    **dict.fromkeys((*_TSED, _DISTANCE, _FLOW), ("cv2", "eval")),
+    **dict.fromkeys(_COLMAP, ("pycolmap", "colmap")),
+}
+"""Packages that figures need beside the encoders', and the extras that have them."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +118,7 @@ def measure_consistency(
     device: str = "cpu",
     report: Reporter = SILENT,
 ) -> Measured:
-    """Compute what the pictures allow for each view and the next.
+    """Compute what the pictures allow for each view and the next, and for all by COLMAP.
 
     Args:
         inputs: with ``poses``. Views that are judged are ``renders``, else the pictures of the
@@ -115,21 +133,26 @@ def measure_consistency(
     done = Measured(inputs)
     cameras, edited, originals = _files(inputs, done)
     names = list(edited)
-    given = {"poses": True, "ply": inputs.ply is not None, "originals": bool(originals)}
+    given = {
+        "poses": True, "ply": inputs.ply is not None, "originals": bool(originals),
+        "colmap": inputs.colmap,
+    }  # fmt: skip
     wanted = []
     for figure in FIGURES:
         absent = [_OPTIONS[need] for need in figure.needs if not given[need]]
-        package = _FOUND_BY.get(figure)
+        package, extra = _FOUND_BY.get(figure, ("", ""))
         if absent:
             done.missing[figure.title] = f"needs {' and '.join(absent)}"
         elif figure.encoder is not None and encoders.get(figure.encoder) == OFF:
             done.missing[figure.title] = f"left out by --{figure.encoder} {OFF}"
-        elif package is not None and not _installed(package):
-            done.missing[figure.title] = f"needs the package {package}; install attnwarp[eval]"
+        elif package and not _installed(package):
+            done.missing[figure.title] = f"needs the package {package}; install attnwarp[{extra}]"
         else:
             wanted.append(figure)
     loaded = load_encoders(wanted, encoders, device, done)
     wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
+    together = [figure for figure in wanted if figure in _COLMAP]
+    wanted = [figure for figure in wanted if figure not in _COLMAP]
     pairs = _Pairs(inputs, cameras, edited, originals, wanted, loaded)
     tasks = (_task(pairs, inputs, one, two, device) for one, two in itertools.pairwise(names))
     values: dict[Figure, dict[str, float]] = {figure: {} for figure in wanted}
@@ -151,6 +174,10 @@ def measure_consistency(
             " or one centre of projection: they have no epipolar distance, and those with too few"
             " matches count against TSED, whatever the edit did"
         )
+    if together:
+        (found,) = results(store, [_reconstruction(pairs, names)], 1, report)
+        every = f"all {len(names)}"
+        done.rows += [Row(f.key, f.title, found[f.key], {every: found[f.key]}) for f in together]
     return done
 
 
@@ -378,6 +405,24 @@ def _along_flow(one: _View, two: _View) -> float:
         one.edited, two.edited[GRID], flow.xy[GRID], flow.accepted[GRID]
     )
     return result.figures("flow_")[_FLOW.key]
+
+
+def _reconstruction(pairs: _Pairs, names: Sequence[str]) -> Task[dict[str, float]]:
+    """All views as one scene, at full size."""
+    spec = {
+        "probe": "user reconstruction",
+        "protocol": PROTOCOL,
+        "edited": [_sha256(pairs.edited[name]) for name in names],
+        "intrinsics": [pairs.cameras[name].K.tolist() for name in names],
+        "background": list(pairs.inputs.background),
+    }
+
+    def compute(report: Reporter) -> Json:
+        views = [pairs._read(name) for name in names]
+        found = metrics.reconstruct([v.edited for v in views], [v.camera for v in views])
+        return {"figures": without_nan(found.figures())}
+
+    return Task("COLMAP", spec, compute, lambda record: with_nan(record["figures"]))
 
 
 def _task(pairs: _Pairs, inputs: Inputs, one: str, two: str, device: str) -> Task[dict[str, float]]:

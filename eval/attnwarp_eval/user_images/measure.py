@@ -64,6 +64,7 @@ class Inputs:
         poses, ply: cameras with pictures, and splats of the scene before the edit, for
             :func:`attnwarp_eval.user_images.consistency.measure_consistency`.
         background: sRGB in [0, 1] behind transparent pixels of pictures.
+        colmap: whether COLMAP reconstructs the views.
     """
 
     renders: Path | None = None
@@ -76,6 +77,7 @@ class Inputs:
     poses: Path | None = None
     ply: Path | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    colmap: bool = False
 
 
 @dataclass(frozen=True)

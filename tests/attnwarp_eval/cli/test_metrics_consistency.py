@@ -61,7 +61,7 @@ def measured(folder, out, *more):
 def test_every_figure_is_that_of_its_function(capture, tmp_path):
     result, _ = measured(capture, tmp_path, "--ply", capture / "scene.ply")
     rows = result["metrics"]
-    assert result["not_computed"] == {}
+    assert all(title.startswith("COLMAP ") for title in result["not_computed"])  # no --colmap
     dataset = read_dataset(capture)
     names = [path.stem for path in dataset.image_paths]
     after = [read_picture(capture / "renders" / path.name) for path in dataset.image_paths]

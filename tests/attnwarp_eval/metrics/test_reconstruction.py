@@ -2,17 +2,22 @@
 corner of three textured walls.
 """
 
+import importlib.util
 import json
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
+from typer.testing import CliRunner
 
 from attnwarp import Camera
 from attnwarp.errors import InputError
+from attnwarp.io import Dataset, write_transforms
 from attnwarp_eval import metrics
+from attnwarp_eval.cli.main import app
 
 pytest.importorskip("pycolmap")  # in this process it is never used: it breaks other packages
 
@@ -82,6 +87,27 @@ def test_right_views_are_all_registered_and_those_of_another_scene_are_not(camer
     assert metrics.reconstruct(right, cameras) == found
     other = [corner(k % 2, camera) for k, camera in enumerate(cameras)]
     assert metrics.reconstruct(other, cameras).registered <= 3
+
+
+def test_the_command_reconstructs_the_edited_pictures_of_a_person(cameras, tmp_path, monkeypatch):
+    paths = [tmp_path / f"{k}.png" for k in range(6)]
+    for path, camera in zip(paths, cameras, strict=True):
+        cv2.imwrite(str(path), np.rint(255 * corner(0, camera)))
+    write_transforms(tmp_path / "transforms.json", Dataset(cameras, paths))
+    options = ["metrics", "--consistency", str(tmp_path), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, [*options, "--colmap"])
+    assert done.exit_code == 0, done.output
+    result = json.loads((tmp_path / "out/metrics.json").read_text())["metrics"]
+    found = {name: row["value"] for name, row in result.items() if ".colmap_" in name}
+    registered, points, length, error, failed = found.values()
+    assert registered == 1 and failed == 0 and points > 100 and 2 < length <= 6 and error < 1
+    # A flag left out and a package that is missing cost these figures alone.
+    assert "COLMAP points: needs --colmap" in CliRunner().invoke(app, options).output
+    find = importlib.util.find_spec
+    absent = lambda name, *more: None if name == "pycolmap" else find(name, *more)  # noqa: E731
+    monkeypatch.setattr(importlib.util, "find_spec", absent)
+    done = CliRunner().invoke(app, [*options, "--colmap"])
+    assert done.exit_code == 0 and "install attnwarp[colmap]" in done.output
 
 
 def test_a_failure_is_counted(cameras):
