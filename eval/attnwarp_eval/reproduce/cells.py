@@ -161,11 +161,9 @@ class Job:
         """Folder of the cell's files."""
         return cell_folder(self.run, self.cell.id)
 
-    def _files(
-        self, *folders: Path, ends: Sequence[str] = (".png", ".ply")
-    ) -> list[dict[str, str]]:
+    def _files(self, *folders: Path) -> list[dict[str, str]]:
         paths = sorted(p for f in folders for p in ([f] if f.is_file() else f.rglob("*")))
-        return [Store(self.run).keep_picture(p) for p in paths if p.suffix in ends]
+        return [Store(self.run).keep_picture(p) for p in paths if p.suffix in (".png", ".ply")]
 
     def fit(self) -> Made:
         """Fit splats to all views; a fit that was killed goes on."""

@@ -18,7 +18,6 @@ from attnwarp_eval.truth import Geometry
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings
     from attnwarp.gaussians import Gaussians
-    from attnwarp.warp import Surface, WarpSettings
     from attnwarp_eval.two_view import Hits
 
 
@@ -78,7 +77,7 @@ def fit_scene(
 
     def errors(splats: Gaussians) -> dict[str, float]:
         figures = [
-            surface_error(splats, camera, hits)[1]
+            rendered_error(splats, camera, hits)
             for camera, hits in zip(parts[1].cameras, truth, strict=True)
         ]
         return {
@@ -91,21 +90,13 @@ def fit_scene(
     )
 
 
-def surface_error(
-    splats: Gaussians,
-    camera: Camera,
-    truth: Hits,
-    settings: WarpSettings | None = None,
-    edge: Any = None,
-) -> tuple[Surface, dict[str, float]]:
-    """Render a surface of splats, and measure its errors of depth and normals.
+def rendered_error(splats: Gaussians, camera: Camera, truth: Hits) -> dict[str, float]:
+    """Errors of the median depth and of the normals that splats have in a view.
 
     Args:
         splats: what is rendered.
         camera: the view, (H, W).
         truth: of the same view.
-        settings: how depth is read off the splats; the median depth if left out.
-        edge: (H, W) bool, the band around edges; None for no scores by place.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -113,17 +104,16 @@ def surface_error(
         >>> from attnwarp_eval.truth import Geometry
         >>> scene = load_scene("spheres").with_size(16, 16)
         >>> truth = Geometry(scene).trace(scene.source)
-        >>> surface, error = surface_error(surface_splats(scene, count=2000), scene.source, truth)
-        >>> surface.depth.shape, error["depth.abs_rel"] < 0.2
-        (torch.Size([16, 16]), True)
+        >>> error = rendered_error(surface_splats(scene, count=2000), scene.source, truth)
+        >>> error["depth.abs_rel"] < 0.2
+        True
     """
     from attnwarp.warp import WarpSettings, render_surface
 
-    surface = render_surface(splats, camera, settings or WarpSettings(depth_statistic="median"))
-    figures = metrics.depth_error(
-        surface.depth, truth.depth, normal=surface.normal, true_normal=truth.normal, edge=edge
+    surface = render_surface(splats, camera, WarpSettings(depth_statistic="median"))
+    return metrics.depth_error(
+        surface.depth, truth.depth, normal=surface.normal, true_normal=truth.normal
     )
-    return surface, figures
 
 
 def picture_error(image: npt.NDArray[Any], true_image: npt.NDArray[np.uint8]) -> dict[str, float]:

@@ -70,10 +70,8 @@ def _noncentral(t: float, free: int, shift: float) -> float:
     return value if math.isfinite(value) else float(t > shift)
 
 
-def effect_interval(
-    mean: float, deviation: float, scenes: int, *, level: float = 0.8
-) -> tuple[float, float]:
-    """Within which bounds the true mean over the true deviation may lie.
+def effect_interval(mean: float, deviation: float, scenes: int) -> tuple[float, float]:
+    """The 80 % interval of the true mean over the true deviation.
 
     The noncentral t distributions under which the observed t would be at either end (Steiger &
     Fouladi 1997, "Noncentrality interval estimation and the evaluation of statistical models").
@@ -81,7 +79,6 @@ def effect_interval(
     Args:
         mean, deviation: of the scenes' differences, as observed; the deviation > 0.
         scenes: how many, at least 2.
-        level: coverage, in (0, 1).
 
     Returns:
         The bounds, lower first.
@@ -101,7 +98,7 @@ def effect_interval(
 
         return float(optimize.brentq(missed, -reach, reach)) / math.sqrt(scenes)
 
-    return bound(0.5 + level / 2), bound(0.5 - level / 2)
+    return bound(0.9), bound(0.1)
 
 
 @dataclass(frozen=True)

@@ -150,9 +150,9 @@ def rgb(color: str) -> npt.NDArray[np.float32]:
     return np.array([int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)], dtype=np.float32)
 
 
-def checkered(shape: tuple[int, int], step: int = 16) -> Image:
-    """(H, W, 3) light grey squares, which mean "nothing"."""
-    y, x = np.indices(shape) // step
+def checkered(shape: tuple[int, int]) -> Image:
+    """(H, W, 3) light grey squares of 16 px, which mean "nothing"."""
+    y, x = np.indices(shape) // 16
     return np.repeat((0.78 + 0.1 * ((x + y) % 2))[..., None], 3, axis=2).astype(np.float32)
 
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from attnwarp import Gaussians
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
-from attnwarp_eval.splats.fitted import surface_error
+from attnwarp_eval.splats.fitted import rendered_error
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.budgets import Spent
 from attnwarp_eval.study.edit_truth import EditTruth, Judgement, neighbours
@@ -279,7 +279,7 @@ class Measurement:
         camera = self.work.world.camera(name)
         row = {}
         for when, model in (("before", self.before), ("after", self.after)):
-            _, error = surface_error(model, camera, hits)
+            error = rendered_error(model, camera, hits)
             row[f"depth.abs_rel.{when}"] = error["depth.abs_rel"]
         return row
 
