@@ -128,7 +128,7 @@ def test_a_variant_has_the_preset_of_its_method_that_it_names(method, name, expe
         ("editing: {editor: {name: small}}\nvariants:\n  v: {editor: {}}\nprobes: {editing: [v]}\n",
          ":4: editing.editor.name: no variant takes it from the study"),
         ("fit: {settings: {iterations: 9}}\nvariants:\n  v: {}\nprobes: {warp: [v]}\n",
-         ":4: fit: nothing that this study measures reads it; add fit to probes"),
+         ":4: fit: nothing that this study measures reads it; add fit or surfaces to probes"),
         ("stability: {levels: quick}\nvariants:\n  v: {}\nprobes: {warp: [v]}\n",
          ":4: stability: nothing that this study measures reads it; add stability to probes"),
         ("seeds: [0, 1]\nvariants:\n  v: {}\nprobes: {editing-timing: [v]}\n",
