@@ -40,10 +40,13 @@ STAGES = {MESH: ("fuse", "nearest"), HELD_OUT: ("held out",), WARP: ("source", "
 """Stages of a cell whose seconds the figures of a kind cost."""
 
 ERRORS = {
-    "feature error": "warp.feature_all_accepted.{layer}",
+    "feature error, accepted": "warp.feature_all_accepted.{layer}",
+    "feature error, visible": "warp.feature_visible.{layer}",
     "right labels": "labels.right",
 }
-"""Errors that they are to predict, by title; the first one decides."""
+"""Errors that they are to predict, by title: of what the mask lets through, of all that the source
+shows, whatever the mask says, and of labels.
+"""
 
 CPU = "CPU seconds of the fit"
 
@@ -100,34 +103,31 @@ def _sign(name: str) -> int:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Agreement of one figure with the errors of warps.
+    """Agreement of one figure with one error of warps.
 
     Attributes:
         title: of the figure.
-        read: what it is read off.
-        taus: of each error of :data:`ERRORS`, by scene.
+        taus: by scene.
     """
 
     title: str
-    read: str
-    taus: Sequence[Mapping[str, float]]
+    taus: Mapping[str, float]
 
     @cached_property
-    def intervals(self) -> list[Interval]:
-        """Mean over scenes for each error."""
-        return [interval({scene: [tau] for scene, tau in own.items()}) for own in self.taus]
+    def mean(self) -> Interval:
+        """Mean over scenes."""
+        return interval({scene: [tau] for scene, tau in self.taus.items()})
 
-    @property
-    def tau(self) -> float:
-        """Mean for the error that decides; -inf where it is undefined."""
-        mean = self.intervals[0].mean
-        return mean if math.isfinite(mean) else -math.inf
+    def __str__(self) -> str:
+        name = self.title.removesuffix(", px").removesuffix(", dB").removesuffix(", deg")
+        many = self.mean.scenes >= FEWEST_SCENES and self.mean.bounded
+        within = f" ± {number(self.mean.high - self.mean.mean, 2)}" if many else ""
+        return f"{name} {number(self.mean.mean, 2)}{within}"
 
-    def behind(self, best: Prediction) -> SignFlips:
-        """Test of the best one's tau less this one's, over the scenes that have both."""
-        ours, theirs = self.taus[0], best.taus[0]
-        gaps = [theirs[scene] - tau for scene, tau in ours.items() if scene in theirs]
-        return SignFlips(np.array([gap for gap in gaps if math.isfinite(gap)]), rounding=1e-12)
+    def behind(self, best: Prediction) -> float:
+        """Probability by flipped signs of the gap to the best one, were both alike."""
+        gaps = [best.taus[scene] - tau for scene, tau in self.taus.items()]
+        return SignFlips(np.array([gap for gap in gaps if math.isfinite(gap)]), rounding=1e-12).p
 
 
 @register_report
@@ -138,10 +138,11 @@ class SurfaceReport(ProbeReport):
     measures = "surfaces of splats, and their warps"
     columns: ClassVar[Mapping[str, str]] = {
         **{title: name for title, (name, _) in FIGURES.items()},
-        **ERRORS,
+        "feature error": ERRORS["feature error, accepted"],
+        "right labels": ERRORS["right labels"],
     }
     tabulates_all = True
-    contrasts = ("surface.chamfer", "surface.f_score", *ERRORS.values())
+    contrasts = tuple(columns.values())
     cost = "fit"
     cost_of = "a fit"
     cost_text = "CPU seconds are those of a fit's iterations."
@@ -155,52 +156,39 @@ class SurfaceReport(ProbeReport):
         ]
         names = [name for name in measured if results.study.variants[name].geometry == "splats"]
         ranked = Rankings(results, names)
-        errors = [name.format(layer=results.layer) for name in ERRORS.values()]
-        found = [
-            Prediction(title, read, [ranked.taus(name, error) for error in errors])
-            for title, (name, read) in FIGURES.items()
-        ]
-        if any(math.isfinite(one.tau) for one in found):
-            found.sort(key=lambda one: -one.tau)
-            yield Place.ANSWER, self._answer(results, layout, ranked, found, errors, measured)
+        found = {
+            error: [
+                Prediction(title, ranked.taus(name, metric.format(layer=results.layer)))
+                for title, (name, _) in FIGURES.items()
+            ]
+            for error, metric in ERRORS.items()
+        }
+        if any(math.isfinite(one.mean.mean) for own in found.values() for one in own):
+            yield Place.ANSWER, self._answer(results, layout, ranked, found, measured)
 
     def _answer(
         self,
         results: Results,
         layout: Layout,
         ranked: Rankings,
-        found: Sequence[Prediction],
-        errors: Sequence[str],
+        found: Mapping[str, Sequence[Prediction]],
         measured: Sequence[str],
     ) -> Section:
-        best, *others = found
-        tests = {one.title: one.behind(best) for one in others}
-        adjusted = benjamini_hochberg([test.p for test in tests.values()])
-        apart = {title: p <= 0.05 for title, p in zip(tests, adjusted, strict=True)}
         seconds = {read: self._seconds(results, ranked.names, read) for read in STAGES}
-        own = {scene: [tau] for scene, tau in ranked.taus(errors[1], errors[0]).items()}
         scenes = len(results.study.scenes)
         rows = [
             [
-                one.title,
-                one.read,
-                *(spread(value, scenes) for value in one.intervals),
-                "–" if one is best else _gap(tests[one.title]),
-                "–" if one is best else "yes" if apart[one.title] else "no",
-                number(seconds[one.read]),
+                title,
+                read,
+                *(spread(own[place].mean, scenes) for own in found.values()),
+                number(seconds[read]),
             ]
-            for one in found
+            for place, (title, (_, read)) in enumerate(FIGURES.items())
         ]
-        columns = [
-            "figure",
-            "read off",
-            *(f"tau with {title}" for title in ERRORS),
-            "behind the first",
-            "told apart",
-            "seconds",
-        ]
+        columns = ["figure", "read off", *(f"tau with {title}" for title in ERRORS), "seconds"]
         everyone = Rankings(results, measured)
-        keys = list(self.columns_at(results.layer).values())
+        shown = {title: name for title, (name, _) in FIGURES.items()} | ERRORS
+        keys = [name.format(layer=results.layer) for name in shown.values()]
         settings = [
             [
                 name,
@@ -209,13 +197,17 @@ class SurfaceReport(ProbeReport):
             ]
             for name in measured
         ]
+        words = list(_words(found))
+        if layout.timings:
+            told = ", ".join(f"{number(taken, 2)} s for {read}" for read, taken in seconds.items())
+            words.append(f"- **Cost** of the figures of one fit: {told}.")
         return Section(
             "Which figure predicts the warp",
-            [*_words(results, found, apart), *_how(results, ranked, interval(own), layout)],
+            ["\n".join(words), *_how(results, ranked, layout)],
             [
                 Table(columns, rows, "Kendall's tau of each figure", timed=("seconds",)),
                 Table(
-                    ["setting", *self.columns, CPU],
+                    ["setting", *shown, CPU],
                     settings,
                     "The settings, means over scenes",
                     timed=(CPU,),
@@ -232,57 +224,30 @@ class SurfaceReport(ProbeReport):
         return median(taken)
 
 
-def _gap(test: SignFlips) -> str:
-    low, high = test.interval()
-    bounds = f" ({number(low)} to {number(high)})" if math.isfinite(low) else ""
-    return f"{number(test.mean)}{bounds}"
+def _words(found: Mapping[str, Sequence[Prediction]]) -> Iterator[str]:
+    """Sentences on what was found, one for each error."""
+    for error, predictions in found.items():
+        known = [one for one in predictions if math.isfinite(one.mean.mean)]
+        if not known:
+            continue
+        best, *others = sorted(known, key=lambda one: -one.mean.mean)
+        adjusted = benjamini_hochberg([one.behind(best) for one in others])
+        worse = [str(one) for one, p in zip(others, adjusted, strict=True) if p <= 0.05]
+        alike = [str(one) for one, p in zip(others, adjusted, strict=True) if not p <= 0.05]
+        told = f"- **{error[0].upper()}{error[1:]}**: best is **{best}**, which orders"
+        told += f" {50 * (1 + best.mean.mean):.0f} % of the pairs of settings alike."
+        told += f" Not told apart from it: {', '.join(alike)}." if alike else ""
+        yield told + (f" Worse: {', '.join(worse)}." if worse else "")
 
 
-def _tau(one: Prediction) -> str:
-    tau = one.intervals[0]
-    within = f" ± {number(tau.high - tau.mean, 2)}" if tau.scenes >= FEWEST_SCENES else ""
-    return f"{number(tau.mean, 2)}{within}"
-
-
-def _words(
-    results: Results, found: Sequence[Prediction], apart: Mapping[str, bool]
-) -> Iterator[str]:
-    """Sentences on what was found."""
-    known = [one for one in found if math.isfinite(one.tau)]
-    best, *others = known
-    yield (
-        f"Best is **{_name(best)}**, read off {best.read}: it orders {50 * (1 + best.tau):.0f} % of"
-        " all pairs of settings as the feature error of their warps does (Kendall's tau"
-        f" {_tau(best)})."
-    )
-    kinds: dict[str, Prediction] = {}
-    for one in known:
-        kinds.setdefault(one.read, one)
-    lines = [
-        f"- Of {read}, the best is **{_name(one)}**: {_tau(one)}."
-        for read, one in kinds.items()
-        if one is not best
-    ]
-    for told, title in ((False, "Not told apart from the first"), (True, "Worse than it")):
-        names = ", ".join(f"{_name(one)} {_tau(one)}" for one in others if apart[one.title] is told)
-        if names:
-            lines.append(f"- {title}: {names}.")
-    yield "\n".join(lines)
-
-
-def _name(one: Prediction) -> str:
-    """The title without its unit."""
-    return one.title.removesuffix(", px").removesuffix(", dB").removesuffix(", deg")
-
-
-def _how(results: Results, ranked: Rankings, own: Interval, layout: Layout) -> Iterator[str]:
+def _how(results: Results, ranked: Rankings, layout: Layout) -> Iterator[str]:
     """Sentences on what was done."""
     study = results.study
     yield (
         f"{len(ranked.names)} settings of fits, {study.scenes_in_words}. In each scene every figure"
-        " ranks the settings; tau is 1 where it orders each pair as the error does, 0 for chance."
-        f" Intervals are over scenes. Right labels, the other error of a warp, have a tau of"
-        f" {spread(own, len(study.scenes))} with the feature error."
+        " ranks the settings, and so does each error of their warps. Kendall's tau is 1 where both"
+        " order every pair of settings alike, and 0 by chance; means and intervals are over scenes."
+        " Masks of two settings accept different features: one that accepts little can err little."
     )
     yield (
         "The mesh is fused of the depth in the views that were fitted (TSDF, voxels of a pixel,"
@@ -290,6 +255,7 @@ def _how(results: Results, ranked: Rankings, own: Interval, layout: Layout) -> I
         f" distance; the F-score's threshold is {THRESHOLD:g} of it. AbsRel, delta, normals and"
         " PSNR are of views that no fit has seen. EPE is the median distance of carried points from"
         f" where they belong. Labels are of {PARTS} parts. All but PSNR need the true surface."
+        " Depth that is exact shows what fusing and sampling cost; its warps have stricter rules."
     )
     if layout.timings:
         yield (
