@@ -315,11 +315,10 @@ def marked(
         if editor_name in bundled():
             say_unmarked(editor_name, report)
         return lambda splats: None
-    mask = source_mask(
-        marks, views.cameras[index], images[index], pictures[index], full[index].width, out, device,
-        report,
-    )  # fmt: skip
-    return lambda splats: lifted_segments(mask, splats, views.cameras, index, report)
+    camera, width = views.cameras[index], full[index].width
+    mask = source_mask(marks, camera, images[index], pictures[index], width, out, device, report)
+    at = None if marks.at is None else [camera.width / width * v for v in marks.at]
+    return lambda splats: lifted_segments(mask, splats, views.cameras, index, report, at)
 
 
 def _fitted(

@@ -19,7 +19,7 @@ from attnwarp.methods.pictures import Segment, check_view_aspect
 from attnwarp.methods.scene import near_of, to_float
 from attnwarp.methods.words import masks_by_words, words_folder
 from attnwarp.reporting import Reporter
-from attnwarp.warp import lift_masks
+from attnwarp.warp import lift_masks, piece_around
 
 COLORED = 0.1
 """Spread of a pixel's channels that no grey picture has: a photograph, or a mask of two colours,
@@ -166,13 +166,22 @@ def source_mask(
 
 
 def lifted_segments(
-    mask: Mask, splats: Gaussians, cameras: Sequence[Camera], source: int, report: Reporter
+    mask: Mask,
+    splats: Gaussians,
+    cameras: Sequence[Camera],
+    source: int,
+    report: Reporter,
+    at: Sequence[float] | None = None,
 ) -> list[Segment]:
     """(H, W) of each view in [0, 1]: the source's mask, lifted through splats.
 
-    Values are whole 255ths, as the pictures of masks have them.
+    Values are whole 255ths, as the pictures of masks have them. A mask of a point ``at``, in px of
+    the source view, is held to the surface around it.
     """
     near = near_of(cameras, splats)
+    if at is not None:
+        mask = mask & piece_around(splats, cameras[source], at, near=near)
+        report.log(f"held to the surface around the point, it marks {mask.mean():.1%}")
     lifted = lift_masks(splats, [cameras[source]], [mask], near=near)
     (agreement,) = lifted.agreement
     left_out = int((~lifted.reached).sum())

@@ -12,6 +12,7 @@ from attnwarp.warp.depth import TAP_SPREAD, depth_slope, resize_depth
 from attnwarp.warp.features import FeatureWarp
 from attnwarp.warp.lifting import LiftedMask, lift_masks
 from attnwarp.warp.masks import resize_mask
+from attnwarp.warp.piece import piece_around
 from attnwarp.warp.rules import (
     EXACT_DEPTH_TOLERANCE,
     RULES,
@@ -70,6 +71,7 @@ __all__ = [
     "parts_of",
     "parts_read",
     "photometric",
+    "piece_around",
     "preset",
     "render_surface",
     "resize_depth",

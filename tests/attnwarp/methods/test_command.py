@@ -36,7 +36,7 @@ from attnwarp.methods.scene import near_of, to_float
 from attnwarp.methods.words import masks_by_words, words_folder
 from attnwarp.render import render
 from attnwarp.reporting import SILENT
-from attnwarp.warp import lift_masks
+from attnwarp.warp import lift_masks, piece_around
 
 runner = CliRunner()
 QUICK = (
@@ -232,6 +232,22 @@ def test_a_box_marks_what_opencv_cuts_out(place, tmp_path, option, value):
     (tmp_path / "mask.png").write_bytes(encode_png(picture))
     ply = ("--ply", place / "splats.ply")
     assert run(place, tmp_path / "a", *ply, option, value).exit_code == 0
+    assert run(place, tmp_path / "b", *ply, "--mask", tmp_path / "mask.png").exit_code == 0
+    for k in range(len(cameras())):
+        one, two = ((tmp_path / f / "segments" / f"v{k}.png").read_bytes() for f in "ab")
+        assert one == two
+
+
+def test_a_click_is_held_to_the_surface_around_it(place, tmp_path):
+    """Oracle: the cut of the source's picture on the piece around the point, given as a file."""
+    source = read_image(place / "data" / "images" / "v0.png").astype(np.float32) / 255
+    mask = cut_out(source, at=(16, 16))
+    mask &= piece_around(read_ply(place / "splats.ply"), cameras()[0], (16, 16))
+    picture = 255 * np.repeat(mask[..., None], 3, axis=2).astype(np.uint8)
+    (tmp_path / "mask.png").write_bytes(encode_png(picture))
+    ply = ("--ply", place / "splats.ply")
+    done = run(place, tmp_path / "a", *ply, "--at", "16,16")
+    assert done.exit_code == 0 and "held to the surface around the point" in done.output
     assert run(place, tmp_path / "b", *ply, "--mask", tmp_path / "mask.png").exit_code == 0
     for k in range(len(cameras())):
         one, two = ((tmp_path / f / "segments" / f"v{k}.png").read_bytes() for f in "ab")

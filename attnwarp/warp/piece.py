@@ -1,0 +1,99 @@
+"""Piece of surface around a point of a picture: what depth parts from it is another thing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.camera import Camera
+from attnwarp.gaussians import Gaussians
+from attnwarp.render import constants
+from attnwarp.warp.view import render_surface
+
+STEP = 0.02
+"""Distance of a neighbour's point from a pixel's tangent plane, of its depth, that parts them."""
+
+FLAT, LEVEL = 0.01, 0.7
+"""Limits of the largest plane: distance from it, of the median depth, and least cosine."""
+
+DRAWN, TRIED = 10_000, 300
+"""Pixels that vote for the largest plane, and those whose planes are tried."""
+
+
+def piece_around(
+    gaussians: Gaussians,
+    camera: Camera,
+    at: Sequence[float],
+    *,
+    near: float = constants.NEAR,
+) -> npt.NDArray[np.bool_]:
+    """(H, W) bool: pixels that a path of rendered surface joins to one, and a pixel around them.
+
+    A path has no step in depth, and avoids the largest plane, on which things stand, unless it
+    begins there. All is joined where nothing is drawn at the pixel.
+
+    Args:
+        gaussians: splats of either kind.
+        camera: of the picture.
+        at: x, y in px of it.
+        near: see :func:`attnwarp.render.render`.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.3), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> front = Camera.look_at((0, 0, 3), (0, 0, 0), width=8, height=8, fov_y=40, up=(0, 1, 0))
+        >>> bool(piece_around(disc, front, (0, 0)).all())  # nothing there
+        True
+    """
+    import cv2
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    seen = render_surface(gaussians, camera, near=near)
+    depth, normal, alpha = (
+        np.asarray(v, np.float64) for v in (seen.depth, seen.normal, seen.alpha)
+    )
+    height, width = depth.shape
+    own = min(int(at[1]), height - 1), min(int(at[0]), width - 1)
+    solid = (alpha > 0.5) & np.isfinite(depth)
+    if not solid[own]:
+        return np.ones_like(solid)
+    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+    place = camera.unproject(pixels, np.where(solid, depth, 1.0))
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+    flat = _in_largest_plane(place, normal, solid, FLAT * float(np.median(depth[solid])))
+    free = solid if flat[own] else solid & ~flat
+    number = np.arange(height * width).reshape(height, width)
+    joined = []
+    for one, two in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        step = place[one] - place[two]
+        off = [np.abs((step * normal[side]).sum(-1)) for side in (one, two)]
+        limit = STEP * np.minimum(depth[one], depth[two])
+        keep = free[one] & free[two] & (np.minimum(*off) < limit)
+        joined.append(np.stack([number[one][keep], number[two][keep]]))
+    i, j = np.concatenate(joined, axis=1)
+    graph = coo_array((np.ones(len(i)), (i, j)), shape=(number.size, number.size))
+    part = connected_components(graph, directed=False)[1].reshape(height, width)
+    piece = (part == part[own]).astype(np.uint8)
+    return np.asarray(cv2.dilate(piece, np.ones((3, 3), np.uint8)) > 0)
+
+
+def _in_largest_plane(place: Any, normal: Any, solid: Any, reach: float) -> npt.NDArray[np.bool_]:
+    """(H, W) bool: points in the plane that most lie in (RANSAC, Fischler & Bolles 1981)."""
+
+    def members(place: Any, normal: Any, point: Any, direction: Any) -> npt.NDArray[np.bool_]:
+        near = np.abs((place - point) @ direction) < reach
+        return np.asarray(near & (np.abs(normal @ direction) > LEVEL))
+
+    drawn = np.random.default_rng(0).permutation(np.flatnonzero(solid))[:DRAWN]
+    some, facing = (v.reshape(-1, 3)[drawn] for v in (place, normal))
+    planes = zip(some[:TRIED], facing[:TRIED], strict=True)
+    best = max((members(some, facing, *plane) for plane in planes), key=np.count_nonzero)
+    middle = some[best].mean(0)
+    axes = np.linalg.svd(some[best] - middle, full_matrices=False)[2]
+    return solid & members(place, normal, middle, axes[-1])
