@@ -3,7 +3,7 @@
 :func:`detect` compares the file with the graph handed to Mitsuba (plugin names) and with Mitsuba's
 scene (BSDF flags, emitter flags, media, textures by class name). An effect in one that another
 lacks is an error. :mod:`attnwarp_eval.effects.proof` compares a plan with a rendering with
-everything on. docs/truth/effects.md has the reasons.
+everything on. docs/truth/truth.md has the reasons.
 """
 
 from __future__ import annotations

@@ -272,7 +272,7 @@ def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Re
         f"{variants}. Made by `attnwarp-eval scenes effects --all --prove --out <this folder>`.",
         (
             f"**Beyond the usual**: effects besides {', '.join(USUAL)}. **Proof**: the ladder of"
-            " docs/truth/effects.md at 32 x 32 from the source; **bound** is |d| + 2.33 SE of the"
+            " docs/truth/truth.md at 32 x 32 from the source; **bound** is |d| + 2.33 SE of the"
             " picture's mean, which must stay below 1 %; the **smallest difference** that would"
             " have been seen with 80 % chance is a share of the picture's mean, for the picture,"
             " an 8 x 8 block and a pixel."

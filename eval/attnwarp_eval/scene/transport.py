@@ -161,7 +161,7 @@ def contradictions(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]
             yield (
                 (
                     f"effects.pin: {effect!r} is pinned, but nothing here causes it;"
-                    " docs/truth/effects.md says what does"
+                    " docs/truth/truth.md says what does"
                 ),
                 ("effects", "pin", k),
             )

@@ -1,7 +1,7 @@
 """The renderings whose sum is a picture of a scene: the cheapest that are faithful to it.
 
 :func:`plan_passes` follows from what the scene file says, without loading anything, for a number of
-bounces; :mod:`attnwarp_eval.truth.plan` knows the scene's own number. docs/truth/effects.md has the
+bounces; :mod:`attnwarp_eval.truth.plan` knows the scene's own number. docs/truth/truth.md has the
 reasons.
 """
 

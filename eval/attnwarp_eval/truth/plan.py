@@ -1,6 +1,6 @@
 """Plan of a scene's pictures, with the number of bounces that its file names.
 
-:func:`plan` needs no loading. docs/truth/effects.md has the reasons.
+:func:`plan` needs no loading. docs/truth/truth.md has the reasons.
 """
 
 from __future__ import annotations
