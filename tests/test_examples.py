@@ -131,8 +131,6 @@ edited_views, rendered_views = {"0": image_srgb}, {"0": target_srgb}
 scene = load_scene("spheres")
 geometry = Geometry(scene)
 source, target = (camera.resize(32, 32) for camera in scene.cameras[:2])
-""",
-    "docs/measuring/consistency.md": """
 originals = list(np.random.default_rng(0).random((3, 64, 64, 3)))
 edited = [1 - picture for picture in originals]
 from few_splats import few_splats
