@@ -23,6 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PAGE = "docs/start/quickstart.md"
+END = "\n## Every command\n"
 BLOCK = re.compile(r"^```(sh|yaml)\n(.*?)^```|^## (.+?)$", re.MULTILINE | re.DOTALL)
 
 
@@ -51,7 +52,7 @@ class Walked:
 
 
 def steps(page: str) -> list[Step]:
-    """Commands and files of a page, in its order.
+    """Commands and files of a page, in its order, up to its list of every command.
 
     Example:
         >>> [step.text for step in steps("## 1\\n```sh\\nmake demo   # minutes\\nls\\n```\\n")]
@@ -59,7 +60,7 @@ def steps(page: str) -> list[Step]:
     """
     found: list[Step] = []
     section = ""
-    for language, text, heading in BLOCK.findall(page):
+    for language, text, heading in BLOCK.findall(page.partition(END)[0]):
         if heading:
             section = heading
         elif language == "sh":

@@ -1,4 +1,4 @@
-"""Call every command of the README and docs/start/commands.md in an environment, as of `make demo`.
+"""Call every command of README and docs/start/quickstart.md in an environment, as of `make demo`.
 
     python scripts/readme_commands.py BIN [RUN]
 
@@ -52,7 +52,7 @@ def problem(words: list[str], folder: Path, run: str | None) -> str | None:
 def main(folder: str, run: str | None = None) -> int:
     """Call them all; the number of those that fail."""
     root = Path(__file__).parents[1]
-    pages = (root / name for name in ("README.md", "docs/start/commands.md"))
+    pages = (root / name for name in ("README.md", "docs/start/quickstart.md"))
     found = [words for page in pages for words in commands(page.read_text(encoding="utf-8"))]
     problems = [text for words in found if (text := problem(words, Path(folder), run))]
     print("\n".join([*problems, f"{len(found) - len(problems)} of {len(found)} commands work"]))

@@ -195,7 +195,7 @@ def test_a_command_that_cannot_be_called_is_found(line, tmp_path, monkeypatch):
 
 
 CHEAP = {
-    "docs/start/commands.md": [
+    "docs/start/quickstart.md": [
         "attnwarp render fits/mine/splats.ply my_capture --out fits/views",
         "attnwarp convert fits/mine/splats.ply mine.splat",
         "attnwarp undistort my_capture undistorted",
