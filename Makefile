@@ -10,7 +10,7 @@ JOBS ?= $(shell awk -v n=$$(nproc) '/MemAvailable/ { m = int($$2 / 3e6); print m
 # By `worksteal` a worker that dies fails its test alone; by `loadscope` and `loadfile` the run would hang.
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal --durations=25 --durations-min=1
 
-# Left to `make test-all` (docs/project/extending.md).
+# Left to `make test-all` (CONTRIBUTING.md).
 THOROUGH := slow or door or damage or training or scripts
 
 # Of the gate: the run, and what it says.
@@ -26,7 +26,7 @@ demo:
 	@scripts/venv.sh edit,eval
 	$(BIN)/attnwarp-eval run quick --jobs $(JOBS) --out $(RUN)
 
-## lint, types, layers, the gate, and the tests that fit in a coffee break (docs/project/extending.md)
+## lint, types, layers, the gate, and the tests that fit in a coffee break (CONTRIBUTING.md)
 test: checks
 	$(PYTEST) -m "not ($(THOROUGH))"
 
