@@ -106,7 +106,7 @@ class Case:
     """A numerically hard input, swept over its hardness until what is computed breaks.
 
     Attributes:
-        number: of docs/measuring/hard-cases.md; several cases may share one.
+        number: in the report of reports/stability; several cases may share one.
         name: for commands and records.
         title: one line for people.
         input: what is built.
