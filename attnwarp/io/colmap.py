@@ -466,13 +466,9 @@ def _text_images(path: Path) -> list[_Pose]:
             raise _damaged(
                 path, number, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
             ) from error
-        if _ends_in_keypoints(poses[-1].name):
-            raise _damaged(
-                path, number, line, "the keypoints on a line of their own; a line end is missing"
-            )
         # The line after it holds the keypoints and may be empty, or missing at the end.
         number, line = next(lines, (number, ""))
-        if _is_image(line) or _holds_image(line):
+        if _is_image(line):
             raise _damaged(
                 path,
                 number,
@@ -503,22 +499,6 @@ def _is_image(line: str) -> bool:
     return len(others) < 2 or not (_is_number(first) and _is_number(name.rsplit(maxsplit=1)[-1]))
 
 
-def _holds_image(line: str) -> bool:
-    """Return True if keypoints are followed by the next image, for want of a line end: numbers,
-    more than stand before an image's name, and then a name.
-    """
-    leading = len(list(itertools.takewhile(_is_number, line.split())))
-    return leading >= 8 and leading < len(line.split())
-
-
-def _ends_in_keypoints(name: str) -> bool:
-    """Return True if keypoints follow an image's name, for want of a line end: X Y POINT3D_ID in
-    threes, the first X perhaps at one with the name.
-    """
-    _, *others = name.split()
-    return len(others) >= 2 and len(others) % 3 != 1 and all(map(_is_number, others))
-
-
 def _is_number(text: str) -> bool:
     try:
         float(text)
@@ -533,8 +513,7 @@ def _text_points(path: Path) -> tuple[Array, npt.NDArray[np.uint8]]:
         if not line:
             continue
         try:
-            _, x, y, z, red, green, blue, *rest = line.split()
-            _check_track(rest)
+            _, x, y, z, red, green, blue, *_ = line.split()
             points.append((float(x), float(y), float(z)))
             colors.append((int(red), int(green), int(blue)))
             if not all(0 <= value <= 255 for value in colors[-1]):
@@ -543,15 +522,6 @@ def _text_points(path: Path) -> tuple[Array, npt.NDArray[np.uint8]]:
             raise _damaged(path, number, line, "POINT3D_ID X Y Z R G B ERROR TRACK[]") from error
     _warn_of_count(path, "points", len(points))
     return _points(path, points, colors)
-
-
-def _check_track(fields: Sequence[str]) -> None:
-    """Refuse what is no ERROR and TRACK[], pairs of IMAGE_ID and POINT2D_IDX: where a line end is
-    missing, the next point stands there.
-    """
-    track = fields[1:]
-    if not all(map(_is_number, fields[:1])) or len(track) % 2 or not all(map(str.isdecimal, track)):
-        raise ValueError(fields)
 
 
 def _warn_of_count(path: Path, noun: str, count: int) -> None:
