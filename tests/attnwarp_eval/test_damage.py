@@ -1,4 +1,4 @@
-"""Damaged studies, runs and derived files: a right result or one line, in 10 s and 1 GiB.
+"""Damaged studies and runs: a right result or one line.
 
 The run is a stored one (``data/runs.tar.xz``), reduced to one scene. A
 failure is repeated by its label: the name of the format and the seed of :mod:`damage_files`.
@@ -10,12 +10,10 @@ import pathlib
 import tarfile
 
 import damage_files
-import numpy as np
 import pytest
 import yaml
 
 from attnwarp.errors import InputError
-from attnwarp_eval import cache
 from attnwarp_eval.report.results import read_results
 from attnwarp_eval.study import Store, load_study
 from attnwarp_eval.study.probe import probe
@@ -108,36 +106,7 @@ class Cell:
         assert record.to_json() == {k: self.content[k] for k in record.to_json()}
 
 
-class CacheFile:
-    """A derived file: either its arrays or none, which are then computed anew."""
-
-    def __init__(self, folder):
-        rng = np.random.default_rng(0)
-        self.arrays = {
-            "vertices": rng.normal(size=(40, 3)),
-            "faces": rng.integers(0, 40, (70, 3), dtype=np.int32),
-            "valid": rng.random(9) < 0.5,
-        }
-        cache.write_arrays("damage", "key", self.arrays)
-        self.path = cache.cache_dir() / "damage" / "key.npz"
-        self.whole = self.path.read_bytes()
-
-    def use(self, data):
-        self.path.write_bytes(data)
-        stored = cache.read_arrays("damage", "key")
-        if stored is None:
-            raise InputError("computed again")
-        assert stored.keys() == self.arrays.keys()
-        for name, value in self.arrays.items():
-            assert stored[name].dtype == value.dtype and np.array_equal(stored[name], value)
-
-
-FORMATS = {
-    "study": StudyFile,
-    "study.json": StudyJson,
-    "cell": Cell,
-    "cache": CacheFile,
-}
+FORMATS = {"study": StudyFile, "study.json": StudyJson, "cell": Cell}
 
 
 def run_in(folder):
@@ -159,14 +128,11 @@ def failures(name, folder, seeds):
     form = FORMATS[name](folder)
     form.use(form.whole)  # the undamaged file is read
     return damage_files.failures(
-        name, form.whole, form.use, seeds, refusals=(InputError,), text=name != "cache"
+        name, form.whole, form.use, seeds, refusals=(InputError,), text=True
     )
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries
 @pytest.mark.parametrize("name", FORMATS)
 @damage_files.seeds_of(FAST, SLOW)
-def test_a_damaged_study_run_or_derived_file_is_refused_in_one_line_or_means_the_same(
-    tmp_path, name, seeds
-):
+def test_a_damaged_study_or_run_is_refused_in_one_line_or_means_the_same(tmp_path, name, seeds):
     assert not (failed := failures(name, tmp_path, seeds)), "\n".join(failed)

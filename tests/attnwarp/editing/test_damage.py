@@ -1,4 +1,4 @@
-"""Damaged folders of diffusion models: the model in the folder, or one line, in 10 s and 1 GiB.
+"""Damaged folders of diffusion models: the model in the folder, or one line.
 
 A failure is repeated by its label: the file and the seed of :mod:`damage_files`.
 """
@@ -71,7 +71,6 @@ def failures(folder, name, seeds):
         (folder / name).write_bytes(whole)
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries
 @pytest.mark.parametrize("name", FILES)
 @damage_files.seeds_of(FAST, SLOW)
 def test_a_damaged_model_is_refused_in_one_line_or_is_that_of_its_files(folder, name, seeds):

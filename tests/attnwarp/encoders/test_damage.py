@@ -1,4 +1,4 @@
-"""Damaged safetensors: the tensors that the file holds, or one line, in 10 s and 1 GiB.
+"""Damaged safetensors: the tensors that the file holds, or one line.
 
 A failure is repeated by its label: the name of the reader and the seed of :mod:`damage_files`.
 """
@@ -106,7 +106,6 @@ def failures(name, folder, seeds):
     return damage_files.failures(name, whole, read, seeds, refusals=(InputError,))
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries
 @pytest.mark.parametrize("name", READERS)
 @damage_files.seeds_of(FAST, SLOW)
 def test_damaged_weights_are_refused_in_one_line_or_are_those_of_the_file(tmp_path, name, seeds):

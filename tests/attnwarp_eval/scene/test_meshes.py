@@ -5,10 +5,10 @@ import struct
 import warnings
 from pathlib import Path
 
+import damage_files
 import matplotlib.path
 import numpy as np
 import pytest
-from damage_files import mutate_bytes, mutate_text, survey
 
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.meshes import MESH_SUFFIXES, read_mesh, read_mesh_file
@@ -526,48 +526,27 @@ def test_a_stray_triangle_is_told_by_a_scene_and_its_truth(tmp_path):
     assert "a thousandth of the surface" in contents(strayed)
 
 
-def whole_or_refused(case):
-    path, data = case
-    path.write_bytes(data)
-    mesh = read_mesh(path)
-    assert np.isfinite(corners(mesh)).all() and len(mesh.faces)
-    assert mesh.tint is None or ((mesh.tint >= 0) & (mesh.tint <= 1)).all()
-    return mesh
-
-
-def damaged_meshes(folder, count):
+@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
+@damage_files.seeds_of(12, 120)
+def test_damaged_meshes_are_refused_in_one_line_or_are_meshes(tmp_path, suffix, seeds):
     ball = trimesh.creation.icosphere(1)
     ball.visual.vertex_colors = np.tile([[200, 100, 50, 255]], (len(ball.vertices), 1))
-    for suffix in MESH_SUFFIXES:
-        path = folder / f"ball{suffix}"
-        ball.export(path)
-        data = path.read_bytes()
-        for seed in range(count):
-            if suffix in (".obj", ".off") and seed % 2:
-                broken = mutate_text(data.decode(), seed).encode()
-            else:
-                broken = mutate_bytes(data, seed)
-            yield f"{suffix} {seed}", (path, broken)
+    path = tmp_path / f"ball{suffix}"
+    ball.export(path)
 
+    def read(data):
+        path.write_bytes(data)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MeshNotice)
+            mesh = read_mesh(path)
+        assert np.isfinite(corners(mesh)).all() and len(mesh.faces)
+        assert mesh.tint is None or ((mesh.tint >= 0) & (mesh.tint <= 1)).all()
 
-def survey_meshes(folder, count):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MeshNotice)
-        outcomes = survey(
-            list(damaged_meshes(folder, count)), whole_or_refused, refusals=(ValueError,)
-        )
-    assert not [outcome for outcome in outcomes if outcome.failed]
-    return [outcome.kind for outcome in outcomes]
-
-
-def test_damaged_meshes_are_refused_in_one_line_or_are_meshes(tmp_path):
-    kinds = survey_meshes(tmp_path, 12)
-    assert len(kinds) == 60 and kinds.count("refused") > 20
-
-
-@pytest.mark.slow
-def test_many_damaged_meshes_are_refused_in_one_line_or_are_meshes(tmp_path):
-    assert len(survey_meshes(tmp_path, 120)) == 600
+    failed = damage_files.failures(
+        suffix, path.read_bytes(), read, seeds, refusals=(ValueError,),
+        text=suffix in (".obj", ".off"),
+    )  # fmt: skip
+    assert not failed, "\n".join(failed)
 
 
 def test_a_mesh_turned_inside_out_is_told(tmp_path):

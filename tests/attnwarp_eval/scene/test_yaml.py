@@ -2,9 +2,9 @@
 
 import math
 
+import damage_files
 import pytest
 import yaml
-from damage_files import mutate_bytes, mutate_text, survey
 
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import SceneError
@@ -90,7 +90,7 @@ def test_what_cannot_be_meant_is_refused_with_its_line(text, line, message):
     assert caught.value.line == line and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text", [SCENE, SCENE.replace("radius: 3", "radius:\t3"), *(mutate_text(SCENE, seed) for seed in range(12))])  # fmt: skip
+@pytest.mark.parametrize("text", [SCENE, SCENE.replace("radius: 3", "radius:\t3"), *(damage_files.mutate(SCENE.encode(), seed, text=True).decode("latin-1") for seed in range(12))])  # fmt: skip
 def test_a_text_means_the_same_without_libyaml(text, monkeypatch):
     def told():
         try:
@@ -152,36 +152,20 @@ def test_a_scene_names_what_cannot_be_meant_on_one_short_line(tmp_path, old, new
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
 
 
-def loaded(case):
-    path, data = case
-    path.write_bytes(data)
-    scene = load_scene(path)
-    assert scene.cameras and scene.content_hash and scene.shapes()
+@damage_files.seeds_of(40, 400)
+def test_damaged_scenes_are_refused_in_one_line_or_are_scenes(tmp_path, seeds):
+    path = tmp_path / "small.yaml"
 
+    def read(data):
+        path.write_bytes(data)
+        scene = load_scene(path)
+        assert scene.cameras and scene.content_hash and scene.shapes()
 
-def survey_scenes(folder, count):
-    path = folder / "small.yaml"
-    cases = [
-        (f"text {seed}", (path, mutate_text(SCENE, seed).encode("utf-8", "surrogatepass")))
-        for seed in range(count)
-    ]
-    cases += [
-        (f"bytes {seed}", (path, mutate_bytes(SCENE.encode(), seed))) for seed in range(count // 4)
-    ]
-    outcomes = survey(cases, loaded, refusals=(SceneError,))
-    assert not [outcome for outcome in outcomes if outcome.failed]
-    return [outcome.kind for outcome in outcomes]
-
-
-def test_damaged_scenes_are_refused_in_one_line_or_are_scenes(tmp_path):
-    loaded((tmp_path / "small.yaml", SCENE.encode()))
-    kinds = survey_scenes(tmp_path, 32)
-    assert len(kinds) == 40 and kinds.count("refused") > 15
-
-
-@pytest.mark.slow
-def test_many_damaged_scenes_are_refused_in_one_line_or_are_scenes(tmp_path):
-    assert len(survey_scenes(tmp_path, 320)) == 400
+    read(SCENE.encode())
+    failed = damage_files.failures(
+        "scene", SCENE.encode(), read, seeds, refusals=(SceneError,), text=True
+    )
+    assert not failed, "\n".join(failed)
 
 
 @pytest.mark.parametrize(
