@@ -1,4 +1,4 @@
-"""YAML from people: one reader that refuses what is doubled, endless or no value, with its line."""
+"""YAML from people: one reader that refuses what is doubled or no value, with its line."""
 
 from __future__ import annotations
 
@@ -8,16 +8,6 @@ from contextlib import suppress
 from typing import Any, TypeVar
 
 import yaml
-from yaml.composer import Composer
-
-LONGEST = 2**20
-"""Characters of a file. The largest scene that comes along has 20,000."""
-
-DEEPEST = 40
-"""Levels of lists and keys within each other; a scene has 8."""
-
-MOST_VALUES = 100_000
-"""Values of a file, each counted as often as aliases repeat it."""
 
 
 class YamlError(ValueError):
@@ -50,16 +40,10 @@ for _kind, _pattern, _first in (
 
 if yaml.__with_libyaml__:
 
-    class _Quick(Composer, yaml.CSafeLoader):
-        """libyaml's parser, four times as fast. PyYAML composes the nodes: libyaml's own composer
-        ends the process where they are nested too deep.
-        """
+    class _Quick(yaml.CSafeLoader):
+        """libyaml's parser, four times as fast."""
 
         yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
-
-        def __init__(self, text: str) -> None:
-            yaml.CSafeLoader.__init__(self, text)
-            Composer.__init__(self)
 
 
 def _root(text: str) -> yaml.Node | None:
@@ -94,17 +78,14 @@ def read_yaml(text: str) -> tuple[dict[Place, int], Any]:
     are words; so are dates, and ``yes``, ``no``, ``on`` and ``off``. Every key is a word.
 
     Raises:
-        YamlError: the text is empty or no YAML; a key stands twice or is no word; a value is not
-            what its tag says; or the text is too long, too deep, or repeats itself by aliases too
-            often.
+        YamlError: the text is empty or no YAML; a key stands twice or is no word; or a value is
+            not what its tag says.
 
     Example:
         >>> lines, data = read_yaml("fov: 045\\nsize: [3e2, 0256]")
         >>> data, lines["size", 1]
         ({'fov': 45, 'size': [300.0, 256]}, 2)
     """
-    if len(text) > LONGEST:
-        raise YamlError(f"has {len(text):,} characters, more than {LONGEST:,}")
     try:
         root = _root(text)
         if root is None:
@@ -121,28 +102,18 @@ def read_yaml(text: str) -> tuple[dict[Place, int], Any]:
             f"{_bare_color(text)}",
             mark.line + 1 if mark else None,
         ) from error
-    except RecursionError:
-        raise YamlError(f"nested deeper than {DEEPEST} levels") from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # an escape such as \\UFFFFFFFF
         raise YamlError(f"not valid YAML: {_line(error)}") from error
 
 
 class _Reading:
-    """Reading of nodes as values; an alias is read wherever it stands, so that its values count
-    again.
-    """
+    """Reading of nodes as values; an alias is read wherever it stands."""
 
     def __init__(self) -> None:
         self.lines: dict[Place, int] = {}
-        self.count = 0
 
     def value(self, node: yaml.Node, place: Place) -> Any:
         line = node.start_mark.line + 1
-        self.count += 1
-        if self.count > MOST_VALUES:
-            raise YamlError(f"means more than {MOST_VALUES:,} values, aliases included", line)
-        if len(place) > DEEPEST:
-            raise YamlError(f"nested deeper than {DEEPEST} levels", line)
         if isinstance(node, yaml.MappingNode):
             return self._mapping(node, place)
         if isinstance(node, yaml.SequenceNode):

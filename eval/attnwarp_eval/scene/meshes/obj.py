@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import re
 from collections import Counter
 
 import numpy as np
@@ -28,16 +27,12 @@ UNUSED = frozenset([
 NOT_SURFACES = {"l": "lines", "p": "points", "curv": "curves", "curv2": "curves",
                 "surf": "free-form surfaces"}  # fmt: skip
 
-STATED = re.compile(r"#\s*(?:number of )?(vertices|faces|triangles)\s*:\s*(\d{1,18})\s*", re.I)
-"""The comment in which MeshLab and Open3D state how much a file holds."""
-
 
 def read_obj(data: bytes) -> Surface:
     """The polygons of an OBJ file (Wavefront's Advanced Visualizer manual, appendix B).
 
     Raises:
-        ValueError: text in UTF-16, a line that cannot be read, a vertex that is not there, or
-            fewer vertices or faces than the file's own comment states.
+        ValueError: text in UTF-16, a line that cannot be read, or a vertex that is not there.
     """
     if data[:2] in (b"\xfe\xff", b"\xff\xfe"):
         raise ValueError("is text in UTF-16, expected ASCII or UTF-8; save it as UTF-8")
@@ -46,7 +41,6 @@ def read_obj(data: bytes) -> Surface:
     colors: list[list[float]] = []
     faces: list[list[int]] = []
     ignored: Counter[str] = Counter()
-    stated: dict[str, list[int]] = {}
     materials = False
     number, pending = 0, ""
     for number, raw in lines(data):
@@ -55,8 +49,6 @@ def read_obj(data: bytes) -> Surface:
             pending = line[:-1] + " "
             continue
         pending = ""
-        if match := STATED.fullmatch(line.strip()):
-            stated.setdefault(match[1].lower(), []).append(int(match[2]))
         words = line.partition("#")[0].split()
         if not words:
             continue
@@ -78,7 +70,6 @@ def read_obj(data: bytes) -> Surface:
             raise ValueError(f"line {number}: got the keyword {clip(key)}, which OBJ does not have")
     if pending:
         raise ValueError(f"line {number}: ends in a continuation that does not come")
-    _check_stated(stated, len(vertices), len(faces))
     words_ignored = [f"{count} {name}" for name, count in ignored.items()]
     if materials:
         words_ignored.append("materials and their textures")
@@ -113,14 +104,3 @@ def _face(words: list[str], vertices: int, line: int) -> list[int]:
             )
         face.append(index)
     return face
-
-
-def _check_stated(stated: dict[str, list[int]], vertices: int, faces: int) -> None:
-    for name, counts in stated.items():
-        count = vertices if name == "vertices" else faces
-        # Several such comments are one for each part of the file.
-        if len(counts) == 1 and counts[0] != count:
-            raise ValueError(
-                f"its own comment states {counts[0]} {name}, but it holds {count}; the file is"
-                " damaged, or the comment is to be corrected"
-            )
