@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from attnwarp.devices import device_of
-from attnwarp.encoders._weights import check_archive, reason_of
+from attnwarp.encoders._weights import reason_of
 from attnwarp.errors import InputError, install_command
 from attnwarp.io.text import read_text
 
@@ -120,8 +120,6 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
     how: dict[str, Any] = {} if issubclass(kind, PreTrainedModel) else {"low_cpu_mem_usage": False}
     if _variants(folder) == ["fp16"]:
         how["variant"] = "fp16"
-    for path in folder.glob("*.bin"):
-        check_archive(path)
     try:
         with readable(folder):
             # Quietly filling what a file lacks with random numbers would look like a bad editor.

@@ -290,7 +290,6 @@ class GroundedSam:
 
 def _check_folder(folder: Path, model_type: str, tokenizers: tuple[str, ...]) -> None:
     """Raise InputError that names the files a folder of transformers lacks."""
-    from attnwarp.encoders._weights import check_archive
     from attnwarp.encoders.preprocess import read_json
 
     if not folder.is_dir():
@@ -304,8 +303,6 @@ def _check_folder(folder: Path, model_type: str, tokenizers: tuple[str, ...]) ->
         ("preprocessor_config.json", "processor_config.json"),
         *([tokenizers] if tokenizers else []),
     ]  # fmt: skip
-    for file in folder.glob("*.bin"):
-        check_archive(file)
     missing = [names[0] for names in wanted if not any((folder / n).is_file() for n in names)]
     if missing:
         raise InputError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,7 +28,6 @@ def state_of(path: Path) -> dict[str, torch.Tensor]:
     Raises:
         InputError: the file cannot be read, or holds anything but tensors by name.
     """
-    check_archive(path)
     try:
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
@@ -47,22 +45,6 @@ def state_of(path: Path) -> dict[str, torch.Tensor]:
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
         raise InputError(f"{path}: holds no dictionary of tensors, expected a state dict")
     return {str(key): value for key, value in state.items()}
-
-
-def check_archive(path: Path) -> None:
-    """Refuse an archive of torch whose parts are compressed: torch compresses none, and a small one
-    could fill the memory.
-
-    Raises:
-        InputError: it is one.
-    """
-    if not path.is_file() or not zipfile.is_zipfile(path):
-        return
-    with zipfile.ZipFile(path) as archive:
-        if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
-            raise InputError(
-                f"{path}: its parts are compressed, as torch writes none; fetch the file again"
-            )
 
 
 def reason_of(error: Exception) -> str:

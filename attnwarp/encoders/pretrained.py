@@ -22,7 +22,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp.devices import device_of
-from attnwarp.encoders._weights import check_archive, full_float32, reason_of, sha256_of
+from attnwarp.encoders._weights import full_float32, reason_of, sha256_of
 from attnwarp.encoders.base import EncoderInfo, Image, Kind, checked_image, checked_texts
 from attnwarp.encoders.preprocess import Preprocessing, read_json, read_preprocessing
 from attnwarp.errors import InputError, optional_imports
@@ -317,8 +317,6 @@ def _load(
     model_class: Any, folder: Path, name: str, kind: Kind, device: torch.device
 ) -> tuple[Any, list[Path]]:
     files = _weight_files(folder, name, kind)
-    for file in files:
-        check_archive(file)
     try:
         with _silent():
             model, loading_info = model_class.from_pretrained(
