@@ -6,7 +6,6 @@ import math
 import numbers
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -161,14 +160,11 @@ def number(value: Any, low: float, high: float, name: str, *, whole: bool = Fals
         Traceback (most recent call last):
         ValueError: steps: got 2.5, expected a whole number >= 0
     """
-    right = is_number(value, whole=whole)
-    # As Python's own before it is compared: the largest float has no float32. A whole number beyond
-    # every float can't be asked whether it is NaN, so its size is looked at first.
+    # As Python's own before it is compared: the largest float has no float32.
     plain: float = math.nan
-    if right:
-        with suppress(OverflowError):
-            plain = int(value) if isinstance(value, numbers.Integral) else float(value)
-    if not right or abs(plain) > LARGEST or math.isnan(plain) or not low <= plain <= high:
+    if is_number(value, whole=whole):
+        plain = int(value) if isinstance(value, numbers.Integral) else float(value)
+    if not (abs(plain) <= LARGEST and low <= plain <= high):
         kind = "a whole number" if whole else "a number"
         bounds = f">= {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
         text = repr(value)

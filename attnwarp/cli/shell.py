@@ -180,7 +180,7 @@ def assignments(changes: list[str], options: dict[str, str]) -> dict[str, Any]:
             raise ValueError(f"--set: {name} has an option of its own, {options[name]}")
         try:
             values[name] = json.loads(text)
-        except (ValueError, RecursionError):
+        except ValueError:
             values[name] = text
     return values
 

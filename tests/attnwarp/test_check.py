@@ -1,7 +1,6 @@
 """Numbers and sizes that public functions take, against Python's own values."""
 
 import json
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -77,9 +76,7 @@ def test_a_size_of_numpy_or_torch_is_one_of_whole_numbers():
 
 
 @pytest.mark.door
-@pytest.mark.parametrize(
-    "value", [10**400, Fraction(10**400), np.longdouble("1e4000"), np.nan, True]
-)
+@pytest.mark.parametrize("value", [10**400, np.longdouble("1e4000"), np.nan, True])
 def test_a_number_that_no_float_holds_is_named(value):
     with pytest.raises(ValueError, match=r"a0: got .*, expected a number in \[0, 1\]"):
         check.number(value, 0, 1, "a0")

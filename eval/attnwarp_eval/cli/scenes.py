@@ -186,7 +186,7 @@ def _check_no_capture(folder: Path) -> None:
     try:
         frames = json.loads(path.read_bytes())["frames"]
         exported = all(EXPORTED.fullmatch(PurePath(frame["file_path"]).name) for frame in frames)
-    except (ValueError, LookupError, TypeError, RecursionError):
+    except (ValueError, LookupError, TypeError):
         exported = False
     if not exported:
         raise InputError(

@@ -159,7 +159,7 @@ def _add(cells: list[Measured], data: dict[str, Any]) -> None:
 def _object(line: str, number: int) -> dict[str, Any]:
     try:
         value = json.loads(line)
-    except (ValueError, RecursionError):
+    except ValueError:
         raise ValueError(f"not a baseline (line {number} is not JSON)") from None
     if not isinstance(value, dict):
         raise ValueError(f"not a baseline (line {number} is no object)")

@@ -40,7 +40,7 @@ def check_nothing_is_lost(
         content = json.loads(path.read_bytes())
         rows = content if table is None else content[table]
         stored = {tuple(str(row[field]) for field in fields) for row in rows}
-    except (ValueError, LookupError, TypeError, RecursionError, OSError):
+    except (ValueError, LookupError, TypeError, OSError):
         raise InputError(f"{path}: is not a file that this command wrote; {remedy}") from None
     lost = sorted(stored.difference(available) if Store(path.parent).done() else stored)
     if lost:

@@ -122,17 +122,6 @@ def test_a_frames_own_intrinsics_win_over_those_at_the_top(tmp_path):
     np.testing.assert_allclose(b.K, [[f, 0, 8], [0, f, 3.25], [0, 0, 1]])
 
 
-@pytest.mark.parametrize(("own", "other"), [("fl_x", "fl_y"), ("fl_y", "fl_x")])
-def test_one_focal_length_beside_another_at_the_top_could_mean_two_things(tmp_path, own, other):
-    image(tmp_path / "a.png")
-    frame = {"file_path": "a.png", "transform_matrix": pose(), own: LENS[own]}
-    refused = rf"frames\[0\] \(a.png\): {own}: got {LENS[own]:g} without {other}, which is {LENS[other]:g}"
-    with pytest.raises(FileFormatError, match=refused):
-        read_transforms(write(tmp_path, [frame], **LENS))
-    square = read_transforms(write(tmp_path, [frame], **LENS | {other: LENS[own]})).cameras[0]
-    assert square.K[0, 0] == square.K[1, 1] == LENS[own]
-
-
 @pytest.mark.filterwarnings("ignore:.*frames have intrinsics other than the top")
 @pytest.mark.parametrize(
     ("top", "frame", "focal"),
@@ -280,19 +269,6 @@ def test_missing_images_are_listed_and_can_be_waived(tmp_path):
     assert len(data.cameras) == 7
 
 
-@pytest.mark.door
-def test_an_image_of_another_size_is_refused_or_resizes_its_camera(tmp_path):
-    path = folder_of(tmp_path)
-    image(tmp_path / "images/001.png", (4, 3))
-    with pytest.raises(
-        FileFormatError, match=r"001.png is 4 x 3, but its camera is 8 x 6.*resize_cameras=True"
-    ):
-        read_transforms(path)
-    cameras = read_transforms(path, resize_cameras=True).cameras
-    assert [(c.width, c.height) for c in cameras] == [(8, 6), (4, 3), (8, 6)]
-    assert cameras[1].K.tolist() == [[5, 0, 1.75], [0, 5.5, 1.625], [0, 0, 1]]
-
-
 @pytest.mark.parametrize(("orientation", "turned"), [(1, False), (3, False), (6, True), (8, True)])
 def test_a_picture_whose_tag_asks_for_a_turn_is_told_from_one_of_another_size(
     tmp_path, orientation, turned
@@ -331,14 +307,6 @@ def test_no_camera_is_resized_to_a_picture_of_another_shape(tmp_path):
     message = r"001.png: got 8 x 6 \(height x width\), expected the aspect ratio of 6 x 8; turn"
     with pytest.raises(FileFormatError, match=message):
         read_transforms(path, resize_cameras=True)
-
-
-@pytest.mark.door
-def test_a_file_that_is_no_image_is_refused(tmp_path):
-    path = folder_of(tmp_path)
-    (tmp_path / "images/001.png").write_text("not a picture")
-    with pytest.raises(FileFormatError, match=r"001.png: cannot be read as an image"):
-        read_transforms(path)
 
 
 def dataset_of(tmp_path, focal=(9.0, 9.0)):
@@ -508,9 +476,6 @@ def test_keys_that_change_nothing_pass_and_unknown_ones_are_named(tmp_path):
         ("-0.25", "true", "holds True"),
         ("-0.25", "null", "holds None"),
         ("-0.25", "1e999", "holds inf"),
-        ("-0.25", "9" * 400, "holds 999"),
-        ("-0.25", "9" * 5000, "not JSON"),
-        ("-0.25", "[" * 100_000, "not JSON"),
         ('"w": 8', '"w": true', "w: got True"),
         ('"w": 8', '"w": "8"', "w: got '8'"),
         ('"w": 8', '"w": 8, "w": 9', "w: stands twice"),

@@ -119,10 +119,7 @@ def test_a_changed_record_is_refused_with_the_remedy(tmp_path, damage, message):
     assert re.search("run (it )?again", str(caught.value))
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["[]", "null", "NaN", '{"format": 2, "x": NaN}', '{"format": 2, "x": 1e999}', "[" * 10**5],
-)
+@pytest.mark.parametrize("text", ["[]", "NaN", '{"format": 2, "x": 1e999}'])
 def test_a_cell_of_another_content_is_refused_in_one_line_and_computed_anew(tmp_path, text):
     store = Store(tmp_path)
     store.write(record())
