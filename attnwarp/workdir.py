@@ -31,7 +31,6 @@ from attnwarp.errors import InputError, InputWarning
 from attnwarp.io.file import FileFormatError, write_atomically
 from attnwarp.io.images import encode_png, read_image
 from attnwarp.io.lock import alone_in
-from attnwarp.io.ply import read_ply
 from attnwarp.settings import Number, Settings, Weight
 
 FORMAT = 4
@@ -108,7 +107,6 @@ class Workdir:
         self.path, self.what = path, what
         self.folders, self.results = folders, results
         self.seconds = Seconds(self)
-        self._again: set[str] = set()  # pictures that are made again
 
     # --- whose it is
 
@@ -180,12 +178,9 @@ class Workdir:
         # Without its manifest, a folder's results are of no known settings.
         remedy = "name another folder" if name == MANIFEST else "remove it, it is made anew"
         try:
-            value = json.loads(path.read_text(encoding="utf-8"))
+            return json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise FileFormatError(path, f"not JSON ({error}); {remedy}") from None
-        if not isinstance(value, dict):
-            raise FileFormatError(path, f"holds no JSON object; {remedy}")
-        return value
 
     def write_picture(self, name: str, pixels: npt.NDArray[np.uint8]) -> None:
         """Write an (H, W, 3) uint8 PNG atomically."""
@@ -195,22 +190,6 @@ class Workdir:
     def read_picture(self, name: str) -> npt.NDArray[np.uint8]:
         """(H, W, 3) uint8 of a PNG that :meth:`write_picture` wrote."""
         return read_image(self.path / name)
-
-    def has_picture(self, name: str) -> bool:
-        """True for a picture that can be read: a disk or a person may have damaged it."""
-        try:
-            self.read_picture(name)
-        except (FileFormatError, FileNotFoundError):
-            return False
-        return True
-
-    def has_splats(self, name: str) -> bool:
-        """True for splats that can be read, as :meth:`has_picture`."""
-        try:
-            read_ply(self.path / name)
-        except (FileFormatError, FileNotFoundError):
-            return False
-        return True
 
     # --- pictures that are made once
 
@@ -226,7 +205,6 @@ class Workdir:
         self.check_same(picture, pixels)
         self.write_picture(picture, pixels)
         self.write_json(record_of(picture), {**about, "sha256": digest(pixels)})
-        self._again.discard(picture)
 
     def check_same(self, picture: str, pixels: npt.NDArray[np.uint8]) -> None:
         """Hold a picture that is made again against its record, if there is one.
@@ -240,45 +218,38 @@ class Workdir:
                 " device, number of threads and versions, or name another folder"
             )
 
-    def record(self, picture: str, *keys: str) -> dict[str, Any]:
+    def record(self, picture: str) -> dict[str, Any]:
         """The record of a picture.
 
         Raises:
-            FileFormatError: it is damaged, or lacks one of the keys.
+            FileFormatError: it is no JSON.
         """
         record: dict[str, Any] = self.read_json(record_of(picture))
-        for key in ("sha256", *keys):
-            if key not in record:
-                raise FileFormatError(
-                    self.path / record_of(picture), f"lacks {key!r}; remove it, it is made anew"
-                )
         return record
 
     def made(self, picture: str) -> bool:
         """True for a picture with a record. The record's "pictures" are files that were written
         with it.
 
-        A picture that is missing, damaged or another one all the same is made again, and its record
-        says what has to come out.
+        A picture that is missing or another one all the same is made again, and its record says
+        what has to come out.
 
         Raises:
-            FileFormatError: the record is damaged.
+            FileFormatError: the record or the picture is damaged.
 
         Warns:
-            InputWarning: a picture is made again; once for each.
+            InputWarning: a picture is made again.
         """
-        if not self.has(record_of(picture)) or picture in self._again:
+        if not self.has(record_of(picture)):
             return False
         record = self.record(picture)
         names = (picture, *record.get("pictures", ()))
-        damaged = next((name for name in names if not self.has_picture(name)), None)
-        what = "missing or damaged"
-        if damaged is None and record["sha256"] != digest(self.read_picture(picture)):
-            damaged, what = picture, "not the picture that the edit made"
-        if damaged is None:
+        again, what = next((name for name in names if not self.has(name)), None), "missing"
+        if again is None and record["sha256"] != digest(self.read_picture(picture)):
+            again, what = picture, "not the picture that the edit made"
+        if again is None:
             return True
-        self._again.add(picture)
-        message = f"{self.path / damaged}: {what}; the view is edited again"
+        message = f"{self.path / again}: {what}; the view is edited again"
         warnings.warn(message, InputWarning, stacklevel=2)
         return False
 
@@ -361,14 +332,7 @@ class Seconds:
 
     def __init__(self, folder: Workdir) -> None:
         self.folder = folder
-        stored = folder.read_json(TIMES) if folder.has(TIMES) else {}
-        for name, value in stored.items():
-            if not isinstance(value, int | float):
-                raise FileFormatError(
-                    folder.path / TIMES,
-                    f"got {value!r}, expected seconds; remove it, it is made anew", field=name,
-                )  # fmt: skip
-        self._ended: dict[str, float] = dict(stored)
+        self._ended: dict[str, float] = folder.read_json(TIMES) if folder.has(TIMES) else {}
         self._part, self._since = "", 0.0
 
     @contextmanager

@@ -428,7 +428,7 @@ class _Run:
             limit = None if self.cut else self._limit(rows)
             if limit is not None:
                 self._cut(limit, number, place)
-            # A run that was cut edits no further, but for files that were damaged since.
+            # A run that was cut edits no further, but for files that were removed since.
             if self.cut is not None and (number, place) >= (self.cut["round"], self.cut["groups"]):
                 return
             self._edit_now(number, views, edit)
@@ -491,7 +491,7 @@ class _Run:
         if not finished:
             self._tune_now(number, training, begin, end, state, order)
         splats = f"rounds/{number + 1}.ply"
-        if not (finished and self.folder.has_splats(splats)):
+        if not (finished and self.folder.has(splats)):
             write_ply(self.folder.path / splats, self.tuning.gaussians())
         self.seconds.write()
 
@@ -547,7 +547,7 @@ class _Run:
             for part, model in (("before", self.work.frozen), ("after", final)):
                 for camera, name in zip(self.work.scene.cameras, self.names, strict=True):
                     path = f"renders/{part}/{name}.png"
-                    if not self.folder.has_picture(path):
+                    if not self.folder.has(path):
                         picture = render_picture(model, camera, self.work.near, self.work.backend)
                         self.folder.write_picture(path, to_bytes(picture))
             self.folder.write_picture("sheet.png", self._sheet())
@@ -594,7 +594,7 @@ class _Run:
     def _write_segments(self) -> None:
         for name, segment in zip(self.names, self.work.scene.segments or (), strict=False):
             path = f"segments/{name}.png"
-            if not self.folder.has_picture(path):
+            if not self.folder.has(path):
                 share = np.repeat(segment[..., None].astype(np.float32), 3, axis=2)
                 self.folder.write_picture(path, to_bytes(share))
 

@@ -55,7 +55,7 @@ def edited_alone(
     for place, view in enumerate(views):
         file = f"{CONTROL}/{names[view]}.png"
         report.step(place, len(views), "control: each view of the page edited alone")
-        if not folder.has_picture(file):
+        if not folder.has(file):
             (edit,) = method.edit((view,), work.frozen, lambda: None)
             folder.write_picture(file, to_bytes(work.composite(view, edit.picture)))
 

@@ -654,37 +654,11 @@ def test_a_view_that_does_not_show_the_words_is_named_and_has_an_empty_mask(tmp_
     assert said == [f"2 of 3 views, so nothing is edited in {views[0].name}, {views[2].name}"]
 
 
-def test_a_folder_of_another_edit_is_one_clear_line(place, tmp_path):
-    ply = ("--ply", place / "splats.ply")
-    assert run(place, tmp_path, *ply).exit_code == 0
-    result = run(place, tmp_path, *ply, instruction="a robot")
-    assert result.exit_code == 2
-    assert 'instruction ("a bear", now "a robot")' in result.output
-    assert "name another folder" in result.output
-
-
 def test_the_commands_help_names_every_preset():
     text = runner.invoke(app, ["edit", "--help"], env={"COLUMNS": "300"}).output
     joined = re.sub(r"[│\s]", "", text)
     for name in PRESETS["attention_warping"]:
         assert name in joined
-
-
-@pytest.mark.parametrize("which", ["source", "view"])
-def test_a_damaged_picture_of_a_cut_off_edit_is_made_again(which, place, tmp_path):
-    """Oracle: the bytes of the whole edit."""
-    ply = ("--ply", place / "splats.ply")
-    assert run(place, tmp_path, *ply).exit_code == 0
-    first = sorted((tmp_path / "rounds/2").glob("*.png"))[0]
-    picture = first if which == "view" else tmp_path / "rounds/1/v0.png"
-    names = (picture, picture.with_suffix(".json"), tmp_path / "edited.ply")
-    whole = [path.read_bytes() for path in names]
-    picture.write_bytes(whole[0][:40])
-    (tmp_path / "result.json").unlink()
-    result = run(place, tmp_path, *ply)
-    assert result.exit_code == 0
-    assert f"{picture.name}: missing or damaged; the view is edited again" in result.stderr
-    assert [path.read_bytes() for path in names] == whole
 
 
 def test_a_refused_edit_leaves_the_masks_of_the_edit_that_is_there(place, tmp_path):
