@@ -35,7 +35,6 @@ def serve(
     host: str = LOCAL,
     port: int = 0,
     announce: Callable[[str], object] = print,
-    left: float = LEFT,
 ) -> None:
     """Serve a window until the last browser has left, or until it is interrupted.
 
@@ -47,14 +46,13 @@ def serve(
         host: address to listen at.
         port: to listen at; 0 takes a free one.
         announce: told the address to open.
-        left: seconds from the last browser's end to the server's.
 
     Raises:
         InputError: the address cannot be used.
     """
     secret = secrets.token_urlsafe(16)
     try:
-        asyncio.run(_serve(_Page(window, announce, left), host, port, secret))
+        asyncio.run(_serve(_Page(window, announce), host, port, secret))
     except OSError as error:
         raise InputError(
             f"--host {host} --port {port}: {error.strerror or error}; choose another, or leave"
@@ -90,10 +88,10 @@ async def _serve(page: _Page, host: str, port: int, secret: str) -> None:
 class _Page:
     """The page's controls, each of which changes the window's state."""
 
-    def __init__(self, window: Window, announce: Callable[[str], object], left: float) -> None:
+    def __init__(self, window: Window, announce: Callable[[str], object]) -> None:
         from trame.app import get_server
 
-        self.window, self.announce, self.left = window, announce, left
+        self.window, self.announce = window, announce
         self.clients, self.joined = 0, False
         self.url: Callable[[int], str] = str
         self.server: Any = get_server("attnwarp-inspect", client_type="vue3")
@@ -188,7 +186,7 @@ class _Page:
             def onClose(self, client_id: Any) -> None:  # noqa: N802
                 page.clients -= 1
                 if page.joined and page.clients == 0:
-                    asyncio.get_running_loop().call_later(page.left, page._end)
+                    asyncio.get_running_loop().call_later(LEFT, page._end)
 
         root.registerLinkProtocol(Clients())
 

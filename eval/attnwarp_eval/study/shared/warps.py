@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import replace
 from typing import Any
 
 from attnwarp import Gaussians
@@ -10,6 +11,8 @@ from attnwarp.warp import WarpedView, WarpSettings, parts_read, render_surface, 
 from attnwarp_eval import metrics
 from attnwarp_eval.ideal.parts import token_parts
 from attnwarp_eval.metrics.labels import Labels
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Probe, Work
 from attnwarp_eval.study.reads import warp_reads
 from attnwarp_eval.study.record import Json, NoExtra
@@ -20,6 +23,7 @@ from attnwarp_eval.study.shared.splats import (
     surface_reads,
     surface_spec,
 )
+from attnwarp_eval.study.shared.things import thing_of
 from attnwarp_eval.study.warping import warp_truth
 from attnwarp_eval.two_view import TwoView
 
@@ -43,6 +47,20 @@ class WarpProbe(Probe[NoExtra]):
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
         """Splats may be fitted."""
         return surface_meaning(study, variant)
+
+
+class ThingWarpProbe(WarpProbe):
+    """Base of probes that carry labels of a scene's thing along the warp."""
+
+    draws = False
+
+    def cells(
+        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
+    ) -> Iterator[Cell]:
+        """One for each scene, variant and seed."""
+        things = {name: thing_of(study, scene) for name, scene in scenes.items()}
+        for cell in super().cells(study, names, scenes):
+            yield replace(cell, spec={**cell.spec, "thing": things[cell.scene]}, pictures=())
 
 
 def warped_views(

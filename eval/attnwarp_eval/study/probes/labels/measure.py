@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Annotated
 
 from pydantic import Field
@@ -11,12 +10,11 @@ from pydantic import Field
 from attnwarp_eval.ideal.editor import FACTOR
 from attnwarp_eval.ideal.thing import labels_of
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Part, Study, Variant, Whole
-from attnwarp_eval.study.shared.things import ThingsPart, thing_of
-from attnwarp_eval.study.shared.warps import WarpProbe, label_figures, warped_views
+from attnwarp_eval.study.shared.things import ThingsPart
+from attnwarp_eval.study.shared.warps import ThingWarpProbe, label_figures, warped_views
 
 GRIDS = (8, 16, 32, 64)
 """Sides of the token grids that are measured where a study names none."""
@@ -54,14 +52,13 @@ def grids_of(study: Study, size: int) -> list[int]:
 
 
 @register
-class LabelTransport(WarpProbe):
+class LabelTransport(ThingWarpProbe):
     """Labels of a thing's parts, carried along the tokens of a warp."""
 
     name = "labels"
     study_part = StudyPart
     metrics = metrics_of("labels.")
     study_keys = frozenset({"size", "views", "seeds", "spp", "labels", "things"})
-    draws = False
 
     def check(self, study: Study) -> None:
         """Grids need to divide the pictures."""
@@ -74,14 +71,6 @@ class LabelTransport(WarpProbe):
     def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
         """A thing of a scene that is not there would be measured nowhere."""
         study.check_scenes(study.part(ThingsPart).things, "things", scenes)
-
-    def cells(
-        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
-    ) -> Iterator[Cell]:
-        """One for each scene, variant and seed."""
-        things = {name: thing_of(study, scene) for name, scene in scenes.items()}
-        for cell in super().cells(study, names, scenes):
-            yield replace(cell, spec={**cell.spec, "thing": things[cell.scene]}, pictures=())
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """Depth, rules, grids and parts."""

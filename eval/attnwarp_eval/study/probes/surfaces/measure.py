@@ -7,8 +7,7 @@ error of the warp does.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -19,16 +18,13 @@ from attnwarp.warp import Surface, WarpSettings, render_surface
 from attnwarp_eval import metrics
 from attnwarp_eval.ideal.editor import FACTOR
 from attnwarp_eval.ideal.thing import labels_of
-from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats import export, fitted, mesh
-from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Study, Variant
 from attnwarp_eval.study.shared import fits
 from attnwarp_eval.study.shared.splats import is_fitted, splats_of
-from attnwarp_eval.study.shared.things import thing_of
-from attnwarp_eval.study.shared.warps import WarpProbe, label_figures, warped_views
+from attnwarp_eval.study.shared.warps import ThingWarpProbe, label_figures, warped_views
 from attnwarp_eval.study.warping import warp_figures
 
 PARTS = 12
@@ -54,7 +50,7 @@ MESH = "mesh"
 
 
 @register
-class SurfaceProbe(WarpProbe):
+class SurfaceProbe(ThingWarpProbe):
     """Every figure of a variant's geometry, and the errors of its warps."""
 
     name = "surfaces"
@@ -62,20 +58,11 @@ class SurfaceProbe(WarpProbe):
     study_keys = frozenset(
         {"size", "views", "seeds", "spp", "feature_sizes", "feature_channels", "fit", "things"}
     )
-    draws = False
 
     def check(self, study: Study) -> None:
         """Tokens have whole pixels."""
         if self.name in study.probes and study.size % FACTOR:
             raise ValueError(f"size: got {study.size}, expected a multiple of {FACTOR}")
-
-    def cells(
-        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
-    ) -> Iterator[Cell]:
-        """One for each scene, variant and seed."""
-        things = {name: thing_of(study, scene) for name, scene in scenes.items()}
-        for cell in super().cells(study, names, scenes):
-            yield replace(cell, spec={**cell.spec, "thing": things[cell.scene]}, pictures=())
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """Depth, rules, feature grids, and the views around the scene."""
