@@ -122,32 +122,35 @@ class Swap:
             ]
         )
 
-    def run(self, guides: Sequence[Image], noise: Tensor) -> list[Image]:
-        """The edited pictures."""
-        return edit(self.editor, guides, INSTRUCTION, steps=STEPS, noise=noise).images
+    def run(self, cases: Sequence[Case], noise: Tensor) -> list[Image]:
+        """The edited pictures, whose answers the noise draws over their things, as in a scene."""
+        guides, things = [case.before for case in cases], [case.thing for case in cases]
+        return edit(
+            self.editor, guides, INSTRUCTION, steps=STEPS, noise=noise, regions=things
+        ).images
 
-    def recorded(self, guides: Sequence[Image], noise: Tensor) -> tuple[list[Image], Recording]:
+    def recorded(self, cases: Sequence[Case], noise: Tensor) -> tuple[list[Image], Recording]:
         """The edited pictures and their features."""
         branches = self.editor.branches
         keep = tuple(b for b in branches if b != "uncond")
         plan = RecordingPlan(
-            self.layers, (noise.shape[2], noise.shape[3]), branches, keep, STEPS, len(guides)
+            self.layers, (noise.shape[2], noise.shape[3]), branches, keep, STEPS, len(cases)
         )
         with record(self.editor.unet, plan) as recording:
-            images = self.run(guides, noise)
+            images = self.run(cases, noise)
         return images, recording
 
     def injected(
-        self, recording: Recording, guides: Sequence[Image], noise: Tensor, *,
+        self, recording: Recording, cases: Sequence[Case], noise: Tensor, *,
         mask: Mask | None = None, warps: Sequence[Any] | None = None, weight: Any = None,
     ) -> list[Image]:  # fmt: skip
         """The edited pictures with features of a recording, by the paper's decay if no weight is given."""
         with inject(
             self.editor.unet, recording, branches=recording.plan.branches,
-            warps=[None] * len(guides) if warps is None else warps, weight=weight or decay(),
+            warps=[None] * len(cases) if warps is None else warps, weight=weight or decay(),
             mask=None if mask is None else torch.from_numpy(mask),
         ):  # fmt: skip
-            return self.run(guides, noise)
+            return self.run(cases, noise)
 
 
 QUESTIONS: dict[str, tuple[str, dict[str, float]]] = {
@@ -184,7 +187,7 @@ def swap_figures(
         for first in range(0, len(cases), BATCH):
             batch = cases[first : first + BATCH]
             compute = partial(_swapped, swap, batch, 1000 * first, number)
-            name = f"swap {len(worlds)} {number} {first}"
+            name = f"swap over things {len(worlds)} {number} {first}"
             found = compute() if kept is None else kept.get(name, compute)
             for key, values in found.items():
                 marks[key] += values
@@ -206,22 +209,22 @@ def _swapped(swap: Swap, batch: Sequence[Case], seed: int, number: int) -> Marks
         number: of the round: it chooses the noises, and whose features another picture gets.
     """
     marks: Marks = {key: [] for key in QUESTIONS}
-    guides = [case.before for case in batch]
-    size = len(guides[0])
+    first = batch[0].before
+    size = len(first)
     left = np.zeros((size, size), dtype=bool)
     left[:, : size // 2] = True
     seeds = [seed + 1000 * k + 2 * number for k in range(len(batch))]
-    noise_a = swap.noise(seeds, guides[0])
-    noise_b = swap.noise([s + 1 for s in seeds], guides[0])
-    run_a, recording = swap.recorded(guides, noise_a)
-    run_b = swap.run(guides, noise_b)
+    noise_a = swap.noise(seeds, first)
+    noise_b = swap.noise([s + 1 for s in seeds], first)
+    run_a, recording = swap.recorded(batch, noise_a)
+    run_b = swap.run(batch, noise_b)
     # Two pictures on, since the next one is often the same world's other view; further in later rounds.
     shift = 1 + (number + 1) % max(1, len(batch) - 1)
     order = [(k + shift) % len(batch) for k in range(len(batch))]
-    strange = swap.injected(recording, [guides[k] for k in order], noise_b[order])
-    whole = swap.injected(recording, guides, noise_b)
-    constantly = swap.injected(recording, guides, noise_b, weight=constant(CONSTANT))
-    half = swap.injected(recording, guides, noise_b, mask=left)
+    strange = swap.injected(recording, [batch[k] for k in order], noise_b[order])
+    whole = swap.injected(recording, batch, noise_b)
+    constantly = swap.injected(recording, batch, noise_b, weight=constant(CONSTANT))
+    half = swap.injected(recording, batch, noise_b, mask=left)
     for k, case in enumerate(batch):
         a, b = case.answer(run_a[k]), case.answer(run_b[k])
         if 0 in (a, b) or a == b:
@@ -280,7 +283,7 @@ class _Rolled:
 
 
 def warped_figure(
-    editor: Any, worlds: Worlds, *, size: int, count: int = 10, noises: int = 8
+    editor: Any, worlds: Worlds, *, size: int, count: int = 20, noises: int = 8
 ) -> Figure:
     """Share of worlds in which a true warp between two views beats the same warp displaced by an
     eighth.
@@ -296,12 +299,12 @@ def warped_figure(
     for source, target in pairs:
         view = _view_warp(worlds, source, target)
         grid = view.at((size, size))
-        guides_a, guides_b = [source.before] * noises, [target.before] * noises
+        sources, targets = [source] * noises, [target] * noises
         seeds = [90_000 + 100 * source.world + k for k in range(noises)]
-        run_a, recording = swap.recorded(guides_a, swap.noise(seeds, source.before))
+        run_a, recording = swap.recorded(sources, swap.noise(seeds, source.before))
         noise_b = swap.noise([s + 50 for s in seeds], source.before)
-        right = swap.injected(recording, guides_b, noise_b, warps=[view] * noises)
-        wrong = swap.injected(recording, guides_b, noise_b, warps=[Displaced(view)] * noises)
+        right = swap.injected(recording, targets, noise_b, warps=[view] * noises)
+        wrong = swap.injected(recording, targets, noise_b, warps=[Displaced(view)] * noises)
         gain = np.array(
             [
                 _disagreement(w, a, grid) - _disagreement(r, a, grid)

@@ -200,7 +200,7 @@ def carries(
     name: str, data: Data = CACHE / "data", weights: Cards = WEIGHTS,
     pairs: Annotated[int, typer.Option(min=1, help="Swaps asked of each question.")] = 200,
 ) -> None:  # fmt: skip
-    """Judge whether swapped features carry the answer, into the card. 20 minutes; a stopped run goes on."""
+    """Judge whether swapped features carry the answer, into the card. 40 minutes; a stopped run goes on."""
     from training.assess import carries as editor_carries
     from training.worlds.editing_pairs import load_pairs
 

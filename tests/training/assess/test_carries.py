@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from attnwarp.editing.small import load_editor
 from training.assess import carries as editor_carries
 from training.assess.card_sections import Kept
 from training.assess.carries import (
     Displaced,
+    Swap,
     carried_section,
     cases_of,
     swap_figures,
@@ -45,29 +47,24 @@ class Scripted:
         obeys: what injected features do: "carry" them where they go, "ignore" them, or paint their colour "anywhere".
     """
 
-    def __init__(self, cases, obeys):
-        self.cases, self.obeys = cases, obeys
+    def __init__(self, obeys):
+        self.obeys = obeys
 
     def noise(self, seeds, before):
         return torch.tensor([[float(s % 2)] for s in seeds])
 
-    def answers(self, guides, noise):
+    def answers(self, cases, noise):
         # Every odd noise answers another colour than every even one.
-        return [
-            case.answers[1 + int(v)] for case, v in zip(self.of(guides), noise[:, 0], strict=True)
-        ]
+        return [case.answers[1 + int(v)] for case, v in zip(cases, noise[:, 0], strict=True)]
 
-    def of(self, guides):
-        return [next(c for c in self.cases if c.before is g) for g in guides]
+    def run(self, cases, noise):
+        return self.answers(cases, noise)
 
-    def run(self, guides, noise):
-        return self.answers(guides, noise)
+    def recorded(self, cases, noise):
+        return self.answers(cases, noise), (cases, noise)
 
-    def recorded(self, guides, noise):
-        return self.answers(guides, noise), (guides, noise)
-
-    def injected(self, recording, guides, noise, *, mask=None, warps=None, weight=None):
-        own, given = self.answers(guides, noise), self.answers(*recording)
+    def injected(self, recording, cases, noise, *, mask=None, warps=None, weight=None):
+        own, given = self.answers(cases, noise), self.answers(*recording)
         if self.obeys == "ignore":
             return own
         mask = np.ones(own[0].shape[:2], bool) if mask is None or self.obeys == "anywhere" else mask
@@ -85,7 +82,7 @@ def test_features_that_carry_the_answer_and_where_score_so(
 ):
     cases = cases_of(worlds, 64)
     monkeypatch.setattr(editor_carries, "cases_of", lambda worlds, size, number=0: cases)
-    monkeypatch.setattr(editor_carries, "Swap", lambda editor: Scripted(cases, obeys))
+    monkeypatch.setattr(editor_carries, "Swap", lambda editor: Scripted(obeys))
     figures = swap_figures(None, worlds, size=64, pairs=2)
     assert [f.value for f in figures[:4]] == [same, same, follows, keeps]
 
@@ -101,14 +98,13 @@ def test_rounds_of_other_pictures_go_on_until_every_question_has_as_many_pairs_a
     ran = []
 
     class Counted(Scripted):
-        def recorded(self, guides, noise):
-            ran.append(len(guides))
+        def recorded(self, cases, noise):
+            ran.append(len(cases))
             if len(ran) == 2:
                 raise KeyboardInterrupt
-            return super().recorded(guides, noise)
+            return super().recorded(cases, noise)
 
-    everything = [c for cases in drawn.values() for c in cases]
-    monkeypatch.setattr(editor_carries, "Swap", lambda editor: Counted(everything, "carry"))
+    monkeypatch.setattr(editor_carries, "Swap", lambda editor: Counted("carry"))
     path = tmp_path / "kept.json"
     with pytest.raises(KeyboardInterrupt):
         swap_figures(None, worlds, size=64, pairs=8, kept=Kept(path))
@@ -126,13 +122,13 @@ def test_rounds_of_other_pictures_go_on_until_every_question_has_as_many_pairs_a
 
 def test_an_editor_that_never_answers_comes_to_an_end(worlds, monkeypatch):
     class Silent(Scripted):
-        def answers(self, guides, noise):
-            return list(guides)
+        def answers(self, cases, noise):
+            return [case.before for case in cases]
 
     cases = cases_of(worlds, 64)[:2]
     monkeypatch.setattr(editor_carries, "cases_of", lambda worlds, size, number: cases)
     monkeypatch.setattr(editor_carries, "MOST_ROUNDS", 2)
-    monkeypatch.setattr(editor_carries, "Swap", lambda editor: Silent(cases, "carry"))
+    monkeypatch.setattr(editor_carries, "Swap", lambda editor: Silent("carry"))
     assert swap_figures(None, worlds, size=64, pairs=5) == []
 
 
@@ -140,9 +136,28 @@ def test_an_editor_that_never_answers_comes_to_an_end(worlds, monkeypatch):
 def test_a_warp_that_is_displaced_is_told_from_the_true_one(worlds, monkeypatch, obeys, clear):
     cases = cases_of(worlds, 64)
     monkeypatch.setattr(editor_carries, "cases_of", lambda worlds, size, number=0: cases)
-    monkeypatch.setattr(editor_carries, "Swap", lambda editor: Scripted(cases, obeys))
+    monkeypatch.setattr(editor_carries, "Swap", lambda editor: Scripted(obeys))
     figure = warped_figure(None, worlds, size=64, noises=3)
     assert (figure.value, figure.count) == (clear, 3)
+
+
+def test_the_noise_draws_an_answer_over_the_thing_alone(worlds):
+    """Noise outside the things draws nothing: what it is there, the pooled noise is the same."""
+    editor = load_editor("small-plain")
+    pooled, draw = [], editor.unet.draw
+    width = editor.vae.config.latent_channels
+    draw.register_forward_pre_hook(lambda _, given: pooled.append(given[0][:, :width].clone()))
+    swap, cases = Swap(editor), cases_of(worlds, 64)[:2]
+    noise = swap.noise([1, 2], cases[0].before)
+    other = noise.clone()
+    other[:, :, :4] += 1  # the thing is a square of 32 px in the middle of 64
+    swap.run(cases, noise)
+    first = pooled[0]
+    pooled.clear()
+    swap.run(cases, other)
+    assert torch.allclose(pooled[0], first, atol=1e-5)
+    inside = noise[:, :, 4:12, 4:12].sum((2, 3)) / 8
+    assert torch.allclose(first[:2], inside, atol=1e-4)
 
 
 def test_a_displaced_warp_reads_an_eighth_to_the_left():
