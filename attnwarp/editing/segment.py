@@ -16,9 +16,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp.digest import digest
 from attnwarp.encoders import load_encoder
-from attnwarp.encoders.base import EncoderInfo, PlaceEncoder, checked_image
+from attnwarp.encoders.base import PlaceEncoder, checked_image
 from attnwarp.errors import InputError, optional_imports
 
 Image = npt.NDArray[Any]
@@ -28,9 +27,6 @@ Mask = npt.NDArray[np.bool_]
 
 WORKING_SIDE = 256
 """Larger pictures are cut at this short side in px."""
-
-MASK_PROTOCOL = 1
-"""Raised when the same settings come to cut pictures otherwise, so that no edit mixes both."""
 
 LONGEST_SIDE = 1024
 """Longest side in px of what is rated and cut: a panorama would take memory without bound. Pictures
@@ -130,36 +126,6 @@ def load_segmenter(name: str, *, device: str = "cpu") -> Segmenter:
             f"segmenter {name!r}: unknown, expected clip-parts, or DINO_FOLDER,SAM_FOLDER"
         )
     return GroundedSam.from_folders(*(Path(folder.strip()) for folder in folders), device=device)
-
-
-def segmenter_digest(segmenter: Segmenter) -> str:
-    """SHA-256 of what decides a segmenter's masks: networks, what prepares their inputs, limits.
-
-    Raises:
-        InputError: a segmenter of another kind than those of :func:`load_segmenter`.
-
-    Example:
-        >>> bundled = load_segmenter("clip-parts")
-        >>> segmenter_digest(bundled) == segmenter_digest(load_segmenter("clip-parts"))
-        True
-    """
-    if isinstance(segmenter, ClipSegmenter):
-        s = segmenter
-        about: EncoderInfo | None = getattr(s.encoder, "about", None)
-        if about is not None:
-            limits = [list(s.sides), s.likely, s.background, s.sure, s.detection]
-            sides = [WORKING_SIDE, LONGEST_SIDE]
-            return digest(["clip", MASK_PROTOCOL, about.weights_sha256, limits, sides])
-    if not isinstance(segmenter, GroundedSam):
-        raise InputError(f"segmenter: {type(segmenter).__name__} does not say whose weights it has")
-    g = segmenter
-    tokens = g.detector_processor.tokenizer.backend_tokenizer.to_str()
-    parts: list[Any] = ["grounded", MASK_PROTOCOL, g.box_threshold, g.text_threshold, tokens]
-    for network, processor in ((g.detector, g.detector_processor), (g.sam, g.sam_processor)):
-        parts += [network.config.to_diff_dict(), processor.image_processor.to_dict()]
-        for key, value in sorted(network.state_dict().items()):
-            parts += [key, value.detach().cpu().contiguous().numpy()]
-    return digest(*parts)
 
 
 @dataclass(frozen=True, eq=False)

@@ -393,24 +393,14 @@ def _masks(
         raise InputError(
             f"--masks: every mask in {folder} is black, so nothing may change; white is edited"
         )
-    _say_empty(masks, cameras, lambda n: f"--masks: {n} are black", report)
-    return masks
-
-
-def _say_empty(
-    masks: list[npt.NDArray[np.bool_]],
-    cameras: Any,
-    text: Callable[[str], str],
-    report: Reporter,
-) -> None:
-    """Name the views whose masks are empty; ``text`` begins the line, with a "2 of 9"."""
     empty = [camera.name for mask, camera in zip(masks, cameras, strict=True) if not mask.any()]
     if empty:
         more = f" and {len(empty) - MOST_NAMES} more" if len(empty) > MOST_NAMES else ""
         report.log(
-            f"{text(f'{len(empty)} of {len(masks)}')}, so nothing is edited in"
+            f"--masks: {len(empty)} of {len(masks)} are black, so nothing is edited in"
             f" {', '.join(empty[:MOST_NAMES])}{more}"
         )
+    return masks
 
 
 def mask_files(folder: Path, cameras: Any) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,17 +10,19 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from attnwarp.camera import Camera
-from attnwarp.editing.segment import Mask, cut_out, load_segmenter
+from attnwarp.digest import digest
+from attnwarp.editing.segment import Mask, cut_out, load_segmenter, segments_of
 from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import read_upright
-from attnwarp.methods.pictures import Segment, check_view_aspect
+from attnwarp.methods.pictures import Segment, check_view_aspect, mask_picture
 from attnwarp.methods.scene import near_of, to_float
-from attnwarp.methods.words import masks_by_words, words_folder
 from attnwarp.reporting import Reporter
 from attnwarp.warp import lift_masks, piece_around
+from attnwarp.workdir import Workdir
 
 COLORED = 0.1
 """Spread of a pixel's channels that no grey picture has: a photograph, or a mask of two colours,
@@ -155,14 +158,40 @@ def source_mask(
         if not mask.any():
             raise InputError(f"--mask: {marks.mask} is black; white is edited")
     elif marks.words is not None:
-        segmenter, how = load_segmenter(marks.segmenter, device=device), "--where"
-        folder = words_folder(out, segmenter, marks.words)
-        (mask,), _ = masks_by_words(segmenter, marks.words, [camera], [image], folder, report)
+        mask, how = mask_by_words(marks, camera, image, out, device), "--where"
     else:
         how = "--box" if marks.at is None else "--at"
         mask = picture_mask(marks, image, camera.width / full_width)
     report.log(f"{how} marks {mask.mean():.1%} of the source view {camera.name}")
     return mask
+
+
+def mask_by_words(
+    marks: Marks, camera: Camera, image: npt.NDArray[Any], out: Path, device: str
+) -> Mask:
+    """(H, W) bool of a view, kept in a folder ``words``, since a network may take a minute and a
+    GPU need not give the same bits again. Other words, segmenters and pictures have other files.
+
+    Args:
+        marks: with ``words``.
+        camera: of the view.
+        image: (H, W, 3) of it.
+        out: folder of the edit.
+        device: of a segmenter.
+
+    Raises:
+        NoDetectionError: the view shows nothing that the words name.
+    """
+    assert marks.words is not None
+    plain = re.sub(r"[^a-z0-9]+", "-", marks.words.lower()).strip("-")[:24] or "mask"
+    of = digest([marks.words, marks.segmenter, digest(image)])[:8]
+    files, name = Workdir(out, "an edit"), f"words/{plain}-{of}.png"
+    if not files.has(name):
+        segmenter = load_segmenter(marks.segmenter, device=device)
+        mask = segments_of(segmenter, marks.words, [camera.name])(0, to_float(image))
+        (out / "words").mkdir(parents=True, exist_ok=True)
+        files.write_picture(name, mask_picture(torch.from_numpy(mask)))
+    return np.asarray(files.read_picture(name)[..., 0] > 127)
 
 
 def lifted_segments(

@@ -16,7 +16,6 @@ import numpy as np
 import PIL.ImageOps
 import pytest
 import torch
-from edit_folders import Watched
 from tiny_editors import pix2pix
 from tiny_scenes import cameras, pictures, splats
 from tiny_segmenters import save_dino, save_sam
@@ -24,18 +23,15 @@ from typer.testing import CliRunner
 
 from attnwarp import Camera
 from attnwarp.cli.main import app
-from attnwarp.editing.segment import GroundedSam, NoDetectionError, cut_out, load_segmenter
+from attnwarp.editing.segment import GroundedSam, cut_out
 from attnwarp.errors import InputError
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp.io.images import encode_png
-from attnwarp.io.lock import alone_in
-from attnwarp.methods import PRESETS, command
+from attnwarp.methods import PRESETS
 from attnwarp.methods.command import _masks, mask_files
-from attnwarp.methods.marks import read_mask, read_over_black
+from attnwarp.methods.marks import Marks, mask_by_words, read_mask, read_over_black
 from attnwarp.methods.scene import near_of, to_float
-from attnwarp.methods.words import masks_by_words, words_folder
 from attnwarp.render import render
-from attnwarp.reporting import SILENT
 from attnwarp.warp import lift_masks, piece_around
 
 runner = CliRunner()
@@ -537,121 +533,40 @@ def test_an_edit_whose_targets_got_no_features_says_so(place, tmp_path):
     assert "in place of" not in result.stderr
 
 
-class Counted:
-    """A segmenter that notes what it is shown, and may be stopped before a view."""
-
-    def __init__(self, segmenter, stop_at=None):
-        self.segmenter, self.stop_at, self.shown = segmenter, stop_at, 0
-
-    def segment(self, image, words):
-        if self.shown == self.stop_at:
-            raise KeyboardInterrupt
-        self.shown += 1
-        return self.segmenter.segment(image, words)
-
-
-def test_masks_by_words_are_made_once(place, tmp_path):
-    """Stopped before the third view, begun anew, then damaged, and repainted."""
-    views = cameras()
-    images = [read_image(place / "data" / "images" / camera.name) for camera in views]
-    segmenter, text = tiny_segmenter(tmp_path), "bear"
-    folder = words_folder(tmp_path / "edit", segmenter, text)
-    alone = [segmenter.segment(to_float(image), text) for image in images]
-
-    def made(stop_at=None, views=views, images=images):
-        counted, steps = Counted(segmenter, stop_at), []
-        try:
-            masks, kept = masks_by_words(
-                counted, text, views, images, folder, Watched(lambda *step: steps.append(step))
-            )
-        except KeyboardInterrupt:
-            return counted.shown
-        assert [(done, total) for done, total, _ in steps] == [
-            (k + 1, len(views)) for k in range(len(views))
-        ]
-        assert kept == len(views) - counted.shown
-        if images is not flipped:
-            assert all(map(np.array_equal, masks, alone))
-        return counted.shown
-
-    flipped = [image[:, ::-1].copy() for image in images]
-    assert made(stop_at=2) == 2
-    assert made() == len(views) - 2
-    assert made() == 0
-    path = folder / "v1.png"
-    path.write_bytes(path.read_bytes()[:-20])
-    (folder / "v2.json").write_text("{")
-    assert made() == 2
-    assert made(images=flipped) == len(views)
-    assert made() == len(views)
-    path.write_bytes(encode_png(255 - read_image(path)))
-    painted = path.read_bytes()
-    with pytest.raises(InputError, match=r"v1.png: is not the mask that was made; .*--masks"):
-        made()
-    (folder / "v1.json").unlink()
-    with pytest.raises(InputError, match="v1.png: is there without v1.json"):
-        made()
-    assert path.read_bytes() == painted
-    with alone_in(folder), pytest.raises(InputError, match="another run writes to this folder"):
-        made()
+def test_a_mask_by_words_is_made_once_and_others_write_over_none(place, tmp_path, monkeypatch):
+    """Oracle: the segmenter itself, and how often it is loaded."""
+    camera = cameras()[0]
+    image = read_image(place / "data" / "images" / camera.name)
+    segmenter, loaded = tiny_segmenter(tmp_path), []
+    monkeypatch.setattr(
+        "attnwarp.methods.marks.load_segmenter",
+        lambda name, *, device: loaded.append(name) or segmenter,
+    )
+    bear = Marks(words="bear", segmenter="dino,sam")
+    out = tmp_path / "edit"
+    for _ in range(2):
+        mask = mask_by_words(bear, camera, image, out, "cpu")
+        assert np.array_equal(mask, segmenter.segment(to_float(image), "bear"))
+    assert loaded == ["dino,sam"]
+    others = [replace(bear, words="Bear"), replace(bear, words="a bear / b")]
+    others += [replace(bear, segmenter="dino,sam2")]
+    for marks in others:
+        mask_by_words(marks, camera, image, out, "cpu")
+    mask_by_words(bear, camera, image[:, ::-1].copy(), out, "cpu")
+    assert len(loaded) == len(list((out / "words").iterdir())) == 5
 
 
-def test_masks_of_other_words_or_segmenters_write_over_none(place, tmp_path):
-    views = cameras()[:2]
-    images = [read_image(place / "data" / "images" / camera.name) for camera in views]
-    files = {}
-    segmenters = [
-        tiny_segmenter(tmp_path), tiny_segmenter(tmp_path, box_threshold=0.3),
-        tiny_segmenter(tmp_path, sam_seed=3), load_segmenter("clip-parts"),
-    ]  # fmt: skip
-    for segmenter in segmenters:
-        for text in ("bear", "Bear", "a bear / b"):
-            folder = words_folder(tmp_path / "edit", segmenter, text)
-            assert folder not in files
-            files[folder] = segmenter, text
-    assert len({folder.parent for folder in files}) == 1
-    for folder, (segmenter, text) in list(files.items())[:4]:
-        _, kept = masks_by_words(segmenter, text, views, images, folder, SILENT)
-        assert kept == 0
-    for folder, (segmenter, text) in list(files.items())[:4]:
-        _, kept = masks_by_words(segmenter, text, views, images, folder, SILENT)
-        assert kept == len(views)
-
-
-def tiny_segmenter(folder, *, sam_seed=2, **thresholds):
+def tiny_segmenter(folder):
     save_dino(folder / "dino")
-    save_sam(folder / f"sam{sam_seed}", seed=sam_seed)
-    return GroundedSam.from_folders(folder / "dino", folder / f"sam{sam_seed}", **thresholds)
+    save_sam(folder / "sam", seed=2)
+    return GroundedSam.from_folders(folder / "dino", folder / "sam")
 
 
 def test_words_that_no_view_shows_are_one_clear_line(place, tmp_path):
-    for _ in range(2):  # kept masks say no more
-        result = run(place, tmp_path, "--ply", place / "splats.ply", "--where", "snowman")
-        assert result.exit_code == 2
-        assert "no 'snowman' was detected in view images/v0.png" in result.output
+    result = run(place, tmp_path, "--ply", place / "splats.ply", "--where", "snowman")
+    assert result.exit_code == 2
+    assert "no 'snowman' was detected in view images/v0.png" in result.output
     assert not (tmp_path / "edited.ply").exists()
-
-
-def test_a_view_that_does_not_show_the_words_is_named_and_has_an_empty_mask(tmp_path):
-    """Oracle: a segmenter that knows which picture shows something."""
-
-    class Bright:
-        def segment(self, image, words):
-            if image.max() < 0.5:
-                raise NoDetectionError(words)
-            return np.asarray(image[..., 0] > 0.5)
-
-    views = cameras()[:3]
-    images = [np.zeros((camera.height, camera.width, 3), np.float32) for camera in views]
-    images[1][4:9, 5:7] = 1
-    arguments = (Bright(), "bear", views, images, tmp_path, SILENT)
-    for kept in (0, 3):
-        masks, again = masks_by_words(*arguments)
-        assert again == kept
-        assert [int(mask.sum()) for mask in masks] == [0, 10, 0]
-    said = []
-    command._say_empty(masks, views, lambda n: f"{n} views", Watched(log=said.append))
-    assert said == [f"2 of 3 views, so nothing is edited in {views[0].name}, {views[2].name}"]
 
 
 def test_the_commands_help_names_every_preset():
