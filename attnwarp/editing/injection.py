@@ -12,7 +12,7 @@ from torch import Tensor
 from attnwarp import check
 from attnwarp.editing.layers import Call, Layer, Size, hooked
 from attnwarp.editing.recording import Recording
-from attnwarp.warp import FeatureWarp, resize_mask
+from attnwarp.warp import resize_mask
 from attnwarp.warp.sampling import work_type
 
 
@@ -218,9 +218,6 @@ def _blend_into(
     if blend is not None:
         work = work_type(new.dtype)
         result.copy_(blend(layer, source[None].to(work), new[None].to(work), alpha)[0])
-    elif isinstance(layer, FeatureWarp) and not torch.is_grad_enabled():
-        # A layer is small: most of a blend's time would go into results and their copies.
-        layer.blend_tokens(source[None], result[None], alpha, in_place=True)
     else:
         result.copy_(layer.blend_tokens(source[None], new[None], alpha)[0])
 

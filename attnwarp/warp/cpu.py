@@ -1,4 +1,4 @@
-"""The kernels of the CPU on tensors: pairs of views, and differentiable sampling and blending.
+"""The kernels of the CPU on tensors: pairs of views, and differentiable sampling.
 
 Threads follow ``torch.set_num_threads``, as the renderer's do; the result has the same bits for any
 number of them.
@@ -146,31 +146,6 @@ def sample_tokens(tokens: Tensor, taps: Taps) -> Tensor:
     return result
 
 
-def blend_tokens(
-    source: Tensor,
-    new: Tensor,
-    taps: Taps,
-    mask: Tensor,
-    alpha: float | Tensor,
-    *,
-    in_place: bool = False,
-) -> Tensor:
-    """:func:`attnwarp.warp.sampling.blend_tokens` by kernels; to ``new`` itself if ``in_place``.
-
-    A gradient flows back to ``source`` and ``new``, and none to ``alpha``.
-    """
-    # In one memory, rows of the source would be read after the blend had written them.
-    apart = source.untyped_storage().data_ptr() != new.untyped_storage().data_ptr()
-    if in_place and apart and new.is_contiguous():
-        _blend(_values(source), _values(new), taps, mask, alpha)
-        # As torch's own operations do: a graph that saved ``new`` must not take it for the same.
-        if not new.is_inference():
-            torch.autograd.graph.increment_version(new)
-        return new
-    result: Tensor = _BlendTokens.apply(source, new, taps, mask, alpha)
-    return new.copy_(result) if in_place else result
-
-
 class _SampleMaps(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, planes: Tensor, taps: Taps) -> Tensor:
@@ -215,62 +190,14 @@ class _SampleTokens(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        share = np.ones(upstream.shape[1], ctx.taps.arrays[1].dtype)
-        return _scatter(upstream, ctx.taps, share, ctx.shape), None
-
-
-class _BlendTokens(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float | Tensor
-    ) -> Tensor:
-        own = _values(new)
-        result = _pool.empty(own.shape, own.dtype)
-        run_jobs(sampling.copy_rows, [(*piece, own, result) for piece in _pieces(result)])
-        _blend(_values(source), result, taps, mask, alpha)
-        ctx.taps, ctx.mask, ctx.alpha, ctx.shape = taps, mask, alpha, source.shape
-        return _tensor(result, new.dtype)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(
-        ctx: Any, upstream: Tensor
-    ) -> tuple[Tensor | None, Tensor | None, None, None, None]:
-        share = ctx.alpha * ctx.mask.to(ctx.taps.weight.dtype)
-        source = own = None
-        if ctx.needs_input_grad[0]:
-            source = _scatter(upstream, ctx.taps, share.numpy(), ctx.shape)
-        if ctx.needs_input_grad[1]:
-            # Not 1 - share: where a is almost 1, its rounding is a large part of the difference.
-            one = share.new_ones(())
-            rest = torch.where(ctx.mask, one * (1 - ctx.alpha), one)
-            own = (upstream * rest[:, None]).to(upstream.dtype)
-        return source, own, None, None, None
-
-
-def _blend(
-    source: np.ndarray, result: np.ndarray, taps: Taps, mask: Tensor, alpha: float | Tensor
-) -> None:
-    index, weight = taps.arrays
-    shares = weight.dtype.type(alpha), weight.dtype.type(1 - alpha)
-    run_jobs(
-        sampling.blend_rows,
-        [
-            (*piece, source, index, weight, mask.numpy(), *shares, result)
-            for piece in _pieces(result)
-        ],
-    )
-
-
-def _scatter(upstream: Tensor, taps: Taps, share: np.ndarray, shape: torch.Size) -> Tensor:
-    index, weight = taps.arrays
-    gradient = _values(upstream.to(taps.weight.dtype))
-    result = _pool.zeros(tuple(shape), weight.dtype)
-    run_jobs(
-        sampling.scatter_rows,
-        [(*piece, gradient, index, weight, share, result) for piece in ranges(shape[2], CHANNELS)],
-    )
-    return torch.from_numpy(result).to(upstream.dtype)
+        index, weight = ctx.taps.arrays
+        gradient = _values(upstream.to(ctx.taps.weight.dtype))
+        result = _pool.zeros(tuple(ctx.shape), weight.dtype)
+        pieces = ranges(result.shape[2], CHANNELS)
+        run_jobs(
+            sampling.scatter_rows, [(*piece, gradient, index, weight, result) for piece in pieces]
+        )
+        return torch.from_numpy(result).to(upstream.dtype), None
 
 
 def _pieces(tokens: np.ndarray) -> list[tuple[int, int]]:

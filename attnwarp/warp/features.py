@@ -113,31 +113,22 @@ class FeatureWarp:
         taps = self._tokens_taps(source)
         return self._engine(source).sample_tokens(source, taps).to(source.dtype)
 
-    def blend_tokens(
-        self,
-        source: check.Array,
-        new: check.Array,
-        alpha: float | Tensor,
-        *,
-        in_place: bool = False,
-    ) -> Tensor:
+    def blend_tokens(self, source: check.Array, new: check.Array, alpha: float | Tensor) -> Tensor:
         """Warp, mask and blend: a (M warp(source) + (1 - M) new) + (1 - a) new, M = ``mask``.
 
         Args:
             source: (B, h*w, C) or (1, h*w, C) recorded tokens of the source's grid, converted to
                 the type of ``new``.
             new: (B, H*W, C) the target's own tokens, floating.
-            alpha: a, in [0, 1]. Where it is a () tensor with a gradient, that flows back too, and
-                torch computes the blend.
-            in_place: write the result to ``new``. Not where a gradient is recorded.
+            alpha: a, in [0, 1]. Where it is a () tensor with a gradient, that flows back too.
 
         Returns:
             (B, H*W, C) in the type of ``new``, with its bits where the mask is False; sums are in
-            float32 for half precision and rounded once. ``new`` itself if ``in_place``.
+            float32 for half precision and rounded once.
 
         Raises:
             ValueError: shapes that do not fit, a type that cannot be blended, ``alpha`` out of
-                range, ``in_place`` with a gradient.
+                range.
 
         Example:
             >>> import numpy as np, torch
@@ -157,17 +148,11 @@ class FeatureWarp:
         """
         source, new = check.tensor(source, "source"), check.tensor(new, "new")
         self._check_tokens(source)
-        self._check_blend(source, new, alpha, in_place)
-        source = source.to(new.dtype)
-        taps, mask = self._tokens_taps(source), self._mask_on(new.device)
-        # The kernels give no gradient of the weight.
-        learned = isinstance(alpha, Tensor) and alpha.requires_grad
-        if learned or self._engine(new) is sampling:
-            result = sampling.blend_tokens(source, new, taps, mask, alpha)
-            return new.copy_(result) if in_place else result
-        from attnwarp.warp import cpu
-
-        return cpu.blend_tokens(source, new, taps, mask, alpha, in_place=in_place)
+        self._check_blend(source, new, alpha)
+        work = sampling.work_type(new.dtype)
+        warped = self.warp_tokens(source.to(new.dtype).to(work))
+        mixed = alpha * warped + (1 - alpha) * new.to(work)
+        return torch.where(self._mask_on(new.device)[:, None], mixed.to(new.dtype), new)
 
     def _check_size(self, features: Tensor) -> None:
         h, w = features.shape[-2:]
@@ -189,9 +174,7 @@ class FeatureWarp:
 
         return cpu
 
-    def _check_blend(
-        self, source: Tensor, new: Tensor, alpha: float | Tensor, in_place: bool
-    ) -> None:
+    def _check_blend(self, source: Tensor, new: Tensor, alpha: float | Tensor) -> None:
         target = self.correspondence.target
         check.instance(new, Tensor, "new", "torch.Tensor")
         check.shape(new, ("B", target.height * target.width, "C"), "new")
@@ -208,12 +191,6 @@ class FeatureWarp:
             check.shape(alpha, (), "alpha")
         if not isinstance(alpha, Real | Tensor) or not 0 <= alpha <= 1:
             raise ValueError(f"alpha: got {alpha!r}, expected a number in [0, 1]")
-        recorded = any(getattr(part, "requires_grad", False) for part in (source, new, alpha))
-        if in_place and torch.is_grad_enabled() and recorded:
-            raise ValueError(
-                "in_place: got True where a gradient is recorded; use torch.no_grad() or"
-                " in_place=False"
-            )
 
     def _check_tokens(self, source: Tensor) -> None:
         camera = self.correspondence.source

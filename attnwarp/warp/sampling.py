@@ -179,22 +179,6 @@ def sample_tokens(tokens: Tensor, taps: Taps) -> Tensor:
     return total
 
 
-def blend_tokens(
-    source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float | Tensor
-) -> Tensor:
-    """a (M warp(source) + (1 - M) new) + (1 - a) new, in the type of ``new``, rounded once.
-
-    Args:
-        source: (B or 1, h*w, C), new: (B, N, C), of one type.
-        taps: as in :func:`sample_maps`.
-        mask: (N,) bool. Where it is False the result has the bits of ``new``.
-        alpha: in [0, 1]; a () tensor has a gradient too.
-    """
-    warped = sample_tokens(source, taps)
-    mixed = alpha * warped + (1 - alpha) * new.to(warped.dtype)
-    return torch.where(mask[:, None], mixed.to(new.dtype), new)
-
-
 def sample_depth(
     source_depth: Array,
     correspondence: Correspondence,

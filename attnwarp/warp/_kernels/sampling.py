@@ -161,50 +161,6 @@ def sample_rows(begin, end, source, index, weight, result):
 
 
 @exact
-def blend_rows(begin, end, source, index, weight, mask, alpha, rest, result):
-    """Tokens ``begin`` to ``end`` become alpha warp(source) + rest result where ``mask``.
-
-    Args:
-        source: (B or 1, h*w, C), result: (B, N, C), of one type.
-        mask: (N,) bool.
-        alpha, rest: the two shares, of the weights' type.
-        index, weight: as in :func:`sample_rows`.
-    """
-    zero = weight.dtype.type(0)
-    for b in range(result.shape[0]):
-        view = b if source.shape[0] > 1 else 0
-        for n in range(begin, end):
-            if not mask[n]:
-                continue
-            row = result[b, n]
-            w0, w1, w2, w3 = weight[0, n], weight[1, n], weight[2, n], weight[3, n]
-            r0, r1 = source[view, index[0, n]], source[view, index[1, n]]
-            r2, r3 = source[view, index[2, n]], source[view, index[3, n]]
-            if _all_used(weight, n):
-                for c in range(row.size):
-                    left = zero + w0 * _wide(r0[c]) + w1 * _wide(r1[c])
-                    total = left + w2 * _wide(r2[c]) + w3 * _wide(r3[c])
-                    row[c] = _narrow(row, alpha * total + rest * _wide(row[c]))
-            else:
-                for c in range(row.size):
-                    total = zero
-                    total += w0 * _wide(r0[c]) if w0 > 0 else zero
-                    total += w1 * _wide(r1[c]) if w1 > 0 else zero
-                    total += w2 * _wide(r2[c]) if w2 > 0 else zero
-                    total += w3 * _wide(r3[c]) if w3 > 0 else zero
-                    row[c] = _narrow(row, alpha * total + rest * _wide(row[c]))
-
-
-@exact
-def copy_rows(begin, end, source, result):
-    """Tokens ``begin`` to ``end`` of ``source`` to ``result``, both (B, N, C)."""
-    for b in range(source.shape[0]):
-        for n in range(begin, end):
-            for c in range(source.shape[2]):
-                result[b, n, c] = source[b, n, c]
-
-
-@exact
 def sample_maps(begin, end, source, index, weight, result):
     """Planes ``begin`` to ``end`` of ``result``.
 
@@ -229,25 +185,22 @@ def sample_maps(begin, end, source, index, weight, result):
 
 
 @exact
-def scatter_rows(begin, end, gradient, index, weight, share, result):
+def scatter_rows(begin, end, gradient, index, weight, result):
     """Channels ``begin`` to ``end`` of the gradient in the source's tokens.
 
     A thread has channels of its own and adds all positions in their order, so the bits are the same
     for any number of threads.
 
     Args:
-        gradient: (B, N, C) in the warped tokens, result: (B or 1, h*w, C) zeros, of the weights'
-            type.
-        share: (N,) factors, of the weights' type.
+        gradient: (B, N, C) in the warped tokens, result: (B, h*w, C) zeros, of the weights' type.
     """
     for b in range(gradient.shape[0]):
-        view = b if result.shape[0] > 1 else 0
         for n in range(gradient.shape[1]):
             upstream = gradient[b, n]
             for k in range(4):
-                factor = weight[k, n] * share[n]
+                factor = weight[k, n]
                 if factor > 0:
-                    row = result[view, index[k, n]]
+                    row = result[b, index[k, n]]
                     for c in range(begin, end):
                         row[c] += factor * upstream[c]
 

@@ -338,22 +338,3 @@ assert (result == expected.view(np.uint16))[~undefined].all()
         text=True,
     )
     assert result.returncode == 0, result.stderr[-500:]
-
-
-def test_a_blend_in_place_is_seen_by_a_graph_that_saved_the_tensor():
-    """Oracle: torch's own operations in place, which are seen: the gradient would be of other
-    numbers.
-    """
-    camera = orbit(0, size=8)
-    surface = Surface(torch.full((8, 8), 3.0, dtype=torch.float64))
-    layer = warp_surfaces(camera, camera, surface, surface, preset("paper")).at((4, 4))
-    source, new = torch.zeros(1, 16, 2), torch.ones(1, 16, 2)
-    weight = torch.ones(1, 16, 2, requires_grad=True)
-    total = (weight * new).sum()
-    with torch.no_grad():
-        assert layer.blend_tokens(source, new, 1.0, in_place=True) is new
-    assert float(new.min()) == 0
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        total.backward()
-    with torch.inference_mode():  # whose tensors have no versions
-        layer.blend_tokens(source, torch.ones(1, 16, 2), 1.0, in_place=True)
