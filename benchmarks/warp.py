@@ -8,14 +8,14 @@ its ratio to itself is what the machine's noise alone does.
 
 - A pair: the correspondence, every rule and the mask at image size, and feature grids of 1/8 and
   1/16; beside it the definition in torch, and the render of the target that it starts from.
-- Tokens (2, h*w, C): the warp, and the blend; beside them torch's ``grid_sample`` and
-  kornia's ``warp_frame_depth`` (which reprojects) on the same features as (2, C, h, w), the
-  definition in torch, and one addition of the warped tokens.
+- Tokens (2, h*w, C): the warp; beside it torch's ``grid_sample`` and kornia's
+  ``warp_frame_depth`` (which reprojects) on the same features as (2, C, h, w), the definition in
+  torch, and one addition of the warped tokens.
 
-The yardstick of memory is torch's copy of the bytes that a warp must move, the source's tokens once
-and the result's once, in the same rounds. A warp's share of the bandwidth is the
-copy's time over its own; a blend moves other bytes and has none. Taps counted are those of weight
-above 0, times channels. Processor time is that of all threads; torch's spin while they wait.
+The yardstick of memory is a copy of the bytes that a warp must move, the source's tokens once and
+the result's once, by the same threads in the same rounds. A warp's share of the bandwidth is the
+copy's time over its own. Taps counted are those of weight above 0, times channels. Processor time
+is that of all threads; torch's spin while they wait.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ from torch import Tensor
 
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
+from attnwarp.render._kernels.compilation import exact
 from attnwarp.render.api import render
-from attnwarp.render.threads import thread_count
+from attnwarp.render.threads import ranges, run_jobs, thread_count
 from attnwarp.warp import FeatureWarp, WarpedView, render_surface, warp_surfaces
 from attnwarp_eval.cost import in_turn
 from attnwarp_eval.statistics.intervals import time_ratio
@@ -42,7 +43,15 @@ from benchmarks import command
 SPLATS = 40_000
 YAW = 20.0
 BATCH = 2
-ALPHA = 0.7
+
+
+@exact
+def copy_rows(begin: int, end: int, source: Any, result: Any) -> None:
+    """Tokens ``begin`` to ``end`` of ``source`` to ``result``, both (B, N, C)."""
+    for b in range(source.shape[0]):
+        for n in range(begin, end):
+            for c in range(source.shape[2]):
+                result[b, n, c] = source[b, n, c]
 
 
 @dataclass
@@ -144,10 +153,12 @@ def tokens_case(grid: int, channels: int, dtype: torch.dtype, *, others: bool) -
     tokens = torch.randn(BATCH, grid * grid, channels, generator=generator).to(dtype)
     new, result = torch.randn(tokens.shape, generator=generator).to(dtype), tokens.clone()
     maps = tokens.transpose(1, 2).reshape(BATCH, channels, grid, grid).contiguous()
+    raw = torch.int16 if dtype.itemsize == 2 else dtype
+    begin, end = (t.view(raw).numpy() for t in (tokens, result))
+    pieces = ranges(grid * grid, max(1, grid * grid // (4 * thread_count())))
     contestants: dict[str, Callable[[], object]] = {
-        "copy": lambda: result.copy_(tokens),
+        "copy": lambda: run_jobs(copy_rows, [(*p, begin, end) for p in pieces]),
         "tokens": lambda: layer.warp_tokens(tokens),
-        "blend": lambda: layer.blend_tokens(tokens, new, ALPHA),
         "tokens + addition": lambda: layer.warp_tokens(tokens) + new,
         "maps": lambda: layer.warp(maps),
     }
