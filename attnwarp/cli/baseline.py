@@ -81,13 +81,13 @@ def baseline(
         settings = methods.preset(method, preset, **changes)
         budget = methods.Budget(seconds, network_rows)
         use_threads(editing.threads)
-        from attnwarp.methods.command import run_baseline
+        from attnwarp.methods.command import edit_dataset
 
         dataset = read_views(data, reading, points=False)
         splats = read_splats(ply, kind, antialiased, screen_filter)
         check_seen(ply, splats, dataset.cameras, report)
         warn_of_misfit(ply, splats, dataset)
-        result, page = run_baseline(
+        result, page = edit_dataset(
             method, dataset, splats, editor, instruction, settings, out, options,
             budget=budget, report=report,
         )  # fmt: skip

@@ -162,7 +162,7 @@ def edit(
         from attnwarp.methods.command import FitPlan, edit_dataset
 
         result, page = edit_dataset(
-            dataset, splats, editor, instruction, settings, out, edit_options,
+            "attention_warping", dataset, splats, editor, instruction, settings, out, edit_options,
             fit_plan=FitPlan(
                 fit_iterations or FIT_ITERATIONS,
                 (kind or Kind.two).value[:2],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -29,8 +29,7 @@ from attnwarp.gaussians import Gaussians
 from attnwarp.io import THIRD_SCALE, Dataset, write_ply
 from attnwarp.io.find import FileFinder, name_key
 from attnwarp.io.names import file_stems
-from attnwarp.methods import METHODS, Budget, MethodSettings, Result
-from attnwarp.methods.attention_warping import attention_warping
+from attnwarp.methods import METHODS, MethodSettings, Result
 from attnwarp.methods.base import VIEWER_PLY, workdir_of
 from attnwarp.methods.features import Features
 from attnwarp.methods.marks import (
@@ -103,40 +102,42 @@ class EditOptions:
 
 
 def edit_dataset(
+    method: str,
     dataset: Dataset,
     splats: Gaussians | None,
     editor_name: str,
     instruction: str,
-    settings: AttentionWarpingSettings,
+    settings: MethodSettings,
     out: Path,
     options: EditOptions,
     *,
-    fit_plan: FitPlan,
-    source_picture: Path | None,
-    store: Any,
+    fit_plan: FitPlan | None = None,
+    source_picture: Path | None = None,
     report: Reporter,
+    **own: Any,
 ) -> tuple[Result, Path]:
-    """Fit where no splats are given, edit, and write the page and a PLY for other viewers.
+    """Fit where no splats are given, edit, and write the page.
 
     Args:
+        method: see :data:`attnwarp.methods.METHODS`.
         dataset: cameras and pictures.
-        splats: the scene before the edit, or None.
+        splats: the scene before the edit; None, by attention warping alone, fits them first.
         editor_name: see :func:`attnwarp.editing.small.load_editor`.
         instruction: in words.
-        settings: of the edit. Without a size, the editor's own is taken.
-        out: folder of all results.
+        settings: of the method. Without a size, the editor's own is taken.
+        out: folder of all results; that of attention warping also has a PLY for other viewers.
         options: of the edit.
-        fit_plan: of the fit.
-        source_picture: file of the source view edited elsewhere.
-        store: see :func:`attnwarp.methods.attention_warping`.
+        fit_plan: of the fit, where splats are None.
+        source_picture: file of the source view edited elsewhere, for attention warping.
         report: receives how the work stands.
+        own: further options of the method, such as "budget".
 
     Returns:
         The edit and the path of its page.
 
     Raises:
         InputError: no such view, mask, editor or segmenter; marks where nothing is found; files of
-            something else where results go.
+            something else where results go; a film of another format.
     """
     check_film(options.turntable)
     workdir_of(out).check_unclaimed()  # again in the edit, but here before a fit
@@ -144,89 +145,10 @@ def edit_dataset(
     views = load_views(dataset, max_size=options.max_size)
     index = view_of(views.cameras, options.source, dataset)
     images = images_of(views)
-    # Views are the cameras with a picture.
-    pictures = [path for path in dataset.image_paths if path is not None]
-    by_hand = None
-    if source_picture is not None:
-        pixels, top = read_over_black(source_picture, beside=pictures[index])
-        by_hand = (pixels / top).astype(np.float32)
-        h, w, _ = by_hand.shape
-        # Again in the edit, but here before an editor is loaded and a fit spends its minutes.
-        check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
-    segments = marked(
-        options.marks, editor_name, dataset, views, images, index, out, device, report
-    )
-    editor = _editor(editor_name, device, options, report)
-    check_instruction(editor_name, editor, instruction)
-    if settings.size is None:
-        settings = replace(settings, size=own_size(editor))
-    if splats is None:
-        # So are settings that the editor or the tuning cannot use.
-        check_editor(editor, settings)
-        Features(editor, settings, "cpu")
-        perceptual_net(settings)
-        splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, device, report)
-    splats = _ready(splats, editor, device, options, report)
-    result = attention_warping(
-        splats,
-        views.cameras,
-        images,
-        editor,
-        instruction,
-        settings,
-        source=index,
-        source_picture=by_hand,
-        segments=segments(splats),
-        tune_outside=options.tune_outside,
-        folder=out,
-        store=store,
-        report=report,
-    )
-    _report_memory(device, report)
-    if result.gaussians.kind == "2d":
-        # Other programs take no splats of two scales.
-        write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
-    return result, _page(out, splats, views, images, editor_name, editor, options, report)
-
-
-def run_baseline(
-    method: str,
-    dataset: Dataset,
-    splats: Gaussians,
-    editor_name: str,
-    instruction: str,
-    settings: MethodSettings,
-    out: Path,
-    options: EditOptions,
-    *,
-    budget: Budget,
-    report: Reporter,
-) -> tuple[Result, Path]:
-    """Run a method on the views of a data set, and write the page.
-
-    Args:
-        method: see :data:`attnwarp.methods.METHODS`.
-        dataset: cameras and pictures.
-        splats: the scene before the edit.
-        editor_name: see :func:`attnwarp.editing.small.load_editor`.
-        instruction: in words.
-        settings: of the method. Without a size, the editor's own is taken.
-        out: folder of all results.
-        options: of the edit.
-        budget: limits of the run.
-        report: receives how the work stands.
-
-    Returns:
-        The edit and the path of its page.
-
-    Raises:
-        InputError: no such editor; a folder of another run; a film of another format.
-    """
-    check_film(options.turntable)
-    device = choose(options.device, report)
-    views = load_views(dataset, max_size=options.max_size)
-    images = images_of(views)
-    index = view_of(views.cameras, options.source, dataset)
+    warping = isinstance(settings, AttentionWarpingSettings)
+    if warping:
+        by_hand = _by_hand(source_picture, dataset, views, index)
+        own = {"source": index, "source_picture": by_hand, **own}
     segments = marked(
         options.marks, editor_name, dataset, views, images, index, out, device, report
     )
@@ -234,7 +156,16 @@ def run_baseline(
     check_instruction(editor_name, editor, instruction)
     if settings.size is None:
         settings = settings.changed(size=own_size(editor))
-    splats = _ready(splats, editor, device, options, report)
+    if splats is None:
+        assert fit_plan is not None and isinstance(settings, AttentionWarpingSettings)
+        # Settings that the editor or the tuning cannot use are refused before it.
+        check_editor(editor, settings)
+        Features(editor, settings, "cpu")
+        perceptual_net(settings)
+        splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, device, report)
+    torch.set_num_threads(thread_count(editor, options.threads))
+    splats = splats.to(device=device)
+    compile_kernels(splats.kind, report, device)
     result = METHODS[method](
         splats,
         views.cameras,
@@ -242,36 +173,39 @@ def run_baseline(
         editor,
         instruction,
         settings,
-        folder=out,
         segments=segments(splats),
         tune_outside=options.tune_outside,
-        budget=budget,
+        folder=out,
         report=report,
+        **own,
     )
     _report_memory(device, report)
-    return result, _page(out, splats, views, images, editor_name, editor, options, report)
-
-
-def _ready(
-    splats: Gaussians, editor: Any, device: str, options: EditOptions, report: Reporter
-) -> Gaussians:
-    """Splats on their device, with threads for the editor and kernels compiled."""
-    torch.set_num_threads(thread_count(editor, options.threads))
-    splats = splats.to(device=device)
-    compile_kernels(splats.kind, report, device)
-    return splats
-
-
-def _page(
-    out: Path, splats: Gaussians, views: Views, images: Sequence[npt.NDArray[Any]],
-    editor_name: str, editor: Any, options: EditOptions, report: Reporter,
-) -> Path:  # fmt: skip
-    """The page of an edit; its views are edited alone too where a bundled editor takes seconds."""
+    if warping and result.gaussians.kind == "2d":
+        # Other programs take no splats of two scales.
+        write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
+    # Views are edited alone too where a bundled editor takes seconds.
     control = editor_name in bundled() if options.control is None else options.control
-    return show_edit(
+    page = show_edit(
         workdir_of(out), splats, views.cameras, images, turntable=options.turntable, report=report,
         editor=editor if control else None,
     )  # fmt: skip
+    return result, page
+
+
+def _by_hand(
+    source_picture: Path | None, dataset: Dataset, views: Views, index: int
+) -> npt.NDArray[np.float32] | None:
+    """(h, w, 3) of the source view edited elsewhere, if it was."""
+    if source_picture is None:
+        return None
+    # Views are the cameras with a picture.
+    pictures = [path for path in dataset.image_paths if path is not None]
+    pixels, top = read_over_black(source_picture, beside=pictures[index])
+    by_hand = (pixels / top).astype(np.float32)
+    h, w, _ = by_hand.shape
+    # Again in the edit, but here before an editor is loaded and a fit spends its minutes.
+    check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
+    return by_hand
 
 
 def _editor(name: str, device: str, options: EditOptions, report: Reporter) -> Any:
