@@ -43,7 +43,8 @@ from attnwarp.render.binned import (
     join,
 )
 from attnwarp.render.dispatch import call
-from attnwarp.render.interface import OUTPUTS, PICTURES, Inputs, Outputs
+from attnwarp.render.exact import outputs_of
+from attnwarp.render.interface import OUTPUTS, Inputs, Outputs
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 
 MAP_READERS = {
@@ -130,22 +131,6 @@ def _exact_distortion(drawn: _Drawn) -> torch.Tensor:
 
     run_jobs(work, binned.pieces(binned.lists.counts))
     return torch.from_numpy(target)
-
-
-class _Exact(torch.autograd.Function):
-    """The exact distortion, made when it is first asked for.
-
-    Its gradient goes to a placeholder among the outputs of ``_Composite``, whose backward pass
-    takes it on with those of the other outputs.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, placeholder: torch.Tensor, drawn: _Drawn) -> torch.Tensor:
-        return _exact_distortion(drawn)
-
-    @staticmethod
-    def backward(ctx: Any, upstream: torch.Tensor) -> tuple[torch.Tensor, None]:
-        return upstream, None
 
 
 def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
@@ -401,34 +386,10 @@ def render(inputs: Inputs) -> Outputs:
         inputs.background,
     )
     (drawn,) = kept
-    *pictures, placeholder, weight = tensors
-    # Without gradients nothing is left for a second pass, which most pictures never need.
-    exact = (
-        partial(_exact_distortion_later, placeholder, drawn)
-        if placeholder.requires_grad
-        else partial(_exact_distortion_anew, inputs, _versions(inputs))
+    return outputs_of(
+        inputs,
+        tensors,
+        drawn.counters,
+        partial(_exact_distortion, drawn),
+        lambda: _exact_distortion(_draw(inputs, with_state=True)),
     )
-    outputs = dict(zip(PICTURES, pictures, strict=True))
-    return Outputs(**outputs, weight=weight, counters=drawn.counters, exact=exact)
-
-
-def _exact_distortion_later(placeholder: torch.Tensor, drawn: _Drawn) -> torch.Tensor:
-    # Whoever reads it first may have switched gradients off; others read the same.
-    with torch.enable_grad():
-        result: torch.Tensor = _Exact.apply(placeholder, drawn)
-    return result
-
-
-def _versions(inputs: Inputs) -> list[int]:
-    tensors = (inputs.means, inputs.quats, inputs.scales, inputs.opacities)
-    return [0 if tensor.is_inference() else tensor._version for tensor in tensors]
-
-
-def _exact_distortion_anew(inputs: Inputs, versions: list[int]) -> torch.Tensor:
-    if _versions(inputs) != versions:
-        raise RuntimeError(
-            "distortion_l1: is made when it is first read, and the splats were modified by an"
-            " inplace operation since they were rendered; read it before that"
-        )
-    with torch.no_grad():
-        return _exact_distortion(_draw(inputs, with_state=True))

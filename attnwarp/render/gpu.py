@@ -28,13 +28,13 @@ import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from attnwarp.errors import optional_imports
+from attnwarp.render.exact import outputs_of
 from attnwarp.render.interface import OUTPUTS, PICTURES, Inputs, Outputs
 
 with optional_imports():
@@ -306,22 +306,6 @@ def _pair_up(drawn: _Drawn) -> tuple[Tensor, Tensor, Tensor]:
     return target, past, ends
 
 
-class _Exact(torch.autograd.Function):
-    """The exact distortion, made when it is first asked for.
-
-    Its gradient goes to a placeholder among the outputs of ``_Composite``, whose backward pass
-    takes it on with those of the other outputs.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, placeholder: Tensor, drawn: _Drawn) -> Tensor:
-        return _pair_up(drawn)[0]
-
-    @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        return upstream, None
-
-
 class _Composite(torch.autograd.Function):
     """The kernels as one differentiable step: the tensors of ``Inputs`` in, those of ``Outputs``
     out.
@@ -419,34 +403,10 @@ def render(inputs: Inputs) -> Outputs:
         inputs.pose, inputs.background,
     )  # fmt: skip
     (drawn,) = kept
-    *pictures, placeholder, weight = tensors
-    # Without gradients nothing is left for a second pass, which most pictures never need.
-    exact = (
-        partial(_exact_later, placeholder, drawn)
-        if placeholder.requires_grad
-        else partial(_exact_anew, inputs, _versions(inputs))
+    return outputs_of(
+        inputs,
+        tensors,
+        drawn.counters,
+        lambda: _pair_up(drawn)[0],
+        lambda: _pair_up(_draw(inputs)[0])[0],
     )
-    outputs = dict(zip(PICTURES, pictures, strict=True))
-    return Outputs(**outputs, weight=weight, counters=drawn.counters, exact=exact)
-
-
-def _exact_later(placeholder: Tensor, drawn: _Drawn) -> Tensor:
-    # Whoever reads it first may have switched gradients off; others read the same.
-    with torch.enable_grad():
-        result: Tensor = _Exact.apply(placeholder, drawn)
-    return result
-
-
-def _versions(inputs: Inputs) -> list[int]:
-    tensors = (inputs.means, inputs.quats, inputs.scales, inputs.opacities)
-    return [0 if tensor.is_inference() else tensor._version for tensor in tensors]
-
-
-def _exact_anew(inputs: Inputs, versions: list[int]) -> Tensor:
-    if _versions(inputs) != versions:
-        raise RuntimeError(
-            "distortion_l1: is made when it is first read, and the splats were modified by an"
-            " inplace operation since they were rendered; read it before that"
-        )
-    with torch.no_grad():
-        return _pair_up(_draw(inputs)[0])[0]
