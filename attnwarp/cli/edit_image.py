@@ -228,8 +228,7 @@ def _sheet(tiles: list[Image]) -> Image:
 
 
 def _write(path: Path, image: Image) -> None:
-    from attnwarp.io.file import write_atomically
-    from attnwarp.io.picture import encode_picture
+    from attnwarp.cli.files import write_image
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda stream: stream.write(encode_picture(image)))
+    write_image(path, image)

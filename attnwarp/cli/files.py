@@ -206,10 +206,7 @@ def _identity(look: Callable[[], os.stat_result]) -> tuple[int, int] | None:
 
 def write_image(path: Path, rgb: Any) -> None:
     """(H, W, 3) sRGB in [0, 1] as an 8-bit PNG, atomically."""
-    import numpy as np
-
     from attnwarp.io.file import write_atomically
-    from attnwarp.io.images import encode_png
+    from attnwarp.io.picture import encode_picture
 
-    data = encode_png(np.round(255 * np.clip(rgb, 0, 1)).astype(np.uint8))
-    write_atomically(path, lambda stream: stream.write(data))
+    write_atomically(path, lambda stream: stream.write(encode_picture(rgb)))

@@ -113,28 +113,21 @@ def fit(
         first = None if start is None else _read_start(start, out, kind)
         kind = kind or (Kind.three if first is not None and first.kind == "3d" else Kind.two)
         _check_third_scale(third_scale, kind)
+        if hold_out == 1:
+            raise ValueError(
+                "--hold-out: got 1, which leaves nothing to fit on; expected 0 or at least 2"
+            )
         use_threads(threads)
+        limits = {"iterations": iterations, "max_splats": max_splats}
+        changes |= {"kind": kind.value[:2], "seed": seed}
+        changes |= {name: value for name, value in limits.items() if value is not None}
+        if first is not None and first.antialiased:
+            changes.setdefault("antialiased", True)
         result = _fit(
-            data,
-            reading,
-            out,
-            kind,
-            start,
-            first,
-            iterations,
-            max_seconds,
-            max_size,
-            max_splats,
-            points,
-            hold_out,
-            seed,
-            changes,
-            checkpoint_seconds,
-            restart,
-            third_scale,
-            device,
-            report,
-        )
+            data, reading, out, changes, start, first, points, hold_out, max_size, device, report,
+            restart=restart, max_seconds=max_seconds, checkpoint_seconds=checkpoint_seconds,
+            third_scale=third_scale,
+        )  # fmt: skip
         from attnwarp.devices import peak_memory
 
         place = result.gaussians.means.device
@@ -170,35 +163,19 @@ def _fit(
     data: Path,
     reading: Reading,
     out: Path,
-    kind: Kind,
+    changes: dict[str, Any],
     start: Path | None,
     first: Gaussians | None,
-    iterations: int | None,
-    max_seconds: float | None,
-    max_size: int | None,
-    max_splats: int | None,
     points: int | None,
     every: int,
-    seed: int,
-    changes: dict[str, Any],
-    checkpoint_seconds: float,
-    restart: bool,
-    third_scale: float | None,
+    max_size: int | None,
     device: str,
     report: Reporter,
+    **options: Any,
 ) -> Fit:
-    changes = {**changes, "kind": kind.value[:2], "seed": seed}
-    if iterations is not None:
-        changes["iterations"] = iterations
-    if max_splats is not None:
-        changes["max_splats"] = max_splats
-    if first is not None and first.antialiased:
-        changes.setdefault("antialiased", True)
-    if every == 1:
-        raise ValueError(
-            "--hold-out: got 1, which leaves nothing to fit on; expected 0 or at least 2"
-        )
-
+    """The fit, with settings in place of the default ones; ``options`` are those of
+    :func:`attnwarp.fit.fit`.
+    """
     import attnwarp.fit
     from attnwarp.devices import choose
     from attnwarp.fit.loop import CHECKPOINT, SPLATS
@@ -231,9 +208,8 @@ def _fit(
     try:
         with asked_to_stop(report) as stop:
             result = attnwarp.fit.fit(
-                first, views, settings, held_out=held_out, folder=out, restart=restart,
-                max_seconds=max_seconds, checkpoint_seconds=checkpoint_seconds,
-                third_scale=third_scale, report=report, stop=stop,
+                first, views, settings, held_out=held_out, folder=out, report=report, stop=stop,
+                **options,
             )  # fmt: skip
     except ValueError as error:
         if not any(str(out / name) in str(error) for name in (CHECKPOINT, SPLATS)):
