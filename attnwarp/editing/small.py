@@ -39,17 +39,14 @@ colours.
 """
 
 
-def bundled(folder: Path = WEIGHTS) -> list[str]:
+def bundled() -> list[str]:
     """Names of the bundled editors.
-
-    Args:
-        folder: with a folder for each editor.
 
     Example:
         >>> bundled()
         ['small', 'small-depth', 'small-plain']
     """
-    return sorted(path.parent.name for path in folder.glob("*/model_index.json"))
+    return sorted(path.parent.name for path in WEIGHTS.glob("*/model_index.json"))
 
 
 def check_sums(folder: Path) -> None:

@@ -202,7 +202,6 @@ def write_ply(
     *,
     third_scale: float | None = None,
     coordinates: Coordinates = "auto",
-    tolerance: float = WORLD_TOLERANCE,
 ) -> None:
     """Write splats as binary little-endian PLY, all properties float32, atomically.
 
@@ -219,17 +218,17 @@ def write_ply(
             written, as 2DGS trainers do.
         coordinates: "world" for world coordinates; "relative" for means relative to the model's
             origin, which a comment of the header gives and only this package knows; "auto" for
-            world coordinates unless float32 would move a splat by more than ``tolerance``.
-        tolerance: share of a splat's largest scale by which rounding may move it.
+            world coordinates unless float32 would move a splat by more than
+            :data:`WORLD_TOLERANCE`.
 
     Warns:
-        InputWarning: "auto" writes an origin, "world" moves splats by more than ``tolerance``, or
-            ``third_scale`` is longer than every splat.
+        InputWarning: "auto" writes an origin, "world" moves splats by more than
+            :data:`WORLD_TOLERANCE`, or ``third_scale`` is longer than every splat.
 
     Raises:
         ValueError: a value of ``gaussians`` is out of range (not finite, a zero quaternion),
-            ``third_scale`` is not positive or is given for the 3D kind, ``tolerance`` is negative,
-            or a world coordinate does not fit float32.
+            ``third_scale`` is not positive or is given for the 3D kind, or a world coordinate does
+            not fit float32.
 
     Example:
         >>> import torch
@@ -265,7 +264,7 @@ def write_ply(
                 stacklevel=2,
             )
         scales = np.concatenate([scales, np.full((len(g), 1), third_scale)], axis=1)
-    origin, means = _place(Path(path), original, coordinates, tolerance)
+    origin, means = _place(Path(path), original, coordinates)
     sh = g.sh.numpy()
     # (N, K, 3) -> (N, 3, K): the trainers flatten channel by channel.
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(g), 3 * (sh.shape[1] - 1))
@@ -708,14 +707,12 @@ def world_error(gaussians: Gaussians) -> Array:
 
 
 def _place(
-    path: Path, g: Gaussians, coordinates: Coordinates, tolerance: float
+    path: Path, g: Gaussians, coordinates: Coordinates
 ) -> tuple[Array, npt.NDArray[np.float32]]:
     """The origin that the file names, and the float32 means relative to it."""
     check.one_of(coordinates, get_args(Coordinates), "coordinates")
-    if not tolerance >= 0:
-        raise ValueError(f"tolerance: got {tolerance}, expected a share of the scales >= 0")
     error = world_error(g)
-    moved = int((~(error <= tolerance)).sum())
+    moved = int((~(error <= WORLD_TOLERANCE)).sum())
     if coordinates == "relative" or (coordinates == "auto" and moved):
         offset, means = split_origin(g.means.numpy())
         origin = g.origin + offset
@@ -724,7 +721,7 @@ def _place(
                 f"{path}: means are relative to the comment 'attnwarp origin"
                 f" {' '.join(repr(float(v)) for v in origin)}', and other programs will show the"
                 f" splats around zero: float32 world coordinates would move {moved} of {len(g)} by"
-                f" more than {tolerance:g} of their scale; coordinates='world' (--coordinates"
+                f" more than {WORLD_TOLERANCE:g} of their scale; coordinates='world' (--coordinates"
                 " world) writes those"
             )
         return origin, means
@@ -734,7 +731,7 @@ def _place(
     if moved:
         _warn(
             f"{path}: float32 world coordinates move {moved} of {len(g)} splats by more than"
-            f" {tolerance:g} of their scale, up to {error.max():.3g} of it"
+            f" {WORLD_TOLERANCE:g} of their scale, up to {error.max():.3g} of it"
         )
     return np.zeros(3), means
 

@@ -19,7 +19,6 @@ from attnwarp.warp.correspondence import (
     positions_in,
 )
 from attnwarp.warp.depth import TAP_SPREAD, Array, blend_depth, valid_depth
-from attnwarp.warp.settings import DepthInterpolation
 from attnwarp.warp.taps import Taps, clamp_index, taps_of
 
 
@@ -183,15 +182,14 @@ def sample_depth(
     source_depth: Array,
     correspondence: Correspondence,
     *,
-    interpolation: DepthInterpolation = "inverse",
     spread: float | None = TAP_SPREAD,
 ) -> Tensor:
-    """The source's own depth at the positions of a correspondence.
+    """The source's own depth at the positions of a correspondence, bilinear in 1 / z.
 
     Args:
         source_depth: (h, w) depth along the source's optical axis, of any size of the source's
             aspect ratio.
-        interpolation, spread: as in :func:`resize_depth`.
+        spread: as in :func:`resize_depth`.
 
     Returns:
         (H, W) float64, NaN outside the source image and where the taps do not answer.
@@ -215,5 +213,5 @@ def sample_depth(
     check_proportions(depth.shape, correspondence.source, "source_depth")
     xy = positions_in(correspondence, depth.shape[1], depth.shape[0])
     inside = in_bounds(correspondence)
-    sampled = blend_depth(depth, torch.where(inside[..., None], xy, 0.5), interpolation, spread)
+    sampled = blend_depth(depth, torch.where(inside[..., None], xy, 0.5), "inverse", spread)
     return torch.where(inside, sampled, torch.nan)

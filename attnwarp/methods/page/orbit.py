@@ -23,6 +23,9 @@ FRAMES = 36
 SPEED = 12
 """Pictures a second of a film."""
 
+LONGEST = 320
+"""Longest side of these pictures in px."""
+
 ALL_AROUND = np.radians(120)
 """Cameras that leave no wider gap surround what they look at."""
 
@@ -70,9 +73,7 @@ def focus_of(cameras: Sequence[Camera], points: Array) -> Array:
     return np.asarray(ahead.mean(axis=0) if parallel or behind else point)
 
 
-def orbit(
-    cameras: Sequence[Camera], points: Array, *, first: int = 0, longest: int = 320
-) -> list[Camera]:
+def orbit(cameras: Sequence[Camera], points: Array, *, first: int = 0) -> list[Camera]:
     """Cameras that turn about what a capture looks at: all around, or to and fro where it was taken
     from one side.
 
@@ -80,7 +81,6 @@ def orbit(
         cameras: of the capture; height and distance follow those nearby.
         points: (N, 3) of the scene.
         first: number of the camera that a full turn begins beside.
-        longest: side of the pictures in px.
 
     Returns:
         :data:`FRAMES` cameras, of which the last leads to the first.
@@ -115,7 +115,7 @@ def orbit(
     else:
         turn = turn + angles[first]
     sides = np.array([[camera.width, camera.height] for camera in cameras])
-    w, h = (sides[first] * min(1.0, longest / sides[first].max())).round().astype(int).clip(1)
+    w, h = (sides[first] * min(1.0, LONGEST / sides[first].max())).round().astype(int).clip(1)
     fov = np.degrees(2 * np.arctan(cameras[first].height / (2 * cameras[first].K[1, 1])))
     result = []
     for number, angle in enumerate(turn):
@@ -154,10 +154,10 @@ def _unit(vector: Array) -> Array:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def renders(gaussians: Gaussians, cameras: Sequence[Camera], backend: str = "auto") -> list[Bytes]:
+def renders(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[Bytes]:
     """(H, W, 3) uint8 of splats from each camera."""
     near = near_of(cameras, gaussians)
-    return [to_bytes(render_picture(gaussians, camera, near, backend)) for camera in cameras]
+    return [to_bytes(render_picture(gaussians, camera, near, "auto")) for camera in cameras]
 
 
 def check_film(path: Path | None) -> None:
