@@ -3,30 +3,13 @@
 import io
 import json
 import math
-import os
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from attnwarp.io.file import ABANDONED_SECONDS, remove_abandoned, write_atomically
 from attnwarp.io.picture import encode_picture
 from attnwarp_eval import canonical_json, files
-
-WRITER = """
-import sys, time
-from attnwarp.io.file import write_atomically
-def write(stream):
-    stream.write(b"half")
-    stream.flush()
-    print("writing", flush=True)
-    time.sleep(60)
-write_atomically(sys.argv[1], write)
-"""
 
 
 def test_numbers_that_json_lacks_become_null_and_all_others_stay():
@@ -70,46 +53,3 @@ def test_pictures_read_back_as_pillow_reads_them(tmp_path):
 def test_pictures_of_another_shape_or_kind_are_refused(shape, suffix, words):
     with pytest.raises(ValueError, match=words):
         encode_picture(np.zeros(shape), suffix)
-
-
-def test_what_a_killed_writer_leaves_is_removed_and_a_living_ones_stays(tmp_path):
-    path = tmp_path / "a.bin"
-    path.write_bytes(b"old")
-    command = [sys.executable, "-c", WRITER, str(path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
-        try:
-            assert writer.stdout.readline() == "writing\n"
-            (half,) = tmp_path.glob(".*.tmp")
-            assert half.read_bytes() == b"half" and path.read_bytes() == b"old"
-            assert remove_abandoned(tmp_path) == 0 and half.exists()
-        finally:
-            writer.send_signal(signal.SIGKILL)
-            writer.wait()
-    assert remove_abandoned(tmp_path) == 1
-    assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
-
-
-def test_files_of_other_machines_go_after_a_day_and_those_of_other_programs_never(tmp_path):
-    token = "0" * 32
-    names = [f".a.00000000-1-{token}.tmp", f".b.00000000-1-{token}.tmp", ".vim.tmp", "c.tmp"]
-    for name in names:
-        (tmp_path / name).write_bytes(b"x")
-    then = time.time() - ABANDONED_SECONDS - 60
-    for name in names[1:]:
-        os.utime(tmp_path / name, (then, then))
-    assert remove_abandoned(tmp_path) == 1
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([names[0], *names[2:]])
-
-
-def test_a_writer_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
-    path = tmp_path / "a.bin"
-    path.write_bytes(b"old")
-
-    def fails(stream):
-        stream.write(b"new")
-        raise OSError("no")
-
-    for durable in (True, False):
-        with pytest.raises(OSError, match="no"):
-            write_atomically(path, fails, durable=durable)
-    assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"old"]

@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -41,7 +42,8 @@ def test_what_a_killed_process_left_is_swept_up_by_the_next(tmp_path):
     )
 
 
-def test_a_write_that_raises_keeps_the_old_file(tmp_path):
+@pytest.mark.parametrize("durable", [True, False])
+def test_a_write_that_raises_keeps_the_old_file(tmp_path, durable):
     write_atomically(tmp_path / "a", lambda stream: stream.write(b"old"))
 
     def fail(stream):
@@ -49,8 +51,20 @@ def test_a_write_that_raises_keeps_the_old_file(tmp_path):
         raise RuntimeError("no")
 
     with pytest.raises(RuntimeError):
-        write_atomically(tmp_path / "a", fail)
+        write_atomically(tmp_path / "a", fail, durable=durable)
     assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"old"]
+
+
+def test_files_of_other_machines_go_after_a_day_and_those_of_other_programs_never(tmp_path):
+    token = "0" * 32
+    names = [f".a.00000000-1-{token}.tmp", f".b.00000000-1-{token}.tmp", ".vim.tmp", "c.tmp"]
+    for name in names:
+        (tmp_path / name).write_bytes(b"x")
+    then = time.time() - file.ABANDONED_SECONDS - 60
+    for name in names[1:]:
+        os.utime(tmp_path / name, (then, then))
+    assert file.remove_abandoned(tmp_path) == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([names[0], *names[2:]])
 
 
 def test_the_writers_of_a_persons_files_follow_a_link_and_the_others_replace_it(tmp_path):

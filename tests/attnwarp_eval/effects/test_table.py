@@ -82,16 +82,7 @@ def test_entries_that_were_timed_otherwise_are_refused_in_one_table():
         table.report([one, other], about)
 
 
-def test_rows_that_no_cell_has_are_not_overwritten_and_a_name_is_one_scene(tmp_path):
-    path = tmp_path / "effects.json"
-    for content, words in (
-        ('{"scenes": [{"scene": "opposed"}]}', "opposed would be lost"),
-        ('{"scenes": [{"sce', "is not a file that this command wrote"),
-    ):
-        path.write_text(content)
-        with pytest.raises(InputError, match=words):
-            collect(["opposed"], tmp_path, Settings())
-        assert path.read_text() == content and [*tmp_path.iterdir()] == [path]
+def test_a_name_is_one_scene(tmp_path):
     text = (scene_folders()[-1] / "opposed.yaml").read_text()
     (tmp_path / "opposed.yaml").write_text(text.replace("bounces: 1", "bounces: 2"))
     names = ["opposed", str(tmp_path / "opposed.yaml")]

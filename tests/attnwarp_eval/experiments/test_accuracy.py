@@ -10,7 +10,6 @@ from edit_folders import Watched
 from effect_scenes import FLOOR, PLAIN, SKY, SUN, ball, make
 from typer.testing import CliRunner
 
-from attnwarp.errors import InputError
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.experiments import accuracy, suite
 from attnwarp_eval.experiments.accuracy import geometry, point_visibility
@@ -18,7 +17,6 @@ from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
 from attnwarp_eval.experiments.accuracy.write import write
 from attnwarp_eval.experiments.distinct_scenes import distinct_scenes
 from attnwarp_eval.scene.file import load_scene, scene_folders
-from attnwarp_eval.study.store import Store
 
 
 def test_the_brute_force_finds_hits_known_in_closed_form():
@@ -135,15 +133,6 @@ def test_tables_show_the_known_ratio_of_each_scene(tmp_path):
     text = (tmp_path / "accuracy.md").read_text()
     assert "**one**" in text and "**two**" in text and "| 0.500 |" in text and "25.00 %" in text
     assert "| again |" in text and "Left out" not in text
-
-
-def test_a_scene_of_an_earlier_call_is_not_dropped(tmp_path):
-    Store(tmp_path).write({"id": "0" * 64, "spec": {}})  # what a call leaves that measured
-    write([depth_panel("bear"), depth_panel("far")], tmp_path)
-    before = (tmp_path / "accuracy.json").read_bytes()
-    with pytest.raises(InputError, match=r"depth of bear would be lost; ask for them too"):
-        next(accuracy.measure(["far"], out=tmp_path))
-    assert (tmp_path / "accuracy.json").read_bytes() == before
 
 
 def test_a_report_whose_panels_are_in_no_cell_is_not_overwritten(tmp_path):

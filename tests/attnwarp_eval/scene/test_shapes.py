@@ -1,13 +1,9 @@
-import multiprocessing
-import time
 import warnings
 
 import numpy as np
 import pytest
 import trimesh
-from cache_writer import write_again_and_again
 
-from attnwarp_eval import cache
 from attnwarp_eval.scene.shapes import Box, Mesh, MeshNotice, Sphere
 from attnwarp_eval.scene.solids import Capsule, Ellipsoid, body_distance, mesh_body
 
@@ -119,35 +115,6 @@ def test_a_body_is_meshed_once_and_read_back_bit_for_bit(monkeypatch, tmp_path):
     assert np.array_equal(first.vertices, second.vertices) and np.array_equal(
         first.faces, second.faces
     )
-
-
-def test_a_damaged_or_unwritable_cache_costs_time_and_nothing_else(monkeypatch, tmp_path):
-    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
-    first = mesh_body(BALL, 0.0, 16)
-    (file,) = (tmp_path / "meshes").iterdir()
-    file.write_bytes(file.read_bytes()[:100])
-    assert np.array_equal(mesh_body(BALL, 0.0, 16).vertices, first.vertices)
-    (tmp_path / "a file").write_text("")
-    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path / "a file"))
-    assert np.array_equal(mesh_body(BALL, 0.0, 16).vertices, first.vertices)
-
-
-@pytest.mark.slow
-def test_two_processes_that_write_the_same_entry_never_show_half_of_one(monkeypatch, tmp_path):
-    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
-    context = multiprocessing.get_context("spawn")
-    writers = [context.Process(target=write_again_and_again, args=(float(k),)) for k in (1, 2)]
-    for writer in writers:
-        writer.start()
-    seen = 0
-    while any(writer.is_alive() for writer in writers):
-        time.sleep(0.001)  # the cores are the writers'
-        if (tmp_path / "k" / "same.npz").exists():
-            stored = cache.read_arrays("k", "same")
-            assert stored is not None and len(np.unique(stored["x"])) == 1
-            seen += 1
-    assert [writer.exitcode for writer in writers] == [0, 0] and seen > 0
-    assert [p.name for p in (tmp_path / "k").iterdir()] == ["same.npz"]
 
 
 def test_a_divided_mesh_is_the_same_closed_surface_in_small_triangles():

@@ -2,11 +2,7 @@
 
 import hashlib
 import json
-import multiprocessing
-import os
 import re
-import signal
-import time
 
 import pytest
 
@@ -211,28 +207,6 @@ def test_success_forgets_the_former_failure(tmp_path):
     assert len(store.failures()) == 1
     store.write(record())
     assert store.failures() == []
-
-
-def _write_forever(path):
-    for i in range(10**9):
-        write_atomic(path, str(i % 10).encode() * 200_000)
-
-
-def test_a_file_is_whole_however_its_writer_was_killed(tmp_path):
-    path = tmp_path / "cell.json"
-    context = multiprocessing.get_context("spawn")
-    for delay in (0.05, 0.1, 0.15):
-        process = context.Process(target=_write_forever, args=(path,))
-        process.start()
-        deadline = time.monotonic() + 30
-        while not path.exists() and time.monotonic() < deadline:
-            time.sleep(0.01)
-        time.sleep(delay)
-        os.kill(process.pid, signal.SIGKILL)
-        process.join()
-        data = path.read_bytes()
-        assert len(data) == 200_000
-        assert len(set(data)) == 1
 
 
 def test_another_version_of_what_decides_an_edit_is_other_code():
