@@ -69,27 +69,11 @@ def test_ssim_in_float32_keeps_five_digits():
     )
 
 
-def test_ssim_of_equal_pictures_is_one_and_its_gradient_zero():
-    image, _ = pictures()
-    image.requires_grad_(True)
-    value = losses.ssim(image, image.detach())
-    value.backward()
-    assert float(value.detach()) == pytest.approx(1, abs=1e-12)
-    assert float(image.grad.abs().max()) < 1e-12
-
-
 def test_ssim_gradient_is_that_of_finite_differences_in_both_pictures():
     image, target = pictures(13, 12, 2)
     image.requires_grad_(True)
     target.requires_grad_(True)
     assert torch.autograd.gradcheck(losses.ssim_map, (image, target), atol=1e-7)
-
-
-def test_ssim_of_constant_pictures_is_the_luminance_term():
-    a, b = 0.3, 0.5
-    value = losses.ssim(torch.full((16, 16, 3), a).double(), torch.full((16, 16, 3), b).double())
-    expected = (2 * a * b + losses.SSIM_C1) / (a * a + b * b + losses.SSIM_C1)
-    assert float(value) == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(10, 30, 3), (1, 1, 3), (30, 10, 3)])

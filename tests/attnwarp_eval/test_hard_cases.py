@@ -2,8 +2,6 @@
 numbers are the cases'.
 """
 
-from pathlib import Path
-
 import mpmath
 import numpy as np
 import pytest
@@ -202,41 +200,3 @@ def test_a_scan_with_a_hole_doubled_faces_and_a_sliver_goes_through_the_whole_ch
     splats = surface_splats(torn, "2d", 500)
     assert np.isfinite(image).all() and image.mean() > 0.05
     assert len(splats.means) > 300 and np.isfinite(np.asarray(splats.means)).all()
-
-
-def nearest(vertices, faces, origin, rays):
-    """First hits of rays with triangles by Moller and Trumbore's formula, in float64, one triangle
-    at a time.
-    """
-    best = np.full(len(rays), np.inf)
-    for a, b, c in vertices[faces]:
-        p = np.cross(rays, c - a)
-        det = p @ (b - a)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = p @ (origin - a) / det
-            q = np.cross(origin - a, b - a)
-            v, t = rays @ q / det, (c - a) @ q / det
-        hit = (np.abs(det) > 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < best)
-        best[hit] = t[hit]
-    return best
-
-
-def test_somebody_elses_open_mesh_is_hit_where_float64_brute_force_hits_it(tmp_path):
-    # A model that comes with PyVista: 223 edges without a second face, one with three, units of its
-    # own.
-    from pyvista import examples
-
-    (tmp_path / "figure.ply").write_bytes(Path(examples.planefile).read_bytes())
-    place = "file: figure.ply, scale: 0.001, position: [-0.9, -0.7, 0.5]"
-    (tmp_path / "scan.yaml").write_text(SCAN.replace("file: figure.ply", place))
-    scene = load_scene(tmp_path / "scan.yaml").with_size(56, 56)
-    hits = Geometry(scene).trace(scene.source)
-    _, mesh = scene.shapes()
-    rays = (scene.source.directions() @ scene.source.rotation).reshape(-1, 3)
-    expected = nearest(mesh.vertices, mesh.faces, scene.source.position, rays).reshape(56, 56)
-    got = np.where(hits.object_id == 1, hits.depth, np.inf)
-    assert np.isfinite(expected).sum() > 60
-    # A ray that grazes an edge may go either way in float32; nothing else may.
-    agree = np.isclose(got, expected, rtol=1e-6) | (np.isinf(got) & np.isinf(expected))
-    assert (~agree).sum() <= 2
-    assert np.isfinite(appearance(scene, scene.source)).all()

@@ -79,13 +79,6 @@ def test_a_run_that_was_stopped_gives_the_bits_of_one_that_was_not(tmp_path):
     assert not list(tmp_path.glob("*.tmp"))
 
 
-def test_without_the_optimizer_s_state_the_bits_would_differ(tmp_path):
-    """So that the test above says something."""
-    whole = Small(tmp_path / "whole.pt").train()
-    stopped(tmp_path / "halves.pt", keep=("model",))
-    assert Small(tmp_path / "halves.pt", keep=("model",)).train().bits() != whole.bits()
-
-
 def test_a_finished_run_is_read_and_not_run(tmp_path):
     done = Small(tmp_path / "a.pt").train()
     again = Small(tmp_path / "a.pt", seed=5).train()

@@ -112,15 +112,6 @@ def test_a_planted_shift_of_colour_comes_back_exactly(spheres, yaw):
     assert figures["consistency.rmse_linear"] == pytest.approx(np.sqrt((shift**2).mean()), abs=1e-6)
 
 
-def test_a_slip_of_a_ramp_is_its_slope_times_the_slip(spheres):
-    # A view against itself: positions are the pixels' own centres.
-    camera = pair_of(spheres, 10, 64).source
-    pair = two_view(spheres, camera, camera)
-    ramp = 0.1 + 0.01 * np.broadcast_to(np.arange(64.0)[None, :, None], (64, 64, 3))
-    result = metrics.cross_view(to_srgb(ramp), to_srgb(ramp + 0.03), pair)
-    np.testing.assert_allclose(result.linear[result.counted], 0.03, atol=1e-12)
-
-
 def test_delta_e_of_greys_has_its_closed_form(spheres):
     # CIEDE2000 without chroma: |dL| / S_L, S_L = 1 + 0.015 (L - 50)^2 / sqrt(20 + (L - 50)^2) at
     # the mean L.

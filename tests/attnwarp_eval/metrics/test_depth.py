@@ -27,14 +27,6 @@ def test_depth_error_of_a_case_by_hand():
     assert got["depth.phantom"] == 1
 
 
-def test_depth_pulled_toward_the_camera_has_a_negative_bias():
-    truth = np.full((3, 3), 4.0)
-    got = metrics.depth_error(truth - 0.084, truth)
-    assert got["depth.bias"] == pytest.approx(-0.084)
-    assert got["depth.bias_relative"] == pytest.approx(-0.021)
-    assert metrics.depth_error(truth, truth)["depth.bias"] == 0
-
-
 def test_undefined_depth_is_left_out_and_counted():
     truth = np.full((1, 5), 2.0)
     got = metrics.depth_error(np.array([[2.0, 0.0, -1.0, np.inf, np.nan]]), truth)

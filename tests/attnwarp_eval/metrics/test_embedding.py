@@ -27,21 +27,11 @@ def by_hand(a, b):
     )
 
 
-def test_angles_of_0_45_90_and_180_degrees():
-    images = np.array([E[0], E[0] + E[1], E[1], -3 * E[0]])
-    expected = [1, math.sqrt(0.5), 0, -1]
-    for values in (
-        clip_similarity(images, 7 * E[0]).values,
-        image_similarity(7 * E[:1], images).values,
-    ):
-        np.testing.assert_allclose(values, expected, atol=1e-15)
-        assert values.dtype == np.float64
-
-
 def test_random_embeddings_by_brute_force():
     random = np.random.default_rng(0)
     a, b, t = random.normal(size=(3, 20, 96)) * random.uniform(0.01, 100, size=(3, 20, 1))
     expected = [by_hand(x, y) for x, y in zip(a, t, strict=True)]
+    assert clip_similarity(a, t).values.dtype == np.float64
     np.testing.assert_allclose(clip_similarity(a, t).values, expected, atol=1e-14)
     np.testing.assert_allclose(
         clip_similarity(a, t[0]).values, [by_hand(x, t[0]) for x in a], atol=1e-14
@@ -57,36 +47,6 @@ def test_random_embeddings_by_brute_force():
     expected = [by_hand(y - x, change) for x, y in zip(unit["a"], unit["b"], strict=True)]
     np.testing.assert_allclose(
         directional_similarity(a, b, t[1], t[3]).values, expected, atol=1e-13
-    )
-
-
-def test_it_agrees_with_torch():
-    import torch
-    from torch.nn.functional import cosine_similarity, normalize
-
-    i0, i1, t0, t1 = (
-        torch.randn(5, 32, generator=torch.Generator().manual_seed(k)).double() for k in range(4)
-    )
-    expected = cosine_similarity(normalize(i1) - normalize(i0), normalize(t1) - normalize(t0))
-    np.testing.assert_allclose(
-        directional_similarity(i0, i1, t0, t1).values, expected.numpy(), atol=1e-13
-    )
-
-
-def test_directions_in_closed_form():
-    # The picture goes from e0 to e1; the prompt goes the same way, across, and back.
-    for t0, t1, expected in ((E[0], E[1], 1), (E[2], E[3], 0), (E[1], E[0], -1), (E[0], E[2], 0.5)):
-        assert directional_similarity(E[:1], 5 * E[1:2], t0, 9 * t1).mean == pytest.approx(
-            expected, abs=1e-15
-        )
-
-
-def test_lengths_do_not_matter_since_they_are_taken_out_first():
-    random = np.random.default_rng(1)
-    i0, i1, t0, t1 = random.normal(size=(4, 6, 16))
-    scaled = directional_similarity(3 * i0, 0.2 * i1, 50 * t0[0], t1[0])
-    np.testing.assert_allclose(
-        scaled.values, directional_similarity(i0, i1, t0[0], t1[0]).values, atol=1e-14
     )
 
 
@@ -218,13 +178,6 @@ def test_changes_of_neighbouring_views_by_brute_force_and_one_undefined():
     assert result.undefined == 2
 
 
-def test_one_edit_in_all_views_has_direction_consistency_1_and_an_opposed_pair_less():
-    before = np.tile(E[0], (3, 1))
-    assert direction_consistency(before, np.tile(E[1], (3, 1))).values == pytest.approx([1, 1])
-    # e1 - e0 and -e1 - e0: orthogonal.
-    assert direction_consistency(before[:2], np.array([E[1], -E[1]])).mean == pytest.approx(0)
-
-
 def test_one_view_or_none_has_no_neighbour():
     for count in (0, 1):
         result = direction_consistency(E[:count], E[1 : 1 + count])
@@ -248,15 +201,6 @@ def test_matched_patches_by_brute_force():
         [by_hand(source_after[i], target_after[j]) for i, j in pairs],
         atol=1e-14,
     )
-
-
-def test_views_that_are_edited_alike_keep_their_matches_whatever_the_order_of_patches():
-    random = np.random.default_rng(7)
-    before, after = random.normal(size=(2, 30, 8))
-    order = random.permutation(30)
-    result = match_similarity(before, before[order], after, after[order])
-    np.testing.assert_allclose(result.values, np.ones(30), atol=1e-14)
-    assert match_similarity(before, before[order], after, random.normal(size=(30, 8))).mean < 0.5
 
 
 def test_patches_without_a_feature_match_nothing_and_those_that_lose_it_are_undefined():

@@ -125,21 +125,12 @@ def test_identical_pictures(size):
     result = metrics.image_error(image, image.copy())
     assert result["image.mse"] == result["image.mse_linear"] == 0
     assert result["image.psnr"] == result["image.psnr_linear"] == math.inf
+    assert metrics.ssim_map(image, image).size == max(size[0] - 10, 0) * max(size[1] - 10, 0)
     for name, least in (("image.ssim", 11), ("image.ms_ssim", 176)):
         if min(size) < least:
             assert math.isnan(result[name])
         else:
             assert result[name] == pytest.approx(1, abs=1e-12)
-
-
-def test_pictures_of_one_pixel_have_an_error_and_no_structure():
-    # Hard case 14.
-    image, target = np.full((1, 1, 3), 0.25), np.full((1, 1, 3), 0.75)
-    result = metrics.image_error(image, target)
-    assert result["image.mse"] == 0.25
-    assert result["image.psnr"] == pytest.approx(20 * math.log10(2), abs=1e-12)
-    assert math.isnan(result["image.ssim"]) and math.isnan(result["image.ms_ssim"])
-    assert metrics.ssim_map(image, target).size == 0
 
 
 @pytest.mark.parametrize("size", [(1, 1), (40, 52), (180, 180)])
@@ -149,14 +140,6 @@ def test_an_empty_mask_leaves_everything_undefined(size):
     result = metrics.image_error(image, target, np.zeros(size, bool))
     assert result.pop("image.pixels") == 0
     assert all(math.isnan(value) for value in result.values())
-
-
-def test_a_constant_offset_has_its_closed_form_whatever_the_mask():
-    image = np.full((30, 30, 3), 0.3)
-    for coverage in (1, 7, 450, 900):
-        mask = np.zeros(900, bool)
-        mask[np.random.default_rng(0).permutation(900)[:coverage]] = True
-        assert metrics.psnr(image, image + 0.1, mask.reshape(30, 30)) == pytest.approx(20, abs=1e-9)
 
 
 def test_masked_psnr_gains_nothing_from_what_is_left_out():
@@ -288,47 +271,6 @@ def test_single_precision_is_measured_in_double():
     )
 
 
-SYMMETRIES = {
-    "transposed": lambda x: np.swapaxes(x, 0, 1),
-    "mirrored": lambda x: x[:, ::-1],
-    "upside down": lambda x: x[::-1],
-}
-
-
-@pytest.mark.parametrize("how", SYMMETRIES)
-@pytest.mark.parametrize("seed", range(3))
-def test_no_direction_no_channel_and_neither_picture_is_special(how, seed):
-    # 192 halves evenly four times, so no row is dropped on one side.
-    image, target = pictures(192, 176, seed)
-    mask = np.ones((192, 176), bool)
-    mask[:3] = False
-    turn = SYMMETRIES[how]
-    expected = metrics.image_error(image, target)
-    assert metrics.image_error(target, image) == pytest.approx(expected, rel=1e-12)
-    assert metrics.image_error(turn(image), turn(target)) == pytest.approx(expected, rel=1e-10)
-    assert metrics.image_error(image[..., ::-1], target[..., ::-1]) == pytest.approx(
-        expected, rel=1e-10
-    )
-    masked = metrics.mse(image, target, mask), metrics.ssim(image, target, mask)
-    turned = turn(image), turn(target), np.ascontiguousarray(turn(mask))
-    assert (metrics.mse(*turned), metrics.ssim(*turned)) == pytest.approx(masked, rel=1e-10)
-
-
-def test_more_noise_is_never_better():
-    random = np.random.default_rng(0)
-    image, _ = pictures(192, 192)
-    grain = random.standard_normal(image.shape)
-    image = 0.3 + 0.4 * image
-    result = [
-        metrics.image_error(image, np.clip(image + s * grain, 0, 1))
-        for s in (0.003, 0.01, 0.03, 0.1)
-    ]
-    for name in ("image.psnr", "image.psnr_linear", "image.ssim", "image.ms_ssim"):
-        values = [each[name] for each in result]
-        assert values == sorted(values, reverse=True) and values[0] > values[-1]
-    assert 0 <= result[-1]["image.ms_ssim"] <= 1
-
-
 def test_edit_psnr_averages_the_error_and_not_the_decibels():
     flat = np.full((4, 5, 3), 0.5)
     edited = {"b": flat + 0.1, "a": flat + 0.01, "same": flat, "unseen": flat}
@@ -349,18 +291,6 @@ def test_edit_psnr_averages_the_error_and_not_the_decibels():
         figures["edit.views_identical"],
         figures["edit.views_undefined"],
     ) == (4, 1, 1)
-
-
-def test_edit_psnr_of_whole_views_of_one_size_is_that_of_one_stack():
-    views = {str(k): pictures(seed=k, noise=0.05 * (k + 1)) for k in range(4)}
-    got = metrics.edit_psnr(
-        {k: v[0] for k, v in views.items()}, {k: v[1] for k, v in views.items()}
-    )
-    stacked = [np.concatenate([v[side] for v in views.values()]) for side in (0, 1)]
-    expected = skimage.metrics.peak_signal_noise_ratio(*stacked, data_range=1.0)
-    assert got.pooled == pytest.approx(expected, abs=1e-10)
-    # Jensen: decibels averaged are never less.
-    assert got.mean_finite > got.pooled
 
 
 @pytest.mark.parametrize(
@@ -464,28 +394,3 @@ def test_an_empty_mask_has_no_distance_and_asks_for_none():
     assert math.isnan(
         metrics.perceptual(image, target, lambda a, b: 1 / 0, np.zeros(image.shape[:2], bool))
     )
-
-
-@pytest.mark.door
-def test_a_perceptual_distance_refuses_what_the_others_do():
-    image, target = pictures()
-    bad = image.copy()
-    bad[3, 4, 1] = np.nan
-    with pytest.raises(ValueError, match="image_srgb: nan at row 3, column 4, channel 1"):
-        metrics.perceptual(bad, target, local)
-    with pytest.raises(ValueError, match="target_srgb: got 39 x 52 pixels"):
-        metrics.perceptual(image, target[1:], local)
-    with pytest.raises(ValueError, match="mask: got uint8, expected bool"):
-        metrics.perceptual(image, target, local, np.ones(image.shape[:2], np.uint8))
-
-
-def test_the_bundled_distance_of_a_masked_picture_is_that_of_the_picture_put_into_its_target():
-    from attnwarp.encoders import load_encoder
-
-    encoder = load_encoder("perceptual-small", "perceptual")
-    image, target = pictures(64, 64)
-    mask = np.zeros((64, 64), bool)
-    mask[:, :32] = True
-    distance = lambda a, b: float(encoder.distance([a], [b])[0])  # noqa: E731
-    put = np.concatenate([image[:, :32], target[:, 32:]], axis=1)
-    assert metrics.perceptual(image, target, distance, mask) == 2 * distance(put, target) > 0

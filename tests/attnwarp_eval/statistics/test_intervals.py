@@ -46,20 +46,6 @@ def test_intervals_cover_the_true_mean_at_their_stated_rate(scenes, between, wit
     assert covered / trials == pytest.approx(0.95, abs=0.028)
 
 
-def test_the_detectable_difference_is_found_at_its_stated_power():
-    rng = np.random.default_rng(11)
-    scenes, trials, sigma = 6, 2000, 1.0
-    # The power of the two-sided t test at the difference that its true standard error makes
-    # detectable.
-    factor = stats.t.ppf(0.975, scenes - 1) + stats.t.ppf(0.8, scenes - 1)
-    truth = factor * sigma / np.sqrt(scenes)
-    result = sum(
-        interval({i: [v] for i, v in enumerate(rng.normal(truth, sigma, scenes))}).p < 0.05
-        for _ in range(trials)
-    )
-    assert result / trials == pytest.approx(0.8, abs=0.06)
-
-
 def test_undefined_values_are_counted_and_never_averaged_in():
     result = interval({"a": [1.0, np.nan], "b": [np.nan, np.nan], "c": [3.0, 3.0]})
     assert result.mean == pytest.approx(2.0)

@@ -80,14 +80,6 @@ def test_of_200_studies_of_equal_arms_no_more_fail_than_the_stated_rate(scenes):
         assert told >= stats.binom.ppf(0.001, 200, 0.04)
 
 
-def test_one_skewed_scene_does_not_hide_that_all_of_them_agree():
-    rng = np.random.default_rng(1)
-    d = rng.exponential(1.0, 15) ** 4
-    assert (d > 0).all() and stats.ttest_1samp(d, 0).pvalue > 0.05
-    assert SignFlips(d).p == pytest.approx(2 / 2**15)
-    assert SignFlips(d).interval()[0] > 0
-
-
 @pytest.mark.parametrize("scenes", [2, 5, 6, 9])
 def test_equal_differences_have_the_sign_tests_p_value_and_no_bounds_below_six(scenes):
     test = SignFlips(np.full(scenes, 0.25))

@@ -53,17 +53,6 @@ def test_a_balanced_figure_has_the_interval_of_the_central_limit():
     assert found.value - found.low == pytest.approx(half, rel=0.1)
 
 
-def test_answers_of_one_world_count_as_one_in_the_interval():
-    random = np.random.default_rng(1)
-    right = random.uniform(size=200) < 0.5
-    alone = figure("?", right, np.arange(200))
-    together = figure("?", np.repeat(right, 9), np.repeat(np.arange(200), 9))
-    assert together.value == alone.value
-    # Nine times the same answer is no more evidence; taken as independent the interval would be a
-    # third as wide.
-    assert together.high - together.low == pytest.approx(alone.high - alone.low, rel=1e-9)
-
-
 def test_an_unbalanced_figure_is_that_of_a_bootstrap_written_out():
     random = np.random.default_rng(2)
     groups = [
