@@ -6,19 +6,16 @@ failure is repeated by its label: the name of the format and the seed of :mod:`d
 
 import contextlib
 import json
-import pathlib
-import tarfile
 
 import damage_files
 import pytest
+import written_runs
 import yaml
 
 from attnwarp.errors import InputError
 from attnwarp_eval.report.results import read_results
 from attnwarp_eval.study import Store, load_study
 from attnwarp_eval.study.probe import probe
-
-DATA = pathlib.Path(__file__).parent / "data" / "runs.tar.xz"
 
 FAST, SLOW = 12, 150
 
@@ -111,11 +108,7 @@ FORMATS = {"study": StudyFile, "study.json": StudyJson, "cell": Cell}
 
 def run_in(folder):
     """The stored run with one of its scenes, which loads at once."""
-    with tarfile.open(DATA) as archive:
-        # Python 3.11.3 and before have no filters.
-        archive.extraction_filter = getattr(tarfile, "data_filter", None)
-        archive.extractall(folder)
-    store = Store(folder / "variants")
+    store = Store(written_runs.unpack_stored(folder) / "variants")
     study = store.read_study()
     study["study"]["scenes"] = ["spheres"]
     del study["scenes"]["bear"]

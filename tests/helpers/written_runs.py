@@ -1,6 +1,8 @@
 """Hand-made runs: records written as JSON, read as a report reads them."""
 
 import copy
+import tarfile
+from pathlib import Path
 
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.results import Outcome, Results
@@ -60,3 +62,13 @@ def outcome(kind, scene, variants, data, cell_id="", seed=0):
 def results(study, cells):
     """The run of a study, given as plain data."""
     return Results(parse_study(study), cells, [])
+
+
+def unpack_stored(folder):
+    """Put the two stored runs, which report/test_stored_runs.py describes, into a folder."""
+    data = Path(__file__).parents[1] / "attnwarp_eval" / "data" / "runs.tar.xz"
+    with tarfile.open(data) as archive:
+        # Python 3.11.3 and before have no filters.
+        archive.extraction_filter = getattr(tarfile, "data_filter", None)
+        archive.extractall(folder)
+    return folder

@@ -86,6 +86,12 @@ def everything(folder, models, *more):
     )
 
 
+def pixels(folder, *more, out="out"):
+    """The command on renders and edited pictures alone."""
+    folders = [f"--{group}={folder / group}" for group in ("renders", "edited")]
+    return call("metrics", *folders, *more, "--out", folder / out)
+
+
 def saved(folder):
     return json.loads((folder / "out" / "metrics.json").read_text())
 
@@ -227,8 +233,7 @@ def test_the_folder_of_a_study_is_refused(data):
     folder, _ = data
     (folder / "run").mkdir()
     (folder / "run" / "study.json").write_text("{}")
-    done = call("metrics", "--renders", folder / "renders", "--edited", folder / "edited",
-                "--out", folder / "run")  # fmt: skip
+    done = pixels(folder, out="run")
     assert done.exit_code == 2 and "is the run of a study" in done.stderr
     assert [path.name for path in (folder / "run").iterdir()] == ["study.json"]
 
@@ -236,14 +241,7 @@ def test_the_folder_of_a_study_is_refused(data):
 def test_pixels_alone_need_no_encoder(data):
     folder, _ = data
     off = ("--clip=none", "--dino=none", "--perceptual=none")
-    done = call(
-        "metrics",
-        f"--renders={folder / 'renders'}",
-        f"--edited={folder / 'edited'}",
-        *off,
-        "--out",
-        folder / "out",
-    )
+    done = pixels(folder, *off)
     assert done.exit_code == 0, done.output
     assert (
         set(saved(folder)["metrics"]) == {"edit.psnr_mean", "edit.psnr_pooled"}
@@ -282,13 +280,7 @@ def test_names_that_never_meet_are_told_apart(data):
     folder, _ = data
     for path in (folder / "edited").iterdir():
         path.rename(path.with_name(f"edit_{path.name}"))
-    done = call(
-        "metrics",
-        f"--renders={folder / 'renders'}",
-        f"--edited={folder / 'edited'}",
-        "--out",
-        folder / "out",
-    )
+    done = pixels(folder)
     assert done.exit_code == 2
     assert (
         "no name stands in all of --renders (view1, view2, view10) and --edited (edit_view1,"
@@ -389,15 +381,7 @@ def test_a_figure_undefined_everywhere_is_too_little(data, models):
     )
     for path in (folder / "masks" / f"{v}.png" for v in VIEWS):
         write(path, np.zeros((40, 48), np.uint8))
-    done = call(
-        "metrics",
-        f"--renders={folder / 'renders'}",
-        f"--edited={folder / 'edited'}",
-        f"--mask={folder / 'masks'}",
-        "--perceptual=none",
-        "--out",
-        folder / "out",
-    )
+    done = pixels(folder, f"--mask={folder / 'masks'}", "--perceptual=none")
     assert done.exit_code == 3 and "every figure is undefined on these pictures" in done.stderr
     assert "3 masks with nothing brighter than half of white" in done.stderr
 
@@ -408,15 +392,7 @@ def test_a_mask_leaves_out_what_is_black_and_divides_by_the_rest(data):
     inside[10:20, 5:30] = 255
     write(folder / "masks" / "view1.png", inside)
     write(folder / "masks" / "view2.png", np.dstack([inside] * 3))
-    done = call(
-        "metrics",
-        f"--renders={folder / 'renders'}",
-        f"--edited={folder / 'edited'}",
-        f"--mask={folder / 'masks'}",
-        "--perceptual=none",
-        "--out",
-        folder / "out",
-    )
+    done = pixels(folder, f"--mask={folder / 'masks'}", "--perceptual=none")
     assert done.exit_code == 0, done.output
     assert "1 of --renders without one in --mask: view10" in done.stderr
     views = saved(folder)["metrics"]["edit.psnr_mean"]["views"]
@@ -433,15 +409,8 @@ def test_transparent_parts_of_a_mask_do_not_count_over_any_background(data, back
     cut_out[..., 3] = 0
     cut_out[10:20, 5:30, 3] = 255
     write(folder / "masks" / "view1.png", cut_out)
-    done = call(
-        "metrics",
-        f"--renders={folder / 'renders'}",
-        f"--edited={folder / 'edited'}",
-        f"--mask={folder / 'masks'}",
-        f"--background={background}",
-        "--perceptual=none",
-        "--out",
-        folder / "out",
+    done = pixels(
+        folder, f"--mask={folder / 'masks'}", f"--background={background}", "--perceptual=none"
     )
     assert done.exit_code == 0, done.output
     views = saved(folder)["metrics"]["edit.psnr_mean"]["views"]
@@ -513,8 +482,6 @@ def test_a_mask_acts_on_the_perceptual_distance_too(data, models):
     ],
 )
 def test_a_bad_picture_is_wrong_input_and_is_named(data, models, spoil, complaint):
-    import re
-
     folder, _ = data
     spoil(folder)
     done = everything(folder, models)
@@ -541,8 +508,7 @@ def test_a_picture_is_measured_as_viewers_turn_it(tmp_path, turn):
         shown = np.asarray(ImageOps.exif_transpose(picture))
     render = np.clip(shown + random.normal(0, 10, shown.shape), 0, 255).round().astype(np.uint8)
     write(tmp_path / "renders/a.png", render)
-    folders = ("--renders", tmp_path / "renders", "--edited", tmp_path / "edited")
-    result = call("metrics", *folders, "--perceptual", "none", "--out", tmp_path / "out")
+    result = pixels(tmp_path, "--perceptual=none")
     assert result.exit_code == 0, result.output
     note = "1 pictures are turned as their EXIF tags ask, a.png first"
     assert note in " ".join(result.output.split())
@@ -551,7 +517,7 @@ def test_a_picture_is_measured_as_viewers_turn_it(tmp_path, turn):
     assert measured == pytest.approx(-10 * math.log10(mse), abs=1e-4)
     if turn >= 5:
         write(tmp_path / "renders/a.png", stored)
-        refused = " ".join(call("metrics", *folders, "--out", tmp_path / "two").output.split())
+        refused = " ".join(pixels(tmp_path, out="two").output.split())
         assert "edited/a.png is turned as its EXIF tag asks): a pair must have" in refused
 
 
@@ -565,8 +531,7 @@ def test_pictures_are_paired_by_names_that_other_systems_spell_otherwise(tmp_pat
         write(tmp_path / f"renders/{one}.png", render)
         write(tmp_path / f"edited/{two}.PNG", edited)
         psnr[one] = -10 * math.log10(((render / 255.0 - edited / 255.0) ** 2).mean())
-    folders = ("--renders", tmp_path / "renders", "--edited", tmp_path / "edited")
-    result = call("metrics", *folders, "--perceptual", "none", "--out", tmp_path / "out")
+    result = pixels(tmp_path, "--perceptual=none")
     assert result.exit_code == 0, result.output
     measured = saved(tmp_path)["metrics"]["edit.psnr_mean"]["views"]
     assert measured == pytest.approx(psnr, abs=1e-4)
@@ -578,8 +543,7 @@ def test_a_jpeg_damaged_inside_is_not_measured(tmp_path):
     write(tmp_path / "edited/a.jpg", random_picture(np.random.default_rng(1), (48, 64)))
     whole = picture.read_bytes()
     picture.write_bytes(whole[:-602] + whole[-2:])
-    folders = ("--renders", tmp_path / "renders", "--edited", tmp_path / "edited")
-    result = call("metrics", *folders, "--out", tmp_path / "out")
+    result = pixels(tmp_path)
     assert result.exit_code == 2
     assert re.search(r"renders/a\.jpg: the picture is damaged", " ".join(result.output.split()))
 
@@ -647,15 +611,7 @@ def test_transparency_is_laid_over_the_chosen_background_before_it_is_measured(t
         ("white", "inf"),
         ("0.5,0.5,0.5", -20 * math.log10(0.5)),
     ):
-        call(
-            "metrics",
-            f"--renders={tmp_path / 'renders'}",
-            f"--edited={tmp_path / 'edited'}",
-            "--perceptual=none",
-            f"--background={background}",
-            "--out",
-            tmp_path / "out",
-        )
+        pixels(tmp_path, "--perceptual=none", f"--background={background}")
         value = saved(tmp_path)["metrics"]["edit.psnr_pooled"]["value"]
         assert value == (
             expected if isinstance(expected, str) else pytest.approx(expected, abs=1e-5)
@@ -664,15 +620,8 @@ def test_transparency_is_laid_over_the_chosen_background_before_it_is_measured(t
 
 def test_a_long_prompt_is_cut_and_that_is_said(data, models):
     folder, _ = data
-    done = call(
-        "metrics",
-        f"--renders={folder / 'renders'}",
-        "--prompt",
-        "bear " * 40,
-        f"--clip={models['clip']}",
-        "--out",
-        folder / "out",
-    )
+    renders, clip = f"--renders={folder / 'renders'}", f"--clip={models['clip']}"
+    done = call("metrics", renders, "--prompt", "bear " * 40, clip, "--out", folder / "out")
     assert (
         done.exit_code == 0
         and "--prompt is longer than the encoder takes: its last 18 tokens" in done.stderr
@@ -713,13 +662,7 @@ def test_a_default_that_is_not_installed_costs_its_figures_but_one_that_was_name
         lambda name, *a: None if name.endswith("bundled") else result(name),
     )
     folder, _ = data
-    pairs = (
-        f"--renders={folder / 'renders'}",
-        f"--edited={folder / 'edited'}",
-        "--out",
-        folder / "out",
-    )
-    done = call("metrics", *pairs)
+    done = pixels(folder)
     assert done.exit_code == 0 and set(saved(folder)["metrics"]) == {
         "edit.psnr_mean",
         "edit.psnr_pooled",
@@ -729,7 +672,7 @@ def test_a_default_that_is_not_installed_costs_its_figures_but_one_that_was_name
         " weights"
     )
     assert saved(folder)["not_computed"]["Perceptual distance"].startswith(reason)
-    done = call("metrics", *pairs, "--perceptual=perceptual-small")
+    done = pixels(folder, "--perceptual=perceptual-small")
     assert (
         done.exit_code == 2
         and "--perceptual: encoder 'perceptual-small': this installation" in done.stderr
@@ -859,8 +802,7 @@ def test_normals_and_depth_that_render_writes_are_no_views(tmp_path):
     assert (tmp_path / "renders" / "left.normal.png").is_file()
     # A map without its picture is a view like any other.
     write(tmp_path / "renders" / "alone.normal.png", random_picture(random, (16, 24)))
-    folders = [f"--{name}={tmp_path / name}" for name in ("renders", "edited")]
-    done = call("metrics", *folders, "--perceptual=none", "--out", tmp_path / "out")
+    done = pixels(tmp_path, "--perceptual=none")
     assert done.exit_code == 0, done.output
     result = saved(tmp_path)
     views = result["metrics"]["edit.psnr_mean"]["views"]

@@ -7,9 +7,7 @@ The run is the stored one of ``data/runs.tar.xz``: two scenes, 24 x 24 px.
 import dataclasses
 import json
 import math
-import pathlib
 import shutil
-import tarfile
 
 import numpy as np
 import pytest
@@ -38,16 +36,11 @@ from attnwarp_eval.study.probes.variability.measure import Varied
 from attnwarp_eval.study.run import plan
 
 DONE = Judgement("red", True, 25.0, 10.0, 10.0)
-DATA = pathlib.Path(__file__).parents[1] / "data" / "runs.tar.xz"
 
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("compare")
-    with tarfile.open(DATA) as archive:
-        # Python 3.11.3 and before have no filters.
-        archive.extraction_filter = getattr(tarfile, "data_filter", None)
-        archive.extractall(folder)
+    folder = written_runs.unpack_stored(tmp_path_factory.mktemp("compare"))
     write_baseline(folder / "baseline.jsonl", read_snapshot(Store(folder / "variants")))
     return folder
 

@@ -8,9 +8,7 @@ the format is changed on purpose, run the studies in their study.json again and 
 """
 
 import json
-import pathlib
 import shutil
-import tarfile
 
 import pytest
 import written_runs
@@ -24,8 +22,6 @@ from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import Layout, report_of
 from attnwarp_eval.study.run import verify
 
-DATA = pathlib.Path(__file__).parents[1] / "data" / "runs.tar.xz"
-
 
 @pytest.fixture(autouse=True)
 def scenes_of_direct_light(monkeypatch):
@@ -34,12 +30,7 @@ def scenes_of_direct_light(monkeypatch):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("stored")
-    with tarfile.open(DATA) as archive:
-        # Python 3.11.3 and before have no filters.
-        archive.extraction_filter = getattr(tarfile, "data_filter", None)
-        archive.extractall(folder)
-    return folder
+    return written_runs.unpack_stored(tmp_path_factory.mktemp("stored"))
 
 
 @pytest.mark.parametrize("name", ["variants", "edits"])

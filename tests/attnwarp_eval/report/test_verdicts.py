@@ -6,7 +6,6 @@ import dataclasses
 import json
 import lzma
 import pathlib
-import tarfile
 
 import numpy as np
 import pytest
@@ -28,17 +27,12 @@ from attnwarp_eval.study import Store
 from attnwarp_eval.study.study import parse_study
 
 ROOT = pathlib.Path(__file__).parents[3]
-DATA = pathlib.Path(__file__).parents[1] / "data" / "runs.tar.xz"
 SLIP = "warp.epe_median_layer.64"
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("stored")
-    with tarfile.open(DATA) as archive:
-        archive.extraction_filter = getattr(tarfile, "data_filter", None)
-        archive.extractall(folder)
-    return folder
+    return written_runs.unpack_stored(tmp_path_factory.mktemp("stored"))
 
 
 def invoke(*arguments):

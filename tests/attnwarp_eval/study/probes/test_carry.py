@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import yaml
-from ball_scene import SCENE
 from skimage.color import deltaE_ciede2000, rgb2lab
 
 from attnwarp_eval.report.build import build
@@ -28,13 +27,6 @@ STUDY = {
     "probes": {"carry": ["painted"]},
 }  # fmt: skip
 RED, PINK = (0.8, 0.1, 0.1), (0.9, 0.5, 0.6)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory, coarse_textures):
-    path = tmp_path_factory.mktemp("study")
-    (path / "ball.yaml").write_text(yaml.safe_dump(SCENE))
-    return path
 
 
 def load(folder, **changes):

@@ -52,13 +52,6 @@ ROUNDING = 0.5 / 255
 """Half a step of 8 bits, which edited views are rounded to."""
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory, coarse_textures):
-    path = tmp_path_factory.mktemp("study")
-    (path / "ball.yaml").write_text(yaml.safe_dump(SCENE))
-    return path
-
-
 def load(folder, **changes):
     (folder / "mine.yaml").write_text(yaml.safe_dump({**STUDY, **changes}))
     return load_study(str(folder / "mine.yaml"))

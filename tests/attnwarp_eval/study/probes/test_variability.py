@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import written_runs
 import yaml
-from ball_scene import COLORS, SCENE
+from ball_scene import COLORS
 from skimage.color import deltaE_ciede2000, rgb2lab
 
 from attnwarp_eval.metrics.gates import gated
@@ -22,13 +22,6 @@ from attnwarp_eval.study.run import execute, plan
 VIEWS = ("source", "yaw015", "yaw030", "yaw120")
 SEEDS = [3, 4, 5]
 NAMES = list(COLORS)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory, coarse_textures):
-    path = tmp_path_factory.mktemp("study")
-    (path / "ball.yaml").write_text(yaml.safe_dump(SCENE))
-    return path
 
 
 def planned(answer):
