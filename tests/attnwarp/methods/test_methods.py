@@ -14,7 +14,7 @@ from tiny_methods import QUICK, close, depth_editor, editor, rows_of, run, scene
 from tiny_scenes import cameras
 
 from attnwarp import Camera, Gaussians, methods
-from attnwarp.editing.editor import edit, shared_noise
+from attnwarp.editing.editor import edit
 from attnwarp.editing.inversion import ddim_invert
 from attnwarp.editing.schedule import Schedule
 from attnwarp.methods import (
@@ -348,15 +348,6 @@ def test_the_controlnets_attention_is_aligned_where_the_settings_say(run):
     plain = run("gaussctrl", quick).edited
     aligned = run("gaussctrl", replace(quick, control_share=0.0)).edited
     assert not any(close(plain[view], aligned[view]) for view in range(3))
-
-
-def test_shared_noise_is_that_of_the_seed(run, scene, editor):
-    from attnwarp.methods.scene import Scene
-
-    model, views, images = scene
-    checked = Scene.checked(views, images, None)
-    work = work_of(model, checked, editor, ByViewSettings(noise="shared", seed=9))
-    assert torch.equal(work.noise(3, [0, 2]), shared_noise((2, 4, 16, 16), 9))
 
 
 def test_every_method_has_settings_and_presets():
