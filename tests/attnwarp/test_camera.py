@@ -46,14 +46,6 @@ def test_unproject_undoes_project_with_skew_and_unequal_focal_lengths():
     assert np.abs(camera().unproject(xy, z) - points).max() < 1e-12
 
 
-def test_points_at_and_behind_the_camera_have_no_pixel():
-    cam = camera(world_to_camera=np.eye(4))
-    xy, z = cam.project([[0, 0, 1], [0, 0, 0], [1, 1, -2]])
-    assert np.isfinite(xy[0]).all()
-    assert np.isnan(xy[1:]).all()
-    assert z.tolist() == [1, 0, -2]
-
-
 def test_directions_are_the_inverse_of_k_times_the_pixel():
     xy = np.array([[0.5, 0.5], [639.5, 479.5], [-40.0, 900.0]])
     expected = (np.linalg.inv(K) @ np.c_[xy, np.ones(3)].T).T

@@ -107,9 +107,9 @@ def test_undefined_depth_is_nan():
 
 
 def test_a_point_behind_has_no_pixel():
-    xy, z = camera().project([0.0, 0.0, 0.0])
+    xy, z = camera().project([[0, 0, 0], [1, 1, -2]])
     assert np.isnan(xy).all()
-    assert z == 0
+    assert z.tolist() == [0, -2]
 
 
 def test_quaternions_are_wxyz():

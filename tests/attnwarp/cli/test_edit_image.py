@@ -190,9 +190,7 @@ def test_words_that_the_picture_does_not_show_are_one_clear_line(folder, tmp_pat
     [
         ({"picture": "nowhere.png"}, "nowhere.png: no such file"),
         ({"picture": "text.png"}, "text.png: cannot be read as an image"),
-        ({"picture": "half.jpg"}, "half.jpg: the picture is damaged (image file is truncated"),
         ({"out": "red.jpg"}, "red.jpg: expected a name that ends in .png"),
-        ({"editor": "smal-plain"}, "editor 'smal-plain': neither bundled"),
         ({"more": ("--segmenter", "clip-parts")}, "--segmenter: needs --where, the words that it"),
         ({"picture": "."}, "is a folder, expected a file"),
         ({"out": "photo.png"}, "photo.png: is the picture to edit; choose another name"),
@@ -208,12 +206,10 @@ def test_what_cannot_be_used_is_one_clear_line(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "text.png").write_text("no picture")
-    whole = cv2.imencode(".jpg", cv2.imread(str(photo[0])))[1].tobytes()
-    (tmp_path / "half.jpg").write_bytes(whole[: len(whole) // 2])
     picture = tmp_path / change["picture"] if "picture" in change else photo[0]
     before = photo[0].read_bytes()
     result = run(
-        picture, "--instruction", change.get("instruction", "a bear"), "--editor", change.get("editor", folder), "--out",
+        picture, "--instruction", change.get("instruction", "a bear"), "--editor", folder, "--out",
         tmp_path / change.get("out", "a.png"), *change.get("more", ()),
     )  # fmt: skip
     assert result.exit_code == 2

@@ -374,12 +374,6 @@ def test_one_picture_or_text_instead_of_a_list_is_refused(clip, dino):
         clip.texts([3])
 
 
-@pytest.mark.door
-def test_a_device_that_is_not_there_is_named(clip_folder):
-    with pytest.raises(InputError, match="device 'tpu-ish': unknown, expected cpu or cuda"):
-        load_encoder(f"clip:{clip_folder[0]}", device="tpu-ish")
-
-
 def _cubic(image, size):
     """Bicubic without antialiasing by its definition, in float64: Keys' kernel with a = -3/4, four pixels a side."""
 

@@ -620,12 +620,6 @@ def test_settings_out_of_range_are_refused_by_name(changes, message):
         FitSettings(**changes)
 
 
-@pytest.mark.door
-def test_an_unknown_setting_is_refused_with_the_nearest_known_one():
-    with pytest.raises(ValueError, match="did you mean 'lr_means'"):
-        FitSettings.from_dict({"lr_mean": 1e-4})
-
-
 def test_defaults_that_depend_on_the_kind_follow_it():
     flat = FitSettings()
     solid = dataclasses.replace(flat, kind="3d")

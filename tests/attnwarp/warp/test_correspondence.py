@@ -81,14 +81,6 @@ def test_images_of_one_pixel_or_one_row_work(height, width, centers):
     assert resize_depth(np.full((height, width), 2.0), (1, 1)).tolist() == [[pytest.approx(2.0)]]
 
 
-def test_a_rotation_that_is_not_orthonormal_is_refused_by_how_much():
-    # Hard case 15.
-    pose = np.eye(4)
-    pose[0, 0] = 1.0001
-    with pytest.raises(ValueError, match=r"not orthonormal.*= 0\.0002"):
-        Camera(np.diag([100.0, 100, 1]), pose, 8, 8)
-
-
 @pytest.mark.parametrize(
     ("turn", "expected"),
     [(lambda d: orbit(30, distance=d), 0.14), (lambda d: rolled(orbit(0, distance=d), 90), 1.0)],

@@ -302,20 +302,10 @@ def test_a_mistaken_argument_is_named_with_what_was_expected():
         with pytest.raises(TypeError, match=message):
             warp_view(**{"gaussians": disc, "source": camera, "target": camera, **change})
     wall = Surface(np.full((8, 8), 2.0))
-    for change, message in (
-        ({"settings": "corrected"}, "settings: got str, expected WarpSettings, such as PRESETS"),
-        ({"target_surface": wall.depth}, "target_surface: got ndarray, expected Surface, such as"),
-        ({"source_surface": wall.depth}, "source_surface: got ndarray, expected Surface, such as"),
-    ):
-        given = {"source": camera, "target": camera, "target_surface": wall, **change}
-        with pytest.raises(TypeError, match=message):
+    for name in ("target_surface", "source_surface"):
+        given = {"source": camera, "target": camera, "target_surface": wall, name: wall.depth}
+        with pytest.raises(TypeError, match=f"{name}: got ndarray, expected Surface, such as"):
             warp_surfaces(**given)
-    view = warp_view(disc, camera, camera)
-    for size in (64, (4,), (4, 4, 4)):
-        with pytest.raises(ValueError, match=r"size: got .*, expected \(height, width\)"):
-            view.at(size)
-    with pytest.raises(TypeError, match="features: got list, expected torch.Tensor"):
-        view.at((4, 4)).warp([[0.0]])
 
 
 @pytest.mark.door
