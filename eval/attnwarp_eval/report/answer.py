@@ -10,7 +10,7 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
 from attnwarp_eval.metrics.registry import Metric
 from attnwarp_eval.report.judging import JudgedClaim
-from attnwarp_eval.statistics.intervals import Interval, interval
+from attnwarp_eval.statistics.intervals import Interval, over_scenes
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of, side_by_side
 from attnwarp_eval.study.results import Results
@@ -230,7 +230,7 @@ def _figure(results: Results, column: AnswerColumn, variant: str) -> tuple[Inter
     """Mean over scenes, and the figure's full name."""
     key = column.metric.format(layer=results.layer)
     table = results.views(column.probe, variant, key, column.yaw)
-    return interval({scene: list(views.values()) for scene, views in table.items()}), key
+    return over_scenes(table), key
 
 
 def _filled(results: Results, asked: Answer, sentence: str) -> str:
@@ -288,9 +288,7 @@ def _each(results: Results, column: AnswerColumn, variant: str, unit: str) -> st
     key = column.metric.format(layer=results.layer)
     metric = probe(column.probe).metric(key)
     table = results.views(column.probe, variant, key, column.yaw)
-    means = [
-        interval({"": list(table.get(s, {}).values())}).mean for s in results.study.scene_names
-    ]
+    means = [over_scenes({s: table.get(s, {})}).mean for s in results.study.scene_names]
     texts = [_cell(mean, metric, key, unit) if math.isfinite(mean) else "–" for mean in means]
     return ", ".join(text.removesuffix(" %") for text in texts) + (" %" if unit == "%" else "")
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from attnwarp_eval.report.compared import between
 from attnwarp_eval.scene.yaml import read_yaml
 from attnwarp_eval.statistics.contrasts import Contrast, contrast
-from attnwarp_eval.statistics.intervals import ByView, Interval, common, interval
+from attnwarp_eval.statistics.intervals import ByView, Interval, common, over_scenes
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.study import parse_variant
@@ -107,10 +107,10 @@ class Claim:
             }
             # Different views cannot be paired; their means can, scene by scene.
             low, high = (
-                {s: {"mean": _interval({s: v}).mean} for s, v in table.items()}
+                {s: {"mean": over_scenes({s: v}).mean} for s, v in table.items()}
                 for table in tables.values()
             )
-            sides = {name: _interval(t) for name, t in tables.items()}
+            sides = {name: over_scenes(t) for name, t in tables.items()}
             return Measured(metric, sides, low, high, contrast(low, high, scale))
         first = results.views(self.probe, a, metric, self.yaw)
         if b is not None:
@@ -123,10 +123,10 @@ class Claim:
             value = contrast(first, second, scale)
         else:
             limit = {s: dict.fromkeys(views, self.against) for s, views in first.items()}
-            sides = {a: _interval(first)}
+            sides = {a: over_scenes(first)}
             return Measured(metric, sides, limit, first, contrast(limit, first, "plain"))
         # Over the views that both have: only there is the difference of the means the claim's.
-        sides = dict(zip(names, map(_interval, common([first, second])), strict=True))
+        sides = dict(zip(names, map(over_scenes, common([first, second])), strict=True))
         return Measured(metric, sides, first, second, value, self._control(results, names[1]))
 
     def _control(self, results: Results, reference: str) -> Seen:
@@ -160,10 +160,6 @@ class Measured:
     b: ByView
     contrast: Contrast
     control: Seen = ""
-
-
-def _interval(table: ByView) -> Interval:
-    return interval({scene: list(views.values()) for scene, views in table.items()})
 
 
 @cache

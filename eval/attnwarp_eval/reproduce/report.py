@@ -21,7 +21,7 @@ from attnwarp_eval.files import write_atomic
 from attnwarp_eval.reproduce.cells import Made, Planned, cell_folder, made_of
 from attnwarp_eval.reproduce.manifest import FIGURES, Row, TablePart, lacking
 from attnwarp_eval.statistics.contrasts import Contrast, contrast
-from attnwarp_eval.statistics.intervals import benjamini_hochberg, interval
+from attnwarp_eval.statistics.intervals import benjamini_hochberg, interval, over_scenes
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.shared.method_run import PARTS
 from attnwarp_eval.study.store import Store
@@ -186,7 +186,7 @@ def _row(results: Results, name: str, value: Value) -> list[str]:
     cells = [name]
     for k, title in enumerate(FIGURES.values()):
         values = results.values(name, title, value)
-        cells.append(spread(interval({s: [*v.values()] for s, v in values.items()}), len(values)))
+        cells.append(spread(over_scenes(values), len(values)))
         paper = results.rows[name].paper
         cells.append(NOT_AT_HAND if paper is None else f"{paper[k]:.3f}")
     return cells

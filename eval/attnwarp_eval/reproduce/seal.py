@@ -16,7 +16,7 @@ from attnwarp_eval.document.numbers import number
 from attnwarp_eval.reproduce.manifest import FIGURES
 from attnwarp_eval.reproduce.report import RESULTS, difference
 from attnwarp_eval.statistics.contrasts import contrast
-from attnwarp_eval.statistics.intervals import interval
+from attnwarp_eval.statistics.intervals import over_scenes
 from attnwarp_eval.study.store import Problems, Store
 
 SEAL = "seal.json"
@@ -113,7 +113,7 @@ def side_by_side(one: Path, two: Path) -> tuple[list[str], Table]:
         keys = [key for key in first if key in second and key[0] == method]
         for head, title in FIGURES.items():
             a, b = _pairs(first, second, keys, title)
-            means = [interval({s: [*v.values()] for s, v in side.items()}).mean for side in (a, b)]
+            means = [over_scenes(side).mean for side in (a, b)]
             apart = contrast(a, b, "plain")
             rows.append([
                 method, head, str(apart.views), str(apart.scenes), *map(number, means),

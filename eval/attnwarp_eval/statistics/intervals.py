@@ -107,6 +107,16 @@ def interval(values: Table, *, level: float = 0.95) -> Interval:
     )  # fmt: skip
 
 
+def over_scenes(table: ByView) -> Interval:
+    """The :func:`interval` of a table by scene and view.
+
+    Example:
+        >>> over_scenes({"bear": {"yaw030": 1.0, "yaw060": 3.0}}).mean
+        2.0
+    """
+    return interval({scene: list(views.values()) for scene, views in table.items()})
+
+
 def _power_factor(scenes: int) -> float:
     """Detectable difference in standard errors: t(0.975) + t(0.80), two-sided 5 % and 80 %
     power."""

@@ -10,7 +10,7 @@ from functools import cached_property
 from statistics import median
 from typing import Any
 
-from attnwarp_eval.statistics.intervals import ByView, Interval, common, interval
+from attnwarp_eval.statistics.intervals import ByView, Interval, common, over_scenes
 from attnwarp_eval.study.record import Failure, Record
 from attnwarp_eval.study.schema import Study
 
@@ -62,7 +62,7 @@ class Shared:
         """Over ``scenes``, all by default, of the means over the views."""
         table = self.tables[variant]
         chosen = table if scenes is None else [scene for scene in scenes if scene in table]
-        return interval({scene: list(table[scene].values()) for scene in chosen})
+        return over_scenes({scene: table[scene] for scene in chosen})
 
     def text(self, title: str) -> list[str]:
         """A paragraph that says what the means are over; none where that is every view.
@@ -188,8 +188,7 @@ class Results:
 
     def mean(self, probe: str, variant: str, metric: str) -> Interval:
         """Mean over scenes of a variant's metric, with its interval."""
-        table = self.views(probe, variant, metric)
-        return interval({scene: list(values.values()) for scene, values in table.items()})
+        return over_scenes(self.views(probe, variant, metric))
 
     def shared(self, probe: str, variants: Sequence[str], metric: str) -> Shared:
         """A metric of several variants over the views that all of them have.

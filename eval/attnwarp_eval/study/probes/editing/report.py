@@ -13,7 +13,7 @@ from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Grid, Picture, Section, Table
 from attnwarp_eval.document.numbers import decibels, number, pooled, spread
 from attnwarp_eval.metrics.multiview import BELOW_FLOOR
-from attnwarp_eval.statistics.intervals import common, interval
+from attnwarp_eval.statistics.intervals import common, interval, over_scenes
 from attnwarp_eval.study.probe_report import (
     Layout,
     Place,
@@ -226,7 +226,7 @@ def by_yaw(results: Results, probe: str, names: Sequence[str], layout: Layout) -
     )
     curves = {
         (metric, name): [
-            interval(_lists(results.views(probe, name, metric, (yaw, yaw)))) for yaw in yaws
+            over_scenes(results.views(probe, name, metric, (yaw, yaw))) for yaw in yaws
         ]
         for metric in BY_YAW
         for name in measured
@@ -277,10 +277,10 @@ def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
     for metric, title in BY_SCENE.items():
         rows = []
         for name in measured:
-            table = _lists(results.views(probe, name, metric))
-            means = [interval({s: table.get(s, [])}).mean for s in scenes]
+            table = results.views(probe, name, metric)
+            means = [over_scenes({s: table.get(s, {})}).mean for s in scenes]
             one, overall = (decibels, pooled) if is_mse(metric) else (number, spread)
-            rows.append([name, *map(one, means), overall(interval(table))])
+            rows.append([name, *map(one, means), overall(over_scenes(table))])
         tables.append(Table(["variant", *scenes, "all scenes"], rows, title))
     tables.insert(0, _ratios(results, probe, measured))
     tables += _injected(results, probe, measured)
@@ -599,10 +599,6 @@ def _over_scenes(values: Iterable[tuple[str, float]]) -> float:
 
 def _editing(seconds: Mapping[str, float]) -> float:
     return seconds["source"] + seconds["warp"] + seconds["edit"]
-
-
-def _lists(table: Mapping[str, Mapping[str, float]]) -> dict[str, list[float]]:
-    return {scene: list(values.values()) for scene, values in table.items()}
 
 
 def _mean(values: Iterable[float]) -> float:

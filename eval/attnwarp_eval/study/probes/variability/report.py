@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 from attnwarp_eval.document.model import Gallery, Picture, Section, Table
 from attnwarp_eval.document.numbers import spread
-from attnwarp_eval.statistics.intervals import ByView, Interval, interval
+from attnwarp_eval.statistics.intervals import ByView, Interval, interval, over_scenes
 from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
 from attnwarp_eval.study.probes.variability.measure import BETWEEN, CHANGE, FLOOR, WITHIN
 from attnwarp_eval.study.results import Results
@@ -53,7 +53,7 @@ class VariabilityReport(ProbeReport):
             )
             disagreement = _less(within, floor)
             excess = _less(disagreement, between, AGREES)
-            figures = [interval(_lists(table)) for table in (change, between, disagreement, excess)]
+            figures = [over_scenes(table) for table in (change, between, disagreement, excess)]
             answers: dict[str, list[float]] = {}
             for scene, _, record in records:
                 answers.setdefault(scene, []).append(len(set(record.extra.answers) - {None}))
@@ -136,7 +136,3 @@ def _less(a: ByView, b: ByView, factor: float = 1.0) -> dict[str, dict[str, floa
         scene: {view: x - factor * b[scene][view] for view, x in views.items()}
         for scene, views in a.items()
     }
-
-
-def _lists(table: Mapping[str, Mapping[str, float]]) -> dict[str, list[float]]:
-    return {scene: list(values.values()) for scene, values in table.items()}

@@ -11,7 +11,7 @@ from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.metrics.occlusion import COUNTS, by_yaw
-from attnwarp_eval.statistics.intervals import Interval, interval
+from attnwarp_eval.statistics.intervals import Interval, over_scenes
 from attnwarp_eval.study.probe_report import (
     Layout,
     Place,
@@ -174,7 +174,7 @@ class WarpReport(ProbeReport):
             }
         )
         tables = [results.views(self.name, variant, metric, (yaw, yaw)) for yaw in yaws]
-        return yaws, [interval({s: list(v.values()) for s, v in table.items()}) for table in tables]
+        return yaws, list(map(over_scenes, tables))
 
 
 def _ambiguous(counts: Mapping[str, int]) -> float:
