@@ -23,39 +23,38 @@ from training.log import Entry, append, cut_log, log_path
 Tensor = torch.Tensor
 Model = TypeVar("Model", bound=torch.nn.Module)
 
+TURN = 8.0
+"""Degrees to either side by which crops are turned."""
+
 
 def crops(
+    images: npt.NDArray[np.uint8], out: int, rng: np.random.Generator, *, scale: tuple[float, float]
+) -> Tensor:
+    """(N, 3, out, out) float32 in [0, 1], channels last: the crops of :func:`placed_crops`."""
+    return placed_crops(images, out, rng, scale=scale)[0]
+
+
+def placed_crops(
     images: npt.NDArray[np.uint8], out: int, rng: np.random.Generator, *, scale: tuple[float, float],
-    turn: float = 8.0, tone: float = 0.12, flip: bool = True,
-) -> Tensor:  # fmt: skip
-    """Random crops of square pictures, turned, mirrored, brightened and darkened a little.
+    tone: float = 0.12,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Random crops of square pictures, brightened and darkened a little. Half of them are mirrored.
 
     Args:
         images: (N, S, S, 3).
         out: side of a crop in px.
         rng: to draw from.
         scale: shares of S, of which the crop's side is drawn.
-        turn: degrees to either side.
         tone: strength of the change in brightness and contrast; hues stay.
-        flip: whether half of the crops are mirrored.
 
     Returns:
-        (N, 3, out, out) float32 in [0, 1], channels last.
-    """
-    return placed_crops(images, out, rng, scale=scale, turn=turn, tone=tone, flip=flip)[0]
-
-
-def placed_crops(
-    images: npt.NDArray[np.uint8], out: int, rng: np.random.Generator, *, scale: tuple[float, float],
-    turn: float = 8.0, tone: float = 0.12, flip: bool = True,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Crops as :func:`crops` cuts them, and the place of each: (N, 2, 3) maps from the crop's [-1,
-    1] to the picture's.
+        The crops, (N, 3, out, out) float32 in [0, 1], channels last; and (N, 2, 3) maps from the
+        crop's [-1, 1] to the picture's.
     """
     n = len(images)
     side = rng.uniform(*scale, n)
-    angle = np.radians(rng.uniform(-turn, turn, n))
-    mirror = np.where(rng.uniform(size=n) < 0.5, -1.0, 1.0) if flip else np.ones(n)
+    angle = np.radians(rng.uniform(-TURN, TURN, n))
+    mirror = np.where(rng.uniform(size=n) < 0.5, -1.0, 1.0)
     free = np.maximum(1 - side * (np.abs(np.cos(angle)) + np.abs(np.sin(angle))), 0)
     shift = rng.uniform(-1, 1, (n, 2)) * free[:, None]
     theta = np.zeros((n, 2, 3))
@@ -70,10 +69,9 @@ def placed_crops(
         torch.from_numpy(theta).float(), [n, 3, out, out], align_corners=False
     )
     x = functional.grid_sample(x, grid, padding_mode="reflection", align_corners=False)
-    if tone:
-        gain = torch.from_numpy(np.exp(rng.normal(0, tone, (n, 1, 1, 1)))).float()
-        gamma = torch.from_numpy(np.exp(rng.normal(0, tone, (n, 1, 1, 1)))).float()
-        x = (x.clamp(1e-4, 1) ** gamma) * gain
+    gain = torch.from_numpy(np.exp(rng.normal(0, tone, (n, 1, 1, 1)))).float()
+    gamma = torch.from_numpy(np.exp(rng.normal(0, tone, (n, 1, 1, 1)))).float()
+    x = (x.clamp(1e-4, 1) ** gamma) * gain
     return x.clamp(0, 1).to(memory_format=torch.channels_last), torch.from_numpy(theta).float()
 
 

@@ -17,12 +17,12 @@ import numpy.typing as npt
 from attnwarp.encoders.base import TextImageEncoder
 from attnwarp_eval.drawn.worlds import ATTRIBUTES, sentence
 from training.assess.card_sections import Kept, percent, short_of
-from training.assess.editors import SEED, draw_row, mask_of, picture_of
+from training.assess.editors import SEED, draw_row
 from training.assess.figures import Figure, figure
 from training.assess.judge import Answer, nearest
 from training.assess.pictures import Pictures
 from training.editors.depth import attributes_of
-from training.worlds.editing_pairs import GROUPS, THING, Worlds, instruction
+from training.worlds.editing_pairs import GROUPS, Worlds, instruction
 
 JUDGED = {"material": "finish", "ground": "ground", "time": "time of day"}
 """Kinds of edits, and the attribute's name in the card."""
@@ -126,7 +126,7 @@ def _judged(
     further = [draw] if draw else []
     rng = np.random.default_rng([SEED, world, list(GROUPS).index(kind), *further])
     row = draw_row(pairs, world, kind, rng)
-    before, after = (picture_of(pairs, row, k) for k in (row.source, row.target))
+    before, after = (pairs.shown(row, k) for k in (row.source, row.target))
     text = instruction(kind, int(worlds.things[world]), worlds.looks[world, row.target], rng)
     image = answer(before, text, world + len(worlds) * draw)
     looks = [k for k in GROUPS[kind] if worlds.valid[world, k]]
@@ -148,9 +148,9 @@ def _judged(
         ).values
         return not np.isnan(values).any() and choices[int(np.argmax(values))] == row.target
 
-    thing = mask_of(pairs, row, THING)
+    thing = pairs.mask(row)
     mask = thing if kind == "material" else ~thing
-    color = looks[nearest(image, [picture_of(pairs, row, k) for k in looks], mask)] == row.target
+    color = looks[nearest(image, [pairs.shown(row, k) for k in looks], mask)] == row.target
     return found(ends[0]), found(ends[1]), color, len(choices)
 
 

@@ -18,18 +18,17 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from attnwarp.camera import Camera
 from attnwarp.editing.editor import Image, edit
 from attnwarp.editing.injection import constant, decay, inject
 from attnwarp.editing.layers import choose_layers
 from attnwarp.editing.recording import Recording, RecordingPlan, record
-from attnwarp.warp import EXACT_DEPTH_TOLERANCE, Surface, WarpSettings, warp_surfaces
 from training.assess.card_sections import Kept, asked_for, percent, short_of
 from training.assess.editors import SEED
 from training.assess.figures import Figure, figure
 from training.assess.judge import nearest
 from training.assess.pictures import Pictures, Row
 from training.worlds.editing_pairs import GROUPS, SIZE, VIEWS, Worlds
+from training.worlds.view_warps import view_warp
 
 INSTRUCTION = "change its color"
 """One sentence for all pictures of a batch; which colour comes out is the noise's choice."""
@@ -48,8 +47,6 @@ CONSTANT = 0.9
 
 LEAST_SHARE = 0.03
 """Least share of the picture: a smaller thing in it, or in a half, is not judged."""
-
-EXACT = WarpSettings(opaque=None, normal_test="none", depth_relative=EXACT_DEPTH_TOLERANCE)
 
 Mask = npt.NDArray[np.bool_]
 
@@ -92,14 +89,11 @@ def cases_of(worlds: Worlds, size: int, number: int = 0) -> list[Case]:
         colors = [k for k in GROUPS["color"] if worlds.valid[world, k]]
         source = int(rng.choice(colors))
         for view in range(VIEWS):
-            row = Row(world, view, source, source, "color", True, (0, 0, SIZE // size), flip=False)
-            thing = pairs.thing(row) > 0.99
+            row = Row(world, view, source, source, (0, 0, SIZE // size))
+            thing = pairs.mask(row)
             if thing.mean() < LEAST_SHARE:
                 continue
-            images = [
-                np.clip((pairs.picture(row, k) + 1) / 2, 0, 1).astype(np.float32)
-                for k in [source, *(k for k in colors if k != source)]
-            ]
+            images = [pairs.shown(row, k) for k in [source, *(k for k in colors if k != source)]]
             cases.append(Case(world, view, images[0], images, thing))
     return cases
 
@@ -297,7 +291,7 @@ def warped_figure(
     pairs = [(a, b) for a, b in itertools.pairwise(cases) if a.world == b.world][:count]
     clear = []
     for source, target in pairs:
-        view = _view_warp(worlds, source, target)
+        view = view_warp(worlds, target.world, target.view)
         grid = view.at((size, size))
         sources, targets = [source] * noises, [target] * noises
         seeds = [90_000 + 100 * source.world + k for k in range(noises)]
@@ -317,19 +311,6 @@ def warped_figure(
         "the true warp is clearly better than one displaced by an eighth", clear,
         [a.world for a, _ in pairs], asked=0.8,
     )  # fmt: skip
-
-
-def _view_warp(worlds: Worlds, source: Case, target: Case) -> Any:
-    def camera(case: Case) -> Camera:
-        K = worlds.K[case.world, case.view]
-        return Camera(K, worlds.world_to_camera[case.world, case.view], SIZE, SIZE)
-
-    def surface(case: Case) -> Surface:
-        return Surface(worlds.depth[case.world, case.view].astype(np.float64))
-
-    return warp_surfaces(
-        camera(source), camera(target), surface(target), surface(source), EXACT, warn_empty=False
-    )
 
 
 def _disagreement(target: Image, source: Image, grid: Any) -> float:

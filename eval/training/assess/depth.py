@@ -71,16 +71,14 @@ def assess_depth(editor: Any, prompts: Prompts) -> list[tuple[Figure, Figure]]:
             choices = [k for k in GROUPS[kind] if worlds.valid[world, k]]
             target = int(rng.choice(choices))
             corner = prompts.corner(world, 0, rng)
-            row = Row(world, 0, target, target, kind, False, corner, False)
-            thing = prompts.thing(row) > 0.99
+            row = Row(world, 0, target, target, corner)
+            thing = prompts.mask(row)
             mask = thing if kind in ("color", "material") else ~thing
             if mask.sum() < 12:
                 continue
             text = prompt_of(editor, prompts, row, rng)
             image = draw(editor, prompts, row, text, seed=world)
-            true = [
-                np.clip((prompts.picture(row, k) + 1) / 2, 0, 1).astype(np.float32) for k in choices
-            ]
+            true = [prompts.shown(row, k) for k in choices]
             answer = choices[nearest(image, true, mask)]
             right.append(answer == target)
             others = [k for k in choices if k != target]

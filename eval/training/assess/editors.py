@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from attnwarp.editing.editor import Image, edit
@@ -23,7 +22,6 @@ from training.assess.scenes import scene_figures
 from training.worlds.editing_pairs import (
     AMBIGUOUS,
     GROUPS,
-    THING,
     Worlds,
     ambiguous_instruction,
     instruction,
@@ -70,15 +68,15 @@ def assess(
         for world in range(len(worlds)):
             rng = np.random.default_rng([SEED, world, list(GROUPS).index(kind)])
             row = draw_row(pairs, world, kind, rng)
-            before = picture_of(pairs, row, row.source)
-            thing = mask_of(pairs, row, THING)
+            before = pairs.shown(row, row.source)
+            thing = pairs.mask(row)
             mask = thing if kind in ("color", "material") else ~thing
             text = instruction(
                 kind, int(worlds.things[world]), worlds.looks[world, row.target], rng
             )
             image = answer(before, text, world)
             choices = [k for k in GROUPS[kind] if worlds.valid[world, k]]
-            true = [picture_of(pairs, row, k) for k in choices]
+            true = [pairs.shown(row, k) for k in choices]
             right.append(choices[nearest(image, true, mask)] == row.target)
             groups.append(world)
             if kind == "color":
@@ -114,10 +112,10 @@ def _open(answer: Answer, pairs: Pictures, noises: int) -> Figure:
     for world in range(0, len(worlds), 4):
         rng = np.random.default_rng([SEED, world, 99])
         row = draw_row(pairs, world, "color", rng)
-        before, mask = picture_of(pairs, row, row.source), mask_of(pairs, row, THING)
+        before, mask = pairs.shown(row, row.source), pairs.mask(row)
         text = ambiguous_instruction("color", int(worlds.things[world]), rng)
         choices = [k for k in GROUPS["color"] if k != row.source and worlds.valid[world, k]]
-        true = [picture_of(pairs, row, k) for k in choices]
+        true = [pairs.shown(row, k) for k in choices]
         for seed in range(noises):
             right.append(nearest(answer(before, text, seed), [before, *true], mask) > 0)
             groups.append(world)
@@ -138,22 +136,12 @@ def draw_row(pairs: Pictures, world: int, kind: str, rng: np.random.Generator) -
     while True:
         source = int(rng.choice(worlds.sources(world, kind)))
         target = int(rng.choice([k for k in GROUPS[kind] if valid[k]]))
-        row = Row(world, view, source, target, kind, False, pairs.corner(world, view, rng), False)
+        row = Row(world, view, source, target, pairs.corner(world, view, rng))
         if (
             not np.array_equal(worlds.looks[world, source], worlds.looks[world, target])
-            and mask_of(pairs, row, THING).sum() >= 12
+            and pairs.mask(row).sum() >= 12
         ):
             return row
-
-
-def picture_of(pairs: Pictures, row: Row, look: int) -> Image:
-    """(S, S, 3) in [0, 1], a look of a row's picture."""
-    return np.clip((pairs.picture(row, look) + 1) / 2, 0, 1)
-
-
-def mask_of(pairs: Pictures, row: Row, what: int) -> npt.NDArray[np.bool_]:
-    """(S, S) where a row's picture shows nothing else than ``what``, such as :data:`training.worlds.editing_pairs.THING`."""
-    return pairs.cut(pairs.worlds.ids[row.world, row.view] == what, row) > 0.99
 
 
 def editor_card(

@@ -28,7 +28,6 @@ from attnwarp_eval.drawn.worlds import (
     draw_look,
     draw_world,
     sentence,
-    surface_words,
 )
 from training.encoders.clip import true_of
 from training.encoders.distort import HELD_OUT_KINDS, TRAIN_KINDS
@@ -104,10 +103,17 @@ def as_float(images: npt.NDArray[np.uint8]) -> list[Image]:
     return list(images.astype(np.float32) / 255)
 
 
-def _unit(x: npt.ArrayLike) -> Array:
+def unit(x: npt.ArrayLike) -> Array:
+    """Rows of length 1."""
     x = np.asarray(x, dtype=np.float64)
     # A vector without length has no direction: it stays zero, with cosine 0 to everything.
     return x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-12)
+
+
+def _rows_of(pictures: Pictures) -> dict[tuple[int, int, int], int]:
+    """(world, view, look) -> the picture's row."""
+    columns = (column.tolist() for column in (pictures.world, pictures.view, pictures.look))
+    return {key: row for row, key in enumerate(zip(*columns, strict=True))}
 
 
 # clip-small
@@ -121,9 +127,9 @@ def word_embeddings(encoder: TextImageEncoder, phrases: Sequence[Sequence[str]])
     rows = []
     for choices in phrases:
         rows.append(
-            _unit(encoder.texts([t.format(c) for t in TEMPLATES for c in choices])).mean(axis=0)
+            unit(encoder.texts([t.format(c) for t in TEMPLATES for c in choices])).mean(axis=0)
         )
-    return _unit(rows)
+    return unit(rows)
 
 
 def _a(words: str) -> str:
@@ -161,7 +167,7 @@ def clip_figures(encoder: TextImageEncoder, sets: dict[str, Pictures]) -> list[F
         "test-rendered": "path-traced",
     }
     sets = {name: sets[name] for name in titles}
-    embedded = {name: _unit(encoder.images(as_float(p.images))) for name, p in sets.items()}
+    embedded = {name: unit(encoder.images(as_float(p.images))) for name, p in sets.items()}
     labels = {
         what: word_embeddings(encoder, _phrases(what))
         for what in ("object", "color", "material", "ground", "time")
@@ -208,7 +214,7 @@ def _retrieval(encoder: TextImageEncoder, images: Array, pictures: Pictures, wha
     rng = np.random.default_rng(1)
     first = np.flatnonzero((pictures.view == 0) & (pictures.look == 0))
     true_attributes = pictures.attributes
-    texts = _unit(
+    texts = unit(
         encoder.texts([sentence(tuple(int(v) for v in true_attributes[k]), rng) for k in first])
     )
     right = []
@@ -229,12 +235,7 @@ def _direction(encoder: TextImageEncoder, images: Array, pictures: Pictures) -> 
     captions, as directional similarity.
     """
     rng = np.random.default_rng(2)
-    index = {
-        (w, v, k): i
-        for i, (w, v, k) in enumerate(
-            zip(pictures.world, pictures.view, pictures.look, strict=True)
-        )
-    }
+    index = _rows_of(pictures)
     right, worlds = [], []
     for (world, view, look), before in index.items():
         if look != 0:
@@ -264,10 +265,10 @@ def _direction(encoder: TextImageEncoder, images: Array, pictures: Pictures) -> 
         texts = encoder.texts(
             [sentence(words, np.random.default_rng(seed)) for words in (old, *targets)]
         )
-        away = _unit(_unit(texts[1:]) - _unit(texts[:1]))
+        away = unit(unit(texts[1:]) - unit(texts[:1]))
         if np.array_equal(pictures.images[after], pictures.images[before]):
             continue  # the change is out of sight: there is no direction
-        likeness = away @ _unit(images[after] - images[before])
+        likeness = away @ unit(images[after] - images[before])
         right.append(bool(likeness[0] > likeness[1:].max()))  # a tie is no find
         worlds.append(world)
     return figure(
@@ -278,12 +279,7 @@ def _direction(encoder: TextImageEncoder, images: Array, pictures: Pictures) -> 
 def _viewpoint(images: Array, pictures: Pictures, labels: dict[str, Array]) -> Figure:
     """Share of things whose two views get the same name."""
     guess = (images @ labels["object"].T).argmax(axis=1)
-    index = {
-        (w, v, k): i
-        for i, (w, v, k) in enumerate(
-            zip(pictures.world, pictures.view, pictures.look, strict=True)
-        )
-    }
+    index = _rows_of(pictures)
     pairs = [(i, index[w, 1, k], w) for (w, v, k), i in index.items() if v == 0]
     same = [guess[i] == guess[j] for i, j, _ in pairs]
     return figure("the same name for two views of a thing", same, [w for *_, w in pairs])
@@ -308,20 +304,15 @@ def nearest(
         Whether the nearest is the thing itself, and the thing's world, for every world.
     """
     rng = np.random.default_rng(seed)
-    unit = _unit(features)
-    index = {
-        (int(w), int(v), int(k)): i
-        for i, (w, v, k) in enumerate(
-            zip(pictures.world, pictures.view, pictures.look, strict=True)
-        )
-    }
+    rows = unit(features)
+    index = _rows_of(pictures)
     worlds = sorted({w for w, _, _ in index})
     right = []
     for world in worlds:
         others = rng.choice([w for w in worlds if w != world], 63, replace=False)
         # The right one last: the first of equals wins, so a tie is no find.
         gallery = [*(index[int(w), 0, 0] for w in others), index[world, 0, 0]]
-        right.append(bool((unit[gallery] @ unit[index[world, 1, look]]).argmax() == 63))
+        right.append(bool((rows[gallery] @ rows[index[world, 1, look]]).argmax() == 63))
     return right, worlds
 
 
@@ -416,7 +407,7 @@ def part_figures(encoder: TokenEncoder, count: int, *, first: int = 5_000_000) -
         centers = np.stack([x, y], axis=-1).reshape(-1, 2) + 0.0
         truth = xy[visible]
         for name, grid in (("patch tokens", tokens), ("raw patches", patches)):
-            flat = _unit(
+            flat = unit(
                 grid.reshape(2, side * side, -1)
                 - grid.reshape(2, side * side, -1).mean(axis=1, keepdims=True)
             )
@@ -496,15 +487,3 @@ def perceptual_figures(
 def test_sets(data: Path) -> dict[str, Pictures]:
     """The held-out pictures, rendered where they are missing."""
     return {name: load(data, name) for name in SPLITS if name.startswith("test")}
-
-
-__all__ = [
-    "Figure",
-    "clip_figures",
-    "dino_figures",
-    "figure",
-    "part_figures",
-    "perceptual_figures",
-    "surface_words",
-    "test_sets",
-]

@@ -49,9 +49,9 @@ def rebuild(editor: Any, prompts: Prompts, world: int, steps: int) -> tuple[floa
     """PSNR of a world's picture rebuilt from its inversion, and of one drawn from other latents."""
     rng = np.random.default_rng([SEED, world, 6])
     look = int(rng.choice([k for k in GROUPS["color"] if prompts.worlds.valid[world, k]]))
-    row = Row(world, 0, look, look, "color", False, prompts.corner(world, 0, rng), False)
+    row = Row(world, 0, look, look, prompts.corner(world, 0, rng))
     text, depth = prompt_of(editor, prompts, row, rng), depth_of(prompts, row)
-    picture = np.clip((prompts.picture(row, look) + 1) / 2, 0, 1).astype(np.float32)
+    picture = prompts.shown(row, look)
     latents = invert_view(editor, depth, picture, text, steps=steps)
     with guided(editor, 1.0):  # what was inverted without guidance is rebuilt without
         again = edit(editor, [depth], text, steps=steps, latents=latents).images[0]

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp.encoders.base import TextImageEncoder
 from attnwarp_eval.drawn.assemblies import KINDS, WHOLE_NOUNS
 from attnwarp_eval.drawn.worlds import draw_look
-from training.assess.figures import Figure, as_float, figure
+from training.assess.figures import Figure, as_float, figure, unit
+from training.assess.scenes import SCENES
 from training.encoders.clip_parts import surface_choices, surface_number
 from training.worlds.part_captions import (
     Caption,
@@ -28,9 +27,6 @@ Array = npt.NDArray[np.float64]
 LEAST_SHARE = 0.02
 """Least share of a picture that a part covers where it is asked about."""
 
-SCENES = ("bear", "person", "dinosaur", "face", "garden", "stump")
-"""The scenes that have edits; no recipe sees them."""
-
 SCENE_SIZE = 256
 SCENE_SAMPLES = 32
 SCENE_VIEWS = 3
@@ -38,7 +34,7 @@ SCENE_VIEWS = 3
 
 def part_figures(encoder: TextImageEncoder, pictures: PartPictures) -> list[Figure]:
     """Naming of wholes and of parts' surfaces, and the direction of an edit of a part."""
-    embedded = _unit(encoder.images(as_float(pictures.images)))
+    embedded = unit(encoder.images(as_float(pictures.images)))
     return [
         _wholes(encoder, embedded, pictures),
         _surfaces(encoder, embedded, pictures),
@@ -48,9 +44,9 @@ def part_figures(encoder: TextImageEncoder, pictures: PartPictures) -> list[Figu
 
 def _wholes(encoder: TextImageEncoder, images: Array, pictures: PartPictures) -> Figure:
     words = np.stack([
-        _unit(encoder.texts([f"a photo of {with_article(n)}" for n in WHOLE_NOUNS[k]])).mean(axis=0) for k in KINDS
+        unit(encoder.texts([f"a photo of {with_article(n)}" for n in WHOLE_NOUNS[k]])).mean(axis=0) for k in KINDS
     ])  # fmt: skip
-    guess = (images @ _unit(words).T).argmax(axis=1)
+    guess = (images @ unit(words).T).argmax(axis=1)
     return figure(
         "name the thing with parts, new shapes",
         guess == pictures.kind,
@@ -65,7 +61,7 @@ def _surfaces(encoder: TextImageEncoder, images: Array, pictures: PartPictures) 
     numbers = surface_number(pictures.surfaces)
     right, worlds = [], []
     words = {
-        p: _unit(encoder.texts([f"a photo of {part_words(p, s, np.random.default_rng(4))}" for s in choices]))
+        p: unit(encoder.texts([f"a photo of {part_words(p, s, np.random.default_rng(4))}" for s in choices]))
         for p in range(len(PARTS))
     }  # fmt: skip
     for row in range(len(pictures)):
@@ -117,10 +113,10 @@ def _directions(encoder: TextImageEncoder, images: Array, pictures: PartPictures
                 ]
                 for q, surface in edits
             ]
-            texts = _unit(encoder.texts([t for pair in pairs for t in pair])).reshape(
+            texts = unit(encoder.texts([t for pair in pairs for t in pair])).reshape(
                 len(edits), 2, -1
             )
-            likeness = _unit(texts[:, 1] - texts[:, 0]) @ _unit(images[after] - images[before])
+            likeness = unit(texts[:, 1] - texts[:, 0]) @ unit(images[after] - images[before])
             right.append(bool(likeness[0] > likeness[1:].max()))  # a tie is no find
             worlds.append(int(pictures.world[before]))
     return figure(
@@ -128,11 +124,8 @@ def _directions(encoder: TextImageEncoder, images: Array, pictures: PartPictures
     )
 
 
-def scene_figure(
-    encoder: TextImageEncoder, *, scenes: Sequence[str] = SCENES
-) -> tuple[Figure, dict[str, float]]:
-    """Choice of the edit that was made among a scene's own, by directional similarity; and the
-    share of each scene.
+def scene_figure(encoder: TextImageEncoder) -> Figure:
+    """Choice of the edit that was made among a scene's own, by directional similarity.
 
     Each answer of an ambiguous edit is an edit of its own. Their true pictures are the package's.
     """
@@ -140,7 +133,7 @@ def scene_figure(
     from attnwarp_eval.world import world
 
     right, names, chance = [], [], []
-    for name in scenes:
+    for name in SCENES:
         of = world(name, SCENE_SIZE)
         views = tuple(
             list(of.targets)[k]
@@ -156,22 +149,14 @@ def scene_figure(
                 pictures.append(
                     [(truth.originals[v], shown[v], truth.union[v].mean()) for v in views]
                 )
-        away = _unit(_unit(encoder.texts(targets)) - _unit(encoder.texts(sources)))
+        away = unit(unit(encoder.texts(targets)) - unit(encoder.texts(sources)))
         for k, row in enumerate(pictures):
             for before, after, share in row:
                 if share < 0.01:
                     continue
-                change = _unit(encoder.images([after])) - _unit(encoder.images([before]))
+                change = unit(encoder.images([after])) - unit(encoder.images([before]))
                 right.append(int((away @ change[0]).argmax()) == k)
                 names.append(name)
                 chance.append(1 / len(pictures))
-    shares = {
-        s: float(np.mean([r for r, n in zip(right, names, strict=True) if n == s])) for s in scenes
-    }
     what = "the edit among a scene's own, by directional similarity"
-    return figure(what, right, names, chance=float(np.mean(chance)), asked=0.85), shares
-
-
-def _unit(x: npt.ArrayLike) -> Array:
-    x = np.asarray(x, dtype=np.float64)
-    return x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-12)
+    return figure(what, right, names, chance=float(np.mean(chance)), asked=0.85)

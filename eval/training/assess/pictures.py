@@ -19,10 +19,8 @@ class Row:
     view: int
     source: int
     target: int
-    kind: str
-    unclear: bool
     corner: tuple[int, int, int]
-    flip: bool
+    flip: bool = False
 
 
 class Pictures:
@@ -61,6 +59,14 @@ class Pictures:
         """(S, S, 3) in [-1, 1]."""
         return self.cut(self.worlds.images[row.world, row.view, look], row) / 127.5 - 1
 
+    def shown(self, row: Row, look: int) -> npt.NDArray[np.float32]:
+        """(S, S, 3) in [0, 1]."""
+        return np.clip((self.picture(row, look) + 1) / 2, 0, 1)
+
     def thing(self, row: Row) -> npt.NDArray[np.float32]:
         """(S, S) share of each pixel that the thing covers."""
         return self.cut(self.worlds.ids[row.world, row.view] == THING, row)
+
+    def mask(self, row: Row) -> npt.NDArray[np.bool_]:
+        """(S, S) where a row's picture shows nothing else than the thing."""
+        return self.thing(row) > 0.99

@@ -84,9 +84,9 @@ def scene_answers(answer: Answer, *, size: int, scenes: Sequence[str] = SCENES) 
     return result
 
 
-def scene_figures(answer: Answer, *, size: int, scenes: Sequence[str] = SCENES) -> list[Figure]:
+def scene_figures(answer: Answer, *, size: int) -> list[Figure]:
     """Three figures: the sentence that was asked for, another one, and no edit."""
-    a = scene_answers(answer, size=size, scenes=scenes)
+    a = scene_answers(answer, size=size)
     chance = float(np.mean(a.chance))
     return [
         figure("nearest of a scene's true results is the one asked for", a.asked, a.scenes, chance=chance, asked=0.7),

@@ -11,7 +11,6 @@ from PIL import ImageDraw
 
 from attnwarp.editing.editor import Image
 from attnwarp_eval.drawn.worlds import NOUNS, OBJECTS
-from training.assess.editors import picture_of
 from training.assess.judge import Answer
 from training.assess.pictures import Pictures, Row
 from training.editors.depth import Prompts
@@ -57,7 +56,7 @@ def sheet(
     pairs = Pictures(worlds, size)
     rows = []
     for row in _spread(pairs):
-        before = picture_of(pairs, row, row.source).astype(np.float32)
+        before = pairs.shown(row, row.source)
         rows.append([before, *(answer(before, text, row.world) for text in instructions)])
     return _arranged(rows, ["before", *instructions])
 
@@ -89,7 +88,7 @@ def _spread(pairs: Pictures) -> Iterator[Row]:
         rng = np.random.default_rng([world, 6])
         color = next(k for k in GROUPS["color"] if worlds.valid[world, k])
         corner = pairs.corner(world, 0, rng) if size < SIZE else (0, 0, 1)
-        yield Row(world, 0, color, color, "color", False, corner, False)
+        yield Row(world, 0, color, color, corner)
 
 
 def _arranged(rows: Sequence[Sequence[Image]], titles: Sequence[str]) -> PIL.Image.Image:

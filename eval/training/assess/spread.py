@@ -15,10 +15,10 @@ import torch
 from attnwarp.editing.editor import Image, edit
 from attnwarp_eval.drawn.worlds import COLORS, GROUNDS, STATUES
 from training.assess.card_sections import Kept
-from training.assess.editors import SEED, draw_row, mask_of, picture_of
+from training.assess.editors import SEED, draw_row
 from training.assess.judge import nearest
 from training.assess.pictures import Pictures
-from training.worlds.editing_pairs import GROUPS, THING, Worlds, ambiguous_instruction
+from training.worlds.editing_pairs import GROUPS, Worlds, ambiguous_instruction
 
 NAMES = {"color": COLORS, "material": STATUES, "ground": GROUNDS}
 """Words of the kinds' answers. Three times of day beside a picture's own are too few to be judged."""
@@ -74,15 +74,15 @@ def questions(worlds: Worlds, size: int, kinds: Sequence[str] = KINDS) -> list[Q
         for world in range(start, len(worlds)):
             rng = np.random.default_rng([SEED, world, 99])
             row = draw_row(pairs, world, kind, rng)
-            thing = mask_of(pairs, row, THING)
+            thing = pairs.mask(row)
             if thing.mean() >= LEAST_THING:
                 break
         else:
             raise ValueError(f"worlds: got none from {start} on whose thing covers {LEAST_THING:.0%} of the picture")  # fmt: skip
         choices = [k for k in GROUPS[kind] if k != row.source and worlds.valid[world, k]]
         text = ambiguous_instruction(kind, int(worlds.things[world]), rng)
-        names = {NAMES[kind][k - GROUPS[kind][0]]: picture_of(pairs, row, k) for k in choices}
-        before = picture_of(pairs, row, row.source)
+        names = {NAMES[kind][k - GROUPS[kind][0]]: pairs.shown(row, k) for k in choices}
+        before = pairs.shown(row, row.source)
         mask = ~thing if kind == "ground" else thing
         result.append(Question(kind, world, text, before, names, mask))
     return result

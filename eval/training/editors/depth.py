@@ -21,7 +21,6 @@ from tokenizers import Tokenizer
 from attnwarp.editing.controlnet import control_image
 from attnwarp.editing.latents import BLOCK, CHANNELS
 from attnwarp_eval.drawn.worlds import sentence
-from attnwarp_eval.scene.yaml import read_yaml
 from training.assess.pictures import Pictures, Row
 from training.editors.answers import codes
 from training.editors.net import (
@@ -35,13 +34,21 @@ from training.editors.net import (
     loss_of,
     noised,
     scheduler,
-    tokens_of,
 )
 from training.editors.pool import PicturePool, Rows
 from training.editors.recipe import tokenizer_of, weights_of
+from training.encoders.byte_pairs import tokens_of
 from training.encoders.clip import true_of
 from training.steps import Task, train_steps
-from training.worlds.editing_pairs import LOOKS, PAIRS_PROTOCOL, SIZE, VIEWS, Worlds, load_pairs
+from training.worlds.editing_pairs import (
+    LOOKS,
+    PAIRS_PROTOCOL,
+    SIZE,
+    VIEWS,
+    Worlds,
+    load_pairs,
+    scene_edits,
+)
 
 Tensor = torch.Tensor
 
@@ -130,15 +137,8 @@ class DepthNet(torch.nn.Module):
 
 @functools.cache
 def reserved_prompts() -> frozenset[str]:
-    """Descriptions in the package's scenes, in lower case: no recipe may learn from one."""
-    import attnwarp_eval
-
-    folder = (Path(attnwarp_eval.__file__).parent / "scenes").resolve()
-    edits = [
-        edit
-        for path in sorted(folder.glob("*.yaml"))
-        for edit in read_yaml(path.read_text())[1].get("edits", ())
-    ]
+    """Descriptions in the package's scenes, in lower case."""
+    edits = scene_edits()
     answers = [answer for edit in edits for answer in edit.get("answers", ())]
     texts = [one[key] for one in (*edits, *answers) for key in ("source", "target") if key in one]
     return frozenset(text.lower() for text in texts)

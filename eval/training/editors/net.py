@@ -7,11 +7,9 @@ and sample steps are flawed").
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tokenizers import Tokenizer
 
 from attnwarp.editing.latents import BLOCK, CHANNELS
 from attnwarp.editing.small_unet import EditUNet
@@ -104,13 +102,6 @@ def scheduler(shift: float = 1.0) -> Any:
     before = torch.cat([torch.ones(1, dtype=torch.float64), shifted[:-1]])
     betas = (1 - shifted / before).tolist()
     return DDIMScheduler(**settings | {"rescale_betas_zero_snr": False, "trained_betas": betas})
-
-
-def tokens_of(tokenizer: Tokenizer, texts: Sequence[str]) -> Tensor:
-    """(N, 24) int64, padded with 0."""
-    return torch.tensor(
-        [code.ids for code in tokenizer.encode_batch(list(texts))], dtype=torch.int64
-    )
 
 
 def draw_steps(count: int, generator: torch.Generator, noisy_from: int) -> Tensor:

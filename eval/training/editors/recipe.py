@@ -34,10 +34,9 @@ from training.editors.net import (
     loss_of,
     noised,
     scheduler,
-    tokens_of,
 )
 from training.editors.pool import Batch, PairPool
-from training.encoders.byte_pairs import learn_byte_pairs
+from training.encoders.byte_pairs import learn_byte_pairs, tokens_of
 from training.steps import Task, train_steps
 from training.worlds.editing_pairs import (
     AMBIGUOUS,

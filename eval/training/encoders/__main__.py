@@ -99,7 +99,7 @@ def assess(
             results = training.assess.figures.clip_figures(encoder, sets)
         if name == "clip-parts":
             results += part_figures(encoder, part_pictures.load(data, "parts-test"))
-            results.append(scene_figure(encoder)[0])
+            results.append(scene_figure(encoder))
         if name == "dino-small":
             results = training.assess.figures.dino_figures(encoder, sets)
         if name == "perceptual-small":

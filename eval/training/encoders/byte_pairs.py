@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
+import torch
 from tokenizers import (
     Tokenizer,
     decoders,
@@ -41,3 +42,9 @@ def learn_byte_pairs(
     tokenizer.enable_padding(pad_id=0, pad_token="<pad>", length=length)
     tokenizer.enable_truncation(most_tokens)
     return tokenizer
+
+
+def tokens_of(tokenizer: Tokenizer, texts: Sequence[str]) -> torch.Tensor:
+    """(N, L) int64, padded with 0."""
+    codes = tokenizer.encode_batch(list(texts))
+    return torch.tensor([code.ids for code in codes], dtype=torch.int64)

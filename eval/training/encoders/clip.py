@@ -29,7 +29,7 @@ from attnwarp_eval.drawn.worlds import (
 )
 from training.common import Run, channels_last, crops, groups, rate, settings
 from training.encoders import naming
-from training.encoders.byte_pairs import learn_byte_pairs
+from training.encoders.byte_pairs import learn_byte_pairs, tokens_of
 from training.encoders.naming import Heads, pictures_of, scrambled, warm_start
 
 SEED = 1
@@ -69,11 +69,6 @@ def _any_attributes(rng: np.random.Generator) -> tuple[int, ...]:
         int(rng.integers(len(OBJECTS))), finish, int(color) if FINISHES[finish] in COLORED else -1,
         int(second) if FINISHES[finish] in TWO_COLORED else -1, int(rng.integers(len(GROUNDS))), int(rng.integers(len(TIMES))),
     )  # fmt: skip
-
-
-def tokens(tokenizer: Tokenizer, sentences: list[str]) -> torch.Tensor:
-    """(N, L) int64, padded with 0."""
-    return torch.tensor([code.ids for code in tokenizer.encode_batch(sentences)], dtype=torch.int64)
 
 
 def true_of(captions: Ints, images: Ints) -> npt.NDArray[np.bool_]:
@@ -206,7 +201,7 @@ def naming_loss(
                 caption[3] = caption[3] if FINISHES[value] in TWO_COLORED else -1
             texts.append(sentence(tuple(int(v) for v in caption), rng))
     with torch.autocast("cpu", torch.bfloat16):
-        words = model.texts(tokens(tokenizer, texts))
+        words = model.texts(tokens_of(tokenizer, texts))
     words = functional.normalize(words.float(), dim=-1)
     logits = model.scale.clamp(max=4.6).exp() * images @ words.T
     total = torch.zeros(())
@@ -290,7 +285,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
                 features = model.pool.features(model.vision(images)[-1])
                 embedded = model.pool.project(features)
                 guessed = heads(features, attributes)
-                sentences = model.texts(tokens(tokenizer, texts))
+                sentences = model.texts(tokens_of(tokenizer, texts))
             embedded = functional.normalize(embedded.float(), dim=-1)
             sentences = functional.normalize(sentences.float(), dim=-1)
             apart = contrast(model, embedded[torch.from_numpy(whole)], sentences, truth)

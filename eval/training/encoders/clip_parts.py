@@ -33,11 +33,12 @@ from attnwarp_eval.drawn.worlds import (
 )
 from training.common import Run, channels_last, groups, placed_crops, rate, settings
 from training.encoders import clip, naming
-from training.encoders.clip import contrast, naming_loss, tokens
+from training.encoders.byte_pairs import tokens_of
+from training.encoders.clip import contrast, naming_loss
 from training.worlds import part_captions, part_pictures
 from training.worlds.data import load as load_pictures
 from training.worlds.part_captions import caption_of, part_words, true_of, with_article, wrong
-from training.worlds.part_pictures import GROUND, OTHER, PARTS, SHARD, SKY, PartPictures
+from training.worlds.part_pictures import GROUND, OTHER, PARTS, SHARD, SKY, PartPictures, shares_of
 
 SEED = 7
 EPOCHS = 36
@@ -178,14 +179,6 @@ def places(ids: npt.NDArray[np.uint8], theta: Tensor, side: int) -> npt.NDArray[
     return np.where(sampled == 0, OTHER, sampled - 1).astype(np.uint8)
 
 
-def shares_of(ids: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
-    """(N, P) share of each crop that every part covers."""
-    return (
-        np.stack([np.bincount(one.ravel(), minlength=256)[: len(PARTS)] for one in ids])
-        / ids[0].size
-    )
-
-
 def surface_choices() -> list[tuple[int, int, int]]:
     """Choices for a part: its colour, or its material."""
     plain = [(-1, c, -1) for c in range(len(COLORS))]
@@ -282,7 +275,7 @@ def whole_losses(
 
 def _texts(model: ClipParts, tokenizer: Tokenizer, texts: Sequence[str]) -> Tensor:
     """(N, D) unit embeddings."""
-    return functional.normalize(model.texts(tokens(tokenizer, list(texts))), dim=-1)
+    return functional.normalize(model.texts(tokens_of(tokenizer, texts)), dim=-1)
 
 
 def _one(choices: Sequence[str], rng: np.random.Generator) -> str:

@@ -292,14 +292,19 @@ def load_mixed(folder: Path, counts: Mapping[str, int | None], *, workers: int =
 # Instructions ---------------------------------------------------------------------------------------------------------
 
 
-@functools.cache
-def reserved() -> frozenset[str]:
-    """Instructions of the package's scenes, in lower case: no recipe may learn from one."""
+def scene_edits() -> list[dict[str, Any]]:
+    """Edits of the package's scenes: no recipe may learn from one."""
     import attnwarp_eval
 
     folder = (Path(attnwarp_eval.__file__).parent / "scenes").resolve()
-    texts = [read_yaml(path.read_text())[1] for path in sorted(folder.glob("*.yaml"))]
-    return frozenset(e["instruction"].lower() for t in texts for e in t.get("edits", ()))
+    scenes = [read_yaml(path.read_text())[1] for path in sorted(folder.glob("*.yaml"))]
+    return [edit for scene in scenes for edit in scene.get("edits", ())]
+
+
+@functools.cache
+def reserved() -> frozenset[str]:
+    """Instructions of the package's scenes, in lower case."""
+    return frozenset(edit["instruction"].lower() for edit in scene_edits())
 
 
 def _one(choices: tuple[str, ...], rng: np.random.Generator) -> str:

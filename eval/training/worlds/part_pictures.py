@@ -234,6 +234,12 @@ def shards(files: list[Path]) -> Iterator[dict[str, npt.NDArray[Any]]]:
             yield {key: stored[key] for key in stored.files}
 
 
+def shares_of(ids: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
+    """(N, P) share of each (S, S) picture that every part covers."""
+    counts = [np.bincount(one.ravel(), minlength=256)[: len(PARTS)] for one in ids]
+    return np.stack(counts) / ids[0].size
+
+
 def load(folder: Path, name: str, workers: int = 2) -> PartPictures:
     """The pictures of a split, rendered where they are missing."""
     columns: dict[str, list[npt.NDArray[Any]]] = {}
@@ -244,9 +250,6 @@ def load(folder: Path, name: str, workers: int = 2) -> PartPictures:
     worlds = len(table["kind"])
     world, view, look = (v.ravel() for v in np.indices((worlds, VIEWS, LOOKS)))
     ids = table["ids"].reshape(-1, SIZE, SIZE)
-    shares = (
-        np.stack([np.bincount(one.ravel(), minlength=256)[: len(PARTS)] for one in ids]) / SIZE**2
-    )
     return PartPictures(
         images=table["images"].reshape(-1, SIZE, SIZE, 3),
         surfaces=table["surfaces"][world, look],
@@ -258,5 +261,5 @@ def load(folder: Path, name: str, workers: int = 2) -> PartPictures:
         look=look,
         place=world * VIEWS + view,
         ids=ids,
-        shares=shares,
+        shares=shares_of(ids),
     )

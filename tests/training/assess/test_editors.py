@@ -58,8 +58,8 @@ def test_an_editor_that_knows_every_answer_gets_all_and_one_that_changes_nothing
 
     def knows(image, text, seed):
         row = asked["row"]
-        assert np.allclose(image, editor_assess.picture_of(asked["pairs"], row, row.source))
-        return editor_assess.picture_of(asked["pairs"], row, row.target)
+        assert np.allclose(image, asked["pairs"].shown(row, row.source))
+        return asked["pairs"].shown(row, row.target)
 
     figures = {f.what: f for f in assess(knows, worlds, size=64, noises=2)}
     for what, found in figures.items():

@@ -298,7 +298,7 @@ def test_a_change_that_is_not_in_the_picture_is_not_asked(sets):
         images[index[world, 0, 1]] = images[index[world, 0, 0]]
     some = Pictures(images, pictures.attributes, pictures.world, pictures.view, pictures.look)
     knowing = Knowing(sets)
-    embedded = assess._unit(knowing.images(assess.as_float(pictures.images)))
+    embedded = assess.unit(knowing.images(assess.as_float(pictures.images)))
     found = assess._direction(knowing, embedded, some)
     assert (found.value, found.count) == (1.0, 170)
 
@@ -339,7 +339,7 @@ def test_histograms_and_pixels_see_what_their_names_say():
     for r, g, b in image.reshape(-1, 3) // 32:
         counted[r, g, b] += 1 / 1024
     np.testing.assert_allclose(one**2, counted.ravel(), atol=1e-12)
-    a, b, c = assess._unit(assess.raw_pixels(np.concatenate([image, image // 2, shuffled])))
+    a, b, c = assess.unit(assess.raw_pixels(np.concatenate([image, image // 2, shuffled])))
     assert (
         a @ b == pytest.approx(1, abs=1e-3) and abs(a @ c) < 0.1
     )  # half as bright is alike, another place is not

@@ -28,7 +28,7 @@ def test_the_guidance_that_edits_is_told_from_those_that_do_not(monkeypatch, tmp
 
     def remember(pairs, world, kind, rng):
         row = draw(pairs, world, kind, rng)
-        asked["picture"] = editor_assess.picture_of(pairs, row, row.target)
+        asked["picture"] = pairs.shown(row, row.target)
         return row
 
     def answers_of(editor):

@@ -119,7 +119,7 @@ def test_a_prompt_of_a_reserved_sentence_is_drawn_again(monkeypatch):
 
 
 def test_the_control_picture_is_the_inverse_depth_of_the_cut(worlds, tokenizer):
-    row = Row(0, 1, 0, 0, "color", False, (32, 8, 1), True)
+    row = Row(0, 1, 0, 0, (32, 8, 1), True)
     expected = 1 / worlds.depth[0, 1, 32:96, 8:72][:, ::-1]
     alone = Prompts(worlds, 64).control(row)
     np.testing.assert_allclose(alone[..., 1], expected / expected.max(), rtol=1e-5)
@@ -131,9 +131,7 @@ def test_the_control_picture_is_the_inverse_depth_of_the_cut(worlds, tokenizer):
     assert len(set(rows.zoom.tolist())) == 2
     for k, image in enumerate(pool.control(rows, 64)):
         corner = (int(rows.y[k]), int(rows.x[k]), int(rows.zoom[k]))
-        one = Row(
-            int(rows.world[k]), int(rows.view[k]), 0, 0, "color", False, corner, bool(rows.flip[k])
-        )
+        one = Row(int(rows.world[k]), int(rows.view[k]), 0, 0, corner, bool(rows.flip[k]))
         np.testing.assert_allclose(
             image.permute(1, 2, 0), Prompts(worlds, 64).control(one), rtol=1e-6
         )
@@ -174,7 +172,7 @@ def test_an_editor_that_knows_every_answer_gets_all(worlds, monkeypatch):
     prompts = Prompts(worlds, 64)
 
     def knows(editor, prompts, row, prompt, *, seed):
-        return np.clip((prompts.picture(row, row.target) + 1) / 2, 0, 1)
+        return prompts.shown(row, row.target)
 
     monkeypatch.setattr("training.assess.depth.draw", knows)
     monkeypatch.setattr("training.assess.depth.SHAPES", 2)

@@ -1,5 +1,7 @@
 """Oracles: pictures cut one by one in numpy, loops over single pairs, exact geometry, counts."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 import torch
@@ -32,11 +34,20 @@ def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
+@dataclass(frozen=True)
+class Asked(Row):
+    """A row with what an instruction asks of it."""
+
+    kind: str = ""
+    unclear: bool = False
+
+
 def one_by_one(rows):
     return [
-        Row(
-            int(rows.world[k]), int(rows.view[k]), int(rows.source[k]), int(rows.target[k]), KIND_NAMES[rows.kind[k]],
-            bool(rows.unclear[k]), (int(rows.y[k]), int(rows.x[k]), int(rows.zoom[k])), bool(rows.flip[k]),
+        Asked(
+            int(rows.world[k]), int(rows.view[k]), int(rows.source[k]), int(rows.target[k]),
+            (int(rows.y[k]), int(rows.x[k]), int(rows.zoom[k])), bool(rows.flip[k]), KIND_NAMES[rows.kind[k]],
+            bool(rows.unclear[k]),
         )
         for k in range(len(rows))
     ]  # fmt: skip

@@ -29,6 +29,7 @@ from training.editors.answers import codes
 from training.editors.export import export_editor, facts_of
 from training.editors.pool import PairPool
 from training.editors.recipe import Stage, make_tokenizer, train_stage
+from training.encoders.byte_pairs import tokens_of
 from training.worlds import editing_pairs
 from training.worlds.data import SPLITS
 from training.worlds.editing_pairs import (
@@ -260,7 +261,7 @@ def test_the_control_differs_from_the_injection_in_what_goes_over_alone(pool, to
     net = editor_net.EditorNet(tokenizer.get_vocab_size(), 64)
     torch.nn.init.normal_(net.unet.conv_out.weight, std=0.05)
     alphas = editor_net.scheduler().alphas_cumprod
-    empty = editor_net.tokens_of(tokenizer, [""])[0]
+    empty = tokens_of(tokenizer, [""])[0]
     inputs = [
         editor_injection.inputs(
             pool, alphas, empty, 64, 3, torch.Generator().manual_seed(2), inject=inject
@@ -402,10 +403,10 @@ def test_more_steps_are_drawn_where_the_answer_is_decided():
 
 def test_a_row_shows_the_same_pixels_of_every_picture(data):
     pairs = Pictures(load_pairs(data, "edit-train", count=2), 64)
-    row = Row(1, 0, 0, 3, "color", False, (20, 30, 1), True)
+    row = Row(1, 0, 0, 3, (20, 30, 1), True)
     full = pairs.worlds.images[1, 0, 3].astype(np.float32)
     expected = full[20:84, 30:94][:, ::-1] / 127.5 - 1
     assert np.allclose(pairs.picture(row, 3), expected, atol=1e-6)
-    whole = Row(1, 0, 0, 3, "color", False, (0, 0, 2), False)
+    whole = Row(1, 0, 0, 3, (0, 0, 2))
     blocks = full.reshape(64, 2, 64, 2, 3).mean(axis=(1, 3)) / 127.5 - 1
     assert np.allclose(pairs.picture(whole, 3), blocks, atol=1e-6)

@@ -13,13 +13,20 @@ from training.encoders.clip_parts import (
     focal,
     place_targets,
     places,
-    shares_of,
     surface_choices,
     surface_number,
 )
 from training.worlds import part_pictures
 from training.worlds.data import Pictures
-from training.worlds.part_pictures import GROUND, LOOKS, OTHER, PARTS, SKY, PartPictures
+from training.worlds.part_pictures import (
+    GROUND,
+    LOOKS,
+    OTHER,
+    PARTS,
+    SKY,
+    PartPictures,
+    shares_of,
+)
 
 
 def noun(text):
