@@ -28,10 +28,6 @@ class BaselineError(InputError):
 def write_baseline(path: Path, snapshot: Snapshot) -> None:
     """Write a baseline atomically.
 
-    Args:
-        path: of the file.
-        snapshot: of a complete run.
-
     Raises:
         BaselineError: cells of the run are missing.
 

@@ -42,12 +42,7 @@ class Change:
 
 
 def pictures_of_run(results: Results, root: Path) -> Pictures:
-    """The pictures of a run's cells.
-
-    Args:
-        results: of the run.
-        root: its folder.
-    """
+    """The pictures of a run's cells."""
     table: dict[tuple[str, int, str], dict[str, Path]] = {}
     for cell in results.cells:
         if (record := cell.record) is None:
@@ -64,12 +59,7 @@ def folder_of(baseline: Path) -> Path:
 
 
 def pictures_of_baseline(baseline: Path, snapshot: Snapshot) -> Pictures:
-    """The pictures beside a baseline's file; none where it was written without them.
-
-    Args:
-        baseline: the file.
-        snapshot: its content.
-    """
+    """The pictures beside a baseline's file; none where it was written without them."""
     table = {}
     for cell in snapshot.cells:
         for view in _views(cell):
@@ -120,11 +110,6 @@ def largest_changes(
     baseline: Snapshot, run: Snapshot, before: Pictures, after: Pictures, most: int = 6
 ) -> list[Change]:
     """The pictured views whose figures changed by the most margins.
-
-    Args:
-        baseline, run: the two sides.
-        before, after: their pictures.
-        most: how many to return.
 
     Example:
         >>> from attnwarp_eval.compare import Snapshot

@@ -158,11 +158,7 @@ def _measured(cell: Outcome, record: Record[Any]) -> Measured:
 
 
 def definition(spec: Mapping[str, Any]) -> str:
-    """Hash of all that decides a cell's figures but its seed.
-
-    Args:
-        spec: of the cell.
-    """
+    """Hash of all that decides a cell's figures but its seed."""
     return digest(without_seed(dict(spec)))[:16]
 
 

@@ -97,9 +97,6 @@ def spread(value: Interval, scenes: int | None = None) -> str:
 def ratio_text(value: Ratio) -> str:
     """A ratio of seconds with its 95 % interval, where it has one.
 
-    Args:
-        value: the ratio.
-
     Example:
         >>> from attnwarp_eval.statistics.intervals import time_ratio
         >>> [ratio_text(time_ratio([[2.0] * n], [[1.0] * n])) for n in (6, 1)]

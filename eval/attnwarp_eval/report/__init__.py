@@ -86,11 +86,7 @@ def write_report_of_parts(folder: Path, *, timings: bool = True) -> list[Path]:
 
 
 def wrong_results(store: Store) -> list[str]:
-    """Faults of a run's ``results.jsonl``, at most one line. It may not be there yet.
-
-    Args:
-        store: the run.
-    """
+    """Faults of a run's ``results.jsonl``, at most one line. It may not be there yet."""
     path = store.root / "results.jsonl"
     there = {file.is_file() for file in (path, _sum_of(path))}
     if there == {False}:

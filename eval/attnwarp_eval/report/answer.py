@@ -35,13 +35,7 @@ _UNITS = {
 
 
 def answer(results: Results, timings: bool = True, pictures: bool = True) -> Section | None:
-    """The answer to a study's own question; None where it states none.
-
-    Args:
-        results: of the run.
-        timings: whether seconds are shown.
-        pictures: whether pictures are shown.
-    """
+    """The answer to a study's own question; None where it states none."""
     asked = results.study.answer
     if asked is None:
         return None
@@ -143,22 +137,14 @@ def by_claims(
 
 
 def against(judged: JudgedClaim) -> str:
-    """Mean of each side of a claim in words, the one that it speaks of first.
-
-    Args:
-        judged: the claim.
-    """
+    """Mean of each side of a claim in words, the one that it speaks of first."""
     metric = probe(judged.claim.probe).metric(judged.metric)
     means = [in_words(side.mean, metric, judged.metric) for side in judged.sides.values()]
     return " against ".join(reversed(means))
 
 
 def question(results: Results) -> list[str]:
-    """The study's title in bold, where it is a question.
-
-    Args:
-        results: of the run.
-    """
+    """The study's title in bold, where it is a question."""
     title = results.study.title.rstrip("?. ")
     return [f"**{title}?**"] if ASKS.search(title) else []
 
@@ -180,11 +166,7 @@ def _time_of_pair(results: Results) -> Iterator[str]:
 
 
 def measured_in_words(results: Results) -> str:
-    """Words on what a run measured, for a report that answers no question.
-
-    Args:
-        results: of the run.
-    """
+    """Words on what a run measured, for a report that answers no question."""
     study = results.study
     things = dict.fromkeys(
         "seconds taken in turn" if probe(name).times_in_turn else report_of(name).measures or name

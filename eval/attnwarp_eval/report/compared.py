@@ -68,11 +68,6 @@ def on_scale(
 def floor_of(results: Results, metric: str, specification: Metric) -> float:
     """The error below which a figure means nothing: that of the calibration, where it is a distance
     that the calibration has too, and at least the metric's tolerance.
-
-    Args:
-        results: of the run.
-        metric: the figure's name.
-        specification: of it.
     """
     if specification.unit not in ("px", "layer px"):
         return specification.atol
@@ -117,11 +112,6 @@ def difference_text(value: Contrast, unit: str, level: float = 0.95) -> str:
     with the lowest and the highest scene.
 
     Factors up to 2 are shown in percent, larger ones and those of odds as factors.
-
-    Args:
-        value: the difference.
-        unit: of the metric.
-        level: of the interval.
 
     Example:
         >>> tables = [{f"s{k}": {"v": v + 0.01 * v * k} for k in range(6)} for v in (1.0, 0.6)]

@@ -27,11 +27,6 @@ def controls_of(results: Results, name: str, baseline: str) -> dict[str, str]:
     """Measured controls of a variant: what each does, by its label.
 
     A control differs from its variant in ``control`` alone.
-
-    Args:
-        results: of the run.
-        name: of the probe.
-        baseline: the variant.
     """
     study, own = results.study, probe(name)
     meaning = own.meaning(study, study.variants[baseline])
@@ -48,7 +43,7 @@ def seen(results: Results, name: str, metric: str, baseline: str, label: str) ->
     """Return True if a figure tells a control from its variant: worse, or other for a seed.
 
     Args:
-        results, name, baseline: see :func:`controls_of`.
+        results, name, baseline: as for :func:`controls_of`.
         metric: a figure for which one direction is better.
         label: of the control.
     """
@@ -76,11 +71,7 @@ def blind(results: Results, name: str, metric: str, baseline: str) -> bool:
 
 
 def controls(results: Results) -> list[Section]:
-    """The section on controls, one table for each baseline that has some.
-
-    Args:
-        results: of the run.
-    """
+    """The section on controls, one table for each baseline that has some."""
     pairs = {(one.probe, one.baseline): None for one in results.study.ablations}
     tables = [
         table

@@ -31,12 +31,7 @@ DRAWS = 1000
 
 
 def fronts(results: Results, layout: Layout) -> list[Section]:
-    """The section of fronts, with its figures; none where the study names no front.
-
-    Args:
-        results: of the run.
-        layout: of the report.
-    """
+    """The section of fronts, with its figures; none where the study names no front."""
     reports = {front.probe: report_of(front.probe) for front in results.study.fronts}
     in_turn = {own.stage: timed_in_turn(results, own.stage) for own in reports.values()}
     text = _text(reports.values(), in_turn)

@@ -139,12 +139,7 @@ def judge(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
 
 
 def found(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
-    """Every claim that the run has measurements for, before a verdict.
-
-    Args:
-        results: of the run.
-        claims: to look for.
-    """
+    """Every claim that the run has measurements for, before a verdict."""
     judged = []
     for claim in (one for entry in claims for one in entry.of_each_editor()):
         measured = claim.measure(results)

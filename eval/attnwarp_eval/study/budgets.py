@@ -57,9 +57,6 @@ class Spent:
 def timed(spec: Mapping[str, Any]) -> bool:
     """Return True if a cell's result depends on how fast the machine is.
 
-    Args:
-        spec: of the cell.
-
     >>> timed({}), timed({"budget": {"network_rows": 9}}), timed({"budget": {"seconds": 2.0}})
     (False, False, True)
     """

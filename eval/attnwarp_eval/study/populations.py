@@ -65,12 +65,7 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_edits_of(data: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """A study's data with the edits of some scenes alone.
-
-    Args:
-        data: of a study.
-        names: of the scenes.
-    """
+    """A study's data with the edits of some scenes alone."""
     editing = data.get("editing")
     if not (editing and editing.get("edits")):
         return dict(data)

@@ -65,11 +65,7 @@ class Shared:
         return over_scenes({scene: table[scene] for scene in chosen})
 
     def text(self, title: str) -> list[str]:
-        """A paragraph that says what the means are over; none where that is every view.
-
-        Args:
-            title: of the table.
-        """
+        """A paragraph that says what the means are over; none where that is every view."""
         if self.views == self.of and not self.apart:
             return []
         text = f"{title}: over the {self.views} of {self.of} views in which all have a value."
