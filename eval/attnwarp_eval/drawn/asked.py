@@ -163,7 +163,7 @@ def _part(draft: Draft) -> Entry:
 
 
 def _size(item: Entry) -> float:
-    boxes = [part.reach() for part in BodySpec.model_validate(item["shape"]).solid()]
+    boxes = [solids.reach(part) for part in BodySpec.model_validate(item["shape"]).solid()]
     low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
     return float(np.prod(high - low))
 
@@ -277,7 +277,7 @@ def _near_surface(thing: Thing, rng: np.random.Generator) -> Iterator[Array]:
             continue
         spec = BodySpec.model_validate(item["shape"])
         parts = spec.solid()
-        boxes = [part.reach() for part in parts if not part.carve]
+        boxes = [solids.reach(part) for part in parts if not part.carve]
         low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
         points = low + (high - low) * rng.random((4000, 3))
         near = np.abs(solids.body_distance(parts, spec.blend, points)) < 0.05

@@ -40,6 +40,7 @@ from attnwarp_eval.drawn.worlds import (
     shade,
 )
 from attnwarp_eval.scene.bodies import BodySpec
+from attnwarp_eval.scene.solids import reach
 from attnwarp_eval.scene.spec import SceneSpec
 from attnwarp_eval.scene.transport import likely_bounces
 
@@ -439,7 +440,7 @@ def _hue(rng: np.random.Generator, color: str) -> str:
 def _reach(shapes: Sequence[dict[str, Any]]) -> tuple[float, float]:
     """Radius of the circle about the upright that holds bodies, and their height."""
     boxes = [
-        part.reach()
+        reach(part)
         for shape in shapes
         for part in BodySpec.model_validate(shape).solid()
         if not part.carve

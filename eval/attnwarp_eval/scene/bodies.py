@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
@@ -198,52 +199,31 @@ class BodySpec(Spec):
         )
 
 
+_TURNED = {
+    "ellipsoid": solids.Ellipsoid,
+    "torus": solids.Torus,
+    "block": solids.Block,
+    "disc": solids.Disc,
+}
+
+
 def _parts(spec: PartSpec) -> Iterator[solids.Part]:
-    color, blend, carve = linear_rgb(spec.color), spec.blend, spec.carve
+    said = spec.model_dump(exclude={"type", "mirror", "ring"}) | {"color": linear_rgb(spec.color)}
     for side in (1.0, -1.0) if spec.mirror else (1.0,):
 
         def flip(v: Vector, side: float = side) -> Vector:
             return (v[0], v[1] * side, v[2])
 
-        if isinstance(spec, CapsulePart | TubePart):
-            points, radii = (
-                ((spec.start, spec.end), spec.radii)
-                if isinstance(spec, CapsulePart)
-                else (spec.points, spec.radii)
-            )
-            for k in range(len(points) - 1):
-                yield solids.Capsule(
-                    flip(points[k]), flip(points[k + 1]), (radii[k], radii[k + 1]),
-                    color=color, blend=blend, carve=carve,
-                )  # fmt: skip
-            continue
-        center, pitch, yaw, roll = flip(spec.center), spec.pitch, spec.yaw * side, spec.roll * side
         match spec:
-            case EllipsoidPart():
-                yield solids.Ellipsoid(
-                    center, spec.radii, pitch, yaw, roll, color=color, blend=blend, carve=carve
-                )
-            case TorusPart():
-                yield solids.Torus(
-                    center, spec.radii, pitch, yaw, roll, color=color, blend=blend, carve=carve
-                )
-            case BlockPart():
-                yield solids.Block(
-                    center,
-                    spec.size,
-                    spec.round,
-                    pitch,
-                    yaw,
-                    roll,
-                    color=color,
-                    blend=blend,
-                    carve=carve,
-                )
-            case DiscPart():
-                yield solids.Disc(
-                    center, spec.radius, spec.height, spec.round, pitch, yaw, roll,
-                    color=color, blend=blend, carve=carve,
-                )  # fmt: skip
+            case CapsulePart(start=start, end=end):
+                yield solids.Capsule(**said | {"start": flip(start), "end": flip(end)})
+            case TubePart(points=points, radii=radii):
+                shared = {key: said[key] for key in ("color", "blend", "carve")}
+                for ends, pair in zip(pairwise(points), pairwise(radii), strict=True):
+                    yield solids.Capsule(flip(ends[0]), flip(ends[1]), pair, **shared)
+            case _:
+                turn = {"yaw": spec.yaw * side, "roll": spec.roll * side}
+                yield _TURNED[spec.type](**said | turn | {"center": flip(spec.center)})
 
 
 def _ring(part: solids.Part, ring: RingSpec | None) -> Iterator[solids.Part]:

@@ -20,6 +20,7 @@ from attnwarp_eval.scene.shapes import Mesh, MeshNotice
 from attnwarp_eval.scene.textures import fractal_noise
 
 Array = npt.NDArray[np.float64]
+Point = tuple[float, float, float]
 
 MESHING_PROTOCOL = 2
 """Raised whenever the same description of a body would give other vertices; part of every cache
@@ -48,153 +49,94 @@ class _Part:
     blend: bool | float = field(default=True, kw_only=True)
     carve: bool = field(default=False, kw_only=True)
 
-    def row(self) -> list[float]:
-        """Row that the kernels read: kind, mode (0 sharp, 1 blended, 2 carved), width (negative for
-        the body's), shape.
-        """
-        mode = 2.0 if self.carve else float(bool(self.blend))
-        width = -1.0 if isinstance(self.blend, bool) else float(self.blend)
-        shape = [*self._shape(), *([0.0] * 13)]
-        return [self._kind(), mode, width, *shape[:13]]
-
-    def reach(self) -> Array:
-        """(2, 3) box that holds the part."""
-        raise TypeError(f"{type(self).__name__} says no reach")
-
-    def _kind(self) -> float:
-        raise TypeError(f"{type(self).__name__} says no kind")
-
-    def _shape(self) -> list[float]:
-        raise TypeError(f"{type(self).__name__} says no shape")
-
-
-def _turn(yaw: float, pitch: float, roll: float) -> list[float]:
-    a = np.radians([pitch, yaw, roll])
-    return [float(f(x)) for x in a for f in (np.cos, np.sin)]
-
-
-@dataclass(frozen=True)
-class Ellipsoid(_Part):
-    """An ellipsoid with its ``radii`` along its own x, y, z: rolled about x, pitched about y, then
-    turned about z.
-    """
-
-    center: tuple[float, float, float]
-    radii: tuple[float, float, float]
-    pitch: float = 0.0
-    yaw: float = 0.0
-    roll: float = 0.0
-
-    def _kind(self) -> float:
-        return 0.0
-
-    def _shape(self) -> list[float]:
-        return [*self.center, *self.radii, *_turn(self.yaw, self.pitch, self.roll)]
-
-    def reach(self) -> Array:
-        """(2, 3) box that holds the part."""
-        c, r = np.asarray(self.center), max(self.radii)
-        return np.stack([c - r, c + r])
-
 
 @dataclass(frozen=True)
 class Capsule(_Part):
     """A rod from ``start`` to ``end`` whose radius goes from ``radii[0]`` to ``radii[1]``."""
 
-    start: tuple[float, float, float]
-    end: tuple[float, float, float]
+    start: Point
+    end: Point
     radii: tuple[float, float]
-
-    def _kind(self) -> float:
-        return 1.0
-
-    def _shape(self) -> list[float]:
-        return [*self.start, *self.end, *self.radii]
-
-    def reach(self) -> Array:
-        """(2, 3) box that holds the part."""
-        ends, r = np.array([self.start, self.end]), max(self.radii)
-        return np.stack([ends.min(0) - r, ends.max(0) + r])
 
 
 @dataclass(frozen=True)
-class Torus(_Part):
-    """A ring of radius ``radii[0]``, ``radii[1]`` thick, about its own z; turned as an
-    :class:`Ellipsoid` is.
-    """
+class _Turned(_Part):
+    """A part with axes of its own: rolled about x, pitched about y, then turned about z."""
 
-    center: tuple[float, float, float]
-    radii: tuple[float, float]
-    pitch: float = 0.0
-    yaw: float = 0.0
-    roll: float = 0.0
-
-    def _kind(self) -> float:
-        return 2.0
-
-    def _shape(self) -> list[float]:
-        return [*self.center, *self.radii, 0.0, *_turn(self.yaw, self.pitch, self.roll)]
-
-    def reach(self) -> Array:
-        """(2, 3) box that holds the part."""
-        c, r = np.asarray(self.center), sum(self.radii)
-        return np.stack([c - r, c + r])
+    center: Point
+    pitch: float = field(default=0.0, kw_only=True)
+    yaw: float = field(default=0.0, kw_only=True)
+    roll: float = field(default=0.0, kw_only=True)
 
 
 @dataclass(frozen=True)
-class Block(_Part):
-    """A box of ``size`` along its own x, y, z with edges rounded by ``round``; turned as an
-    :class:`Ellipsoid` is.
-    """
+class Ellipsoid(_Turned):
+    """An ellipsoid with its ``radii`` along its own x, y, z."""
 
-    center: tuple[float, float, float]
+    radii: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Torus(_Turned):
+    """A ring of radius ``radii[0]``, ``radii[1]`` thick, about its own z."""
+
+    radii: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Block(_Turned):
+    """A box of ``size`` along its own x, y, z with edges rounded by ``round``."""
+
     size: tuple[float, float, float]
     round: float = 0.0
-    pitch: float = 0.0
-    yaw: float = 0.0
-    roll: float = 0.0
-
-    def _kind(self) -> float:
-        return 3.0
-
-    def _shape(self) -> list[float]:
-        half = (x / 2 - self.round for x in self.size)
-        return [*self.center, *half, *_turn(self.yaw, self.pitch, self.roll), self.round]
-
-    def reach(self) -> Array:
-        """(2, 3) box that holds the part."""
-        c, r = np.asarray(self.center), float(np.linalg.norm(self.size)) / 2
-        return np.stack([c - r, c + r])
 
 
 @dataclass(frozen=True)
-class Disc(_Part):
-    """An upright cylinder of ``radius`` and ``height``, edges rounded by ``round``; turned as an
-    Ellipsoid is.
-    """
+class Disc(_Turned):
+    """A cylinder of ``radius`` and ``height`` along its own z, edges rounded by ``round``."""
 
-    center: tuple[float, float, float]
     radius: float
     height: float
     round: float = 0.0
-    pitch: float = 0.0
-    yaw: float = 0.0
-    roll: float = 0.0
-
-    def _kind(self) -> float:
-        return 4.0
-
-    def _shape(self) -> list[float]:
-        shape = [self.radius - self.round, self.height / 2 - self.round, 0.0]
-        return [*self.center, *shape, *_turn(self.yaw, self.pitch, self.roll), self.round]
-
-    def reach(self) -> Array:
-        """(2, 3) box that holds the part."""
-        c, r = np.asarray(self.center), math.hypot(self.radius, self.height / 2)
-        return np.stack([c - r, c + r])
 
 
 Part = Ellipsoid | Capsule | Torus | Block | Disc
+
+
+def _measured(part: Part) -> tuple[float, list[Point], float, list[float]]:
+    """Kind of a part, the points that it lies around, how far it reaches from them, its shape."""
+    match part:
+        case Capsule(start=start, end=end, radii=ends):
+            return 1.0, [start, end], max(ends), [*start, *end, *ends]
+        case Ellipsoid(radii=radii):
+            kind, far, sizes, edge = 0.0, max(radii), radii, 0.0
+        case Torus(radii=(ring, rod)):
+            kind, far, sizes, edge = 2.0, ring + rod, (ring, rod, 0.0), 0.0
+        case Block(size=(x, y, z), round=edge):
+            kind, far = 3.0, float(np.linalg.norm(part.size)) / 2
+            sizes = (x / 2 - edge, y / 2 - edge, z / 2 - edge)
+        case Disc(radius=radius, height=height, round=edge):
+            kind, far = 4.0, math.hypot(radius, height / 2)
+            sizes = (radius - edge, height / 2 - edge, 0.0)
+    angles = np.radians([part.pitch, part.yaw, part.roll])
+    turn = [float(f(a)) for a in angles for f in (np.cos, np.sin)]
+    return kind, [part.center], far, [*part.center, *sizes, *turn, edge]
+
+
+def reach(part: Part) -> Array:
+    """(2, 3) box that holds a part."""
+    _, points, far, _ = _measured(part)
+    return np.stack([np.min(points, 0) - far, np.max(points, 0) + far])
+
+
+def _row(part: Part) -> list[float]:
+    """Row that the kernels read: kind, mode (0 sharp, 1 blended, 2 carved), width (negative for the
+    body's), shape.
+    """
+    kind, _, _, shape = _measured(part)
+    mode = 2.0 if part.carve else float(bool(part.blend))
+    width = -1.0 if isinstance(part.blend, bool) else float(part.blend)
+    return [kind, mode, width, *shape, *[0.0] * (13 - len(shape))]
 
 
 @dataclass(frozen=True)
@@ -277,7 +219,7 @@ def _part_distances(points: Array, parts: Array) -> Array:
 def _table(parts: Sequence[Part]) -> Array:
     if not parts:
         raise ValueError("parts: got an empty list, expected at least one part")
-    return np.array([part.row() for part in parts], dtype=np.float64)
+    return np.array([_row(part) for part in parts], dtype=np.float64)
 
 
 def body_distance(
@@ -344,8 +286,7 @@ def mesh_body(
             than they are that the lattice would not fit into memory.
     """
     # repr of frozen dataclasses of floats is exact and readable, which makes it a good key. Colours
-    # are no part of
-    # it: a body painted otherwise is the same mesh.
+    # are no part of it: a body painted otherwise is the same mesh.
     bare = [replace(part, color=(1.0, 1.0, 1.0)) for part in parts]
     key = content_key(
         "body", MESHING_PROTOCOL, [repr(part) for part in bare], blend, resolution, repr(relief)
@@ -360,8 +301,8 @@ def mesh_body(
 
 
 def _lattice_of(parts: Sequence[Part], resolution: int) -> tuple[Array, Array, float]:
-    reach = np.stack([part.reach() for part in parts if not part.carve])
-    low, high = reach[:, 0].min(0), reach[:, 1].max(0)
+    boxes = np.stack([reach(part) for part in parts if not part.carve])
+    low, high = boxes[:, 0].min(0), boxes[:, 1].max(0)
     return low, high, float((high - low).max() / resolution)
 
 

@@ -30,9 +30,9 @@ def test_a_meshed_ball_is_a_sphere():
 
 def test_a_blended_body_is_closed_and_carries_its_parts_colours():
     parts = [
-        Ellipsoid((0, 0, 0.5), (0.4, 0.3, 0.5), 20.0, color=(1.0, 0.5, 0.2)),
+        Ellipsoid((0, 0, 0.5), (0.4, 0.3, 0.5), pitch=20.0, color=(1.0, 0.5, 0.2)),
         Capsule((0.2, 0, 0.5), (0.9, 0, 0.8), (0.2, 0.1), color=(0.1, 0.2, 0.9)),
-        Ellipsoid((0.0, 0, 1.02), (0.08, 0.08, 0.08), 0.0, color=(0.0, 0.0, 0.0), blend=False),
+        Ellipsoid((0.0, 0, 1.02), (0.08, 0.08, 0.08), color=(0.0, 0.0, 0.0), blend=False),
     ]
     mesh = mesh_body(parts, 0.1, 48)
     _, count = edges_of(mesh)
