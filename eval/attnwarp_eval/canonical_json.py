@@ -51,8 +51,6 @@ def write_json(path: Path, value: Any, *, sort_keys: bool = True, durable: bool 
     """Write ``value`` as JSON that a person can read, atomically.
 
     Args:
-        path: of the file.
-        value: what JSON has.
         sort_keys: whether the keys of objects are sorted.
         durable: see :func:`attnwarp_eval.files.write_atomic`.
 

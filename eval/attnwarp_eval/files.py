@@ -18,8 +18,6 @@ def write_atomic(path: Path, data: bytes, *, durable: bool = True) -> None:
     Folders that are missing are made.
 
     Args:
-        path: of the file.
-        data: its content.
         durable: False does without the flush, which takes milliseconds; after a power cut the file
             may then be missing or damaged.
 

@@ -43,7 +43,6 @@ def placed_crops(
     Args:
         images: (N, S, S, 3).
         out: side of a crop in px.
-        rng: to draw from.
         scale: shares of S, of which the crop's side is drawn.
         tone: strength of the change in brightness and contrast; hues stay.
 

@@ -84,10 +84,8 @@ def train_steps(
     Args:
         net: on the device.
         plan: how many steps, at which rate, from which seed.
-        tasks: what steps are of.
         checkpoint: written as it goes.
         recipe: what the result depends on, see :class:`training.common.Run`.
-        device: of torch.
         spent: seconds that went before the first step.
     """
     recipe = {**recipe, "device": device.type}  # optimizers of a CPU and of a GPU hold other states
@@ -146,8 +144,6 @@ class Stepper:
     Args:
         net: on the device.
         peak: learning rate.
-        tasks: what steps are of.
-        device: of torch.
     """
 
     def __init__(

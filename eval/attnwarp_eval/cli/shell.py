@@ -30,10 +30,6 @@ class Regression(SystemExit):
 def check_not_of_run(out: Path, run: Path) -> None:
     """Refuse to write a command's result over a file of a run.
 
-    Args:
-        out: file of the result.
-        run: folder that the command reads.
-
     Raises:
         InputError: the file says what the run is, or is its report; or it would lie among its cells
             or pictures.

@@ -75,7 +75,6 @@ def write_pictures(baseline: Path, pictures: Pictures) -> None:
     Those are removed when all of the new ones are there.
 
     Args:
-        baseline: the file.
         pictures: of the run that it was written from.
     """
     folder = folder_of(baseline)

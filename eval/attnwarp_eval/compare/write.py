@@ -59,10 +59,6 @@ def summary(comparison: Comparison) -> str:
 def document(comparison: Comparison, notes: Sequence[str] = ()) -> Report:
     """The comparison as a document: faults first, then every verdict but "equal".
 
-    Args:
-        comparison: the verdicts.
-        notes: sentences that come before them.
-
     Example:
         >>> document(Comparison("quick", True, 3, (), ())).title
         'Comparison of study quick'

@@ -96,11 +96,6 @@ HOVER = "hover: "
 def hover(axes: Axes, x: float, y: float, text: str) -> None:
     """Give a point of a figure a text that a browser shows where the pointer rests on it.
 
-    Args:
-        axes: of the figure.
-        x, y: of the point, in the axes' units.
-        text: on one line or several.
-
     Example:
         >>> from pathlib import Path
         >>> with drawing(Path("figure.svg")) as (axes,):

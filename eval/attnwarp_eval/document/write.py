@@ -282,7 +282,6 @@ def write_files(report: Report, folder: Path, name: str) -> list[Path]:
 
     Args:
         report: its pictures and figures lie below ``folder``.
-        folder: of the files.
         name: of the files, without a suffix.
 
     Example:

@@ -392,8 +392,6 @@ def draw_look(thing: int, rng: np.random.Generator, *, pairs: str = "seen") -> L
     """A random look for an object.
 
     Args:
-        thing: index of the object.
-        rng: to draw from.
         pairs: "seen" (colours that training shows it in), "new" (those it never does; always a coloured finish of one
             colour) or "any".
     """

@@ -64,9 +64,7 @@ def measure_entry(scene: Scene, settings: Settings, report: Reporter = SILENT) -
     """A scene's effects, the cost of its plan, and the proof, as JSON.
 
     Args:
-        scene: the scene.
         settings: how the entry is made; pictures are apart, see :func:`side_by_side`.
-        report: receives what is at work.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene

@@ -168,9 +168,7 @@ def compare(
         study: with the probe ``editing``.
         views: pictures and cameras, the source first.
         splats: the scene before the edit.
-        words: the edit.
         out: folder of ``captured.json``, ``.md`` and ``.html``, and of a folder for each variant.
-        report: receives each variant.
         editors: what edits single views.
 
     Raises:

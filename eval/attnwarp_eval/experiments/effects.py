@@ -38,8 +38,6 @@ def collect(
     Args:
         names: scenes' names or paths.
         out: folder of ``effects.json``, the report, ``<scene>.jpg`` and ``cells/``.
-        settings: how an entry is made.
-        report: receives each step of each scene.
 
     Returns:
         The entries, as they stand in ``effects.json``.

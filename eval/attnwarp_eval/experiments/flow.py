@@ -100,8 +100,6 @@ def measure(
         scenes: names among :data:`SCENES`.
         yaws: degrees from the source.
         out: the run's folder, which also takes the pictures.
-        options: how each row is measured.
-        report: receives each row.
 
     Raises:
         InputError: another scene than :data:`SCENES`; another run is writing to ``out``, or rows of
@@ -187,7 +185,6 @@ def measure_pair(
         name: of the scene, or its path.
         edit: one with at least two answers, which changes objects and not the light.
         yaw: degrees from the source.
-        options: how it is measured.
         keep: given the kind of each pair and (H, W, 3) sRGB pictures to look at.
 
     Raises:

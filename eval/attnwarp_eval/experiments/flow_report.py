@@ -54,8 +54,6 @@ def write(rows: Sequence[Row], out: Path, *, size: int, spp: int) -> list[Path]:
 
     Args:
         rows: of :func:`attnwarp_eval.experiments.flow.measure`, of one flow method.
-        out: folder.
-        size, spp: of the pictures, which the report names.
     """
     from attnwarp_eval.cost import environment
     from attnwarp_eval.document.write import write_files

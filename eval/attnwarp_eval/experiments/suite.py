@@ -68,8 +68,6 @@ def measure(
         views: the source and the targets that come first in the file, fewer where a scene has
             fewer.
         geometry_size, size: of the square images of depth and ids, and of the pictures.
-        spp: samples a pixel of the pictures.
-        report: receives each step of each scene.
 
     Raises:
         InputError: a scene that cannot be used, or two scenes of one name.

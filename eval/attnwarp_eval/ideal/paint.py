@@ -53,8 +53,6 @@ def painted(scene: Scene, objects: Sequence[str], color: str) -> Scene:
     What shows no texture, as metal and glass, becomes matt.
 
     Args:
-        scene: before.
-        objects: names.
         color: as #rrggbb.
 
     Raises:

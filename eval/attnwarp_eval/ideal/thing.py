@@ -26,11 +26,8 @@ def labels_of(
     """(H, W) part of each pixel by the view's name, -1 outside the thing.
 
     Args:
-        scene: with the objects.
-        geometry: of the scene.
         cameras: of the views, whose surface points are pooled.
         objects: names of what the thing is made of.
-        parts: number of parts.
 
     Raises:
         ValueError: no such object, or no view shows one.
@@ -81,7 +78,6 @@ class Thing:
         Args:
             scene, geometry, cameras, objects, parts: see :func:`labels_of`. The source comes first.
             colors: answers of each part.
-            spp: samples a pixel of the true pictures.
 
         Example:
             >>> from attnwarp_eval.scene.file import load_scene
@@ -137,7 +133,6 @@ def in_front(pair: TwoView, source: Labels) -> Labels:
     none, and for a point that does not fall into it.
 
     Args:
-        pair: the exact relation of the two views.
         source: (H, W) part of each pixel of the source.
     """
     result = np.full(pair.label.shape, -1, dtype=np.int16)

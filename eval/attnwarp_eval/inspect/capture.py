@@ -172,7 +172,6 @@ def read_edit(path: Path, names: Sequence[str]) -> Edit:
     """The edit in a folder.
 
     Args:
-        path: of the folder.
         names: of the data set's views, without suffix.
 
     Raises:

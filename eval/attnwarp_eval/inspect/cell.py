@@ -107,9 +107,7 @@ def cell_of(pair: Pair, size: Size, column: int, row: int) -> tuple[int, int]:
     """The cell (column, row) of a feature grid that a target pixel's centre lies in.
 
     Args:
-        pair: of views.
         size: (h, w) of the feature grid.
-        column, row: of the pixel.
 
     Example:
         >>> from attnwarp.warp import PRESETS
@@ -125,9 +123,7 @@ def cell_report(pair: Pair, size: Size, column: int, row: int) -> CellReport:
     """Everything about one cell of the target's feature grid.
 
     Args:
-        pair: the views and the variant.
         size: (h, w) of the grid.
-        column, row: of the cell.
 
     Raises:
         ValueError: the cell lies outside the grid.

@@ -19,7 +19,6 @@ def inspect_command(
     """Command that shows a view of a run in 3D.
 
     Args:
-        run: folder of the run.
         scene, variant, view: as the run names them.
         seed: one of the run's; its first if None.
         color: what the surface is coloured by; the command's own choice if None.

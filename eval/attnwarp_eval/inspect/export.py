@@ -194,7 +194,6 @@ def glb(
     """A binary glTF file of the parts, upright, with ``center`` at its origin.
 
     Args:
-        parts: of the 3D view.
         center: (3,) subtracted in float64, so that far-away worlds keep their digits.
         up: (3,) unit vector, which becomes glTF's +y.
     """
@@ -276,7 +275,6 @@ def page(parts: Sequence[Part], subject: Subject, pair: Pair, title: str, legend
     """An HTML page with the parts and a viewer in it, which works without a network.
 
     Args:
-        parts: of the 3D view.
         subject, pair: whose cameras are in view.
         title: of the page, and of what it shows.
         legend: (text, "#rrggbb") of what the colours mean.

@@ -59,8 +59,6 @@ class Parts:
 
         Args:
             layer: the warp of the tokens' grid, (h, w).
-            target: name of the view.
-            truth: of the pair.
         """
         size = tuple(layer.mask.shape)
         source, own = (token_parts(self.labels[n], size) for n in (self.world.source.name, target))

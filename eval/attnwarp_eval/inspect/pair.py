@@ -104,11 +104,7 @@ class Pair:
 
     Args:
         views: a scene with truth, or a user's own.
-        target: name of the target view.
-        settings: the rules of the warp.
         model: the splats that give depth; None takes the truth's own depth.
-        spp: samples a pixel of the true pictures.
-        edit: of the scene.
         exact_mask: whether the mask is the truth's, as an oracle's.
         thing: the scene's thing, in as many parts as a run's probe ``labels`` has, by number.
     """

@@ -137,10 +137,6 @@ class PixelReport:
 def report(pair: Pair, column: int, row: int) -> PixelReport:
     """Everything about one target pixel.
 
-    Args:
-        pair: the views and the variant.
-        column, row: of the pixel.
-
     Raises:
         ValueError: the pixel lies outside the target's image.
 

@@ -111,10 +111,8 @@ def measured(
     """Variants of a run: those that edit the scene, or fit splats to it.
 
     Args:
-        folder: of the run.
         cells: the expected ones, as ``study.json`` lists them.
         scene, seed: of the cells to read.
-        source: name of the source view.
         content: hash of the scene as it is now.
 
     Raises:

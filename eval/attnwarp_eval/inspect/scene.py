@@ -40,7 +40,6 @@ def seen_surface(seen: Seen, colors: Image, seam: float = SEAM) -> pyvista.PolyD
     """The surface that a view sees: a vertex a pixel, faces between neighbours of one surface.
 
     Args:
-        seen: of the view, H x W.
         colors: (H, W, 3) sRGB in [0, 1].
         seam: pixels whose depths differ by more than this fraction are not joined.
 
@@ -68,7 +67,6 @@ def coarser_surface(seen: Seen, surface: pyvista.PolyData, faces: int) -> pyvist
     """:func:`seen_surface` with about ``faces`` faces: of every k-th pixel of every k-th row.
 
     Args:
-        seen: of the view.
         surface: the :func:`seen_surface` of it, for its colours.
         faces: about so many.
     """

@@ -195,7 +195,6 @@ def of_run(
     """A run's variants and views; edited views, of which the run has pictures, come first.
 
     Args:
-        folder: of the run.
         scene: one of the run's; the first, if left out.
         size: of the images; the run's own, if left out.
         seed: one of the run's; the first, if left out.

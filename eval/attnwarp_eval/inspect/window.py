@@ -58,7 +58,6 @@ class Window:
     """A warp in 3D.
 
     Args:
-        subject: what can be shown.
         state: what is shown at first.
         off_screen: draw without a display.
         size: of the window, in pixels.

@@ -41,7 +41,6 @@ def carried_labels(layer: Layer, source: Labels) -> Labels:
     """(h, w) label that each token of a target takes: the one of the largest weight among its taps.
 
     Args:
-        layer: the warp.
         source: (h', w') part of each token of the source, -1 outside the thing.
 
     Returns:

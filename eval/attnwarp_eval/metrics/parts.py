@@ -69,8 +69,6 @@ def part_answers(
 
     Args:
         picture: (H, W, 3) sRGB in [0, 1].
-        truth: of the view.
-        parts: P.
         among: (H, W) bool, pixels that count; all if left out.
 
     Example:
@@ -95,7 +93,6 @@ def answered(truth: PartTruth, answers: npt.NDArray[np.int64]) -> Image:
     whose part has none, or none of its own.
 
     Args:
-        truth: of the view.
         answers: (P,) from :func:`part_answers` of the source.
     """
     picture = np.where(truth.outside[..., None], truth.before, np.nan).astype(np.float32)
@@ -118,7 +115,6 @@ def part_figures(
 
     Args:
         picture: (H, W, 3) sRGB in [0, 1], edited.
-        truth: of the view.
         answers: (P,) of the source, from :func:`part_answers`.
         visible: (H, W) bool, the source certainly shows the pixel's surface.
         hidden: (H, W) bool, it falls inside the source image and is certainly not shown there.

@@ -22,7 +22,6 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
     """Write the report of a run's folder, from whatever cells are done.
 
     Args:
-        store: the run.
         timings: False leaves out everything measured in seconds or memory, so that two runs of the
             same study on the same code give the same bytes.
         pictures: False leaves out the views' pictures, for a report that lies beside the code or

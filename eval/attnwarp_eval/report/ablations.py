@@ -70,12 +70,7 @@ class Row:
 
 
 def ablations(results: Results, compared: Sequence[Sequence[Row]]) -> list[Section]:
-    """A section for each ablation that the study names.
-
-    Args:
-        results: of the run.
-        compared: of each, from :func:`compared_of`.
-    """
+    """A section for each ablation that the study names."""
     sections = list(map(partial(_section, results), results.study.ablations, compared))
     for section, ablation in zip(sections, results.study.ablations, strict=True):
         if any(map(is_mse, report_of(ablation.probe).columns_at(results.layer).values())):
@@ -130,12 +125,7 @@ def _section(results: Results, ablation: Ablation, compared: Sequence[Row]) -> S
 
 
 def compared_of(results: Results, judged: Sequence[JudgedClaim]) -> list[list[Row]]:
-    """The :func:`rows_of` each table of variants of the study.
-
-    Args:
-        results: of the run.
-        judged: the claims that it has measurements for.
-    """
+    """The :func:`rows_of` each table of variants of the study."""
     claimed = of_comparisons(judged)
     return [rows_of(results, ablation, claimed) for ablation in results.study.ablations]
 
@@ -149,8 +139,6 @@ def rows_of(
     test of this table.
 
     Args:
-        results: of the run.
-        ablation: of the study.
         claimed: from :func:`attnwarp_eval.report.judging.of_comparisons`.
     """
     own, baseline = report_of(ablation.probe), ablation.baseline

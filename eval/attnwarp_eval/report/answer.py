@@ -82,8 +82,6 @@ def by_claims(
     that gives no verdict.
 
     Args:
-        results: of the run.
-        judged: the claims that it has measurements for.
         timings: whether seconds are shown.
     """
     own = [one for one in judged if one.verdict is not None]

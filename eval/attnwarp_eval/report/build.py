@@ -28,8 +28,6 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
     """The report's content; figures are written below ``root``/figures.
 
     Args:
-        results: of the run.
-        root: the run's folder.
         timings: whether anything measured in seconds or bytes of memory is shown.
         pictures: whether the views' pictures are shown.
     """

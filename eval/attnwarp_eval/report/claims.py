@@ -205,9 +205,7 @@ def variant_like(
     """The name of the first measured variant that means what ``data`` means.
 
     Args:
-        results: of the run.
         data: a variant as a study's YAML has it.
-        name: of the probe whose records are needed.
         own: whether settings that ``data`` leaves out may be the variant's own.
     """
     asked, study = probe(name), results.study

@@ -28,7 +28,6 @@ def add_commands(
     """Give pictures of a variant in a target view their command; the others have none.
 
     Args:
-        results: of the run.
         sections: whose galleries also get one command a scene, for plain text.
         findings: with pictures.
     """

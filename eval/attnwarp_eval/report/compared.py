@@ -29,10 +29,6 @@ def between(
     """The second variant against the first.
 
     Args:
-        results: of the run.
-        name: of the probe.
-        first, second: variants.
-        metric: the figure's name.
         yaw: closed range of degrees that a view's yaw from the source must lie in; any if None.
     """
     a, b = (results.views(name, who, metric, yaw) for who in (first, second))
@@ -51,9 +47,6 @@ def on_scale(
     """One table of a figure against another, on the figure's scale.
 
     Args:
-        results: of the run.
-        name: of the probe.
-        metric: the figure's name.
         a, b: scene -> view (and seed) -> value.
         counts: things that each share is of; None where they are not known.
     """
@@ -143,8 +136,6 @@ def scene_texts(value: Contrast, unit: str, scenes: Sequence[str]) -> list[str]:
     """The difference of each scene; a dash where it is undefined.
 
     Args:
-        value: the difference.
-        unit: of the metric.
         scenes: names, in the order wanted.
 
     Example:

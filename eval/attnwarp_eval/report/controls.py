@@ -60,10 +60,7 @@ def blind(results: Results, name: str, metric: str, baseline: str) -> bool:
     where features come from, so "can't tell" about two warps says nothing.
 
     Args:
-        results: of the run.
-        name: of the probe.
         metric: a figure for which one direction is better.
-        baseline: of the comparison.
     """
     found = controls_of(results, name, baseline)
     wrong = [label for label, control in found.items() if control != OTHER_SEED]

@@ -52,9 +52,7 @@ def findings(
     effects of the tables.
 
     Args:
-        results: of the run.
         problems: of the instrument, one line each.
-        judged: the claims that it has measurements for.
         compared: of :func:`attnwarp_eval.report.ablations.compared_of`.
         pictures: whether each has its picture.
     """

@@ -291,12 +291,7 @@ SAMPLED = (
 
 
 def claims_section(results: Results, findings: Sequence[JudgedClaim]) -> Section:
-    """The section of the report.
-
-    Args:
-        results: of the run.
-        findings: the claims that it has measurements for.
-    """
+    """The section of the report."""
     declared = {claim.id: claim for claim in load_claims()}
     judges = any(finding.judges for finding in findings)
     rows, names = [], results.study.scene_names

@@ -63,11 +63,7 @@ def needed(value: Contrast, difference: float) -> int:
 
 
 def plan_table(results: Results) -> Table:
-    """For each claim, and each row of the study's tables of differences, how many scenes it needs.
-
-    Args:
-        results: of the pilot.
-    """
+    """For each claim, and each row of the study's tables of differences, the scenes it needs."""
     rows = []
     for title, name, metric, value in _contrasts(results):
         if len(value.by_scene) < 3:

@@ -39,7 +39,6 @@ def write_raw(store: Store, path: Path) -> Path:
     """Write the raw results of a run, without its pictures and without paths of this machine.
 
     Args:
-        store: the run.
         path: of the file; in a folder, the file is called :data:`NAME`.
 
     Returns:

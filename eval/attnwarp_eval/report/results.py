@@ -61,7 +61,6 @@ def lines(results: Results, timings: bool = True) -> Iterable[str]:
     be read.
 
     Args:
-        results: of the run.
         timings: whether seconds and memory are in the lines.
     """
     rows = []

@@ -27,8 +27,6 @@ def settling(
     """The section of the report; none where every claim has a verdict.
 
     Args:
-        results: of the run.
-        judged: the claims that it has measurements for.
         timings: whether it says what that would take.
     """
     findings = [

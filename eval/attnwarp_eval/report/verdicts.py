@@ -112,7 +112,6 @@ def table(judged: list[Judged], beside: Path) -> Table:
     """The table of all claims.
 
     Args:
-        judged: of :func:`verdicts`.
         beside: folder that links start from.
     """
     rows = []
@@ -139,11 +138,7 @@ def table(judged: list[Judged], beside: Path) -> Table:
 
 
 def headlines(judged: list[Judged]) -> list[str]:
-    """Lines of the claims that README.md names, in their order; none where none was judged.
-
-    Args:
-        judged: of :func:`verdicts`.
-    """
+    """Lines of the claims that README.md names, in their order; none where none was judged."""
     chosen = sorted(
         (each for each in judged if each.claim.headline), key=lambda each: each.claim.headline
     )
@@ -164,9 +159,7 @@ def filled(text: str, judged: list[Judged], beside: Path) -> str:
     no claim among them has raw results.
 
     Args:
-        text: of the document.
         judged: of :func:`verdicts`.
-        beside: folder of the document.
 
     Example:
         >>> filled("<!-- headlines -->\\nas before\\n<!-- /headlines -->\\n", [], Path())

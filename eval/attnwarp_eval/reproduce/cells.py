@@ -437,11 +437,8 @@ def execute(
     """Compute what is still to do, fits first, and return what failed.
 
     Args:
-        planned: the cells.
-        store: the run's folder.
         jobs: worker processes; 1 stays in this process.
         scheduler: a dask scheduler whose workers see the run's folder and the manifest's.
-        report: receives each cell.
     """
     from attnwarp_eval.study.reporting import CellReporter
     from attnwarp_eval.study.run import compute_cells

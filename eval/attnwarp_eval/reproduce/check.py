@@ -72,8 +72,6 @@ def check(loaded: Loaded, run: Path, device: str = "cpu") -> Checked:
     """Check captures, splats, masks, weights, and whether methods and editors fit.
 
     Args:
-        loaded: the manifest.
-        run: the run's folder.
         device: of the networks while they are probed.
     """
     done = Checked()

@@ -19,7 +19,6 @@ def explain(problem: Any, model: type[BaseModel], file: str) -> str:
 
     Args:
         problem: an item of ``ValidationError.errors()``.
-        model: what was validated.
         file: that says what each key means.
 
     Example:

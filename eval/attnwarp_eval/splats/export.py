@@ -67,8 +67,6 @@ def orbit(scene: Scene, count: int, size: int | None = None) -> list[Camera]:
     Yaws are evenly spaced. Each camera lies two rings above the one before, modulo the rings.
 
     Args:
-        scene: whose orbit it is.
-        count: number of cameras.
         size: height and width of their images in px; the scene's if left out.
 
     Raises:
@@ -155,7 +153,6 @@ def first_points(
     in its colours.
 
     Args:
-        scene: whose surfaces they lie on.
         count: number of points, at least 10.
         noise: standard deviation of the displacement along each axis, in local spacings of the
             points.
@@ -197,11 +194,6 @@ def first_points(
 def picture(scene: Scene, camera: Camera, spp: int) -> npt.NDArray[np.uint8]:
     """(H, W, 3) uint8 sRGB truth of a view, rounded as in an 8-bit file.
 
-    Args:
-        scene: what is rendered.
-        camera: whose view; (H, W) is its size.
-        spp: samples a pixel.
-
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
         >>> scene = load_scene("spheres").with_size(8, 8)
@@ -235,9 +227,7 @@ def export(
         scene: any of scenes/.
         folder: made if need be.
         views, size: number of views, and the edge of their images in px.
-        spp: samples a pixel.
         points, noise, seed: see :func:`first_points`.
-        report: receives what is done next.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene

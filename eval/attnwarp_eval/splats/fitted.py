@@ -43,7 +43,6 @@ def fit_scene(
 
     Args:
         scene: with the image size that the fit is to have.
-        settings: what is fitted and how.
         folder: of the fit's files; a fit that was stopped there is resumed.
         views, spp, points, noise, seed: see :func:`attnwarp_eval.splats.export.export`.
         geometry: ``Geometry(scene)``, if there is one already.
@@ -92,11 +91,6 @@ def fit_scene(
 
 def rendered_error(splats: Gaussians, camera: Camera, truth: Hits) -> dict[str, float]:
     """Errors of the median depth and of the normals that splats have in a view.
-
-    Args:
-        splats: what is rendered.
-        camera: the view, (H, W).
-        truth: of the same view.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene

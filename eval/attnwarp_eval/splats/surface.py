@@ -86,7 +86,6 @@ def surface_splats(
 
     Args:
         kind: "2d" (discs) or "3d" (flat ellipsoids, ``thickness`` thick).
-        count: number of splats.
         position_noise: standard deviation of a displacement in every direction, in local spacings.
             The colour stays that of the undisturbed point.
         normal_noise: standard deviation of a tilt about each of the two tangents, in degrees.
@@ -94,7 +93,6 @@ def surface_splats(
         size: standard deviation of a splat in its plane, in local spacings. Larger splats close
             holes and reach further beyond outlines (reports/splats/surface.md).
         thickness: the third standard deviation of "3d" splats, in local spacings.
-        opacity: of every splat.
         focus: the radius about the scene's centre, in scene units, within which points are about
             equally dense; further out the density falls with the square of the distance. A third of
             the cameras' orbit if left out.
@@ -225,7 +223,6 @@ def sample_surface(
     splats of a floor are about equally large in the pictures of cameras that orbit it.
 
     Args:
-        geometry: of the scene.
         count: number of points, exactly.
         center: (3,) world.
         focus: scene units.

@@ -55,7 +55,6 @@ def auroc(groups: Sequence[tuple[Values, Values]], *, seed: int = 0) -> Auroc:
     Args:
         groups: (flawed, right) of each group, such as each yaw; no result of one group is compared
             with one of another.
-        seed: of the resampling.
 
     Example:
         >>> flawed, right = {"bear": [2.0, float("nan")]}, {"bear": [1.0]}

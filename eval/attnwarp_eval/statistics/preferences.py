@@ -127,7 +127,6 @@ def preferences(choices: Choices, methods: Sequence[str], *, seed: int = 0) -> P
     Args:
         choices: of each person; one without any counts for nothing.
         methods: all names.
-        seed: of the bootstrap.
 
     Raises:
         ValueError: no choices, or a name that is no method's.

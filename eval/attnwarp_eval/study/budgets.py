@@ -74,24 +74,14 @@ class Stopwatch:
         self._warm: set[str] = set()
 
     def note(self, spec: Json, seconds: float) -> None:
-        """Take the seconds of a run.
-
-        Args:
-            spec: all that decides the run.
-            seconds: that it took.
-        """
+        """Take the seconds of a run."""
         kind = digest([spec["method"], spec["editor"], spec["size"]])
         if kind in self._warm:
             self._seconds.setdefault(digest(spec), seconds)
         self._warm.add(kind)
 
     def seconds(self, spec: Json, run: Callable[[], float]) -> float:
-        """Seconds of a run; those taken before, else it is run.
-
-        Args:
-            spec: all that decides the run.
-            run: computes it, and returns its seconds.
-        """
+        """Seconds of a run; those taken before, else it is run."""
         while (taken := self._seconds.get(digest(spec))) is None:
             self.note(spec, run())
         return taken

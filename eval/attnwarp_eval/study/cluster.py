@@ -149,12 +149,6 @@ def run_on_workers(
 ) -> Generator[Ended]:
     """Compute and write cells on this machine, one process a worker.
 
-    Args:
-        cells: what to compute.
-        root: the run's folder.
-        jobs: number of workers.
-        report: receives each cell as it is handed out.
-
     Yields:
         Each cell as it ends, with what went wrong.
     """
@@ -246,7 +240,6 @@ def run_on_scheduler(
     """Compute cells on the workers of the user's own scheduler, and write them here.
 
     Args:
-        cells: what to compute.
         store: the run's folder, which no worker needs to see unless ``needs`` has it.
         scenes: by the names that cells give them.
         scheduler: its address, such as ``tcp://host:8786``, or its scheduler file.
@@ -347,8 +340,6 @@ class _Runner:
     it has computed, a refused one gets nothing, and a worker that is lost takes its own cell alone.
 
     Args:
-        client: of the cluster.
-        cells: what to compute.
         place: how a cell travels.
         report: receives each cell as it is handed out, and lines about workers.
         code: that a worker must have; workers are not asked if None.

@@ -127,7 +127,6 @@ def edit_truth(
 
     Args:
         scene, size: of :func:`attnwarp_eval.world.world`.
-        spp: samples a pixel.
         edit: as for :func:`answers_of`.
         views: names, the source among them.
         planned: the answers for which the cell was planned; whatever the file says if None.

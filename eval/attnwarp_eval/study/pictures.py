@@ -51,9 +51,6 @@ def of_warp(
     """JPEG files of a warp: the two true views, the warped source, mask and endpoint error.
 
     Args:
-        world: of the scene.
-        name: the target view.
-        spp: samples a pixel of the true views.
         truth: of the pair, at image size (H, W).
         view: the warp to show, (H, W).
     """
@@ -106,11 +103,8 @@ def of_mask(
     """JPEG file of a lifted mask in the colours of :data:`MARKS` over the darkened target.
 
     Args:
-        world: of the scene.
-        name: the target view.
         marked: (H, W) bool, the mask.
         thing: (H, W) bool, the exact one.
-        spp: samples a pixel of the true view.
     """
     target = world.image(name, spp)
     classes = (marked & thing, ~marked & thing, marked & ~thing)

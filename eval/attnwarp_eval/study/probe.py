@@ -204,7 +204,6 @@ class Probe(ABC, Generic[E]):
         """The cells of a study: here, one for each scene, variant and seed.
 
         Args:
-            study: with this probe.
             names: of the variants that the study names for it.
             scenes: by the names that the study gives them.
 

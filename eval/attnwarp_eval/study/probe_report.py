@@ -129,7 +129,6 @@ class ProbeReport:
         """Folded tables below a table of variants.
 
         Args:
-            results: of the run.
             names: of the variants, the baseline first.
         """
         return []
@@ -205,11 +204,9 @@ def side_by_side(
     """Pictures of variants in the views of one scene; None where the run has none.
 
     Args:
-        results: of the run.
         probe, variants: whose pictures; variants are the rows.
         content: what they show.
         scene: whose; the first one that has some where this has none.
-        caption: above them.
         first: label of a row before them -> what it shows, the same for all variants.
     """
     found: dict[str, dict[str, dict[tuple[str, str], str]]] = {}

@@ -55,7 +55,6 @@ def warp_reads(settings: WarpSettings, truth: bool = False) -> set[str]:
     """Keys ``set.FIELD`` of a variant that decide its warp, and ``preset``.
 
     Args:
-        settings: of the warp.
         truth: whether depth is the truth's own, which has no splats and no alpha.
     """
     idle = {"set.segment"}  # scenes have none
@@ -81,7 +80,6 @@ def unused(
     Args:
         study: with the parts of every probe.
         named: keys that its file has.
-        probes: all that there are.
     """
     known = list(probes)
     measuring = [p for p in known if p.name in study.probes or (p.always and study.scenes)]

@@ -139,8 +139,6 @@ def compute_and_send(probe: Probe[Any], cell: Cell, scene: SceneFiles | None) ->
     Fits stay on the worker, where later cells want them again.
 
     Args:
-        probe: of the cell.
-        cell: what to compute.
         scene: its files; None where this worker has them, or needs none.
     """
     from distributed import get_worker

@@ -166,7 +166,6 @@ class Results:
 
         Args:
             probe, variant: whose records.
-            metric: the figure's name.
             yaw: closed range of degrees that a view's yaw from the source must lie in; any if None.
         """
         table: dict[str, dict[str, float]] = {}

@@ -291,8 +291,6 @@ def execute(
     """Compute the cells that are still to do, writing each as soon as it is finished.
 
     Args:
-        plan: what to do.
-        store: the run's folder.
         jobs: worker processes, at most one a cell and a core; 1 stays in this process. The
             numbers do not depend on it.
         scheduler: address or file of a dask scheduler, whose workers compute instead.
@@ -331,7 +329,6 @@ def compute_cells(
     Args:
         cells: of registered probes.
         store: the run's folder, which gets every record and failure.
-        report: of these cells.
         jobs: worker processes, at most one a cell; 1 stays in this process.
         scheduler: see :func:`execute`.
         scenes: by the names that cells give them.

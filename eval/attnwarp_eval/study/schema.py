@@ -285,11 +285,6 @@ class Study(Part):
     def check_scenes(self, names: Iterable[str], key: str, scenes: Iterable[Scene]) -> None:
         """Refuse names that are those of no scene, of the chosen ones or of those left out.
 
-        Args:
-            names: under the key.
-            key: for the message.
-            scenes: that were chosen.
-
         Raises:
             StudyError: a name that is no scene's.
         """
@@ -304,7 +299,6 @@ class Study(Part):
         """Raise ValueError unless every name is a variant's, and ``probe`` measures it.
 
         Args:
-            names: of variants.
             key: of the YAML, for the message.
             probe: whose table needs them; any if empty.
         """
@@ -338,7 +332,6 @@ class Study(Part):
         """Those of the views that the study wants pictures of, in its own order.
 
         Args:
-            views: of a cell.
             variant: of the cell; None where it has none, as in the calibration.
         """
         if variant is not None and variant not in self.pictures.variants:

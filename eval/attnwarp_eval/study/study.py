@@ -245,7 +245,6 @@ def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:
     """Every cell of a study, scene by scene; variants of the same content share one.
 
     Args:
-        study: what to measure.
         scenes: the loaded scenes by the names that the study gives them.
 
     Raises:
@@ -361,7 +360,6 @@ def _read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], _Li
     """A study's data joined with what it extends, and where each of its places is written.
 
     Args:
-        path: of the file.
         above: files that extend this one, the first of them first.
     """
     try:

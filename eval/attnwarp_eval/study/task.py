@@ -39,7 +39,6 @@ def results(
     Args:
         store: of the folder, which is locked meanwhile.
         tasks: taken one by one, so that what one of them holds can be freed.
-        total: how many there are.
         report: receives each task, and what is at work in it.
 
     Raises:

@@ -17,9 +17,7 @@ def warp_truth(world: World, truth: TwoView, settings: WarpSettings, **images: A
     """Warp by the truth's own depth.
 
     Args:
-        world: of the scene.
         truth: of the pair, (H, W).
-        settings: of the warp.
         images: ``source_image`` and ``target_image``, (H, W, 3) sRGB in [0, 1], for photometric
             rules.
     """
@@ -39,8 +37,6 @@ def warp_figures(work: Work, name: str, view: WarpedView) -> dict[str, float]:
 
     Args:
         work: the cell; its spec names the feature sizes, their channels and their seed.
-        name: the target view.
-        view: the warp to measure.
     """
     spec, world, meter = work.spec, work.world, work.meter
     size = spec["size"]

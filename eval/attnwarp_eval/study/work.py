@@ -24,8 +24,6 @@ def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = Non
     """Compute a cell.
 
     Args:
-        probe: of the cell.
-        cell: what to compute.
         root: the run's folder; the cell's pictures go below it.
         threads: of the renderer; every core this process may use, if left out.
 

@@ -34,7 +34,6 @@ def two_view(
     labels.
 
     Args:
-        geometry: of the scene.
         source, target: the cameras. The result has the target's (H, W).
         bands: :func:`edge_band` of the source and of the target, where they are computed already.
 
@@ -179,7 +178,6 @@ def edge_band(geometry: Geometry, camera: Camera, width: float = EDGE_BAND) -> M
     included.
 
     Args:
-        geometry: of the scene.
         camera: whose view; (H, W) is its size.
         width: px.
 

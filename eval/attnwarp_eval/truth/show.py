@@ -80,7 +80,6 @@ def render_views(
         out: folder, made if it is missing.
         views: names of cameras; all of them if left out.
         spp: samples a pixel; the scene's own number if left out.
-        report: receives each view at work.
 
     Yields:
         The files, as they are written; the sheet, ``sheet.png``, last.

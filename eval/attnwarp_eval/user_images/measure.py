@@ -194,7 +194,6 @@ def measure(
     """Compute every figure of the paper's table that the pictures and prompts allow.
 
     Args:
-        inputs: the pictures and prompts.
         encoders: kind -> name, see :func:`attnwarp.encoders.load_encoder`; "none" leaves its
             figures out. A kind that is not named, or named None, takes the bundled one, and its
             figures are left out where there is none.
@@ -202,7 +201,6 @@ def measure(
             goes on where it was. Views are known by the content of their files.
         device: "cpu" or "cuda", for real encoders.
         load: gives an encoder, in place of :func:`attnwarp.encoders.load_encoder`.
-        report: receives each batch of views.
 
     Raises:
         InputError: nothing can be computed (the message says why, figure by figure), a picture that

@@ -54,8 +54,6 @@ def draw(
 
     Args:
         methods: of each item.
-        questions: by name.
-        plans: how many.
         choices: of a plan; all comparisons where there are fewer.
         checks: attention checks of a plan, beside the choices.
         seed: of everything drawn.

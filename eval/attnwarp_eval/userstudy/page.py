@@ -48,8 +48,6 @@ def build_page(items: Sequence[Item], design: Design, title: str) -> str:
 
     Args:
         items: of :func:`attnwarp_eval.userstudy.material.read_items`.
-        design: of the study.
-        title: of the page.
 
     Raises:
         InputError: a picture's file is missing.

@@ -56,7 +56,6 @@ def description(
     Args:
         attributes: (6,) of the look.
         kind: a key of :data:`JUDGED`.
-        encoder: of texts.
     """
     named = {"ground": ("ground",), "time": ("time",), "material": ("finish", "color", "second")}
     values = tuple(
@@ -75,11 +74,8 @@ def judgements(
     """Edit pictures of every world and put the question about each.
 
     Args:
-        answer: the editor.
-        worlds: of the test split.
         encoder: the judge.
         kept: answers of every kind and draw.
-        size: of the pictures in px.
         draws: pictures and looks of each world; the first are those of :func:`training.assess.editors.assess`.
     """
     results = []

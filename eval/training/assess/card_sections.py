@@ -16,7 +16,6 @@ def with_section(card: str, section: str) -> str:
     """A card with a section; one of the same heading is replaced, another one stands at the end.
 
     Args:
-        card: in Markdown.
         section: its first line is its heading, ``## ...``.
     """
     parts = [part.strip("\n") for part in re.split(r"(?m)^(?=## )", card)]

@@ -77,8 +77,6 @@ def cases_of(worlds: Worlds, size: int, number: int = 0) -> list[Case]:
     """Both whole views of every world whose thing is large enough.
 
     Args:
-        worlds: of the test split.
-        size: of the pictures in px.
         number: of the round, which draws the colour that each world has before.
     """
     pairs = Pictures(worlds, size)
@@ -167,9 +165,7 @@ def swap_figures(
     Rounds of other pictures and noises go on until every question has as many answers as were asked for.
 
     Args:
-        editor: to judge.
         worlds: of the test split.
-        size: of the pictures in px.
         pairs: answers asked of every question; after :data:`MOST_ROUNDS` rounds it is as many as were had.
         kept: results of batches, so that a stopped measurement goes on.
     """
@@ -197,7 +193,6 @@ def _swapped(swap: Swap, batch: Sequence[Case], seed: int, number: int) -> Marks
     """The answers of a batch of pictures.
 
     Args:
-        swap: of the editor.
         batch: the pictures, those of a world one after the other.
         seed: of the first picture's noise.
         number: of the round: it chooses the noises, and whose features another picture gets.
@@ -341,7 +336,6 @@ def carried_section(carried: Sequence[Figure], pairs: int) -> str:
     """A card's section of these figures.
 
     Args:
-        carried: of :func:`carries`.
         pairs: that were asked of each question about a swap.
     """
     lines = [

@@ -135,9 +135,7 @@ def assess_depth_editor(
     """The card of an exported editor of depth maps.
 
     Args:
-        folder: of the editor.
         data: folder of the pictures.
-        facts: of its training.
         worlds: of the test split; all if left out.
     """
     from attnwarp.editing.small import DEPTH_GUIDANCE, load_editor

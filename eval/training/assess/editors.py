@@ -54,11 +54,8 @@ def assess(
     whose mean colour in the mask is nearest to the result's has to be the one that was asked for.
 
     Args:
-        answer: the editor.
         worlds: of the test split.
-        size: of the pictures in px.
         noises: of an open instruction, for each of a quarter of the worlds; 0 leaves that figure out.
-        kinds: of edits.
     """
     pairs = Pictures(worlds, size)
     results = []
@@ -151,9 +148,7 @@ def editor_card(
     """A bundled editor's card in Markdown.
 
     Args:
-        name: of the editor.
         figures, control: of it and of an editor that changes nothing.
-        facts: of its training.
         scenes: figures of :mod:`training.assess.scenes`.
     """
     learned, missing = "", "parts of things (a jacket, a pot), "
@@ -212,9 +207,6 @@ def assess_editor(
     """The card of an exported editor.
 
     Args:
-        folder: of the editor.
-        data: of the pictures.
-        facts: of its training.
         worlds: of each test split; all if left out.
         scenes: whether to judge it on the package's own scenes too.
     """

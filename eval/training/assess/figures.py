@@ -156,7 +156,6 @@ def clip_figures(encoder: TextImageEncoder, sets: dict[str, Pictures]) -> list[F
     """Naming, retrieval and direction on shapes, worlds and pairs that training never saw.
 
     Args:
-        encoder: to be judged.
         sets: "test" (new shapes), "test-new-pairs" (colours an object never had), "test-rendered"
             (by Mitsuba).
     """
@@ -296,7 +295,6 @@ def nearest(
 
     Args:
         features: (N, D); compared by their cosine.
-        pictures: whose they are.
         look: of the query; the 64 are seen in look 0.
         seed: of the galleries.
 
@@ -341,7 +339,6 @@ def dino_figures(
     """Finding a thing from another side, and parts of it; beside raw pixels and colour histograms.
 
     Args:
-        encoder: to be judged.
         sets: "test-bare" (things alone, all on the same grass in the same light), "test" (each in
             its own place) and "test-moved" (each on another ground at another time).
         parts: worlds for the correspondence of parts.

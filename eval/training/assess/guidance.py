@@ -38,10 +38,8 @@ def figures_of(editor: Any, worlds: Worlds, kept: Kept, *, size: int) -> list[li
     """Figures of an editor at each of :data:`GUIDANCES`.
 
     Args:
-        editor: of the pictures' kind.
         worlds: see :func:`shown`.
         kept: figures that were computed before.
-        size: of the pictures in px.
     """
     rows = []
     for text, picture in GUIDANCES:

@@ -70,7 +70,6 @@ def inverts(
         editor: a :class:`attnwarp.editing.controlnet.DepthControlNet`.
         prompts: of test worlds.
         kept: results by world.
-        steps: numbers of steps of denoising.
     """
     worlds = np.arange(len(prompts.worlds))
     result = []

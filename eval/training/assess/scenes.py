@@ -45,13 +45,7 @@ class SceneAnswers:
 
 
 def scene_answers(answer: Answer, *, size: int, scenes: Sequence[str] = SCENES) -> SceneAnswers:
-    """Edit views of each scene by each of its sentences, and judge the pictures.
-
-    Args:
-        answer: the editor.
-        size: of the pictures in px.
-        scenes: names.
-    """
+    """Edit views of each scene by each of its sentences, and judge the pictures."""
     from attnwarp_eval.study.edit_truth import edit_truth
     from attnwarp_eval.world import world
 

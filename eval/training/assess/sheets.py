@@ -48,9 +48,7 @@ def sheet(
     """A picture with a row a world: before, then the answer to each instruction.
 
     Args:
-        answer: the editor.
         worlds: of a test split; spread evenly over it.
-        size: of the pictures in px.
         instructions: one a column.
     """
     pairs = Pictures(worlds, size)
@@ -69,7 +67,6 @@ def depth_sheet(
     Args:
         draw: the editor: the picture of a row of prompts, a description and a seed.
         worlds: of a test split; spread evenly over it.
-        size: of the pictures in px.
         descriptions: one a column; braces stand for the thing.
     """
     prompts = Prompts(worlds, size)

@@ -94,11 +94,7 @@ def answered(
     """Count how often each answer comes out, with :data:`NONE` among them.
 
     Args:
-        editor: to judge.
-        question: that it is asked.
         noises: each of a seed of its own, from 0.
-        kept: results of batches.
-        steps: of denoising.
     """
     counts: Counter[str] = Counter()
     h, w = (side // editor.factor for side in question.before.shape[:2])

@@ -187,7 +187,6 @@ class PromptPool(PicturePool):
 
     Args:
         worlds, device: see :class:`training.editors.pool.PicturePool`.
-        tokenizer: of the prompts.
         prompts: made ahead for each world.
     """
 
@@ -285,7 +284,6 @@ def train_depth_stage(
         data: folder of the pictures, rendered where they are missing.
         out: folder of checkpoints, with the one that the stage starts from.
         stage: in place of the one of that name.
-        threads: of torch.
         device: of torch; on a GPU matrices are multiplied in bfloat16.
         pool: on that device, if it is there already.
     """

@@ -172,10 +172,8 @@ def inputs(
     """Pairs of runs A and B as the network gets them, with their targets; the runs of a pair share their step.
 
     Args:
-        pool: to draw from.
         alphas: alpha-bar of the steps.
         empty: tokens of no text.
-        size: of the pictures in px.
         count: of pairs.
         generator: on the pool's device.
         inject: False is the control: nothing goes over, B's target is its own answer.

@@ -198,7 +198,6 @@ class PairPool(PicturePool):
 
     Args:
         worlds, device: see :class:`PicturePool`.
-        tokenizer: of the instructions.
         sentences: instructions made ahead for each thing and result.
     """
 
@@ -224,7 +223,6 @@ class PairPool(PicturePool):
         """Draw pairs.
 
         Args:
-            count: of them.
             generator: on the pool's device.
             size: of the pictures in px. At 64, half of the pictures are a quarter of the full one about the thing,
                 so that things come large and small.
@@ -280,7 +278,6 @@ class PairPool(PicturePool):
         """Draw pairs with noise at some steps.
 
         Args:
-            count: of pairs.
             generator: on the pool's device.
             size: of the pictures in px, 64 or 128.
             t: (B,) time steps.
@@ -312,7 +309,6 @@ def cut_regions(thing: Tensor, pool: PicturePool, generator: torch.Generator) ->
 
     Args:
         thing: (B, S, S) bool.
-        pool, generator: to draw from.
     """
     count, size = len(thing), thing.shape[1]
     weights = thing.flatten(1).float()

@@ -204,9 +204,7 @@ def train_stage(
     Args:
         name: a key of :data:`STAGES`.
         data: folder of the pictures, rendered where they are missing.
-        out: folder of checkpoints.
         stage: in place of the one of that name.
-        threads: of torch.
         device: of torch; on a GPU matrices are multiplied in bfloat16.
         pool: on that device, if it is there already.
     """

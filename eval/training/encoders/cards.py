@@ -86,7 +86,6 @@ def card(
     """A card in Markdown.
 
     Args:
-        name: of the encoder.
         figures: of the trained network (:class:`training.assess.figures.Figure` as dictionaries).
         control: the same of a network with random weights.
         facts: what the text's blanks say.

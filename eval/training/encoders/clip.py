@@ -177,10 +177,8 @@ def naming_loss(
     are harder, go unlearned for long.
 
     Args:
-        model: the two towers.
         images: (N, D) unit embeddings.
         shown: (N, 6) attributes.
-        tokenizer: of the text tower.
         rng: picks one way to say each.
     """
     texts: list[str] = []

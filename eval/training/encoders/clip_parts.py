@@ -209,7 +209,6 @@ def part_losses(
         dense: (N, h, w, D) unit vectors of places.
         ids: (N, h, w).
         surfaces: (N, P, 3).
-        tokenizer: of the text tower.
         rng: to draw words and parts.
     """
     numbers = surface_number(surfaces)

@@ -161,8 +161,6 @@ def draw_pair(
     """A weaker and a stronger distortion, each (kind, strength, seed).
 
     Args:
-        rng: to draw from.
-        kinds: to draw from.
         across: share of pairs of two different kinds, at least a full step apart; of one kind, at
             least 0.35 of a step.
     """

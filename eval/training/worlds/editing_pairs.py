@@ -320,7 +320,6 @@ def instruction(
         kind: a key of :data:`GROUPS`: what the edit changes.
         thing: index into :data:`attnwarp_eval.drawn.worlds.OBJECTS`.
         look: (5,) finish, color, second, ground, time of the result.
-        rng: to draw the words from.
     """
     while True:
         text = _draw_instruction(kind, thing, look, rng)

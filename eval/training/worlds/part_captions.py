@@ -82,10 +82,7 @@ def caption_of(
     """A caption that is true of a picture.
 
     Args:
-        pictures: the set.
-        row: of the picture.
         shares: (P,) share of what is shown that each part covers; parts below a hundredth are not named.
-        rng: to draw from.
     """
     surfaces = pictures.surfaces[row]
     own = np.flatnonzero(surfaces[:, 0] >= 0)

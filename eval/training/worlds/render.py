@@ -35,10 +35,8 @@ def pictures(world: World, looks: Sequence[Look], size: int, *, view: int = 0) -
     """One view of a world in several looks.
 
     Args:
-        world: what to show.
         looks: how; geometry is traced once for all of them.
         size: width and height in pixels.
-        view: which of the world's cameras.
 
     Returns:
         (size, size, 3) sRGB pictures, and what the rays hit.

@@ -42,9 +42,6 @@ def measure(
     Args:
         names: scenes' names or paths; :data:`PICTURE_SCENES` and :data:`GEOMETRY_SCENES` if left
             out. Of those without a triangle depth and visibility are closed forms, and left out.
-        out: the run's folder.
-        rounds: of every timing.
-        report: receives each step of each panel.
 
     Raises:
         InputError: a scene that cannot be used, or two of one name; another run is writing to

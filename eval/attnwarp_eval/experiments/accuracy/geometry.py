@@ -88,8 +88,6 @@ def depth(
     Args:
         size: of the square image that is traced.
         rays: pixels held against every triangle in float64.
-        rounds: of the timing.
-        report: receives what is at work.
     """
     from attnwarp_eval._open3d import open3d
     from attnwarp_eval.truth.raycast import Geometry

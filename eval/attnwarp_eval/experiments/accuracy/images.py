@@ -33,7 +33,6 @@ def pictures(
         rounds: pictures of each contestant.
         reference: how many pictures of how many samples the converged one is the mean of. Its own
             noise is estimated from their spread and taken out of the errors.
-        report: receives what is at work.
     """
     from attnwarp_eval.truth.llvm import LLVM, SCALAR, variant
     from attnwarp_eval.truth.mitsuba import render_plan, use

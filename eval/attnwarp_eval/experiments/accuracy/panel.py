@@ -96,9 +96,7 @@ def panel_spec(question: str, name: str, content: str, rounds: int) -> Json:
 
     Args:
         question: "pictures", "depth" or "visibility".
-        name: of the scene.
         content: its hash.
-        rounds: of every timing.
     """
     spec: Json = {
         "probe": "accuracy",

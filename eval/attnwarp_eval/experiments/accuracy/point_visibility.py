@@ -45,7 +45,6 @@ def visibility(
         points: how many of them are held against every triangle.
         rounds: of the timing, which covers all points and the making of the depth map.
         maps: sizes of the depth maps.
-        report: receives what is at work.
 
     Returns:
         A panel without contestants where no point can be asked about.

@@ -71,10 +71,7 @@ def run_method(
 
     Args:
         work: of the cell, whose spec has ``method``, ``settings``, ``editor`` and ``edit``.
-        truth: of the edit.
         names: of the views, the source first.
-        before: the splats to edit.
-        budget: limits of the method.
         editor: in place of the one that the spec names.
         donor: of the control's features; the other scene's source with the same editor if left out.
         segments: (H, W) bool of each view, outside which nothing changes.

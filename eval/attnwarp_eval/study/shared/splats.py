@@ -36,7 +36,6 @@ def check_splats(study: Study, probe: str, what: str) -> None:
 
     Args:
         study: with or without the probe.
-        probe: its name.
         what: of a render it measures.
     """
     for name in study.probes.get(probe, []):
@@ -77,7 +76,6 @@ def splats_of(work: Work, spec: Mapping[str, Any] | None = None) -> Gaussians:
     """The splats that a cell's spec names.
 
     Args:
-        work: the cell.
         spec: in place of the cell's own.
     """
     spec = work.spec if spec is None else spec

@@ -119,9 +119,7 @@ def label_figures(
     """Figures of the part labels that a warp carries.
 
     Args:
-        work: the cell.
         truth: of the pair, (H, W).
-        view: the warp.
         labels: (H, W) part of each pixel of the source and of the target.
         grid: side of the token grid, a divisor of the image's.
     """

@@ -43,7 +43,6 @@ def render_plan(
     """A picture by a plan: (H, W, 3) float32, linear RGB, every value finite. It is not cached.
 
     Args:
-        scene: what is rendered.
         camera: whose view; (H, W) is its size.
         plan: of :func:`attnwarp_eval.truth.plan.plan`; it has the samples a pixel.
         seed: the same seed and variant give the same bits, except for light paths ("ptracer").

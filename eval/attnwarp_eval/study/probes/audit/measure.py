@@ -252,7 +252,6 @@ class _Pair:
         refit: Edit PSNR of each of several pairs.
         before: source and target before the edit.
         partners: the true target of each true source after the edit, the right edit's first.
-        encoders: by kind.
         texts: what the source and the edit show, in words.
 
     Attributes:

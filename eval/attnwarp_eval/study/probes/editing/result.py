@@ -95,12 +95,8 @@ class Measurement:
     """The figures of one edited scene.
 
     Args:
-        work: the cell.
-        truth: of the edit.
         names: of the views, the source first.
         before: the splats before the edit.
-        result: of the method.
-        encoders: by kind.
     """
 
     def __init__(

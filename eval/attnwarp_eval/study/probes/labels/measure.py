@@ -45,7 +45,6 @@ def grids_of(study: Study, size: int) -> list[int]:
 
     Args:
         study: with or without the probe.
-        size: of the pictures, in px.
     """
     grids = study.part(StudyPart).labels.grids
     return grids or [grid for grid in GRIDS if size % grid == 0]
