@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,63 +12,32 @@ from tokenizers import Tokenizer
 from attnwarp.editing.latents import HaarLatents
 from attnwarp.editing.small import write_sums
 from training import steps
-from training.editors.depth import DEPTH_STAGES, DepthNet
+from training.editors.depth import DEPTH_STAGES, DepthNet, DepthStage
 from training.editors.net import TOKENS, EditorNet, scheduler
-from training.editors.recipe import STAGES, tokenizer_of
+from training.editors.recipe import STAGES, Stage, tokenizer_of, weights_of
 
 
-@dataclass(frozen=True)
-class Spent:
-    """Steps and time that a stage took so far.
-
-    Attributes:
-        steps: taken.
-        seconds: of them.
-        device: on which.
-    """
-
-    steps: int
-    seconds: float
-    device: str
-
-
-def averaged(stage: str, out: Path) -> tuple[EditorNet, Tokenizer, Spent]:
-    """The averaged networks of a checkpoint, the tokenizer, and what it took so far."""
-    tokenizer = tokenizer_of(out)
-    net = EditorNet(tokenizer.get_vocab_size(), STAGES[stage].size, draws=STAGES[stage].draws)
-    return net, tokenizer, _load(net, out / f"{stage}.pt")
-
-
-def depth_averaged(stage: str, out: Path) -> tuple[DepthNet, Tokenizer, Spent]:
-    """Averaged network, as :func:`averaged`, of a stage of :mod:`training.editors.depth`."""
-    tokenizer = tokenizer_of(out)
-    net = DepthNet(tokenizer.get_vocab_size(), DEPTH_STAGES[stage].size)
-    return net, tokenizer, _load(net, out / f"{stage}.pt")
-
-
-def _load(net: torch.nn.Module, checkpoint: Path) -> Spent:
-    """Load a checkpoint's averaged weights."""
-    stored = torch.load(checkpoint, weights_only=True, map_location="cpu")
-    average = {k.removeprefix("module."): v for k, v in stored["average"].items()}
-    del average["n_averaged"]
-    net.load_state_dict(average)
-    net.eval()
-    taken = steps.STEPS_AN_EPOCH * int(stored["epoch"])
-    return Spent(taken, float(stored["seconds"]), stored.get("device", "one CPU core"))
+def _averaged(net: Any, stage: str, out: Path) -> Any:
+    """``net`` with the averaged weights of a stage."""
+    net.load_state_dict(weights_of(out, stage))
+    return net.eval()
 
 
 def export_editor(stage: str, out: Path, folder: Path) -> Path:
     """Write a stage's editor to ``folder`` in half precision, as diffusers and transformers load it."""
-    net, tokenizer, _ = averaged(stage, out)
+    tokenizer, plan = tokenizer_of(out), STAGES[stage]
+    net = EditorNet(tokenizer.get_vocab_size(), plan.size, draws=plan.draws)
     parts = {"unet": ["attnwarp.editing.small_unet", "EditUNet"]}
     pipeline = "StableDiffusionInstructPix2PixPipeline"
-    return _write(folder, net, tokenizer, pipeline, parts, STAGES[stage].shift)
+    return _write(folder, _averaged(net, stage, out), tokenizer, pipeline, parts, plan.shift)
 
 
 def export_depth_editor(stage: str, out: Path, folder: Path) -> Path:
     """Write a stage of :mod:`training.editors.depth` to ``folder``, as :func:`export_editor` does."""
-    net, tokenizer, _ = depth_averaged(stage, out)
-    net.half()
+    tokenizer = tokenizer_of(out)
+    net = _averaged(
+        DepthNet(tokenizer.get_vocab_size(), DEPTH_STAGES[stage].size), stage, out
+    ).half()
     net.controlnet.save_pretrained(folder / "controlnet")
     parts = {
         "unet": ["diffusers", "UNet2DConditionModel"], "controlnet": ["diffusers", "ControlNetModel"],
@@ -107,22 +75,28 @@ def _write(
     return folder
 
 
+def _facts(stage: str, out: Path, plan: Stage | DepthStage) -> dict[str, Any]:
+    """Facts of a stage's training that both kinds' cards have."""
+    stored = torch.load(out / f"{stage}.pt", weights_only=True, map_location="cpu")
+    taken = steps.STEPS_AN_EPOCH * int(stored["epoch"])
+    return {
+        "steps": taken, "planned": plan.steps, "batch": plan.batch, "minutes": float(stored["seconds"]) / 60,
+        "device": stored.get("device", "one CPU core"), "worlds": plan.worlds,
+        "state": "The stage is complete." if taken >= plan.steps else "Unfinished: a milestone, to be replaced.",
+    }  # fmt: skip
+
+
 def facts_of(stage: str, out: Path) -> dict[str, object]:
     """Facts in an editor's card about its training."""
-    spent, plan = averaged(stage, out)[2], STAGES[stage]
-    before, seconds, start = 0, spent.seconds, plan.start
+    plan = STAGES[stage]
+    own, before, start = _facts(stage, out, plan), [], plan.start
     while start is not None:
-        earlier = averaged(start, out)[2]
-        before, seconds, start = (
-            before + earlier.steps,
-            seconds + earlier.seconds,
-            STAGES[start].start,
-        )
-    done = spent.steps >= plan.steps
+        before.append(_facts(start, out, STAGES[start]))
+        start = STAGES[start].start
     return {
-        "steps": spent.steps, "planned": plan.steps, "before": before, "batch": plan.batch, "minutes": seconds / 60,
-        "device": spent.device, "worlds": plan.worlds, "parts": plan.parts, "large": plan.size * 2 if plan.large else 0,
-        "state": "The stage is complete." if done else "Unfinished: a milestone, to be replaced.",
+        **own, "before": sum(facts["steps"] for facts in before),
+        "minutes": sum(facts["minutes"] for facts in [own, *before]),
+        "parts": plan.parts, "large": plan.size * 2 if plan.large else 0,
         "injection": {
             "none": "none; what its attention features carry, it learned from editing alone.",
             "features": "trained with injected features, so that its features would carry the answer; the figures of swapped"
@@ -134,11 +108,5 @@ def facts_of(stage: str, out: Path) -> dict[str, object]:
 
 def depth_facts_of(stage: str, out: Path) -> dict[str, object]:
     """Facts in the card of an editor of depth maps about its training."""
-    spent, plan = depth_averaged(stage, out)[2], DEPTH_STAGES[stage]
-    done = spent.steps >= plan.steps
-    return {
-        "steps": spent.steps, "planned": plan.steps, "batch": plan.batch, "minutes": spent.seconds / 60,
-        "device": spent.device, "worlds": plan.worlds,
-        "start": plan.start,
-        "state": "The stage is complete." if done else "Unfinished: a milestone, to be replaced.",
-    }  # fmt: skip
+    plan = DEPTH_STAGES[stage]
+    return _facts(stage, out, plan) | {"start": plan.start}
