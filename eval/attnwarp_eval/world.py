@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, lru_cache
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -167,51 +167,30 @@ def changed(what: str) -> InputError:
     return InputError(f"{what} has changed since the run was planned; start the run again")
 
 
-def splats(
-    scene: str,
-    size: int,
-    seed: int,
-    *,
-    kind: Literal["2d", "3d"],
-    count: int,
-    position_noise: float,
-    normal_noise: float,
-) -> Gaussians:
+def splats(scene: str, size: int, seed: int, **settings: Any) -> Gaussians:
     """Gaussians on a scene's surfaces; the last few are cached here, all of them on disk.
 
     Args:
         scene, size: of the :func:`world`.
         seed: of their places and their noise.
-        kind, count, position_noise, normal_noise: see
+        settings: kind, count, position_noise and normal_noise of
             :func:`attnwarp_eval.splats.surface.surface_splats`.
     """
     content = world(scene, size).content_hash
-    return _splats(content, scene, size, seed, kind, count, position_noise, normal_noise)
+    return _splats(content, scene, size, seed, tuple(settings.items()))
 
 
 @lru_cache(maxsize=8)
 def _splats(
-    content: str,
-    scene: str,
-    size: int,
-    seed: int,
-    kind: Literal["2d", "3d"],
-    count: int,
-    position_noise: float,
-    normal_noise: float,
+    content: str, scene: str, size: int, seed: int, items: tuple[tuple[str, Any], ...]
 ) -> Gaussians:
-    settings: dict[str, Any] = {
-        "kind": kind,
-        "count": count,
-        "position_noise": position_noise,
-        "normal_noise": normal_noise,
-    }
+    settings = dict(items)
     key = content_key("surface splats", SPLATS_PROTOCOL, content, seed, settings)
     stored = read_arrays("splats", key)
     names = ("means", "quats", "scales", "opacities", "sh")
     if stored is None:
         scene_world = world(scene, size)
-        samples = scene_world.samples(count, seed)
+        samples = scene_world.samples(settings["count"], seed)
         made = surface_splats(scene_world.scene, seed=seed, samples=samples, **settings)
         write_arrays(
             "splats",
@@ -220,4 +199,4 @@ def _splats(
         )
         return made
     means, quats, scales, opacities, sh = (torch.from_numpy(stored[name]) for name in names)
-    return Gaussians(kind, means, quats, scales, opacities, sh, origin=stored["origin"])
+    return Gaussians(settings["kind"], means, quats, scales, opacities, sh, origin=stored["origin"])
