@@ -89,18 +89,13 @@ def _face(words: list[str], vertices: int, line: int) -> list[int]:
         raise ValueError(f"line {line}: a face has {len(words)} corners, expected at least 3")
     face = []
     for word in words:
-        parts = word.split("/")
-        if len(parts) > 3:
-            raise ValueError(f"line {line}: got {clip(word)}, expected v, v/vt, v//vn or v/vt/vn")
-        for part in parts[1:]:
-            if part:
-                whole(part, line)
-        index = whole(parts[0], line)
+        corner = word.partition("/")[0]  # v, v/vt, v//vn or v/vt/vn
+        index = whole(corner, line)
         # Counted from 1; a negative one counts back from the vertices so far.
         index = index - 1 if index > 0 else vertices + index if index < 0 else -1
         if index < 0:
             raise ValueError(
-                f"line {line}: a face names vertex {clip(parts[0])}, but there are {vertices}"
+                f"line {line}: a face names vertex {clip(corner)}, but there are {vertices}"
             )
         face.append(index)
     return face

@@ -67,8 +67,6 @@ def read_off(data: bytes) -> Surface:
                 f"line {line}: a face announces {size} corners, and {len(words) - 1} numbers follow"
             )
         faces.append([whole(word, line) for word in words[1 : size + 1]])
-        for word in words[size + 1 :]:
-            decimal(word, line)
         painted += extra > 0
     corners, sizes = polygons(faces)
     tint = unit_colors(values[:, columns : columns + 3]) if color else None
