@@ -75,10 +75,12 @@ def test_the_wheel_carries_every_file_of_the_packages(wheel):
 IMPORT_ALL = """
 import importlib, pkgutil, sys
 import attnwarp
-# Networks that diffusers' files name by class; they load inside functions that name the extra.
-networks = {"attnwarp.editing.latents", "attnwarp.editing.small_unet"}
+# Networks that diffusers' files name by class, and the kernels of the extra gpu; they load inside
+# functions that name the extra.
+inside = ("attnwarp.editing.latents", "attnwarp.editing.small_unet")
+inside += ("attnwarp.render.gpu", "attnwarp.render._gpu.")
 for module in pkgutil.walk_packages(attnwarp.__path__, "attnwarp."):
-    if module.name not in networks:
+    if not module.name.startswith(inside):
         importlib.import_module(module.name)
 print(attnwarp.__file__)
 heavy = {"mitsuba", "open3d", "pyvista", "distributed", "transformers", "diffusers"}

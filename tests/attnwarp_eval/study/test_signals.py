@@ -39,7 +39,10 @@ def command(run):
 
 def children(pid):
     """Living processes that ``pid`` started."""
-    tasks = pathlib.Path(f"/proc/{pid}/task").glob("*")
+    try:
+        tasks = list(pathlib.Path(f"/proc/{pid}/task").iterdir())
+    except OSError:  # it has ended
+        return []
     return [int(child) for task in tasks for child in read(task / "children").split()]
 
 
