@@ -310,16 +310,6 @@ def test_views_without_pictures_are_neither_fitted_on_nor_held_out(data, tmp_pat
     assert [path.name for path in (tmp_path / "out" / "held_out").iterdir()] == ["1.png"]
 
 
-def test_the_ply_opens_in_another_reader(data, tmp_path):
-    done = in_process("fit", data, "--kind", "3dgs", "--out", tmp_path, "--iterations", 5)
-    assert done.exit_code == 0, done.stderr
-    vertex = PlyData.read(tmp_path / "splats.ply")["vertex"]
-    assert len(vertex) == len(read_ply(tmp_path / "splats.ply"))
-    assert {"x", "f_dc_0", "f_rest_44", "opacity", "scale_2", "rot_3"} <= {
-        p.name for p in vertex.properties
-    }
-
-
 def test_the_number_of_threads_changes_no_bit(data, tmp_path):
     for count in (1, 3):
         done = in_process(

@@ -1,4 +1,4 @@
-"""Oracles: shares of choices for two methods, the likelihood by brute force, planted strengths, pairs counted one by one."""
+"""Oracles: the likelihood by brute force, planted strengths, pairs counted one by one."""
 
 import itertools
 import math
@@ -8,13 +8,6 @@ import pytest
 from scipy import optimize, special, stats
 
 from attnwarp_eval.statistics.preferences import agreement, chances, preferences, strengths
-
-
-def test_for_two_methods_the_probability_is_the_share_of_choices():
-    for for_a, for_b in ((1, 1), (7, 3), (200, 1)):
-        a, b = strengths([[0, for_a], [for_b, 0]])
-        # The ridge moves a share of n choices by about 1e-6 |s| / n.
-        assert 1 / (1 + math.exp(b - a)) == pytest.approx(for_a / (for_a + for_b), abs=3e-6)
 
 
 def test_strengths_have_the_highest_likelihood():
