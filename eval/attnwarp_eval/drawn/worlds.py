@@ -7,6 +7,7 @@ of day. One world has many looks, so pictures come that differ in one attribute 
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -483,38 +484,38 @@ FILLERS = (
 def surface_words(finish: int, color: int, second: int, rng: np.random.Generator) -> tuple[str, bool]:
     """The adjective of a surface, and whether it names a statue ("bronze statue of a bear")."""
     kind = FINISHES[finish]
-    hue = _one(HUES[COLORS[color]], rng) if color >= 0 else ""
+    hue = one_of(HUES[COLORS[color]], rng) if color >= 0 else ""
     match kind:
         case "plain":
             return hue, False
         case "shiny":
-            return _one((f"shiny {hue}", f"glossy {hue}", f"{hue} plastic", f"polished {hue}"), rng), False
+            return one_of((f"shiny {hue}", f"glossy {hue}", f"{hue} plastic", f"polished {hue}"), rng), False
         case "striped" | "checked":
-            other = _one(HUES[COLORS[second]], rng)
+            other = one_of(HUES[COLORS[second]], rng)
             one, two = (hue, other) if rng.uniform() < 0.5 else (other, hue)
-            word = {"striped": "striped", "checked": _one(("checked", "chequered"), rng)}[kind]
+            word = {"striped": "striped", "checked": one_of(("checked", "chequered"), rng)}[kind]
             return f"{one} and {two} {word}", False
     words = {
         "golden": ("golden", "gold"), "silver": ("silver", "steel", "chrome"), "bronze": ("bronze", "copper"),
         "wooden": ("wooden",), "stone": ("stone",), "marble": ("marble", "white marble"),
     }[kind]  # fmt: skip
-    return _one(words, rng), bool(rng.uniform() < 0.4)
+    return one_of(words, rng), bool(rng.uniform() < 0.4)
 
 
 def sentence(values: tuple[int, ...], rng: np.random.Generator, *, fillers: bool = False) -> str:
     """A caption of the attributes that are not -1; ``values`` in the order of :func:`attributes`."""
     thing, finish, color, second, ground, time = values
-    noun = _one(NOUNS[OBJECTS[thing]], rng) if thing >= 0 else _one(("thing", "object", "something"), rng)
+    noun = one_of(NOUNS[OBJECTS[thing]], rng) if thing >= 0 else one_of(("thing", "object", "something"), rng)
     statue = False
     words = ""
     if finish >= 0:
         words, statue = surface_words(finish, color, second, rng)
     elif color >= 0:
-        words = _one(HUES[COLORS[color]], rng)
+        words = one_of(HUES[COLORS[color]], rng)
     if fillers and rng.uniform() < 0.35:
-        words = f"{_one(FILLERS, rng)} {words}"
+        words = f"{one_of(FILLERS, rng)} {words}"
     if statue:
-        described = f"{words} {_one(('statue', 'sculpture'), rng)} of {with_article(noun)}"
+        described = f"{words} {one_of(('statue', 'sculpture'), rng)} of {with_article(noun)}"
     elif noun in ("bust of a man", "head of a man"):
         described = f"{words} {noun}"
     else:
@@ -522,10 +523,10 @@ def sentence(values: tuple[int, ...], rng: np.random.Generator, *, fillers: bool
     if noun == "bear" and not statue and rng.uniform() < 0.5 and color >= 0 and finish in (-1, 0):
         named = {"white": "polar bear", "brown": "grizzly bear"}.get(COLORS[color])
         described = named or described
-    parts = [_one(OPENINGS, rng), with_article(" ".join(described.split()))]
-    tail = [_one(PLACES[GROUNDS[ground]], rng)] if ground >= 0 else []
+    parts = [one_of(OPENINGS, rng), with_article(" ".join(described.split()))]
+    tail = [one_of(PLACES[GROUNDS[ground]], rng)] if ground >= 0 else []
     if time >= 0:
-        tail.insert(int(rng.uniform() < 0.8) * len(tail), _one(HOURS[TIMES[time]], rng))
+        tail.insert(int(rng.uniform() < 0.8) * len(tail), one_of(HOURS[TIMES[time]], rng))
     return " ".join(" ".join(parts + tail).split())
 
 
@@ -547,7 +548,8 @@ def captioned(pictured: tuple[int, ...], rng: np.random.Generator) -> tuple[int,
     return thing, finish, color, second, ground, time
 
 
-def _one(choices: tuple[str, ...], rng: np.random.Generator) -> str:
+def one_of(choices: Sequence[str], rng: np.random.Generator) -> str:
+    """One of some words, each as likely."""
     return choices[int(rng.integers(len(choices)))]
 
 

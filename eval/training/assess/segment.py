@@ -11,7 +11,7 @@ import typer
 
 from attnwarp.editing.segment import ClipSegmenter, Image, Mask, NoDetectionError, Segmenter
 from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS, WHOLE_NOUNS
-from attnwarp_eval.drawn.worlds import NOUNS, OBJECTS
+from attnwarp_eval.drawn.worlds import NOUNS, OBJECTS, one_of
 from training.assess.figures import Figure, figure
 from training.editors.__main__ import CACHE
 from training.encoders.clip_parts import CLUTTER
@@ -80,10 +80,10 @@ def part_pictures(pictures: PartPictures) -> Iterator[tuple[Image, Mask, str, st
         parts = np.flatnonzero(pictures.shares[pictures.place[row]] >= LEAST_PART)
         own = pictures.surfaces[row, :, 0] >= 0
         if rng.uniform() < 0.3 or not len(parts):
-            words, mask = _one(WHOLE_NOUNS[KINDS[int(pictures.kind[row])]], rng), ids < len(PARTS)
+            words, mask = one_of(WHOLE_NOUNS[KINDS[int(pictures.kind[row])]], rng), ids < len(PARTS)
         else:
             part = PARTS[int(rng.choice(parts))]
-            words = _one(PART_NOUNS[part], rng)
+            words = one_of(PART_NOUNS[part], rng)
             called = [p for p in np.flatnonzero(own) if words in PART_NOUNS[PARTS[p]]]
             mask = np.isin(ids, called)
         names = {n for p in np.flatnonzero(own) for n in PART_NOUNS[PARTS[p]]}
@@ -93,12 +93,8 @@ def part_pictures(pictures: PartPictures) -> Iterator[tuple[Image, Mask, str, st
             for p in PARTS
             if not names & set(PART_NOUNS[p]) and not set(CLUTTER) & set(PART_NOUNS[p])
         ]
-        other = _one(PART_NOUNS[absent[int(rng.integers(len(absent)))]], rng)
+        other = one_of(PART_NOUNS[absent[int(rng.integers(len(absent)))]], rng)
         yield pictures.images[row].astype(np.float32) / 255, mask, words, other
-
-
-def _one(choices: Sequence[str], rng: np.random.Generator) -> str:
-    return choices[int(rng.integers(len(choices)))]
 
 
 def assess(segmenter: Segmenter, asked: Iterable[tuple[Image, Mask, str, str]]) -> list[Figure]:

@@ -29,6 +29,7 @@ from attnwarp_eval.drawn.worlds import (
     STATUES,
     TIMES,
     captioned,
+    one_of,
     sentence,
 )
 from training.common import Run, channels_last, groups, placed_crops, rate, settings
@@ -117,7 +118,7 @@ def draw_phrases(rng: np.random.Generator) -> Phrases:
     """One name of every part, kind and ground, and the sky."""
     whole = [WHOLE_NOUNS[k] for k in KINDS]
     grounds = [GROUND_NOUNS[g] for g in GROUNDS]
-    words = sorted({_one(c, rng) for c in (*PART_NOUNS.values(), *whole, *grounds)})
+    words = sorted({one_of(c, rng) for c in (*PART_NOUNS.values(), *whole, *grounds)})
     words.append("the sky")
     prefix = ("a photo of ", "", "a picture of ")
 
@@ -257,9 +258,9 @@ def whole_losses(
 ) -> Tensor:
     """Losses of what a picture shows, on which ground and at what time, each by its words alone."""
     columns = [
-        (kind, [f"a photo of {with_article(_one(WHOLE_NOUNS[k], rng))}" for k in KINDS]),
-        (ground, [f"something {_one(PLACES[g], rng)}" for g in GROUNDS]),
-        (time, [f"something {_one(HOURS[t], rng)}" for t in TIMES]),
+        (kind, [f"a photo of {with_article(one_of(WHOLE_NOUNS[k], rng))}" for k in KINDS]),
+        (ground, [f"something {one_of(PLACES[g], rng)}" for g in GROUNDS]),
+        (time, [f"something {one_of(HOURS[t], rng)}" for t in TIMES]),
     ]
     words = _texts(model, tokenizer, [t for _, texts in columns for t in texts])
     logits = model.scale.clamp(max=4.6).exp() * pooled @ words.T
@@ -275,10 +276,6 @@ def whole_losses(
 def _texts(model: ClipParts, tokenizer: Tokenizer, texts: Sequence[str]) -> Tensor:
     """(N, D) unit embeddings."""
     return functional.normalize(model.texts(tokens_of(tokenizer, texts)), dim=-1)
-
-
-def _one(choices: Sequence[str], rng: np.random.Generator) -> str:
-    return choices[int(rng.integers(len(choices)))]
 
 
 def recipe() -> dict[str, Any]:

@@ -43,6 +43,7 @@ from attnwarp_eval.drawn.worlds import (
     draw_look,
     draw_world,
     held_out,
+    one_of,
     surface_words,
 )
 from attnwarp_eval.scene.yaml import read_yaml
@@ -108,12 +109,12 @@ def noun_of(thing: int, kind: str, rng: np.random.Generator) -> str:
     Of a thing with parts, an edit of the ground or the light names the whole.
     """
     if thing < len(OBJECTS):
-        return "it" if rng.uniform() < 0.5 else f"the {_one(NOUNS[OBJECTS[thing]], rng)}"
+        return "it" if rng.uniform() < 0.5 else f"the {one_of(NOUNS[OBJECTS[thing]], rng)}"
     number, index = divmod(thing - len(OBJECTS), len(PARTS))
     whole, part = WHOLE_NOUNS[KINDS[number]], PARTS[index]
     if part == WHOLE or kind in ("ground", "time"):
-        return "it" if rng.uniform() < 0.3 else f"the {_one(whole, rng)}"
-    noun = _one(PART_NOUNS[part], rng)
+        return "it" if rng.uniform() < 0.3 else f"the {one_of(whole, rng)}"
+    noun = one_of(PART_NOUNS[part], rng)
     if rng.uniform() < 0.2 and " of " not in noun:
         return f"the {noun} of the {min(whole, key=len)}"
     return f"the {noun}"
@@ -307,10 +308,6 @@ def reserved() -> frozenset[str]:
     return frozenset(edit["instruction"].lower() for edit in scene_edits())
 
 
-def _one(choices: tuple[str, ...], rng: np.random.Generator) -> str:
-    return choices[int(rng.integers(len(choices)))]
-
-
 def instruction(
     kind: str, thing: int, look: npt.NDArray[np.int64], rng: np.random.Generator
 ) -> str:
@@ -334,10 +331,10 @@ def _draw_instruction(
     it = noun_of(thing, kind, rng)
     match kind:
         case "color":
-            hue = _one(HUES[COLORS[color]], rng)
+            hue = one_of(HUES[COLORS[color]], rng)
             if FINISHES[finish] == "shiny" and rng.uniform() < 0.3:
                 hue = f"shiny {hue}"
-            return _one(
+            return one_of(
                 (
                     f"make {it} {hue}", f"paint {it} {hue}", f"turn {it} {hue}", f"color {it} {hue}",
                     f"change {it} to {hue}", f"{it} should be {hue}", f"dye {it} {hue}",
@@ -360,21 +357,21 @@ def _draw_instruction(
                     choices += [f"turn {it} into a {words} statue", f"make {it} a {words} statue"]
             else:
                 choices += [f"give {it} a {words} pattern", f"paint {it} {words}"]
-            return _one(tuple(choices), rng)
+            return one_of(tuple(choices), rng)
         case "ground":
-            place = _one(PLACES[GROUNDS[ground]], rng)
+            place = one_of(PLACES[GROUNDS[ground]], rng)
             name = {"boards": "wooden boards", "earth": "bare earth"}.get(
                 GROUNDS[ground], GROUNDS[ground]
             )
-            return _one(
+            return one_of(
                 (
                     f"put {it} {place}", f"move {it} {place}", f"place {it} {place}", f"show {it} {place}",
                     f"make the ground {name}", f"cover the floor with {name}", f"turn the ground into {name}",
                 ), rng,
             )  # fmt: skip
-    hour = _one(HOURS[TIMES[time]], rng)
+    hour = one_of(HOURS[TIMES[time]], rng)
     name = {"cloudy": "cloudy", "day": "a sunny day"}.get(TIMES[time], TIMES[time])
-    return _one(
+    return one_of(
         (
             f"show {it} {hour}",
             f"make it look as {hour}",
@@ -408,7 +405,7 @@ def ambiguous_instruction(kind: str, thing: int, rng: np.random.Generator) -> st
     """A sentence that asks for a change of a kind and leaves open which; kinds are those of :data:`AMBIGUOUS`."""
     while True:
         it = noun_of(thing, kind, rng)
-        text = _one(AMBIGUOUS[kind], rng)
+        text = one_of(AMBIGUOUS[kind], rng)
         # Which part "its colour" means, no one could tell.
         open_ended = "{}" not in text or "statue" in text
         if is_part(thing) and kind in ("color", "material") and open_ended:

@@ -25,6 +25,7 @@ from attnwarp_eval.drawn.worlds import (
     TIMES,
     TWO_COLORED,
     draw_look,
+    one_of,
     surface_words,
 )
 from training.worlds.part_pictures import PARTS, PartPictures
@@ -185,7 +186,7 @@ def true_of(
 
 def part_words(part: int, surface: Surface, rng: np.random.Generator) -> str:
     """A part and its surface, with an article where it takes one: "a red jacket", "brown hair"."""
-    noun = _one(PART_NOUNS[PARTS[part]], rng)
+    noun = one_of(PART_NOUNS[PARTS[part]], rng)
     return with_article(noun, surface_text(surface, rng, part=PARTS[part]))
 
 
@@ -194,7 +195,7 @@ def surface_text(surface: Surface, rng: np.random.Generator, *, part: str = "") 
     finish, color, second = surface
     if finish == SAID:
         more = SOME_HUES.get(f"{COLORS[color]} {part}", ())
-        return _one((*HUES[COLORS[color]], *more), rng)
+        return one_of((*HUES[COLORS[color]], *more), rng)
     words, _ = surface_words(finish, color, second, rng)
     if FINISHES[finish] in TWO_COLORED and rng.uniform() < 0.25:
         return words.split()[-1]  # "checked", without its colours
@@ -218,9 +219,9 @@ def sentence(caption: Caption, rng: np.random.Generator, *, fillers: bool = Fals
         >>> sentence(Caption(KINDS.index("person"), None, (jacket,)), rng)
         'a rendering of a human figure in a crimson shirt'
     """
-    tail = [_one(PLACES[GROUNDS[caption.ground]], rng)] if caption.ground >= 0 else []
+    tail = [one_of(PLACES[GROUNDS[caption.ground]], rng)] if caption.ground >= 0 else []
     if caption.time >= 0:
-        tail.append(_one(HOURS[TIMES[caption.time]], rng))
+        tail.append(one_of(HOURS[TIMES[caption.time]], rng))
     named = [part_words(p, s, rng) for p, s in caption.parts]
     if caption.kind < 0:
         described = " and ".join(named)
@@ -239,11 +240,11 @@ def sentence(caption: Caption, rng: np.random.Generator, *, fillers: bool = Fals
                 described = (
                     f"{described} {'in' if worn and rng.uniform() < 0.7 else 'with'} {joined}"
                 )
-    return " ".join(" ".join([_one(OPENINGS, rng), described, *tail]).split())
+    return " ".join(" ".join([one_of(OPENINGS, rng), described, *tail]).split())
 
 
 def _whole(caption: Caption, rng: np.random.Generator, fillers: bool) -> str:
-    noun = _one(WHOLE_NOUNS[KINDS[caption.kind]], rng)
+    noun = one_of(WHOLE_NOUNS[KINDS[caption.kind]], rng)
     adjective = surface_text(caption.whole, rng) if caption.whole is not None else ""
     if (
         caption.whole is not None
@@ -251,13 +252,7 @@ def _whole(caption: Caption, rng: np.random.Generator, fillers: bool) -> str:
         and FINISHES[caption.whole[0]] in STATUES
         and rng.uniform() < 0.5
     ):
-        return (
-            f"{with_article(_one(('statue', 'sculpture'), rng), adjective)} of {with_article(noun)}"
-        )
+        return f"{with_article(one_of(('statue', 'sculpture'), rng), adjective)} of {with_article(noun)}"
     if fillers and rng.uniform() < 0.25:
-        adjective = f"{_one(FILLERS, rng)} {adjective}".strip()
+        adjective = f"{one_of(FILLERS, rng)} {adjective}".strip()
     return with_article(noun, adjective)
-
-
-def _one(choices: Sequence[str], rng: np.random.Generator) -> str:
-    return choices[int(rng.integers(len(choices)))]
