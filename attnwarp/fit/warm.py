@@ -38,7 +38,7 @@ def compile_kernels(
     place = torch.device(device)
     if (kind, place.type) in _ready:
         return
-    text = "waiting for the renderer, which is compiled once after an installation: about a minute"
+    text = "loading the renderer; after an installation it is compiled once, in about a minute"
     timer = threading.Timer(QUIET_SECONDS, report.log, [text])
     timer.daemon = True
     timer.start()

@@ -45,7 +45,7 @@ def test_a_long_compilation_is_told_once(cold, monkeypatch):
     warm.compile_kernels("2d", Watched(log=said.append))
     warm.compile_kernels("2d", Watched(log=said.append))
     (line,) = said
-    assert line.startswith("waiting for the renderer, which is compiled once")
+    assert line.startswith("loading the renderer; after an installation it is compiled once")
 
 
 @pytest.mark.parametrize("off", [torch.no_grad, torch.inference_mode])
