@@ -33,6 +33,15 @@ def test_the_interval_is_students_t_over_the_means_of_the_scenes():
     assert result.p == pytest.approx(stats.ttest_1samp(means, 0.0).pvalue)
 
 
+@pytest.mark.parametrize("scenes", [6, 12, 40])
+def test_a_detectable_difference_is_found_at_80_percent(scenes):
+    result = interval({f"s{i}": [v] for i, v in enumerate(np.linspace(-1.0, 1.0, scenes))})
+    ratio = result.detectable / stats.sem(np.linspace(-1.0, 1.0, scenes))
+    power = stats.nct.sf(stats.t.ppf(0.975, scenes - 1), scenes - 1, ratio)
+    # Two quantiles of Student's t are added, an approximation for few scenes.
+    assert power == pytest.approx(0.8, abs=0.01)
+
+
 @pytest.mark.parametrize("scenes", [3, 6])
 @pytest.mark.parametrize(("between", "within"), [(1.0, 0.5), (0.3, 1.0)])
 def test_intervals_cover_the_true_mean_at_their_stated_rate(scenes, between, within):
