@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ import torch
 from attnwarp.camera import Camera
 from attnwarp.digest import digest
 from attnwarp.editing.segment import Mask, cut_out, load_segmenter, segments_of
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, InputWarning
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import read_upright
 from attnwarp.methods.pictures import Segment, check_view_aspect, mask_picture
@@ -219,8 +220,13 @@ def lifted_segments(
         f"lifted through the splats: the source sees {lifted.seen.mean():.0%} of them, the rest"
         f" follow their neighbours{alone}; back in the source the mask"
         f" overlaps itself by {agreement:.0%}"
-        + ("; the splats do not fit it well, look at segments/" if agreement < POOR else "")
     )
+    if agreement < POOR:
+        warnings.warn(
+            "the splats do not fit the mask well, so other things may be edited; look at segments/",
+            InputWarning,
+            stacklevel=2,
+        )
     # The soft edge lies inside, so that nothing changes where less than half of a pixel is marked.
     soft = (np.clip(4 * lifted.render(camera) - 2, 0, 1) for camera in cameras)
     return [np.rint(255 * share).astype(np.float32) / np.float32(255) for share in soft]
