@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -72,9 +71,7 @@ class Geometry:
         return self._masked(warp)
 
     def _masked(self, warp: WarpedView) -> WarpedView:
-        if self.settings.mask:
-            return warp
-        return replace(warp, mask=warp.rules["defined"].clone(), _at={})
+        return warp if self.settings.mask else warp.with_mask(warp.rules["defined"])
 
     def _surface(self, view: int, model: Gaussians) -> Surface:
         if model is self.work.frozen and view in self._frozen:

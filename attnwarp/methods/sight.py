@@ -148,7 +148,7 @@ class Sight:
     scales: Sequence[float] | None = None
     margins: Sequence[int] | None = None
     zeros: bool = False
-    _choices: dict[tuple[Size, bool], Tensor] = field(default_factory=dict, repr=False)
+    _choices: dict[tuple[Size, bool], Tensor] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def quality(self) -> list[Tensor]:
@@ -246,7 +246,7 @@ class SourceWarp:
     sight: Sight
     number: int
     picture: bool = False
-    _at: dict[tuple[int, ...], LayerOfSource] = field(default_factory=dict, repr=False)
+    _at: dict[tuple[int, ...], LayerOfSource] = field(default_factory=dict, init=False, repr=False)
 
     def at(self, size: Size, *, source_size: Size | None = None) -> LayerOfSource:
         """The warp of an (h, w) grid of the target from a grid of the source."""

@@ -48,7 +48,7 @@ class FeatureWarp:
     correspondence: Correspondence
     mask: Tensor
     backend: Backend = "auto"
-    _taps: dict[tuple[Any, ...], Taps] = field(default_factory=dict, repr=False)
+    _taps: dict[tuple[Any, ...], Taps] = field(default_factory=dict, init=False, repr=False)
     _masks: dict[torch.device, Tensor] = field(default_factory=dict, repr=False)
 
     @cached_property

@@ -66,12 +66,31 @@ class WarpedView:
     target: Surface
     source: Surface | None = None
     backend: Backend = "auto"
-    _at: dict[tuple[int, ...], FeatureWarp] = field(default_factory=dict)
+    # Not of ``init``, so that dataclasses.replace begins anew: the layers have the mask.
+    _at: dict[tuple[int, ...], FeatureWarp] = field(default_factory=dict, init=False, repr=False)
 
     def __repr__(self) -> str:
         rules = ", ".join(f"{name} {share_of(rule)}" for name, rule in self.rules.items())
         sizes = self.correspondence.sizes
         return f"WarpedView({sizes}, mask {share_of(self.mask)}; rules: {rules})"
+
+    def with_mask(self, mask: Tensor) -> WarpedView:
+        """The same correspondence with another mask, such as the exact one.
+
+        Args:
+            mask: (H, W) bool; pixels without a position in the source are left out of it.
+
+        Example:
+            >>> import numpy as np
+            >>> from attnwarp import Camera
+            >>> from attnwarp.warp import Surface, warp_surfaces
+            >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
+            >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
+            >>> view = warp_surfaces(camera, camera, wall, wall)
+            >>> view.with_mask(torch.zeros(8, 8, dtype=torch.bool)).at((4, 4)).mask.any().item()
+            False
+        """
+        return replace(self, mask=mask & self.correspondence.defined)
 
     def at(
         self, size: tuple[int, int], *, source_size: tuple[int, int] | None = None

@@ -188,7 +188,7 @@ class Pair:
         if not self.exact_mask or self.truth is None:
             return view
         visible = torch.from_numpy(np.ascontiguousarray(self.truth.visible))
-        return replace(view, mask=visible & view.correspondence.defined, _at={})
+        return view.with_mask(visible)
 
     def _warped_view(self) -> WarpedView:
         source, target = self.cameras

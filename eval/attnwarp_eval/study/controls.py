@@ -54,12 +54,12 @@ class MovedView(WarpedView):
 
     control: Control = "mirrored"
     share: float = DISPLACEMENT
-    _moved: dict[tuple[int, ...], FeatureWarp] = field(default_factory=dict)
+    _moved: dict[tuple[int, ...], FeatureWarp] = field(default_factory=dict, init=False)
 
     @classmethod
     def of(cls, view: WarpedView, control: Control, share: float = DISPLACEMENT) -> MovedView:
         """The wrong warp of a right one."""
-        own = {f.name: getattr(view, f.name) for f in fields(view) if f.name != "_at"}
+        own = {f.name: getattr(view, f.name) for f in fields(view) if f.init}
         return cls(**own, control=control, share=share)
 
     def at(

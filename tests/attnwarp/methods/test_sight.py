@@ -1,7 +1,5 @@
 """Oracles: the Jacobian of a plane's homography by differences, loops over pixels, formulas written out."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -57,7 +55,7 @@ def test_the_ratio_of_pixels_is_the_determinant_of_the_homographys_jacobian(sour
 def test_zeros_stand_around_the_source_as_padding_has_them(size):
     """Oracle: torch's grid_sample with zero padding."""
     view = warp(SIDE, in_front=False, opaque=None, depth_agreement=False, normal_test="none")
-    view = replace(view, mask=view.rules["defined"].clone(), _at={})
+    view = view.with_mask(view.rules["defined"])
     h, w = size
     features = torch.rand(
         1, h * w, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64

@@ -417,6 +417,21 @@ def test_pictures_of_the_wrong_axes_or_range_are_refused_and_a_segment_may_be_an
     assert np.array_equal(view.rules["segment"], segment)
 
 
+def test_another_mask_reaches_a_layer_that_was_made_already():
+    source, target = orbit(0, size=64), orbit(10, size=64)
+    depth = plane_depth(target, (1, 0, 0), 0.0)
+    depth[40:, :] = np.nan
+    wall = Surface(depth)
+    view = warp_surfaces(source, target, wall, None, preset("paper", gaussian_filter="none"))
+    assert view.at((16, 16)).mask[5, 5]
+    right = torch.zeros(64, 64, dtype=torch.bool)
+    right[:, 32:] = True
+    other = view.with_mask(right)
+    expected = torch.zeros(16, 16, dtype=torch.bool)
+    expected[:10, 8:] = True  # a pixel of the layer is 4 x 4 of the mask's
+    assert torch.equal(other.at((16, 16)).mask, expected)
+
+
 def test_a_layers_mask_drops_pixels_whose_own_correspondence_is_undefined():
     source, target = orbit(0, size=64), orbit(10, size=64)
     depth = plane_depth(target, (1, 0, 0), 0.0)

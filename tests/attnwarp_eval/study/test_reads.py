@@ -269,7 +269,7 @@ OTHERS = {
 
 def result(view, mask=None):
     if mask is not None:
-        view = dataclasses.replace(view, mask=mask & view.correspondence.defined, _at={})
+        view = view.with_mask(mask)
     layer = view.at((8, 8))
     return [view.correspondence.xy, view.mask, layer.correspondence.xy, layer.mask]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -197,7 +196,7 @@ def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
                 view = warp_view(model, pair.source, pair.target, settings, warn_empty=False)
             if spec["mask"] == "truth":
                 visible = torch.from_numpy(np.ascontiguousarray(pair.visible))
-                view = replace(view, mask=visible & view.correspondence.defined, _at={})
+                view = view.with_mask(visible)
             made[source, target] = view if control is None else MovedView.of(view, control)
         return made[source, target]
 
