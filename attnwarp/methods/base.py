@@ -230,8 +230,8 @@ class Method(ABC):
 
     @abstractmethod
     def run(self, loop: Loop) -> None:
-        """Make all edits and all tuning, by way of the loop. It is called twice, once to learn the
-        plan, so that it draws the same numbers each time.
+        """Make all edits and all tuning, by way of the loop. It is called twice, first to learn the
+        plan; a run whose calls differ from it is ended by RuntimeError.
         """
 
     def clear(self) -> None:  # noqa: B027  (most have nothing)
@@ -243,14 +243,21 @@ class Method(ABC):
 
 
 class Plan:
-    """A loop that does nothing but note what a method would do."""
+    """A loop that does nothing but note what a method would do.
+
+    Attributes:
+        rounds: of the method.
+        calls: each edit and tuning with its round, views, and rows or iterations.
+    """
 
     def __init__(self, method: Method) -> None:
         self.rounds: list[Round] = []
+        self.calls: list[tuple[str, int, tuple[int, ...], int]] = []
         method.run(self)
 
     def edit(self, number: int, views: Sequence[int], edit: Edit, *, rows: int) -> None:
         """Plan an edit of views together."""
+        self.calls.append(("edit", number, tuple(views), rows))
         now = self._round(number)
         self._change(number, views=(*now.views, *views), rows=now.rows + rows)
 
@@ -258,6 +265,7 @@ class Plan:
         self, number: int, views: Sequence[int], iterations: int, order: Order | None = None
     ) -> None:
         """Plan a round of tuning."""
+        self.calls.append(("tune", number, tuple(views), iterations))
         self._change(number, training=tuple(views), iterations=iterations)
 
     def _round(self, number: int) -> Round:
@@ -331,7 +339,8 @@ class _Run:
         self.clock = CheckpointClock(options.get("checkpoint_seconds", 30.0))
         self.names = file_stems(work.scene.cameras)
         self.seconds = self.folder.seconds
-        self.rounds = tuple(Plan(method).rounds)
+        plan = Plan(method)
+        self.rounds, self.planned = tuple(plan.rounds), iter(plan.calls)
         bound = work.scene.segments is not None and work.settings.composite == "original"
         self.bound = bound and not options.get("tune_outside", False)
         self.tuning = Tuning(
@@ -385,6 +394,7 @@ class _Run:
         self._write_segments()
         self.method.clear()
         self.method.run(self)
+        self._follow(None)
         self.method.clear()
         result = self._finish()
         if self.cut is None:
@@ -392,6 +402,15 @@ class _Run:
         else:
             self._tell(f"cut short by its {self.cut['limit'].replace('_', ' ')}")
         return result
+
+    def _follow(self, call: tuple[str, int, tuple[int, ...], int] | None) -> None:
+        """Raise RuntimeError unless a call is the plan's next; None is the end."""
+        planned = next(self.planned, None)
+        if call != planned:
+            raise RuntimeError(
+                f"{self.name}: its run calls {call or 'nothing more'}, planned was"
+                f" {planned or 'nothing more'}; draw the same numbers each time that it is called"
+            )
 
     # --- budget
 
@@ -420,6 +439,7 @@ class _Run:
 
     def edit(self, number: int, views: Sequence[int], edit: Edit, *, rows: int) -> None:
         """Edit views together, as :class:`Loop` tells."""
+        self._follow(("edit", number, tuple(views), rows))
         place = self.places[number]
         self.places[number] += 1
         if all([self.folder.made(self._picture(number, view)) for view in views]):
@@ -474,6 +494,7 @@ class _Run:
         self, number: int, views: Sequence[int], iterations: int, order: Order | None = None
     ) -> None:
         """Tune the splats, as :class:`Loop` tells."""
+        self._follow(("tune", number, tuple(views), iterations))
         cut = self.cut
         # A round without an edit would tune on those before once more.
         edited = number in self.latest.values() or not self.rounds[number].views

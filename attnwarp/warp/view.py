@@ -75,7 +75,7 @@ class WarpedView:
         return f"WarpedView({sizes}, mask {share_of(self.mask)}; rules: {rules})"
 
     def with_mask(self, mask: Tensor) -> WarpedView:
-        """The same correspondence with another mask, such as the exact one.
+        """This warp with another mask, such as the exact one.
 
         Args:
             mask: (H, W) bool; pixels without a position in the source are left out of it.

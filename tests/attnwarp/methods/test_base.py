@@ -3,6 +3,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import held_pictures
 import numpy as np
@@ -27,6 +28,7 @@ from attnwarp.methods import (
     preset,
 )
 from attnwarp.methods import base as run_module
+from attnwarp.methods.by_view import ByView
 
 
 @pytest.fixture(scope="module")
@@ -285,6 +287,28 @@ def test_a_folder_of_another_method_or_budget_is_refused_by_name(run, tmp_path):
 
 
 @pytest.mark.door
+@pytest.mark.parametrize("what", ["views", "iterations", "end"])
+def test_a_method_that_works_otherwise_than_planned_is_ended(scene, editor, what):
+    class Fickle(ByView):
+        runs = 0
+
+        def run(self, loop):
+            self.runs += 1
+            later = self.runs > 1
+            views = [1] if later and what == "views" else [0]
+            edit = partial(self.edit, views)
+            loop.edit(0, views, edit, rows=len(views))
+            if not (later and what == "end"):
+                loop.tune(0, views, 1 + (later and what == "iterations"))
+
+    model, views, images = scene
+    settings = replace(QUICK["by_view"], iterations=1)
+    with pytest.raises(RuntimeError, match=r"fickle: its run calls .*, planned was \('\w+', 0, "):
+        run_module.run(
+            "fickle", Fickle, ByViewSettings, model, views, images, editor, "red", settings
+        )
+
+
 def test_a_budget_of_another_type_is_named(run):
     with pytest.raises(TypeError, match=r"budget: got dict, expected attnwarp.methods.Budget"):
         run("by_view", budget={"seconds": 3})
