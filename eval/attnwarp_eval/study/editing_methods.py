@@ -6,7 +6,7 @@ A method gets a :class:`Job` and gives an :class:`EditedScene`. A new one is one
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.methods.settings import PRESETS
-from attnwarp_eval.study.reads import MASK_RULES, warp_reads
 
 if TYPE_CHECKING:
     from attnwarp.camera import Camera
@@ -124,10 +123,6 @@ class EditedScene:
     cut: str | None = None
 
 
-def _reads_all(settings: Mapping[str, Any]) -> Set[str]:
-    return {"preset", "set", "options", "geometry", "mask", "editor"}
-
-
 @dataclass(frozen=True)
 class Method:
     """Settings and run of a method.
@@ -137,9 +132,6 @@ class Method:
             the fields of a study and a variant, and the seed. ValueError: an unknown field or a
             value out of range.
         run: the method.
-        reads: keys of a variant that decide its result with these settings: of ``preset``, ``set``,
-            ``options``, ``geometry``, ``mask`` and ``editor``, or of a single one such as
-            ``options.steps``. A study that sets another is refused.
         takes_budget: whether it can be cut short by a budget.
         takes_picture: whether its source view can be edited by hand.
         edited: how many of a number of views it edits at most with these settings; None where that
@@ -148,7 +140,6 @@ class Method:
 
     settings: Callable[[str | None, dict[str, Any], int], dict[str, Any]]
     run: Callable[[Job], EditedScene]
-    reads: Callable[[Mapping[str, Any]], Set[str]] = _reads_all
     takes_budget: bool = False
     takes_picture: bool = False
     edited: Callable[[Mapping[str, Any], int], int] | None = None
@@ -160,74 +151,6 @@ def _attention_warping_settings(
     from attnwarp.methods import preset
 
     return dict(preset("attention_warping", name, **fields, seed=seed).to_dict())
-
-
-_LOSSES = frozenset(
-    {
-        "l1", "ssim", "perceptual", "normal", "distortion", "perceptual_encoder", "color_rate",
-        "geometry_rate", "background", "training",
-    }
-)  # fmt: skip
-"""Settings of tuning beside its length."""
-
-_FEATURES = frozenset(
-    {
-        "a0", "decay", "fractions", "kinds", "blocks", "feature_steps", "branches", "feature_type",
-    }
-)  # fmt: skip
-"""Settings of the features that are carried from the source to the views."""
-
-_NOT_IN_STUDIES = frozenset({"seed", "composite", "composite_blur", "psnr_views"})
-"""Settings that decide nothing in a study: it has seeds of its own, no segments of its scenes, and
-counts every edited view."""
-
-
-def _options(settings: Mapping[str, Any], idle: Set[str]) -> set[str]:
-    """The settings that are left, as keys of a variant."""
-    unread = set(idle)
-    if not settings["iterations"]:
-        unread |= _LOSSES
-    if not settings["perceptual"]:
-        unread.add("perceptual_encoder")
-    return {f"options.{name}" for name in settings if name not in unread} | {
-        "preset",
-        "options.preset",
-    }
-
-
-def _attention_warping_reads(settings: Mapping[str, Any]) -> Set[str]:
-    from attnwarp.methods import AttentionWarpingSettings
-
-    s = AttentionWarpingSettings.from_dict(dict(settings))
-    idle = set(_NOT_IN_STUDIES)
-    if s.estimate == 0:
-        idle |= {"estimate_until", "estimate_in", "estimate_margin"}
-    if s.sources == 1:
-        idle.add("chain_coverage")
-    if s.start is None:
-        idle.add("grid")
-        if s.latents == "random":
-            idle.add("start_picture")
-    if s.views_per_stage is None:
-        idle.add("fill_last_stage")
-    if s.mask:
-        idle.add("outside")
-    warp = warp_reads(s.warp)
-    if s.confidence:  # weighs by the margin of depth agreement, whether that is a rule or not
-        warp |= {"set.depth_relative", "set.depth_slope"}
-    read = {"editor"}
-    alone = s.method == "each view alone"
-    if alone:
-        idle |= _FEATURES
-    if not alone or s.estimate > 0 or s.sources > 1 or s.noise == "surface":
-        read |= {"geometry", "mask"}
-    else:
-        idle |= {"mask", "confidence"}
-        warp = {"set.depth", "set.depth_statistic"}  # of the depth that guides an editor
-    if not s.mask:
-        read -= {"mask"}
-        warp -= MASK_RULES if s.sources == 1 and not s.confidence else set()
-    return read | warp | {f"options.warp.{key[4:]}" for key in warp} | _options(vars(s), idle)
 
 
 def _attention_warping(job: Job) -> EditedScene:
@@ -269,9 +192,9 @@ def _with_features_of(job: Job, donor: Donor) -> EditedScene:
         def edit_source(self, number: int, *rest: Any) -> list[ViewEdit]:
             edits = super().edit_source(number, *rest)
             own = self.views.recorded(number + 1)[number]
-            assert own.recording is not None  # what records nothing reads no control
-            recordings.append(own.recording)
-            self.views.keep(number, replace(own, recording=recordings[0]))
+            if own.recording is not None:
+                recordings.append(own.recording)
+                self.views.keep(number, replace(own, recording=recordings[0]))
             return edits
 
     settings = AttentionWarpingSettings.from_dict(job.settings)
@@ -332,20 +255,6 @@ def _true_pictures(job: Job) -> EditedScene:
     return replace(result, counters={**result.counters, "network_rows": 0})
 
 
-def _true_pictures_reads(settings: Mapping[str, Any]) -> Set[str]:
-    from attnwarp.methods import AttentionWarpingSettings
-
-    read = {"stages", "views_per_stage", "iterations", "sources", "detail", *_LOSSES}
-    if settings["detail"] == "none":
-        read.add("size")
-    warp: set[str] = set()
-    if settings["sources"] > 1:  # what the sources see of each other orders them
-        read |= {"chain_coverage", "mask"}
-        warp = warp_reads(AttentionWarpingSettings.from_dict(dict(settings)).warp)
-    options = {f"options.warp.{key[4:]}" for key in warp}
-    return warp | options | _options(settings, settings.keys() - read)
-
-
 def _warped_views(settings: Mapping[str, Any], views: int) -> int:
     """The sources, and the views that the stages draw."""
     from attnwarp.methods import AttentionWarpingSettings
@@ -374,14 +283,6 @@ def _baseline(name: str) -> Method:
 
         return dict(preset(name, wanted, **fields, seed=seed).to_dict())
 
-    def reads(settings: Mapping[str, Any]) -> Set[str]:
-        idle = set(_NOT_IN_STUDIES)
-        if settings.get("latents") == "random":
-            idle.add("source_prompt")
-        if name == "by_view" and settings["start"] is not None and settings["noise"] == "fresh":
-            idle.add("batch")
-        return {"editor"} | _options(settings, idle)
-
     def run(job: Job) -> EditedScene:
         from attnwarp import methods
 
@@ -399,19 +300,18 @@ def _baseline(name: str) -> Method:
             )
         )
 
-    return Method(settings, run, reads, takes_budget=True, edited=_drawn_views)
+    return Method(settings, run, takes_budget=True, edited=_drawn_views)
 
 
 EDITING_METHODS: dict[str, Method] = {
     "attention_warping": Method(
         _attention_warping_settings,
         _attention_warping,
-        _attention_warping_reads,
         takes_budget=True,
         takes_picture=True,
         edited=_warped_views,
     ),
-    "true pictures": Method(_attention_warping_settings, _true_pictures, _true_pictures_reads),
+    "true pictures": Method(_attention_warping_settings, _true_pictures),
     **{name: _baseline(name) for name in PRESETS if name != "attention_warping"},
 }
 """Every method by name, as in :mod:`attnwarp.methods`. ``attention_warping`` with ``method: each

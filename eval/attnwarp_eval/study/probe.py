@@ -143,10 +143,7 @@ class Probe(ABC, Generic[E]):
         always: whether every run has its cells, with or without the study's asking.
         main: whether tables of a report speak of it where they name no probe.
         times_in_turn: stages of the :class:`InTurn` that its records have.
-        draws: whether it can save pictures.
         edits: whether it measures methods that edit, whose presets are their own.
-        study_keys: every key of a study that decides its cells; None for all of them.
-        shared: settings of the study by their place -> the variant's key that goes before them.
     """
 
     name: ClassVar[str]
@@ -159,10 +156,7 @@ class Probe(ABC, Generic[E]):
     always: ClassVar[bool] = False
     main: ClassVar[bool] = False
     times_in_turn: ClassVar[Sequence[str]] = ()
-    draws: ClassVar[bool] = True
     edits: ClassVar[bool] = False
-    study_keys: ClassVar[Set[str] | None] = None
-    shared: ClassVar[Mapping[tuple[str, ...], str]] = {}
 
     @property
     def tabled(self) -> bool:
@@ -189,14 +183,6 @@ class Probe(ABC, Generic[E]):
     def measured(self, study: Study) -> Set[str]:
         """Variants of a study that decide cells of this probe."""
         return set(study.probes.get(self.name, ()))
-
-    def reads(self, study: Study, variant: Variant) -> Set[str]:
-        """Keys of a variant that decide its cells of this probe; here, all of them.
-
-        ``splats`` stands for all that is below it, ``splats.count`` for that alone. A study that
-        sets what none of its probes reads is refused.
-        """
-        return set(type(variant).model_fields)
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

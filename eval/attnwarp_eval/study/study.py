@@ -20,7 +20,6 @@ from attnwarp_eval.scene.yaml import Place, YamlError, line_of, read_yaml
 from attnwarp_eval.study.cell import Cell, merged
 from attnwarp_eval.study.populations import expanded, with_edits_of
 from attnwarp_eval.study.probe import Probe, probe, probes
-from attnwarp_eval.study.reads import unused
 from attnwarp_eval.study.schema import (
     FIGURE,
     Front,
@@ -296,8 +295,8 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         overrides: fields to replace, such as ``size`` or ``scenes``; None leaves a field as it is.
 
     Raises:
-        StudyError: no such study, not YAML, an unknown key, a value out of range, a setting that
-            decides nothing of the study, or studies that extend each other in a circle.
+        StudyError: no such study, not YAML, an unknown key, a value out of range, a variant that no
+            probe measures, or studies that extend each other in a circle.
 
     Example:
         >>> study = load_study("quick", scenes=["spheres"])
@@ -312,7 +311,6 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
             " file's path"
         )
     data, lines = _read(path)
-    keys = set(data)
     try:
         data = expanded(data)
     except InputError as error:
@@ -338,17 +336,13 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         file, line = line_of(lines, place) if place else (path, None)
         at = f"{file}:{line}" if line else str(file)
         raise StudyError(f"{at}: {explain_errors(error)}") from None
-    problems: dict[Path, list[tuple[int, str]]] = {}
-    for place, why in unused(study, keys, probes()):
-        file, line = line_of(lines, place)
+    measured = set[str]().union(*(p.measured(study) for p in probes()))
+    for name in (name for name in study.variants if name not in measured):
+        file, line = line_of(lines, ("variants", name))
         inherited = "" if file == path else f", or take it away with null in {path.name}"
-        problems.setdefault(file, []).append((line, f"{'.'.join(place)}: {why}{inherited}"))
-    if problems:
         raise StudyError(
-            "; ".join(
-                f"{file}:" + "; line ".join(f"{line}: {problem}" for line, problem in sorted(found))
-                for file, found in problems.items()
-            )
+            f"{file}:{line}: variants.{name}: no probe measures it; name it under probes, or leave"
+            f" it out{inherited}"
         )
     if isinstance(every, list):
         called = {scene_name(name) for name in study.scenes}

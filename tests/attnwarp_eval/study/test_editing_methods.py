@@ -6,7 +6,9 @@ import pytest
 from tiny_scenes import cameras, pictures, splats
 
 from attnwarp.editing.small import load_editor
+from attnwarp_eval.study import parse_study
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, Job
+from attnwarp_eval.study.shared import edits
 
 
 @pytest.mark.parametrize(("detail", "size"), [("none", 16), ("none", None), ("change", 16)])
@@ -27,4 +29,24 @@ def test_true_pictures_have_the_size_at_which_other_methods_edit(detail, size, t
         how = cv2.INTER_AREA if edge < images[0].shape[0] else cv2.INTER_CUBIC
         expected = cv2.resize(truth[view], (edge, edge), interpolation=how)
         assert np.abs(edited / 255.0 - expected.clip(0, 1)).max() <= 0.5 / 255 + 1e-6
-    assert {"options.detail", "options.size"} <= method.reads(settings) or detail == "change"
+
+
+@pytest.mark.parametrize(
+    ("method", "name", "expected"),
+    [
+        ("igs2gs", "released", {"text_guidance": 12.5, "image_guidance": 1.5, "iterations": 7500}),
+        ("igs2gs", "improved", {"text_guidance": 12.5, "image_guidance": 1.5, "iterations": 3000}),
+        ("dge", "released", {"text_guidance": 7.5, "image_guidance": 1.5}),
+        ("gaussctrl", "paper", {"text_guidance": 5.0, "control_share": None}),
+        ("gaussctrl", "released", {"text_guidance": 5.0, "control_share": 0.0}),
+        ("igs2gs", None, {"text_guidance": None, "image_guidance": None}),
+    ],
+)
+def test_a_variant_has_the_preset_of_its_method_that_it_names(method, name, expected):
+    """The published numbers of docs/method/baselines.md."""
+    variant = {"method": method} | ({} if name is None else {"preset": name})
+    study = parse_study(
+        {"name": "s", "scenes": ["bear"], "variants": {"v": variant}, "probes": {"editing": ["v"]}}
+    )
+    settings = edits.settings_of(study, study.variants["v"], 0)
+    assert {key: settings[key] for key in expected} == expected

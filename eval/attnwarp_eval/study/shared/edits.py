@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
@@ -18,10 +18,9 @@ from attnwarp_eval.study.edit_truth import answers_of
 from attnwarp_eval.study.editing_methods import EDITING_METHODS
 from attnwarp_eval.study.hand_made import Kind
 from attnwarp_eval.study.probe import Probe
-from attnwarp_eval.study.reads import MASK_RULES
 from attnwarp_eval.study.record import Extra, Json
 from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, Whole, did_you_mean
-from attnwarp_eval.study.shared.splats import splats_meaning, splats_reads, splats_spec
+from attnwarp_eval.study.shared.splats import splats_meaning, splats_spec
 
 E = TypeVar("E", bound=Extra)
 
@@ -105,54 +104,13 @@ class VariantPart(Part):
     control: Control | None = None
 
 
-GUIDANCE = frozenset(
-    {
-        "options.text_guidance", "options.image_guidance", "options.guidance_drop",
-        "options.source_text_guidance", "options.suffix", "options.negative_prompt",
-    }
-)  # fmt: skip
-"""Settings of words and their guidance, which decide nothing for the ideal editor."""
-
-
 class MethodProbe(Probe[E]):
     """Base of probes that run a variant's method of editing."""
 
     edits = True
-    other_scenes = False
-    """True where a cell can take features of another scene."""
     whole = False
     """True where methods run whole and edit their source themselves: ``budget`` and ``by_hand``
     decide nothing."""
-    shared: ClassVar[Mapping[tuple[str, ...], str]] = {
-        ("editing", "options"): "options",
-        ("editing", "editor"): "editor",
-    }
-
-    def reads(self, study: Study, variant: Variant) -> Set[str]:
-        """Keys that the method reads, and those of its editor and its splats."""
-        own = variant.part(VariantPart)
-        settings = settings_of(study, variant, 0)
-        limits = set() if self.whole else {"budget", "by_hand"}
-        read = {"method", *limits, *splats_reads(variant)}
-        warps = EDITING_METHODS[own.method].takes_picture and settings["method"] == "warp"
-        if own.control == OTHER_SEED or (
-            warps and (own.control != OTHER_SCENE or self.other_scenes)
-        ):
-            read.add("control")
-        read |= EDITING_METHODS[own.method].reads(settings)
-        one_mask = settings.get("sources", 1) == 1 and not settings.get("confidence")
-        if own.mask == "truth" and one_mask:
-            read -= MASK_RULES
-        if "preset" in own.options:
-            read -= {"preset"}
-        if "editor" in read:
-            guidance = ("text_guidance", "image_guidance")
-            read -= {"editor"}
-            if editor_of(study, variant).ideal is not None:
-                return (read | {"editor.ideal"}) - GUIDANCE
-            read |= {"editor.name", "editor.draws"}
-            read |= {f"editor.{name}" for name in guidance if settings.get(name) is None}
-        return read
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """The method with all its settings, the editor, and where splats and warps come from."""

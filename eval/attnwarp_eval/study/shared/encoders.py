@@ -49,7 +49,6 @@ class MetricsProbe(Probe[Seconds]):
     """Base of probes that judge metrics on pictures that no variant changes."""
 
     judges_variants = False
-    draws = False
 
     def check(self, study: Study) -> None:
         """Variants change no metric."""

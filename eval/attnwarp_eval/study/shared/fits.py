@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,10 +42,6 @@ class VariantPart(Part):
 
     fitted: bool = False
     fit: dict[str, Any] = Field(default_factory=dict)
-
-
-FIT_READS = frozenset(f"fit.{f.name}" for f in fields(FitSettings))
-"""Keys of a variant that decide its fit."""
 
 
 def settings_of(study: Study, variant: Variant, seed: int) -> FitSettings:

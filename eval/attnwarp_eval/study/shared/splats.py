@@ -45,16 +45,6 @@ def check_splats(study: Study, probe: str, what: str) -> None:
             )
 
 
-def splats_reads(variant: Variant) -> set[str]:
-    """Keys of a variant that decide its splats."""
-    return {"fitted", *fits.FIT_READS} if variant.part(fits.VariantPart).fitted else {"splats"}
-
-
-def surface_reads(variant: Variant) -> set[str]:
-    """Keys of a variant that decide where its depth comes from."""
-    return {"geometry"} | (set() if variant.geometry == "truth" else splats_reads(variant))
-
-
 def splats_meaning(study: Study, variant: Variant) -> str:
     """Key that variants of the same splats share, for claims."""
     return canonical_json(splats_spec(study, variant, 0))

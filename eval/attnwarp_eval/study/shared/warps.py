@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,13 +14,11 @@ from attnwarp_eval.metrics.labels import Labels
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Probe, Work
-from attnwarp_eval.study.reads import warp_reads
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Study, Variant
 from attnwarp_eval.study.shared.splats import (
     splats_of,
     surface_meaning,
-    surface_reads,
     surface_spec,
 )
 from attnwarp_eval.study.shared.things import thing_of
@@ -30,11 +28,6 @@ from attnwarp_eval.two_view import TwoView
 
 class WarpProbe(Probe[NoExtra]):
     """Base of probes that judge a variant's warp."""
-
-    def reads(self, study: Study, variant: Variant) -> Set[str]:
-        """Depth and rules."""
-        truth = variant.geometry == "truth"
-        return surface_reads(variant) | warp_reads(variant.settings(), truth)
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """Depth and rules."""
@@ -51,8 +44,6 @@ class WarpProbe(Probe[NoExtra]):
 
 class ThingWarpProbe(WarpProbe):
     """Base of probes that carry labels of a scene's thing along the warp."""
-
-    draws = False
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

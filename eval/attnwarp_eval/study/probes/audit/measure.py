@@ -88,7 +88,6 @@ class AuditProbe(MetricsProbe):
     protocol = 2
     study_part = StudyPart
     metrics = metrics_of("consistency.", "embedding.", "multiview.")
-    study_keys = frozenset({"size", "seeds", "spp", "timing_rounds", "encoders", "audit"})
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

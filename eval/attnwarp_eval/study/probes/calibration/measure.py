@@ -80,7 +80,6 @@ class Calibration(Probe[Extra]):
     metrics = metrics_of("calibration.", "warp.", "occlusion.")
     judges_variants = False
     always = True
-    study_keys = frozenset({"size", "views", "seeds", "spp", "feature_sizes", "feature_channels"})
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

@@ -64,7 +64,6 @@ class CarryProbe(MethodProbe[NoExtra]):
     whole = True
     study_part = StudyPart
     metrics = Registry({"multiview.delta_e": METRICS["multiview.delta_e"]})
-    study_keys = frozenset({"carry", "editing", "seeds", "size", "spp", "things", "views"})
 
     def check(self, study: Study) -> None:
         """Require an edit, variants that edit, and an editor that follows words."""

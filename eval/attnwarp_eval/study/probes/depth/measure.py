@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Set
 from functools import partial
 from typing import Any
 
@@ -10,14 +9,12 @@ from attnwarp.warp import WarpSettings, render_surface
 from attnwarp_eval import metrics
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.probe import Probe, Work, metrics_of, register
-from attnwarp_eval.study.reads import DEPTH_READS
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Study, Variant
 from attnwarp_eval.study.shared.splats import (
     check_splats,
     splats_of,
     surface_meaning,
-    surface_reads,
     surface_spec,
 )
 
@@ -28,15 +25,10 @@ class Depth(Probe[NoExtra]):
 
     name = "depth"
     metrics = metrics_of("depth.")
-    study_keys = frozenset({"size", "views", "seeds", "spp"})
 
     def check(self, study: Study) -> None:
         """A variant without splats renders nothing."""
         check_splats(study, self.name, "depth to measure")
-
-    def reads(self, study: Study, variant: Variant) -> Set[str]:
-        """Splats, and how depth is read off them."""
-        return surface_reads(variant) | DEPTH_READS
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """Splats, and how depth is read off them."""

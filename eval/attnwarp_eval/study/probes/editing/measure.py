@@ -60,11 +60,9 @@ class EditingProbe(MethodProbe[EditResult]):
 
     name = "editing"
     protocol = 3
-    other_scenes = True
     study_part = EditingPart
     variant_part = VariantPart
     metrics = metrics_of("multiview.", "fidelity.", "embedding.", "depth.", "image.", "cost.")
-    study_keys = frozenset({"size", "views", "seeds", "spp", "editing", "encoders"})
 
     # From a study to cells
 

@@ -77,8 +77,6 @@ class EditingTimingProbe(MethodProbe[Rounds]):
     protocol = 2
     study_part = StudyPart
     times_in_turn = STAGES
-    draws = False
-    study_keys = frozenset({"size", "views", "spp", "timing_rounds", "editing", "editing_timing"})
 
     def check(self, study: Study) -> None:
         """Every contestant runs to its end, by what it sees itself."""

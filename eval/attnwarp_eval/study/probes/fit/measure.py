@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats import export, fitted
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.probe import Probe, Work, metrics_of, register
-from attnwarp_eval.study.reads import DEPTH_READS
 from attnwarp_eval.study.record import Json, finite, with_nan
 from attnwarp_eval.study.schema import Study, Variant
 from attnwarp_eval.study.shared import fits
@@ -76,12 +75,6 @@ class Fit(Probe[Curve]):
     study_part = fits.StudyPart
     variant_part = fits.VariantPart
     metrics = metrics_of("fit.", "depth.")
-    study_keys = frozenset({"size", "seeds", "spp", "fit"})
-    shared: ClassVar[Mapping[tuple[str, ...], str]] = {("fit", "settings"): "fit"}
-
-    def reads(self, study: Study, variant: Variant) -> Set[str]:
-        """The fit, and how depth is read off it."""
-        return fits.FIT_READS | DEPTH_READS | {"fitted"}
 
     def check_variant(self, study: Study, variant: Variant) -> None:
         """Fit settings are refused even where nothing is fitted."""

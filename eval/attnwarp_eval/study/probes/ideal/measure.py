@@ -85,9 +85,6 @@ class IdealProbe(MethodProbe[IdealResult]):
     whole = True
     study_part = ThingsPart
     metrics = metrics_of("parts.")
-    study_keys = frozenset({"size", "views", "seeds", "spp", "editing", "things"})
-    draws = False
-    other_scenes = True
 
     def check(self, study: Study) -> None:
         """Every variant needs the ideal editor, and a method that it can serve."""

@@ -57,7 +57,6 @@ class LabelTransport(ThingWarpProbe):
     name = "labels"
     study_part = StudyPart
     metrics = metrics_of("labels.")
-    study_keys = frozenset({"size", "views", "seeds", "spp", "labels", "things"})
 
     def check(self, study: Study) -> None:
         """Grids need to divide the pictures."""

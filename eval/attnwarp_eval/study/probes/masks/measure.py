@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -27,7 +27,6 @@ from attnwarp_eval.study.shared.splats import (
     check_splats,
     splats_meaning,
     splats_of,
-    splats_reads,
     surface_spec,
 )
 from attnwarp_eval.study.shared.things import thing_of
@@ -61,15 +60,10 @@ class Masks(Probe[NoExtra]):
     name = "masks"
     variant_part = VariantPart
     metrics = metrics_of("masks.")
-    study_keys = frozenset({"size", "views", "seeds", "spp", "things"})
 
     def check(self, study: Study) -> None:
         """A variant without splats has nothing to lift through."""
         check_splats(study, self.name, "mask to lift")
-
-    def reads(self, study: Study, variant: Variant) -> Set[str]:
-        """Splats, and the masks that are lifted."""
-        return {"geometry", "lifted", *splats_reads(variant)}
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

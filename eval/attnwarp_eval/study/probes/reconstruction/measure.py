@@ -72,7 +72,6 @@ class ReconstructionProbe(MetricsProbe):
     name = "reconstruction"
     study_part = StudyPart
     metrics = metrics_of("consistency.colmap_")
-    study_keys = frozenset({"size", "seeds", "spp", "reconstruction"})
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

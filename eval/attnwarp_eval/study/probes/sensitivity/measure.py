@@ -71,7 +71,6 @@ class Sensitivity(MetricsProbe):
     name = "sensitivity"
     study_part = StudyPart
     metrics = metrics_of("fidelity.", "consistency.", "embedding.")
-    study_keys = frozenset({"size", "views", "seeds", "spp", "timing_rounds", "encoders", "edits"})
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

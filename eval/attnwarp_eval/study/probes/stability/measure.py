@@ -80,8 +80,6 @@ class Stability(Probe[Extra]):
     metrics = metrics_of("stability.")
     needs_scenes = False
     judges_variants = False
-    draws = False
-    study_keys = frozenset({"stability"})
 
     def check(self, study: Study) -> None:
         """Cases have names; variants change none of them."""

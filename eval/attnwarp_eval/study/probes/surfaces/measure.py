@@ -55,9 +55,6 @@ class SurfaceProbe(ThingWarpProbe):
 
     name = "surfaces"
     metrics = metrics_of("surface.", "depth.", "fit.", "warp.", "occlusion.", "labels.")
-    study_keys = frozenset(
-        {"size", "views", "seeds", "spp", "feature_sizes", "feature_channels", "fit", "things"}
-    )
 
     def check(self, study: Study) -> None:
         """Tokens have whole pixels."""

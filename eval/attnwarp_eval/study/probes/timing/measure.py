@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 from attnwarp.warp import WarpSettings, render_surface, warp_view
@@ -10,11 +10,10 @@ from attnwarp_eval.cost import in_turn
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import InTurn, Probe, Work, register
-from attnwarp_eval.study.reads import warp_reads
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Outcome
-from attnwarp_eval.study.schema import Study, Variant
-from attnwarp_eval.study.shared.splats import check_splats, splats_of, surface_reads, surface_spec
+from attnwarp_eval.study.schema import Study
+from attnwarp_eval.study.shared.splats import check_splats, splats_of, surface_spec
 
 
 @dataclass(frozen=True)
@@ -40,16 +39,10 @@ class Timing(Probe[Rounds]):
 
     name = "timing"
     times_in_turn = ("render", "pair")
-    draws = False
-    study_keys = frozenset({"size", "views", "seeds", "spp", "feature_sizes", "timing_rounds"})
 
     def check(self, study: Study) -> None:
         """A variant without splats renders nothing."""
         check_splats(study, self.name, "time to take")
-
-    def reads(self, study: Study, variant: Variant) -> Set[str]:
-        """Splats and rules."""
-        return surface_reads(variant) | warp_reads(variant.settings())
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

@@ -77,7 +77,6 @@ class VariabilityProbe(MethodProbe[Varied]):
     name = "variability"
     protocol = 2
     metrics = metrics_of("variability.")
-    study_keys = frozenset({"size", "views", "seeds", "spp", "editing"})
 
     def check(self, study: Study) -> None:
         """One seed varies from no other, and a method that was cut short varies with the clock."""

@@ -34,9 +34,6 @@ class Warp(WarpProbe):
     study_part = StudyPart
     metrics = metrics_of("warp.", "occlusion.")
     main = True
-    study_keys = frozenset(
-        {"size", "views", "seeds", "spp", "feature_sizes", "feature_channels", "yaw"}
-    )
 
     def check(self, study: Study) -> None:
         """Masks by yaw need their variants measured."""
