@@ -145,8 +145,6 @@ def needs_truth(variant: Variant) -> str | None:
         return "its edits are the true pictures"
     if own.mask == "truth" or variant.geometry == "truth":
         return "its warp is the true one"
-    if own.by_hand is not None:
-        return "its source is drawn from the true picture"
     if variant.part(fits.VariantPart).fitted:
         return "its splats are fitted to true pictures"
     return None

@@ -95,12 +95,28 @@ def read_raw(path: Path) -> Results:
         head, *cells = map(json.loads, lzma.decompress(path.read_bytes()).decode().splitlines())
         if head["raw"] != FORMAT:
             raise InputError(f"{path}: {head['raw']!r} is another version's; {remedy}")
-        study = parse_study(head["study"])
+        study = _study(head["study"])
         outcomes = [_outcome(**line) for line in cells]
     except (lzma.LZMAError, ValueError, LookupError, TypeError, AttributeError) as error:
         why = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
         raise InputError(f"{path}: no raw results ({why}); {remedy}") from None
     return Results(study, outcomes, [], {k: v for k, v in head["notices"].items() if v})
+
+
+def _study(data: Any) -> Study:
+    """The study of raw results, without keys that later versions lack: the results outlive them."""
+    try:
+        return parse_study(data)
+    except ValidationError as error:
+        lacking = [one["loc"] for one in error.errors() if one["type"] == "extra_forbidden"]
+        if not lacking:
+            raise
+    for *above, key in lacking:
+        part = data
+        for step in above:
+            part = part[step]
+        del part[key]
+    return parse_study(data)
 
 
 def _outcome(cell: dict[str, Any], record: dict[str, Any] | None) -> Outcome:

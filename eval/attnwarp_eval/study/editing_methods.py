@@ -82,8 +82,6 @@ class Job:
         truth: the true edited views by answer, in the order of ``cameras``. Only methods that
             bound others may look at it.
         budget: limits of the method; None for none. Only methods with ``takes_budget`` get one.
-        source_picture: (H, W, 3) sRGB in [0, 1], the source view edited by hand; None where the
-            editor edits it. Only methods with ``takes_picture`` get one.
         donor: of the features that targets get in place of the source's; None for the source's.
         segments: (H, W) bool of each view, outside which nothing may change; None for everywhere.
     """
@@ -98,7 +96,6 @@ class Job:
     warps: Callable[[int, int], WarpedView] | None
     truth: Mapping[str, Sequence[Image]]
     budget: Budget | None = None
-    source_picture: Image | None = None
     donor: Donor | None = None
     segments: Sequence[npt.NDArray[np.bool_]] | None = None
 
@@ -133,7 +130,6 @@ class Method:
             value out of range.
         run: the method.
         takes_budget: whether it can be cut short by a budget.
-        takes_picture: whether its source view can be edited by hand.
         edited: how many of a number of views it edits at most with these settings; None where that
             is not known.
     """
@@ -141,7 +137,6 @@ class Method:
     settings: Callable[[str | None, dict[str, Any], int], dict[str, Any]]
     run: Callable[[Job], EditedScene]
     takes_budget: bool = False
-    takes_picture: bool = False
     edited: Callable[[Mapping[str, Any], int], int] | None = None
 
 
@@ -169,7 +164,6 @@ def _attention_warping(job: Job) -> EditedScene:
             AttentionWarpingSettings.from_dict(job.settings),
             warps=job.warps,
             folder=job.folder,
-            source_picture=job.source_picture,
             budget=job.budget,
             segments=job.segments,
         )
@@ -206,7 +200,7 @@ def _with_features_of(job: Job, donor: Donor) -> EditedScene:
     return _edited(
         run(
             "attention_warping",
-            lambda work, s: Swapping(work, s, 0, job.source_picture, job.warps, "cpu"),
+            lambda work, s: Swapping(work, s, 0, None, job.warps, "cpu"),
             AttentionWarpingSettings, job.gaussians, job.cameras, job.images, job.editor,
             job.instruction, settings, folder=job.folder, budget=job.budget,
         )
@@ -308,7 +302,6 @@ EDITING_METHODS: dict[str, Method] = {
         _attention_warping_settings,
         _attention_warping,
         takes_budget=True,
-        takes_picture=True,
         edited=_warped_views,
     ),
     "true pictures": Method(_attention_warping_settings, _true_pictures),

@@ -29,7 +29,7 @@ LEAST = 256
 """Least longest side of a picture that people see, in px."""
 
 OF_A_METHOD = (
-    "method", "settings", "editor", "geometry", "mask", "fit", "splats", "budget", "by_hand",
+    "method", "settings", "editor", "geometry", "mask", "fit", "splats", "budget",
 )  # fmt: skip
 """Entries of a cell's spec that decide its pictures, not how they are measured."""
 

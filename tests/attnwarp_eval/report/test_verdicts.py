@@ -19,7 +19,7 @@ from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import read_results
 from attnwarp_eval.report.claims import load_claims
 from attnwarp_eval.report.judging import decided, found
-from attnwarp_eval.report.raw import PARTS, read_parts, read_raw, together
+from attnwarp_eval.report.raw import PARTS, read_parts, read_raw, together, write_raw
 from attnwarp_eval.report.results import lines
 from attnwarp_eval.report.verdicts import filled, headlines, table, verdicts
 from attnwarp_eval.statistics.contrasts import contrast
@@ -79,6 +79,17 @@ def written(folder, scenes, factors, *, name="suite", rounds=None):
 
 
 SCENES = [f"drawn-{k}" for k in range(8)]
+
+
+def test_raw_results_outlive_the_keys_of_their_study(folder, tmp_path):
+    path = write_raw(Store(folder / "variants"), tmp_path)
+    head, *cells = lzma.decompress(path.read_bytes()).decode().splitlines()
+    older = json.loads(head)
+    variant = next(iter(older["study"]["variants"].values()))
+    older["study"]["gone"] = variant["gone"] = None
+    text = "\n".join([json.dumps(older), *cells])
+    (tmp_path / "older.jsonl.xz").write_bytes(lzma.compress(text.encode()))
+    assert read_raw(tmp_path / "older.jsonl.xz").study == read_raw(path).study
 
 
 @pytest.mark.parametrize("name", ["variants", "edits"])

@@ -16,7 +16,6 @@ from attnwarp_eval.study.budgets import BudgetPart
 from attnwarp_eval.study.controls import OTHER_SCENE, OTHER_SEED, SCENE_STEP, SEED_STEP, Control
 from attnwarp_eval.study.edit_truth import answers_of
 from attnwarp_eval.study.editing_methods import EDITING_METHODS
-from attnwarp_eval.study.hand_made import Kind
 from attnwarp_eval.study.probe import Probe
 from attnwarp_eval.study.record import Extra, Json
 from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, Whole, did_you_mean
@@ -90,9 +89,8 @@ class VariantPart(Part):
     before the variant's. ``{source}`` in ``source_prompt`` stands for the edit's
     ``source`` words. ``mask: truth`` injects where the source truly sees the
     surface, ``geometry: truth`` warps by exact depth. ``budget`` cuts the method short.
-    ``by_hand`` gives the method a source view that was edited by hand
-    (:mod:`attnwarp_eval.study.hand_made`) instead of letting the editor edit it. ``control`` takes
-    features from the wrong place or scene, or another seed (:mod:`attnwarp_eval.study.controls`).
+    ``control`` takes features from the wrong place or scene, or another seed
+    (:mod:`attnwarp_eval.study.controls`).
     """
 
     method: str = "attention_warping"
@@ -100,7 +98,6 @@ class VariantPart(Part):
     mask: Literal["rules", "truth"] = "rules"
     editor: EditorPart | None = None
     budget: BudgetPart | None = None
-    by_hand: Kind | None = None
     control: Control | None = None
 
 
@@ -109,17 +106,13 @@ class MethodProbe(Probe[E]):
 
     edits = True
     whole = False
-    """True where methods run whole and edit their source themselves: ``budget`` and ``by_hand``
-    decide nothing."""
+    """True where methods run whole: ``budget`` decides nothing."""
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """The method with all its settings, the editor, and where splats and warps come from."""
         own = variant.part(VariantPart)
         settings = settings_of(study, variant, seed + SEED_STEP * (own.control == OTHER_SEED))
-        limits: Json = {}
-        if not self.whole:
-            by_hand = {"by_hand": own.by_hand} if own.by_hand is not None else {}
-            limits = {**self._budget_spec(study, variant, seed), **by_hand}
+        limits: Json = {} if self.whole else self._budget_spec(study, variant, seed)
         return {
             "spp": study.spp,
             "method": own.method,
@@ -175,7 +168,7 @@ class MethodProbe(Probe[E]):
         settings = settings_of(study, variant, 0)
         return (
             own.method, settings, variant.geometry, own.mask, splats_meaning(study, variant),
-            editor_of(study, variant), own.budget, own.by_hand, own.control,
+            editor_of(study, variant), own.budget, own.control,
         )  # fmt: skip
 
     def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:

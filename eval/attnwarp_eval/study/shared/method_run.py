@@ -24,7 +24,6 @@ from attnwarp_eval.study.editing_methods import (
     Job,
     with_source_words,
 )
-from attnwarp_eval.study.hand_made import hand_made
 from attnwarp_eval.study.probe import Work
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.schema import StudyError
@@ -37,8 +36,6 @@ if TYPE_CHECKING:
     from attnwarp.editing.editor import Editor
     from attnwarp.editing.pix2pix import InstructPix2Pix
     from attnwarp.methods import Budget
-
-Image = npt.NDArray[np.float32]
 
 EDITING_PARTS = ("source", "warp", "edit")
 """Parts of a method's seconds that are neither tuning nor for people."""
@@ -94,7 +91,6 @@ def run_method(
             _warps(work, before, names),
             {a: [views[n] for n in names] for a, views in truth.answers.items()},
             budget,
-            source_by_hand(work, truth, names[0]),
             donor,
             segments,
         )
@@ -102,21 +98,6 @@ def run_method(
     for part, seconds in result.seconds.items():
         work.meter.add(f"method: {part}", seconds)
     return result
-
-
-def source_by_hand(work: Work, truth: EditTruth, source: str) -> Image | None:
-    """The source view that a cell's spec has edited by hand: the first answer; None for none."""
-    kind = work.spec.get("by_hand")
-    if kind is None:
-        return None
-    answer = next(iter(truth.answers))
-    return hand_made(
-        kind,
-        truth.originals[source],
-        truth.answers[answer][source],
-        truth.masks[answer][source],
-        work.spec["seed"],
-    )
 
 
 def other_world(work: Work) -> World | None:

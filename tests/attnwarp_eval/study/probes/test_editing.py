@@ -410,32 +410,6 @@ def test_studies_that_compare_methods_tune_attention_warping_alike(name):
     assert len(set(totals.values())) == 1, totals
 
 
-@pytest.mark.parametrize("kind", ["recoloured", "painted", "pasted"])
-def test_a_source_made_by_hand_is_replayed_and_all_views_are_held_against_the_true_edit(
-    folder, tmp_path, kind
-):
-    edits = {"ball": {"some_colour=blue": "make the ball blue"}}
-    options = {"views_per_stage": 2, "stages": 1, "steps": 8, "iterations": 1}
-    record = record_of(
-        folder, tmp_path,
-        editing={"edits": edits, "options": options},
-        variants={"planned": {"by_hand": kind}},
-        pictures={"variants": ["planned"], "views": ["yaw030"]},
-    )  # fmt: skip
-    assert record.spec["by_hand"] == kind
-    made = next(p for p in record.pictures if p.content == "by-hand")
-    replayed = next(p for p in record.pictures if p.content == "source-edit")
-    pictures = [np.asarray(Image.open(tmp_path / p.path), float) for p in (made, replayed)]
-    before = next(p for p in record.pictures if p.content == "before")
-    before = np.asarray(Image.open(tmp_path / before.path), float)
-    # The replay is the hand-made picture but for the editor's own losses, JPEG's among them.
-    assert np.abs(pictures[0] - pictures[1]).mean() < 8
-    # What a hand made blue is nearer to the true blue ball than the grey one is.
-    assert record.extra.source.answer == "blue"
-    assert record.extra.source.psnr > record.extra.source.unedited + 3
-    assert record.extra.source.done
-
-
 def test_an_editor_of_depth_maps_gets_the_description_and_others_the_instruction(
     folder, tmp_path, monkeypatch
 ):
@@ -522,11 +496,6 @@ def test_the_scenes_words_are_handed_to_an_inversion_that_asks_for_them(
             "'true pictures' runs to its end",
         ),
         ({"variants": {"planned": {"method": "dge", "budget": {}}}}, "got no limit"),
-        (
-            {"editing": {}, "variants": {"planned": {"method": "dge", "by_hand": "painted"}}},
-            "edits its source itself",
-        ),
-        ({"variants": {"planned": {"by_hand": "drawn"}}}, "by_hand"),
         (
             {
                 "editing": {},

@@ -105,14 +105,6 @@ class EditingProbe(MethodProbe[EditResult]):
             raise ValueError(
                 f"budget: method {own.method!r} runs to its end; methods with a budget are {able}"
             )
-        if own.by_hand is not None and not EDITING_METHODS[own.method].takes_picture:
-            able = ", ".join(
-                repr(name) for name, method in EDITING_METHODS.items() if method.takes_picture
-            )
-            raise ValueError(
-                f"by_hand: method {own.method!r} edits its source itself; methods that take a"
-                f" picture are {able}"
-            )
         if own.control == OTHER_SCENE:
             self._check_other_scene(study, variant)
         if own.options or any(probe(name).edits for name in study.probes):

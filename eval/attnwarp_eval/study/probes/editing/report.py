@@ -405,8 +405,7 @@ def _grid(caption: str, methods: Mapping[str, Record[EditResult]]) -> Grid:
     truths: dict[tuple[str, ...], list[str]] = {}
     for name, own in files.items():
         undone = "" if methods[name].comparable else f" {UNDONE}"
-        by_hand = any(content == "by-hand" for content, _ in own)
-        rows.append(row(name + undone, own, "edited", "by-hand" if by_hand else "source-edit"))
+        rows.append(row(name + undone, own, "edited", "source-edit"))
         if truth := tuple(p.sha256 for (content, _), p in own.items() if content == "truth"):
             truths.setdefault(truth, []).append(name)
     for names in truths.values():

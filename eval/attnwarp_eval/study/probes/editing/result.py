@@ -23,7 +23,6 @@ from attnwarp_eval.study.probe import Work
 from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.schema import StudyError
 from attnwarp_eval.study.shared.edits import LEAST_PIXELS
-from attnwarp_eval.study.shared.method_run import source_by_hand
 
 if TYPE_CHECKING:
     from attnwarp_eval.two_view import Hits
@@ -298,7 +297,6 @@ class Measurement:
         answer = self.judged.answer
         images = {
             "before": self.truth.originals[name],
-            "by hand": source_by_hand(self.work, self.truth, self.source),
             "source edit": self.pictures["edit"].get(self.source),
             "edited": self.pictures["edit"].get(name),
             "render": self._render(self.after, name, pictures.WIDTH),
