@@ -67,9 +67,8 @@ def _lines(snapshot: Snapshot) -> Iterator[str]:
             "variants": list(cell.variants),
             "seed": cell.seed,
         }
-        seeds = {"seeds": list(cell.seeds)} if cell.seeds else {}
         yield canonical_json(
-            {**name, **seeds, "counters": dict(cell.counters), "definition": cell.definition}
+            {**name, "counters": dict(cell.counters), "definition": cell.definition}
         )
         for key, figure in sorted(cell.figures.items()):
             values = without_nan(figure.values)
@@ -136,8 +135,7 @@ def _add(cells: list[Measured], data: dict[str, Any]) -> None:
     name = (data["scene"], data["probe"], tuple(map(str, data["variants"])), int(data["seed"]))
     if "counters" in data:
         counters = {key: int(value) for key, value in data["counters"].items()}
-        seeds = tuple(map(int, data.get("seeds", ())))
-        cells.append(Measured(*name, data["definition"], counters, {}, seeds))
+        cells.append(Measured(*name, data["definition"], counters, {}))
         return
     values = {
         view: math.nan if value is None else float(value) for view, value in data["values"].items()

@@ -202,8 +202,8 @@ def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparis
 
 
 def _of_seeds(side: Snapshot, seeds: Set[int]) -> Snapshot:
-    """The cells of some seeds; a cell of several has them all, and no other."""
-    cells = [cell for cell in side.cells if seeds >= set(cell.seeds or (cell.seed,))]
+    """The cells of some seeds."""
+    cells = [cell for cell in side.cells if cell.seed in seeds]
     missing = {key: reason for key, reason in side.missing.items() if key[3] in seeds}
     return replace(side, cells=tuple(cells), missing=missing)
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import chain
 from typing import Any
 
 from attnwarp_eval.canonical_json import digest
@@ -45,7 +44,6 @@ class Measured:
         definition: hash of all that decides its figures but the seed.
         counters: of work.
         figures: gated metrics by key.
-        seeds: all seeds of a cell that has several; empty where ``seed`` is the only one.
 
     A cell whose figures depend on the machine has neither counters nor figures.
     """
@@ -57,7 +55,6 @@ class Measured:
     definition: str
     counters: Mapping[str, int]
     figures: Mapping[str, Figure]
-    seeds: tuple[int, ...] = ()
 
     @property
     def key(self) -> tuple[str, str, tuple[str, ...], int]:
@@ -88,8 +85,7 @@ class Snapshot:
     @property
     def seeds(self) -> frozenset[int]:
         """Seeds of the expected cells."""
-        own = (cell.seeds or (cell.seed,) for cell in self.cells)
-        return frozenset(chain.from_iterable(own)) | {key[3] for key in self.missing}
+        return frozenset(cell.seed for cell in self.cells) | {key[3] for key in self.missing}
 
 
 def read_snapshot(store: Store) -> Snapshot:
@@ -153,7 +149,6 @@ def _measured(cell: Outcome, record: Record[Any]) -> Measured:
         definition(record.spec),
         dict(record.cost.counters) if repeatable else {},
         figures,
-        tuple(record.spec.get("seeds", ())),
     )
 
 
@@ -168,20 +163,13 @@ def shortened(value: float) -> float:
 
 
 def without_seed(value: Any) -> Any:
-    """A cell's spec without its seeds, at whatever depth they stand; of several, their number
-    counts.
+    """A cell's spec without its seeds, at whatever depth they stand.
 
     >>> without_seed({"seed": 1, "fit": {"iterations": 4, "seed": 1}})
     {'fit': {'iterations': 4}}
-    >>> without_seed({"seed": 5, "seeds": [5, 6]})
-    {'seeds': 2}
     """
     if isinstance(value, dict):
-        return {
-            key: len(item) if key == "seeds" and isinstance(item, list) else without_seed(item)
-            for key, item in value.items()
-            if key != "seed"
-        }
+        return {key: without_seed(item) for key, item in value.items() if key != "seed"}
     if isinstance(value, list):
         return [without_seed(item) for item in value]
     return value

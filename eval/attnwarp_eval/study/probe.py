@@ -5,8 +5,7 @@ How a report shows one is in :mod:`attnwarp_eval.study.probe_report`.
 
 >>> [probe.name for probe in probes()]
 ['audit', 'calibration', 'carry', 'depth', 'editing', 'editing-timing', 'fit', 'ideal', 'labels',
- 'masks', 'reconstruction', 'sensitivity', 'stability', 'surfaces', 'timing', 'variability',
- 'warp']
+ 'masks', 'reconstruction', 'sensitivity', 'stability', 'surfaces', 'timing', 'warp']
 >>> probe("depth").metric("depth.abs_rel").direction
 'lower'
 """

@@ -21,19 +21,17 @@ from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.compare import Snapshot, compare, read_baseline, read_snapshot, write_baseline
 from attnwarp_eval.compare.judge import FEWEST_SCENES, _means_of_shared
-from attnwarp_eval.compare.snapshot import Figure, Measured, definition, shortened, snapshot
+from attnwarp_eval.compare.snapshot import Figure, Measured, shortened, snapshot
 from attnwarp_eval.compare.write import document, summary
 from attnwarp_eval.cost import environment
 from attnwarp_eval.metrics.gates import GATES, gated
 from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.report.results import read_results
-from attnwarp_eval.study import Store, load_study
+from attnwarp_eval.study import Store
 from attnwarp_eval.study.edit_truth import Judgement
 from attnwarp_eval.study.probe import register, unregister
 from attnwarp_eval.study.probe_report import reports
 from attnwarp_eval.study.probes.editing.result import EditResult
-from attnwarp_eval.study.probes.variability.measure import Varied
-from attnwarp_eval.study.run import plan
 
 DONE = Judgement("red", True, 25.0, 10.0, 10.0)
 
@@ -587,29 +585,6 @@ def test_few_scenes_with_other_seeds_are_too_little_and_never_equal():
     assert not compare(samples(1, 0, 6), samples(2, 3, 6)).too_little
 
 
-def test_a_cell_of_several_seeds_is_the_same_with_as_many_others():
-    def planned(seeds):
-        cells = plan(load_study("variability", scenes=["bear"], seeds=seeds), Store("none")).cells
-        return Snapshot("my", "", tuple(
-            Measured(cell.scene, cell.probe, cell.labels, cell.seed, definition(cell.spec), {}, {})
-            for cell in cells if cell.probe == "variability"
-        ))  # fmt: skip
-
-    assert compare(planned([1, 2]), planned([7, 9])).faults == ()
-    assert {f.kind for f in compare(planned([1, 2]), planned([7, 8, 9])).faults} == {"redefined"}
-
-
-def test_a_cell_of_several_seeds_is_another_sample_with_another_of_them(tmp_path):
-    """Margins of equal seeds would call chance a regression."""
-    before = edited({"variability.within": 2.0}, "variability", seeds=[1, 2])
-    after = edited({"variability.within": 3.0}, "variability", seeds=[1, 3])
-    write_baseline(tmp_path / "baseline.jsonl", before)
-    for side in (before, read_baseline(tmp_path / "baseline.jsonl")):
-        assert compare(side, side).exact
-        result = compare(side, after)
-        assert not result.exact and not result.regressed and "seeds differ" in result.too_little
-
-
 def errors(by_seed, scenes=FEWEST_SCENES):
     """Cells of one view a scene, with the same errors by seed in all scenes but for 1 % each."""
     return Snapshot("my", "", tuple(
@@ -707,17 +682,15 @@ EDITED = {
 }
 
 
-def edited(figures, probe="editing", seconds=None, seeds=()):
+def edited(figures, probe="editing", seconds=None):
     """A calibrated run of one edit of one scene."""
     study = {"name": "edits", "scenes": ["ball"], "seeds": [1, 2], "variants": {"ours": {}},
              "probes": {probe: ["ours"]}}  # fmt: skip
     extra = {
         "editing": EditResult("red", "make it red", DONE, DONE, {}, {}, 30.0, 2, 1.0),
-        "variability": Varied("red", "make it red", (1, 2), ("red", "red")),
         "chord": Longest("yaw015", 1.0),
     }[probe].to_json()
     spec = {"budget": {"seconds": seconds}} if seconds else {}
-    spec |= {"seeds": seeds} if seeds else {}
     cells = [
         written_runs.outcome("calibration", "ball", ["calibration"], written_runs.record(
             [("yaw015", 15.0, {"warp.epe_median": 0.1})])),
@@ -738,12 +711,6 @@ def test_an_edit_that_got_worse_in_any_figure_is_a_regression():
         left = {k: v for k, v in EDITED.items() if k != key}
         (fault,) = compare(before, edited(left)).faults
         assert (fault.kind, fault.name) == ("missing", f"ball / editing / ours / seed 0 / {key}")
-
-
-def test_views_of_a_seed_that_agree_less_are_a_regression():
-    before, after = (edited({"variability.within": v, "variability.between": 9.0}, "variability")
-                     for v in (2.0, 3.0))  # fmt: skip
-    assert compare(before, after).regressed and not compare(after, before).regressed
 
 
 def test_a_probe_of_which_nothing_was_compared_is_too_little():
@@ -795,7 +762,7 @@ def test_every_headline_figure_is_gated_and_every_gate_is_a_figure_of_a_probe(st
     # Claims and the tests of these probes read the rest.
     elsewhere = {
         "fidelity.ssim", "fidelity.preserved_mse", "fidelity.preserved_psnr",
-        "embedding.clip_similarity", "variability.within", "stability.margin",
+        "embedding.clip_similarity", "stability.margin",
     }  # fmt: skip
     assert GATES.keys() - {METRICS[key].name for key in keys if gated(key)} == elsewhere
 

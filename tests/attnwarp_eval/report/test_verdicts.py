@@ -160,9 +160,7 @@ def test_the_table_has_verdict_difference_and_time_and_parts_of_a_study_are_read
 
 
 def test_parts_of_other_studies_and_two_runs_of_one_are_refused(tmp_path):
-    runs = [
-        written(tmp_path / name, SCENES, [2.0] * 8, name=name) for name in ("suite", "variability")
-    ]
+    runs = [written(tmp_path / name, SCENES, [2.0] * 8, name=name) for name in ("suite", "fitted")]
     parts = [read_results(store) for store in runs]
     with pytest.raises(InputError, match="parts differ in name"):
         together(parts)

@@ -12,7 +12,6 @@ from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probes.editing import measure as editing
 from attnwarp_eval.study.probes.editing_timing import measure as editing_timing
 from attnwarp_eval.study.probes.sensitivity import measure as sensitivity
-from attnwarp_eval.study.probes.variability import measure as variability
 from attnwarp_eval.study.run import plan
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.world import splats, world
@@ -56,14 +55,14 @@ def planned(path, kind, root):
     return next(cell for cell in cells if cell.probe == kind)
 
 
-@pytest.mark.parametrize("kind", ["editing", "editing-timing", "variability", "sensitivity"])
+@pytest.mark.parametrize("kind", ["editing", "editing-timing", "sensitivity"])
 def test_a_cell_of_an_edit_that_the_file_no_longer_has_is_refused(
     path, tmp_path, kind, monkeypatch
 ):
     def computed(*_):
         raise AssertionError("the cell goes on behind its truth")
 
-    for module in (editing, editing_timing, variability):
+    for module in (editing, editing_timing):
         monkeypatch.setattr(module, "splats_of", computed)
     monkeypatch.setattr(sensitivity, "_Prompts", computed)
     write(path, RED)
