@@ -682,8 +682,10 @@ def test_inverted_latents_are_held_against_random_ones_only_where_no_others_were
         content = study(
             scenes=["one"], variants=variants, probes={"editing": list(variants)}, ablations=[]
         )
-        run = written_runs.results(content, [edited(name, values[name]) for name in measured])
-        found = declared[f"{claim}-dino"].measure(run)
+        run = written_runs.results(
+            content, [edited(n, values[n], metric="image.psnr.edit_render") for n in measured]
+        )
+        found = declared[f"{claim}-edit-psnr"].measure(run)
         return found and {name: side.mean for name, side in found.sides.items()}
 
     assert sides("over-gaussctrl", variants) == {"GaussCtrl": 0.3, "inverted": 0.2}

@@ -89,7 +89,6 @@ class EditingReport(ProbeReport):
         "multiview.delta_e_above.render_inside",
         "fidelity.psnr.edit_inside",
         "fidelity.psnr.render_inside",
-        "embedding.clip_directional.render",
         "depth.abs_rel.after",
     )
     stage = "whole"
