@@ -250,7 +250,8 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
     folder.mkdir(exist_ok=True)
     near = _near(result.settings, result.extent)
     white = result.settings.background == "white"
-    background = torch.full((3,), 1.0 if white else 0.0, device=result.gaussians.means.device)
+    behind = 1.0 if white else 0.0
+    background = torch.full((3,), behind, dtype=torch.float32, device=result.gaussians.means.device)
     for index, (camera, name) in enumerate(
         zip(held_out.cameras, file_stems(held_out.cameras), strict=True)
     ):

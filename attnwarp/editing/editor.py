@@ -108,8 +108,6 @@ class Edit:
 def shared_noise(shape: tuple[int, int, int, int], seed: int) -> Tensor:
     """(B, C, h, w) white noise, the same for all views.
 
-    It is drawn on the CPU, so that every device starts from the same bits.
-
     Args:
         shape: (B, C, h, w).
         seed: of torch's generator.
@@ -119,8 +117,21 @@ def shared_noise(shape: tuple[int, int, int, int], seed: int) -> Tensor:
         >>> torch.equal(first, second)
         True
     """
+    return drawn((1, *shape[1:]), seed).expand(shape).clone()
+
+
+def drawn(shape: Sequence[int], seed: int) -> Tensor:
+    """Standard normal numbers, float32.
+
+    Drawn on the CPU, so that every device starts from the same bits, and in float32 whatever the
+    process's default type is: float64 would draw other numbers.
+
+    Args:
+        shape: of the result.
+        seed: of torch's generator.
+    """
     generator = torch.Generator().manual_seed(seed)
-    return torch.randn((1, *shape[1:]), generator=generator).expand(shape).clone()
+    return torch.randn(tuple(shape), generator=generator, dtype=torch.float32)
 
 
 def edit(

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from attnwarp import check
-from attnwarp.editing.editor import Editor, Image, guided, shared_noise
+from attnwarp.editing.editor import Editor, Image, drawn, guided, shared_noise
 from attnwarp.editing.schedule import Schedule, following
 
 Predict = Callable[[Tensor, int], Tensor]
@@ -179,7 +179,7 @@ def edit_friendly_invert(
     """
     shape = (len(timesteps), *latents.shape)
     if noises is None:
-        noises = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+        noises = drawn(shape, seed)
     check.shape(noises, shape, "noises")
     noises = noises.to(latents)
     states = [
@@ -212,8 +212,7 @@ def noise_maps(
         seed: of :func:`attnwarp.editing.editor.shared_noise`.
     """
     latents = editor.encode([picture])
-    generator = torch.Generator().manual_seed(seed + 1)
-    noises = torch.randn((len(timesteps), *latents.shape), generator=generator)
+    noises = drawn((len(timesteps), *latents.shape), seed + 1)
     noises[0] = shared_noise((1, *latents.shape[1:]), seed)
     return edit_friendly_invert(editor.schedule, task.predict, latents, timesteps, noises=noises)
 

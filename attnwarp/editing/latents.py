@@ -80,12 +80,14 @@ class HaarLatents(ModelMixin, ConfigMixin):
         scaling_factor: float = 1.0,
     ) -> None:
         super().__init__()
-        gains = torch.repeat_interleave(torch.tensor(GAINS), torch.tensor([3, 9, 36]))
+        gains = torch.repeat_interleave(
+            torch.tensor(GAINS, dtype=torch.float32), torch.tensor([3, 9, 36])
+        )
         basis = haar_basis().float()
         self.register_buffer("encoder", basis * gains[:, None, None, None], persistent=False)
         self.register_buffer("decoder", basis / gains[:, None, None, None], persistent=False)
         # diffusers reads a model's dtype off its parameters, and this one has none to learn.
-        self.unit = torch.nn.Parameter(torch.ones(1), requires_grad=False)
+        self.unit = torch.nn.Parameter(torch.ones(1, dtype=torch.float32), requires_grad=False)
 
     def encode(self, x: Tensor, return_dict: bool = True) -> AutoencoderTinyOutput | tuple[Tensor]:
         """(B, 3, H, W) pictures in [-1, 1], sides multiples of 4 -> (B, 48, H / 4, W / 4)."""

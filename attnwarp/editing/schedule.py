@@ -51,7 +51,9 @@ class Schedule:
 
     def alpha(self, timestep: int | None) -> Tensor:
         """() alpha-bar of a step; None is what comes after the last."""
-        return torch.tensor(self.final_alpha) if timestep is None else self.alphas[timestep]
+        if timestep is None:
+            return self.alphas.new_tensor(self.final_alpha)
+        return self.alphas[timestep]
 
     def add_noise(self, x: Tensor, noise: Tensor, timestep: int) -> Tensor:
         """sqrt(alpha-bar) x + sqrt(1 - alpha-bar) noise, in the type of ``x``."""

@@ -75,11 +75,13 @@ def _info(
 
 
 def _read(net: torch.nn.Module, path: Path) -> None:
-    """Load weights, stored in half precision, into a network in single precision."""
+    """Load weights, stored in half precision, into a network in single precision on the CPU."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
     try:
+        # A network is made in the process's default type, which may be float64.
+        net.to("cpu", torch.float32)
         net.load_state_dict({key: value.float() for key, value in load_file(path).items()})
     except FileNotFoundError:
         raise InputError(

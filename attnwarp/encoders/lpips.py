@@ -202,7 +202,8 @@ class Lpips:
     def _units(self, pictures: torch.Tensor) -> list[torch.Tensor]:
         """(N, C_k, h_k, w_k) unit features of each stage, of pictures (N, 3, H, W) in [0, 1]."""
         shift, scale = (
-            torch.tensor(v, device=self._device).reshape(1, 3, 1, 1) for v in (SHIFT, SCALE)
+            torch.tensor(v, dtype=torch.float32, device=self._device).reshape(1, 3, 1, 1)
+            for v in (SHIFT, SCALE)
         )
         x = (2 * pictures.to(self._device) - 1 - shift) / scale
         units: list[torch.Tensor] = []

@@ -51,7 +51,7 @@ def screen_gradient(
     z = means.double() @ R[2] + moved[2]
     across = gradient.double() @ R[:2].T
     across[:, 1] -= float(camera.K[0, 1] / camera.K[0, 0]) * across[:, 0]
-    focal = torch.tensor([camera.K[0, 0], camera.K[1, 1]], device=device)
+    focal = torch.tensor([camera.K[0, 0], camera.K[1, 1]], dtype=torch.float64, device=device)
     half = torch.tensor([camera.width / 2, camera.height / 2], dtype=torch.float64, device=device)
     on_screen = across * z[:, None] / focal * half
     return torch.where(z > near, on_screen.norm(dim=1), 0.0).float()
@@ -79,7 +79,7 @@ class Density:
         self.last = int(settings.densify_until * settings.iterations)
 
     def _clear(self, count: int) -> None:
-        self.total = torch.zeros(count, device=self.center.device)
+        self.total = torch.zeros(count, dtype=torch.float32, device=self.center.device)
         self.seen = torch.zeros_like(self.total)
 
     def watch(self, model: Model, gaussians: Gaussians, camera: Camera, weight: Tensor) -> None:
@@ -164,7 +164,8 @@ class Density:
         half = {name: tensor[index].clone() for name, tensor in t.items()}
         scales = half["scales"].exp()
         # Drawn in main memory: every device grows the same splats.
-        offset = torch.randn(scales.shape, generator=random).to(scales.device) * scales
+        drawn = torch.randn(scales.shape, generator=random, dtype=torch.float32)
+        offset = drawn.to(scales.device) * scales
         if scales.shape[1] == 2:
             offset = torch.nn.functional.pad(offset, (0, 1))
         kind = self.settings.kind

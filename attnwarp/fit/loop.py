@@ -414,8 +414,10 @@ class _Run:
         if choice == "auto":
             choice = "random" if self.views.transparent else "black"
         if choice == "random" and fitting:
-            return torch.rand(3, generator=self.random).to(self.model.device)
-        return torch.full((3,), 1.0 if choice == "white" else 0.0, device=self.model.device)
+            drawn = torch.rand(3, generator=self.random, dtype=torch.float32)
+            return drawn.to(self.model.device)
+        value = 1.0 if choice == "white" else 0.0
+        return torch.full((3,), value, dtype=torch.float32, device=self.model.device)
 
     def iterate(self) -> None:
         s = self.settings

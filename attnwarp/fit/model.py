@@ -135,7 +135,7 @@ class Model:
                 [self.first[name]],
                 [self.second[name]],
                 [],
-                [torch.tensor(float(self.steps), device=tensor.device)],
+                [torch.tensor(float(self.steps), dtype=torch.float32, device=tensor.device)],
                 fused=True,
                 amsgrad=False,
                 beta1=0.9,

@@ -140,20 +140,21 @@ def from_points(
     else:
         distance, _ = cKDTree(local).query(local, k=min(NEIGHBOURS + 1, n))
         size = np.sqrt((distance[:, 1:] ** 2).mean(1))
-    quats = torch.zeros(n, 4)
+    quats = torch.zeros(n, 4, dtype=torch.float32)
     quats[:, 0] = 1
     if kind == "2d":
         # Four independent normals point evenly over the 3-sphere: every rotation is as likely.
-        quats = torch.randn(n, 4, generator=torch.Generator().manual_seed(seed))
+        generator = torch.Generator().manual_seed(seed)
+        quats = torch.randn(n, 4, generator=generator, dtype=torch.float32)
         quats = quats / quats.norm(dim=1, keepdim=True)
-    sh = torch.zeros(n, (sh_degree + 1) ** 2, 3)
+    sh = torch.zeros(n, (sh_degree + 1) ** 2, 3, dtype=torch.float32)
     sh[:, :1] = Gaussians.sh_from_rgb(torch.from_numpy(rgb.astype(np.float32) / 255))
     return Gaussians(
         kind,
         torch.from_numpy(local.astype(np.float32)),
         quats,
         torch.from_numpy(size.astype(np.float32))[:, None].repeat(1, 2 if kind == "2d" else 3),
-        torch.full((n,), FIRST_OPACITY),
+        torch.full((n,), FIRST_OPACITY, dtype=torch.float32),
         sh,
         origin=origin,
     )

@@ -124,9 +124,8 @@ def to_float(image: npt.NDArray[Any]) -> Image:
 
 def images_of(views: Views) -> list[npt.NDArray[Any]]:
     """(H, W, 3) of each view as it is stored; transparent ones over black, as float32."""
-    black = torch.zeros(3)
     return [
-        image if image.shape[2] == 3 else views.target(k, black).numpy()
+        image if image.shape[2] == 3 else views.target(k, np.zeros(3)).numpy()
         for k, image in enumerate(views.images)
     ]
 

@@ -360,7 +360,7 @@ def _prepare(
             values = values[:, : (sh_degree + 1) ** 2]
     channels = 3 if features is None else features.shape[1]
     if background is None:
-        behind = torch.zeros(channels, device=device)
+        behind = torch.zeros(channels, dtype=torch.float32, device=device)
     else:
         behind = _as_tensor(background, channels, device)
         if not behind.is_floating_point() and not behind.requires_grad:
@@ -396,8 +396,9 @@ def _as_tensor(
 ) -> Tensor:
     if isinstance(background, Tensor):
         return background
+    own = None if isinstance(background, np.ndarray) else torch.float32
     try:
-        return torch.tensor(background, device=device)
+        return torch.tensor(background, dtype=own, device=device)
     except (TypeError, ValueError, RuntimeError):  # a word, an object; rows of unequal length
         raise TypeError(
             f"background: got {background!r}, expected a tensor or a sequence of {channels} numbers"

@@ -222,7 +222,7 @@ class _Composite(torch.autograd.Function):
         # Not saved, as most gradients read neither. Detached, they hold no graph, but they share
         # the caller's memory and its count of changes in place.
         ctx.maps = {"alpha": alpha.detach(), "depth": depth.detach()}
-        placeholder = torch.zeros(1).expand(inputs.height, inputs.width)
+        placeholder = torch.zeros(1, dtype=torch.float32).expand(inputs.height, inputs.width)
         return *outputs, placeholder, torch.from_numpy(drawn.weight)
 
     @staticmethod

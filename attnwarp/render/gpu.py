@@ -224,9 +224,9 @@ def _draw(inputs: Inputs) -> tuple[_Drawn, tuple[Tensor, ...], Tensor]:
 def _draw_here(inputs: Inputs) -> tuple[_Drawn, tuple[Tensor, ...], Tensor]:
     view, splats, device = _view(inputs), _splats(inputs), inputs.means.device
     n, tiles = len(splats.means), view.across * view.down
-    single: dict[str, Any] = {"device": device}
+    single: dict[str, Any] = {"dtype": torch.float32, "device": device}
     whole: dict[str, Any] = {"dtype": torch.int32, "device": device}
-    doubles = torch.empty(n, layout.DOUBLES, dtype=PRECISE, **single)
+    doubles = torch.empty(n, layout.DOUBLES, dtype=PRECISE, device=device)
     singles = torch.empty(n, layout.SINGLES, **single)
     depths, counts = torch.empty(n, **single), torch.empty(n, **whole)
     _launch(
@@ -295,8 +295,8 @@ def _pair_up(drawn: _Drawn) -> tuple[Tensor, Tensor, Tensor]:
             f"distortion_l1: {total} pairs of a splat and a pixel, more than {MOST_ENTRIES}; use"
             " distortion_ordered, or a smaller picture"
         )
-    past = torch.empty(total, 5, device=drawn.device)
-    target = torch.empty(hits.shape, device=drawn.device)
+    past = torch.empty(total, 5, dtype=torch.float32, device=drawn.device)
+    target = torch.empty(hits.shape, dtype=torch.float32, device=drawn.device)
     with _on(drawn.device):
         _launch(
             compositing.pair_up, drawn.threads, drawn.device,
@@ -326,7 +326,9 @@ class _Composite(torch.autograd.Function):
             # Copies of the two that the backward pass reads: the caller may change its own.
             made = dict(zip(PICTURES, pictures, strict=True))
             ctx.drawn, ctx.maps = drawn, {name: made[name].clone() for name in ("alpha", "depth")}
-        placeholder = torch.zeros(1, device=drawn.device).expand(inputs.height, inputs.width)
+        placeholder = torch.zeros(1, dtype=torch.float32, device=drawn.device).expand(
+            inputs.height, inputs.width
+        )
         return *pictures, placeholder, weight
 
     @staticmethod
@@ -351,13 +353,13 @@ def _gradients(
     image = tuple(drawn.state.shape[1:])
     shapes = {"color": (*image, channels), "normal": (*image, 3), "weight": (n,)}
     given = {
-        name: torch.zeros(shapes.get(name, image), device=device)
+        name: torch.zeros(shapes.get(name, image), dtype=torch.float32, device=device)
         if grad is None
         else grad.float().contiguous()
         for name, grad in upstream.items()
     }
-    past, ends = torch.empty(0, 5, device=device), torch.zeros(1, 1, dtype=torch.int64)
-    ends = ends.to(device)
+    past = torch.empty(0, 5, dtype=torch.float32, device=device)
+    ends = torch.zeros(1, 1, dtype=torch.int64, device=device)
     if upstream["distortion_l1"] is not None:
         _, past, ends = _pair_up(drawn)
     extra = max(0, channels - 3)

@@ -81,7 +81,11 @@ def render(
         features = harmonics.color(values, direction)
     else:
         features = values
-    axis = torch.full((len(means),), 2) if inputs.kind == "2d" else scales.argmin(dim=-1)
+    axis = (
+        torch.full((len(means),), 2, dtype=torch.int64)
+        if inputs.kind == "2d"
+        else scales.argmin(dim=-1)
+    )
     pick = axis[:, None, None].expand(-1, 3, 1)
     facing = (axes.gather(2, pick)[..., 0] * centers).sum(-1)
     normals = world_axes.gather(2, pick)[..., 0] * torch.where(facing > 0, -1.0, 1.0)[:, None]

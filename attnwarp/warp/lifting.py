@@ -196,7 +196,9 @@ def _votes(
     backend: str,
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """(N,) sum over counted pixels of w_i mask, and of w_i."""
-    values = torch.zeros(len(splats), 2, device=splats.means.device, requires_grad=True)
+    values = torch.zeros(
+        len(splats), 2, dtype=torch.float32, device=splats.means.device, requires_grad=True
+    )
     with torch.enable_grad():
         picture = render(splats, camera, features=values, near=near, backend=backend)
         marks = torch.from_numpy(np.stack([mask * counted, counted], axis=-1))

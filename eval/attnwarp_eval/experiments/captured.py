@@ -250,9 +250,7 @@ def _reference(variant: Variant) -> str | None:
 
 def write_originals(views: Views, folder: Path) -> list[npt.NDArray[np.float32]]:
     """(H, W, 3) pictures over black, also written as files."""
-    import torch
-
-    images = [views.target(k, torch.zeros(3)).numpy() for k in range(len(views.cameras))]
+    images = [views.target(k, np.zeros(3)).numpy() for k in range(len(views.cameras))]
     for k, image in enumerate(images):
         write_picture(folder / f"{_name(k)}.png", _bytes(image))
     return images
@@ -276,8 +274,6 @@ def _edit(
     folder: Path,
     seconds: dict[str, float],
 ) -> EditedScene:
-    import torch
-
     from attnwarp.editing.editor import own_size
     from attnwarp.methods import Budget
 
@@ -300,8 +296,7 @@ def _edit(
             limit = seconds[own.budget.seconds_of]
         budget = Budget(limit, own.budget.network_rows)
     text = words.target or words.instruction if editor.guide == "depth" else words.instruction
-    black = torch.zeros(3)
-    images = [views.target(k, black).numpy() for k in range(len(views.cameras))]
+    images = [views.target(k, np.zeros(3)).numpy() for k in range(len(views.cameras))]
     folder.mkdir(parents=True, exist_ok=True)
     job = Job(
         splats, views.cameras, images, editor, text, settings, folder, None, {}, budget

@@ -102,7 +102,7 @@ class Capture:
 
         one = Dataset([data.cameras[index]], [data.image_paths[index]], lenses=[data.lenses[index]])
         views = load_views(one, max_size=self.size)
-        return views.target(0, torch.zeros(3)).numpy()
+        return views.target(0, np.zeros(3)).numpy()
 
 
 @dataclass(frozen=True, eq=False)

@@ -78,7 +78,9 @@ def refit_psnr(
     if not stacks:
         return []
     count = 3 * len(stacks)
-    values = torch.zeros(len(splats), count, device=splats.means.device, requires_grad=True)
+    values = torch.zeros(
+        len(splats), count, dtype=torch.float32, device=splats.means.device, requires_grad=True
+    )
     with torch.enable_grad():
         views = [render(splats, camera, features=values) for camera in cameras]
     covered = [view.alpha.detach()[..., None] for view in views]
@@ -99,7 +101,7 @@ def refit_psnr(
         return sums
 
     weight = gathered([alpha.expand(*alpha.shape[:2], count) for alpha in covered])
-    scale = torch.where(weight > 0, 1 / weight.clamp_min(1e-12), torch.zeros(()))
+    scale = torch.where(weight > 0, 1 / weight.clamp_min(1e-12), 0.0)
     colors = scale * gathered(wanted)
     left = [w - s for w, s in zip(wanted, shown(colors), strict=True)]
     residual = gathered(left)
@@ -108,7 +110,7 @@ def refit_psnr(
     for _ in range(ITERATIONS):
         moved = shown(step)
         length = torch.stack([(one**2).sum((0, 1)) for one in moved]).sum(0)
-        stride = torch.where(length > 0, power / length.clamp_min(1e-30), torch.zeros(()))
+        stride = torch.where(length > 0, power / length.clamp_min(1e-30), 0.0)
         colors = colors + stride * step
         left = [one - stride * change for one, change in zip(left, moved, strict=True)]
         residual = gathered(left)

@@ -157,7 +157,7 @@ def surface_splats(
         means=single(position),
         quats=single(quaternions_from_normals(normal)),
         scales=single(scales),
-        opacities=torch.full((count,), float(opacity)),
+        opacities=torch.full((count,), float(opacity), dtype=torch.float32),
         sh=Gaussians.sh_from_rgb(single(to_srgb(color))),
         origin=scene.center,
     )

@@ -105,7 +105,7 @@ class Unet(torch.nn.Module):
         self.attn1 = torch.nn.Linear(channels, channels, dtype=dtype)
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
-            values = torch.randn(channels, channels + 1, generator=generator)
+            values = torch.randn(channels, channels + 1, generator=generator, dtype=torch.float32)
             self.attn1.weight.copy_(values[:, :-1])
             self.attn1.bias.copy_(values[:, -1])
 

@@ -43,7 +43,8 @@ def _camera(height: int, width: int) -> Camera:
 def _warp(xy: torch.Tensor, size: tuple[int, int], way: Way) -> FeatureWarp:
     """The warp of positions (H, W, 2) on a source grid of ``size``."""
     target, source = _camera(*xy.shape[:2]), _camera(*size)
-    points, depth = torch.zeros(*xy.shape[:2], 3).double(), torch.ones(xy.shape[:2]).double()
+    points = torch.zeros(*xy.shape[:2], 3, dtype=torch.float64)
+    depth = torch.ones(xy.shape[:2], dtype=torch.float64)
     result = Correspondence(source, target, xy, points, depth)
     return FeatureWarp(result, result.defined, engine_of(way))
 

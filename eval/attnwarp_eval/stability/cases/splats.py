@@ -231,7 +231,8 @@ def _coverage(sigma: float, way: Way) -> float:
     pixels = np.stack([x.ravel() - size / 2, y.ravel() - size / 2], -1)
     means = np.c_[pixels * depth / focal, np.full(len(pixels), depth)]
     # Flat across the view: a splat as deep as wide is magnified toward the picture's border.
-    made = splats(means, torch.tensor([1, 1, 1e-9]) * sigma * depth / focal, 1.0, kind="3d")
+    flat = torch.tensor([1, 1, 1e-9], dtype=torch.float32) * sigma * depth / focal
+    made = splats(means, flat, 1.0, kind="3d")
     shot = Shot(made, front_camera(size, focal), [], {"antialiased": True})
     mean = float(shot.render(way).alpha.double().sum()) / len(means)
     integral = 2 * math.pi * sigma**2

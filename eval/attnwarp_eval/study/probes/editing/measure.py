@@ -224,12 +224,13 @@ class EditingProbe(MethodProbe[EditResult]):
 def _compile(kind: Literal["2d", "3d"]) -> None:
     """Compile what renders, tunes and warps, so that a first edit's seconds do not hold it."""
     compile_kernels(kind)
-    splats = Gaussians(
-        kind, torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 2 + (kind == "3d")),
-        torch.ones(1), torch.zeros(1, 1, 3),
-    )  # fmt: skip
+    axes = 3 if kind == "3d" else 2
+    shapes = ((1, 3), (1, 4), (1, axes), (1,), (1, 1, 3))  # centre, rotation, scales, opacity, sh
+    splats = Gaussians(kind, *(torch.ones(shape, dtype=torch.float32) for shape in shapes))
     camera = Camera.look_at((0, 0, 3), (0, 0, 0), width=16, height=16, fov_y=40, up=(0, 1, 0))
-    warp_view(splats, camera, camera).at((4, 4)).warp_tokens(torch.zeros(1, 16, 4))
+    warp_view(splats, camera, camera).at((4, 4)).warp_tokens(
+        torch.zeros(1, 16, 4, dtype=torch.float32)
+    )
 
 
 _SHARED = ("probe", "protocol", "scene", "size", "views", "seed", "edit", "encoders")
