@@ -58,14 +58,23 @@ def edit(
         Path | None, typer.Option(help="Splats of the scene; fitted first if left out.")
     ] = None,
     editor: EditorOption = "small-plain",
-    preset: Annotated[
+    method: Annotated[
         str,
         typer.Option(
             metavar="NAME",
-            help="The method's choices: corrected, extended, paper, released, released-controlnet"
-            " (see docs/method/algorithm.md).",
+            help="attention_warping, or for comparison by_view, igs2gs, dge or gaussctrl"
+            " (see docs/method/baselines.md).",
         ),
-    ] = "corrected",
+    ] = "attention_warping",
+    preset: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="The method's choices: corrected, extended, paper, released, released-controlnet"
+            " (see docs/method/algorithm.md); those of other methods are in"
+            " docs/method/baselines.md. The method's first if left out.",
+        ),
+    ] = None,
     source_picture: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The source view, edited elsewhere.")
     ] = None,
@@ -105,7 +114,15 @@ def edit(
     ] = None,
     antialiased: AntialiasedOption = None,
     screen_filter: ScreenFilterOption = None,
-    store: Annotated[Store, typer.Option(help="Where recorded features are kept.")] = Store.cpu,
+    store: Annotated[
+        Store | None, typer.Option(help="Where recorded features are kept (cpu).")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0, help="Begin no edit and no iteration after so many.")
+    ] = None,
+    network_rows: Annotated[
+        int | None, typer.Option(min=0, help="Rows through the network at most.")
+    ] = None,
     *,
     editing: Editing,
     reading: Reading,
@@ -143,11 +160,18 @@ def edit(
         check_inputs_stay((out / name for name in results), (source_picture, ply, editing.mask))
         check_words(instruction)
         guide_of(editor)  # refuses what is no editor
-        from attnwarp import methods
+        from attnwarp import check, methods
         from attnwarp.methods.marks import Marks
 
         edit_options = editing.checked()
-        settings = methods.preset("attention_warping", preset, **changes)
+        check.one_of(method, list(methods.METHODS), "--method")
+        settings = methods.preset(method, preset, **changes)
+        budget = methods.Budget(seconds, network_rows)
+        given = {"source_picture": source_picture, "store": store and store.value}
+        own: dict[str, Any] = {k: v for k, v in given.items() if v is not None}
+        if own and method != "attention_warping":
+            name = next(iter(own)).replace("_", "-")
+            raise ValueError(f"--{name}: is of attention_warping, not of {method}; leave it out")
         use_threads(editing.threads)
         if bundled:
             data = capture(str(data), out / "scene", report)
@@ -162,18 +186,17 @@ def edit(
         from attnwarp.methods.command import FitPlan, edit_dataset
 
         result, page = edit_dataset(
-            "attention_warping", dataset, splats, editor, instruction, settings, out, edit_options,
+            method, dataset, splats, editor, instruction, settings, out, edit_options,
             fit_plan=FitPlan(
                 fit_iterations or FIT_ITERATIONS,
                 (kind or Kind.two).value[:2],
                 max_splats or FIT_SPLATS,
             ),
-            source_picture=source_picture, store=store.value, report=report,
+            budget=budget, report=report, **own,
         )  # fmt: skip
-        seconds = sum(result.seconds.values())
         views = len(result.edited)
         carried = ""
-        if settings.method == "warp" and views > 1:
+        if getattr(settings, "method", None) == "warp" and views > 1:
             share = result.counters["injected"]
             carried = f"; {share:.0%} of the targets' pixels got features of the source"
             if share < NO_FEATURES:
@@ -185,9 +208,10 @@ def edit(
                     InputWarning,
                     stacklevel=1,
                 )
+        ended = f"; cut short by its {result.cut.replace('_', ' ')}" if result.cut else ""
         typer.echo(
-            f"{out / 'edited.ply'}: {views} edited view{'s' * (views > 1)} in {seconds:.0f} s"
-            f"{carried}"
+            f"{out / 'edited.ply'}: {views} edited view{'s' * (views > 1)} in"
+            f" {sum(result.seconds.values()):.0f} s{carried}{ended}"
         )
         typer.echo(page)
 

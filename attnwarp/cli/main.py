@@ -5,7 +5,6 @@ from __future__ import annotations
 import typer
 
 from attnwarp.cli import shell
-from attnwarp.cli.baseline import baseline
 from attnwarp.cli.convert import convert, undistort
 from attnwarp.cli.edit import edit
 from attnwarp.cli.edit_image import edit_image
@@ -36,7 +35,6 @@ app.command()(render)
 app.command()(convert)
 app.command()(undistort)
 app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})(inspect)
-app.command()(baseline)
 app.command("edit-image")(shell.clear_errors()(edit_image))
 
 

@@ -1,4 +1,4 @@
-"""The work of the commands attnwarp edit and baseline: from photographs to an edited scene."""
+"""The work of the command attnwarp edit: from photographs to an edited scene."""
 
 from __future__ import annotations
 
@@ -121,11 +121,11 @@ def edit_dataset(
     Args:
         method: see :data:`attnwarp.methods.METHODS`.
         dataset: cameras and pictures.
-        splats: the scene before the edit; None, by attention warping alone, fits them first.
+        splats: the scene before the edit; None fits them first.
         editor_name: see :func:`attnwarp.editing.small.load_editor`.
         instruction: in words.
         settings: of the method. Without a size, the editor's own is taken.
-        out: folder of all results; that of attention warping also has a PLY for other viewers.
+        out: folder of all results, with a PLY for other viewers too.
         options: of the edit.
         fit_plan: of the fit, where splats are None.
         source_picture: file of the source view edited elsewhere, for attention warping.
@@ -157,10 +157,11 @@ def edit_dataset(
     if settings.size is None:
         settings = settings.changed(size=own_size(editor))
     if splats is None:
-        assert fit_plan is not None and isinstance(settings, AttentionWarpingSettings)
+        assert fit_plan is not None
         # Settings that the editor or the tuning cannot use are refused before it.
-        check_editor(editor, settings)
-        Features(editor, settings, "cpu")
+        if isinstance(settings, AttentionWarpingSettings):
+            check_editor(editor, settings)
+            Features(editor, settings, "cpu")
         perceptual_net(settings)
         splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, device, report)
     torch.set_num_threads(thread_count(editor, options.threads))
@@ -180,7 +181,7 @@ def edit_dataset(
         **own,
     )
     _report_memory(device, report)
-    if warping and result.gaussians.kind == "2d":
+    if result.gaussians.kind == "2d":
         # Other programs take no splats of two scales.
         write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
     # Views are edited alone too where a bundled editor takes seconds.

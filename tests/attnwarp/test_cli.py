@@ -91,7 +91,6 @@ def test_help_of_every_command_imports_nothing_heavy():
     code = """
 from typer.main import get_command
 from typer.testing import CliRunner
-from attnwarp.cli import baseline
 from attnwarp.cli.main import app
 names = sorted(get_command(app).commands)
 assert {"fit", "render", "edit", "edit-image", "convert"} <= set(names)
@@ -108,17 +107,14 @@ def test_mistyped_words_are_answered_before_anything_heavy_is_imported(tmp_path)
     garbage.write_bytes(b"hello, this is a text")
     edit = ["edit", "data", "--out", str(tmp_path / "out"), "--instruction"]
     image = ["edit-image", "a.png", "--out", str(tmp_path / "a.png"), "--instruction"]
-    more = ["--ply", "a.ply", "--out", str(tmp_path / "out"), "--instruction"]
-    dge = ["baseline", "dge", "data", *more]
     wrong = {
-        "instruction: is empty": [[*edit, " "], [*image, " "], [*dge, " "]],
-        "editor 'smal': neither": [[*c, "red", "--editor", "smal"] for c in (edit, image, dge)],
+        "instruction: is empty": [[*edit, " "], [*image, " "]],
+        "editor 'smal': neither": [[*c, "red", "--editor", "smal"] for c in (edit, image)],
         "takes depth maps": [[*image, "red", "--editor", "small-depth"]],
         "not a PLY": [["convert", str(garbage), str(tmp_path / "a.splat")]],
     }
     code = f"""
 from typer.testing import CliRunner
-from attnwarp.cli import baseline
 from attnwarp.cli.main import app
 for message, calls in {wrong!r}.items():
     for call in calls:
@@ -540,31 +536,20 @@ def test_render_leaves_the_photographs_of_its_cameras_alone(way, data, tmp_path)
     assert {path.name for path in out.iterdir()} == set(before)
 
 
-@pytest.mark.parametrize(
-    ("command", "option", "name"),
-    [
-        (["edit"], "--ply", "edited.ply"),
-        (["edit"], "--ply", "edited-3dgs.ply"),
-        (["baseline", "by_view"], "--ply", "edited.ply"),
-    ],
-)
-def test_an_edit_leaves_the_files_that_it_is_given_alone(command, option, name, data, tmp_path):
-    path = tmp_path / name
+@pytest.mark.parametrize("name", ["edited.ply", "edited-3dgs.ply"])
+def test_an_edit_leaves_the_splats_that_it_is_given_alone(name, data, tmp_path):
+    path, link = tmp_path / name, tmp_path / "out" / name
     path.write_bytes(b"a person's own")
-    done = in_process(
-        *command, data, "--instruction", "make it red", "--out", tmp_path, option, path
-    )
-    assert done.exit_code == 2
-    assert f"{path}: is read, and a result would replace it" in done.stderr
-    assert path.read_bytes() == b"a person's own" and list(tmp_path.iterdir()) == [path]
-    # Where a result is written through a link, the file that it leads to is the result's.
-    if option == "--ply":
-        link = tmp_path / "out" / name
-        link.parent.mkdir()
-        link.symlink_to(path)
-        arguments = (data, "--instruction", "make it red", "--out", link.parent, option, path)
-        done = in_process(*command, *arguments)
-        assert done.exit_code == 2 and f"{link}: is read, and a result" in done.stderr
+    link.parent.mkdir()
+    link.symlink_to(path)  # the file that a link leads to is the result's
+    for result in (path, link):
+        done = in_process(
+            "edit", data, "--instruction", "red", "--out", result.parent, "--ply", path
+        )
+        assert done.exit_code == 2
+        assert f"{result}: is read, and a result would replace it" in done.stderr
+    assert path.read_bytes() == b"a person's own"
+    assert set(tmp_path.iterdir()) == {path, link.parent} and [*link.parent.iterdir()] == [link]
 
 
 def test_views_of_the_same_file_name_do_not_overwrite_each_other(data, tmp_path):
