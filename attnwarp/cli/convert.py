@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import Annotated
 
 import typer
 
@@ -21,23 +20,12 @@ from attnwarp.cli.options import (
 from attnwarp.cli.shell import check_out, clear_errors
 from attnwarp.reporting import reporter
 
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from attnwarp.gaussians import Gaussians
-
-FORMATS = (".ply", ".splat", ".spz", ".glb")
-
-AROUND = 8
-"""Views from which the round trip through another format is measured."""
+FORMATS = (".ply", ".splat")
 
 
 def convert(
     source: Annotated[Path, typer.Argument(metavar="IN", help="Splats: .ply or .splat.")],
-    out: Annotated[
-        Path, typer.Argument(metavar="OUT", help="File to write: .ply, .splat, .spz or .glb.")
-    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write: .ply or .splat.")],
     kind: SplatKindOption = None,
     antialiased: AntialiasedOption = None,
     screen_filter: ScreenFilterOption = None,
@@ -56,10 +44,7 @@ def convert(
         ),
     ] = Coordinates.auto,
 ) -> None:
-    """Convert splats for other programs: 2DGS as thin 3DGS, .splat, fewer harmonics, no origin.
-
-    SPZ and glTF are written by splat-transform; how much they change is measured and said.
-    """
+    """Convert splats for other programs: 2DGS as thin 3DGS, .splat, fewer harmonics, no origin."""
     with clear_errors():
         suffix = out.suffix.lower()
         if suffix not in FORMATS:
@@ -81,67 +66,9 @@ def convert(
                 third_scale=THIRD_SCALE if third_scale is None else third_scale,
                 coordinates="relative" if coordinates == "relative" else "world",
             )
-        elif suffix == ".ply":
-            write_ply(out, splats, third_scale=third_scale, coordinates=coordinates.value)
         else:
-            third = third_scale or (THIRD_SCALE if splats.kind == "2d" else None)
-            typer.echo(_by_splat_transform(out, splats, third, coordinates.value))
-            return
+            write_ply(out, splats, third_scale=third_scale, coordinates=coordinates.value)
         typer.echo(f"{out}: {len(splats)} splats")
-
-
-def _by_splat_transform(
-    out: Path, splats: Gaussians, third_scale: float | None, coordinates: str
-) -> str:
-    """Write SPZ or glTF; return a line on what its round trip changes in renders."""
-    from tempfile import TemporaryDirectory
-
-    from attnwarp.io import read_ply, write_ply
-    from attnwarp.io.splat_transform import read_back, transform
-
-    with TemporaryDirectory() as place:
-        ply = Path(place) / "splats.ply"
-        write_ply(ply, splats, third_scale=third_scale, coordinates=cast(Any, coordinates))
-        transform(ply, out)
-        before = read_ply(ply, kind="3d", antialiased=splats.antialiased)
-    after, turn = read_back(out)
-    psnr = _psnr_around(before, after, turn)
-    met = f"{psnr:.1f} dB" if math.isfinite(psnr) else "equal pictures"
-    size = out.stat().st_size / 2**20
-    return (
-        f"{out}: {len(splats)} splats, {size:.1f} MiB; written and read again they render with"
-        f" {met} (PSNR over {AROUND} views around them)"
-    )
-
-
-def _psnr_around(before: Gaussians, after: Gaussians, turn: npt.NDArray[np.float64]) -> float:
-    """PSNR of renders of two models, pooled over views around them.
-
-    Args:
-        before, after: the models; ``after`` in a frame of its own.
-        turn: (4, 4) from the frame of ``before`` to that of ``after``.
-    """
-    from dataclasses import replace
-
-    import numpy as np
-
-    from attnwarp.camera import Camera
-    from attnwarp.losses import psnr_of_mse
-    from attnwarp.render import render
-
-    points = before.world_means()
-    middle = np.median(points, axis=0)
-    reach = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.75)) or 1.0
-    after, errors = replace(after, antialiased=before.antialiased), []
-    for angle in 2 * np.pi * np.arange(AROUND) / AROUND:
-        place = middle + 2.5 * reach * np.array([np.cos(angle), np.sin(angle), 0.3])
-        camera = Camera.look_at(tuple(place), tuple(middle), width=256, height=256, fov_y=50)
-        pose = camera.world_to_camera @ np.linalg.inv(turn)
-        turned = replace(camera, world_to_camera=pose)
-        one = render(before, camera, near=0.01 * reach).color.clamp(0, 1)
-        two = render(after, turned, near=0.01 * reach).color.clamp(0, 1)
-        errors.append(float((one - two).double().square().mean()))
-    return psnr_of_mse(sum(errors) / len(errors))
 
 
 def _check_start(path: Path) -> None:

@@ -702,7 +702,7 @@ def test_convert_to_splat_and_back(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["{a}", "{out}.obj"], "ending in .ply, .splat, .spz, .glb"),
+        (["{a}", "{out}.obj"], "ending in .ply, .splat"),
         (["{a}", "{out}.ply", "--third-scale", "1"], "--third-scale"),
         (["{none}", "{out}.ply"], "no such file"),
     ],
