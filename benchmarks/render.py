@@ -2,17 +2,7 @@
 
 One process. The cases run in turn (:func:`attnwarp_eval.cost.in_turn`), so that a slow moment of
 the machine falls on all of them; the median over rounds is reported, with the fastest beside it.
-The machine's own peak is measured in the same rounds: independent fused multiply-adds in registers,
-on as many threads as the renderer uses.
-
-The share of the peak is that of processor time on both sides, so that a busy machine, which makes
-everything take longer, hardly changes it; on a quiet one it is the share of wall time but for the
-moments in which a thread waits.
-
-A splat-pixel pair counts as 45 floating-point operations (an intersection, a Gaussian, and the sums
-of colour, normal, depth and distortion). The share of the peak is that of the pairs evaluated, 16
-for each splat whose intersection with a 4 x 4 square of pixels was computed; beside it stands that
-of those composited, in squares that the splat draws to.
+Pairs evaluated are 16 for each splat whose intersection with a 4 x 4 square of pixels was computed.
 
 Two models are fitted over the cases by least squares of the relative error, and reported with R^2
 (of the plain residuals) and 95 % intervals: processor time of the forward pass = a pairs + b splats
@@ -41,12 +31,9 @@ from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
 from attnwarp.render import _pool
 from attnwarp.render.api import render
-from attnwarp.render.threads import run_jobs, thread_count
+from attnwarp.render.threads import thread_count
 from attnwarp_eval.cost import in_turn, peak_memory_mb
 from benchmarks import command
-
-FLOPS_PER_PAIR = 45
-GSPLAT_SECONDS = 90.0
 
 
 @dataclass
@@ -63,11 +50,9 @@ class Case:
     forward_cpu: list[float] = field(default_factory=list)
     both: list[float] = field(default_factory=list)
     both_cpu: list[float] = field(default_factory=list)
-    peak: list[float] = field(default_factory=list)
     counters: dict[str, int] = field(default_factory=dict)
     forward_bytes: int = 0
     both_bytes: int = 0
-    gsplat_seconds: float | None = None
 
     @property
     def name(self) -> str:
@@ -105,20 +90,6 @@ def camera(size: int) -> Camera:
     return Camera.look_at([0, -3, 0], [0, 0, 0], width=size, height=size, fov_y=42)
 
 
-def measure_peak(threads: int, milliseconds: float = 15) -> float:
-    """Floating-point operations a second in independent fused multiply-adds held in registers, on
-    ``threads`` threads."""
-    from benchmarks import peak
-
-    operations = 2.0 * 16 * peak.CHAINS * 64
-    rounds = int(milliseconds * 1e-3 * 2e11 / operations)
-    jobs = [(rounds, peak.start()) for _ in range(threads)]
-    peak.multiply_add(1, peak.start())
-    start = time.process_time()
-    run_jobs(peak.multiply_add, jobs)
-    return operations * rounds * threads / (time.process_time() - start)
-
-
 def _differentiate(splats: Gaussians, view: Camera) -> None:
     """A forward and a backward pass. Upstream gradients of ones: the loss is not what is
     measured."""
@@ -140,19 +111,18 @@ def _with_leaves(splats: Gaussians) -> Gaussians:
 @dataclass(frozen=True)
 class Round:
     """Seconds of one forward pass and of one forward and backward pass, on the wall and of the
-    processor; the peak beside them, and the renderer's counters.
+    processor, and the renderer's counters.
     """
 
     forward: float
     forward_cpu: float
     both: float
     both_cpu: float
-    peak: float
     counters: dict[str, int]
 
 
 def time_once(splats: Gaussians, view: Camera) -> Round:
-    """One forward, one forward with backward, one measure of the peak."""
+    """One forward, one forward with backward."""
     start, start_cpu = time.perf_counter(), time.process_time()
     result = render(splats, view, backend="cpu")
     forward, forward_cpu = time.perf_counter() - start, time.process_time() - start_cpu
@@ -162,7 +132,7 @@ def time_once(splats: Gaussians, view: Camera) -> Round:
     start, start_cpu = time.perf_counter(), time.process_time()
     _differentiate(again, view)
     both, both_cpu = time.perf_counter() - start, time.process_time() - start_cpu
-    return Round(forward, forward_cpu, both, both_cpu, measure_peak(thread_count()), counters)
+    return Round(forward, forward_cpu, both, both_cpu, counters)
 
 
 def _contestant(splats: Gaussians, view: Camera) -> Callable[[int], Round]:
@@ -182,7 +152,6 @@ def time_in_turn(built: Sequence[tuple[Case, Gaussians, Camera]], rounds: int) -
         case.forward_cpu = [r.forward_cpu for r in results]
         case.both = [r.both for r in results]
         case.both_cpu = [r.both_cpu for r in results]
-        case.peak = [r.peak for r in results]
         case.counters = results[-1].counters
 
 
@@ -254,10 +223,8 @@ def fits(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def run(cases: list[Case], rounds: int, gsplat: int) -> dict[str, Any]:
-    """Time ``cases``, gsplat's reference up to ``gsplat`` contributing pairs; all of the table, as
-    JSON values.
-    """
+def run(cases: list[Case], rounds: int) -> dict[str, Any]:
+    """Time ``cases``; all of the table, as JSON values."""
     start = time.perf_counter()
     for kind in sorted({case.kind for case in cases}):
         time_once(scene(kind, 100, 0.1), camera(32))
@@ -267,8 +234,6 @@ def run(cases: list[Case], rounds: int, gsplat: int) -> dict[str, Any]:
     for case, splats, view in built:
         measure_memory(case, splats, view)
     memory = peak_memory_mb()
-    if gsplat:
-        judge(built, gsplat)
     rows = [row(case) for case in cases]
     return {
         "machine": _processor(),
@@ -276,9 +241,6 @@ def run(cases: list[Case], rounds: int, gsplat: int) -> dict[str, Any]:
         "rounds": rounds,
         "first_call_seconds": round(warm_up, 2),
         "peak_memory_mib": round(memory, 1),
-        "fma_peak_gflops_per_thread": round(
-            statistics.median(p for case in cases for p in case.peak) / 1e9, 1
-        ),
         "fits": fits(rows),
         "cases": rows,
     }
@@ -294,42 +256,11 @@ def _processor() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def judge(built: list[tuple[Case, Gaussians, Camera]], most: int) -> None:
-    """Time gsplat's torch reference on the cases with up to ``most`` contributing pairs; its memory
-    grows with them.
-
-    The pictures of the aim (50k splats, 512 x 512) first, then the easy ones; no further one after
-    GSPLAT_SECONDS.
-    """
-    try:
-        from benchmarks import gsplat_torch
-
-        start = time.perf_counter()
-        wanted = [item for item in built if item[0].counters["contributing"] <= most]
-        aim = (512, 50_000)
-        wanted.sort(
-            key=lambda item: (
-                (item[0].size, item[0].splats) != aim,
-                item[0].counters["contributing"],
-            )
-        )
-        for case, splats, view in wanted:
-            if time.perf_counter() - start > GSPLAT_SECONDS:
-                break
-            case.gsplat_seconds = gsplat_torch.render(splats, view).seconds
-    except ImportError:
-        return
-
-
 def row(case: Case) -> dict[str, Any]:
     """One line of the table."""
     forward, both = statistics.median(case.forward), statistics.median(case.both)
     pairs = case.counters["pairs"]
     cpu, both_cpu = statistics.median(case.forward_cpu), statistics.median(case.both_cpu)
-    # Against the peak of the same rounds: the processor's clock moves.
-    share = statistics.median(
-        FLOPS_PER_PAIR / f / p for f, p in zip(case.forward_cpu, case.peak, strict=True)
-    )
     return {
         "kind": case.kind,
         "size": case.size,
@@ -345,23 +276,14 @@ def row(case: Case) -> dict[str, Any]:
         "contributing": case.counters["contributing"],
         "gigapairs_per_second": round(pairs / forward / 1e9, 3),
         "composited": case.counters["composited"],
-        "fma_share": round(pairs * share, 4),
-        "fma_share_composited": round(case.counters["composited"] * share, 4),
         "forward_bytes": case.forward_bytes,
         "forward_backward_bytes": case.both_bytes,
-        "gsplat_torch_ms": (
-            None if case.gsplat_seconds is None else round(1e3 * case.gsplat_seconds, 1)
-        ),
-        "times_gsplat": (
-            None if case.gsplat_seconds is None else round(case.gsplat_seconds / forward, 1)
-        ),
     }
 
 
 def table(result: dict[str, Any]) -> str:
     """The result for a person, as Markdown."""
     head = f"{result['threads']} threads, {result['rounds']} rounds, median; "
-    head += f"FMA peak {result['fma_peak_gflops_per_thread']} GFLOP/s a thread, "
     head += f"peak memory {result['peak_memory_mib']:.0f} MiB, "
     head += f"first call {result['first_call_seconds']} s (compilation or its cache)"
     lines = [
@@ -369,15 +291,11 @@ def table(result: dict[str, Any]) -> str:
         "",
         (
             "| kind | size | splats | max sigma | forward ms (best; cpu) | fwd + bwd ms (cpu) | bwd"
-            " / fwd | Mpairs | Gpairs/s | of FMA peak (composited) | MiB (fwd + bwd) | gsplat torch"
-            " ms | times faster |"
+            " / fwd | Mpairs | Gpairs/s | MiB (fwd + bwd) |"
         ),
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in result["cases"]:
-        gsplat = ("", "")
-        if r["gsplat_torch_ms"] is not None:
-            gsplat = (f"{r['gsplat_torch_ms']:.0f}", f"{r['times_gsplat']:.0f}")
         cells = [
             r["kind"],
             r["size"],
@@ -388,9 +306,7 @@ def table(result: dict[str, Any]) -> str:
             f"{r['backward_over_forward']:.2f}",
             f"{r['pairs'] / 1e6:.1f}",
             f"{r['gigapairs_per_second']:.2f}",
-            f"{100 * r['fma_share']:.1f} % ({100 * r['fma_share_composited']:.1f} %)",
             f"{r['forward_bytes'] / 2**20:.0f} ({r['forward_backward_bytes'] / 2**20:.0f})",
-            *gsplat,
         ]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     lines += ["", *_sentences(result["fits"])]
@@ -426,9 +342,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     parser = command.parser("render", "Time the CPU renderer.")
     command.add_turns(parser, "256 x 256 with 10k and 50k splats only, 3 rounds", rounds=7)
-    parser.add_argument(
-        "--no-gsplat", action="store_true", help="leave out gsplat's torch reference"
-    )
     options = parser.parse_args(arguments)
     sizes, counts = (
         ([256], [10_000, 50_000]) if options.quick else ([256, 512], [10_000, 50_000, 200_000])
@@ -440,8 +353,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for sigma in (0.03, 0.1)
         for kind in ("2d", "3d")
     ]
-    most = 0 if options.no_gsplat else 1_500_000 if options.quick else 12_000_000
-    result = run(cases, 3 if options.quick else options.rounds, most)
+    result = run(cases, 3 if options.quick else options.rounds)
     print(table(result))
     command.write_figures(options.out, result)
 

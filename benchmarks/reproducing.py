@@ -11,6 +11,7 @@ alone, and has the figures of these. CPU seconds are of all threads of the proce
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import time
@@ -24,12 +25,11 @@ import torch
 from attnwarp.editing.small import thread_count
 from attnwarp.methods import METHODS, Budget, Result, preset
 from attnwarp.process import core_count
-from attnwarp_eval.cost import peak_memory_mb
+from attnwarp_eval.cost import peak_memory_mb, reset_peak_memory
 from attnwarp_eval.reproduce.manifest import Loaded, Row, load_manifest
 from attnwarp_eval.study.editing_methods import with_source_words
 from benchmarks import command
 from benchmarks.gpu import TINY, Sizes, random_editor, ring
-from benchmarks.recording import reset_peak
 from benchmarks.render import scene
 
 ALONE = "each view alone"
@@ -182,7 +182,9 @@ def measure(name: str, row: Row, editor: Any, sizes: Sizes, **changes: Any) -> C
     """
     short = {**SHORT.get(row.method, {}), **changes}
     settings = settings_of(row, sizes.edit_pixels, steps=1, iterations=1, **short)
-    reset_peak()
+    # What was freed is given back first: a run that used it again would not show in the peak.
+    gc.collect()
+    reset_peak_memory()
     with counted(editor) as (seconds, rows):
         result = run(row, settings, editor, views=2, splats=sizes.fit_splats)
     peak = peak_memory_mb() / 1024

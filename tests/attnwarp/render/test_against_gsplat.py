@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import gsplat_torch
 import numpy as np
 import pytest
 import torch
@@ -19,7 +20,6 @@ from backends import GPU
 from attnwarp import Camera
 from attnwarp.render import api, constants, reference, render
 from attnwarp.render.interface import Outputs
-from benchmarks import gsplat_torch
 
 
 def scene(kind: str, make_splats, opacity: float = 0.5):
@@ -115,7 +115,6 @@ def test_an_off_centre_principal_point_agrees(make_splats) -> None:
     judged = gsplat_torch.render(splats, camera)
     view = render(splats, camera)
     assert float((view.color - judged.color).abs().max()) < 2e-6
-    assert np.isfinite(judged.seconds)
 
 
 def without_stop(splats, camera) -> Outputs:

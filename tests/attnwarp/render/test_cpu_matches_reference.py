@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import torch
 from backends import GPU
+from rounding import MODES, excess, mixed_scales, prepared
 
 from attnwarp import Camera, Gaussians
 from attnwarp.render import binned, constants, cpu, render
 from attnwarp.render.interface import OUTPUTS
-from benchmarks.precision import MODES, excess, mixed_scales, prepared
 
 
 @pytest.mark.parametrize("backend", ["cpu", GPU])

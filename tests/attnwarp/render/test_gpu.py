@@ -8,11 +8,11 @@ import dataclasses
 import pytest
 import torch
 from imported_modules import modules_after
+from rounding import excess, prepared
 
 from attnwarp import Gaussians
 from attnwarp.render import render
 from attnwarp.render.interface import OUTPUTS
-from benchmarks.precision import excess, prepared
 
 
 @pytest.mark.usefixtures("one_thread")

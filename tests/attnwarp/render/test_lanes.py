@@ -23,7 +23,6 @@ from attnwarp.render._kernels import (
     projection_backward,
     rasterization,
 )
-from benchmarks import peak
 
 
 def test_estimates_made_better_and_sums_in_another_order() -> None:
@@ -188,6 +187,5 @@ def test_a_change_in_any_module_throws_cached_code_away(tmp_path) -> None:
         projection_backward.project_backward,
         ordering.depths,
         binning.find_runs,
-        peak.multiply_add,
     ):
         assert dispatcher._cache._cache_file._source_stamp == compilation.FINGERPRINT

@@ -1,5 +1,4 @@
-"""gsplat's own torch reference, run whole on a CPU: an independent judge for the tests and a
-yardstick for the benchmark.
+"""gsplat's own torch reference, run whole on a CPU: an independent judge.
 
 gsplat enumerates splat-pixel pairs in CUDA and composites with nerfacc; both are supplied here: the
 pairs by brute force over each splat's box, nerfacc's two functions by a cumulative sum of
@@ -15,7 +14,6 @@ from __future__ import annotations
 import itertools
 import os
 import sys
-import time
 import types
 from dataclasses import dataclass
 
@@ -39,15 +37,12 @@ STOP = 1e-4
 class Judged:
     """gsplat's picture: (H, W, 3) colour over black, (H, W) alpha, (H, W, 3) normals in world axes
     (2D only), (H, W) expected depth of the centres in scene units (NaN where nothing was drawn;
-    None if not asked for); the pairs it composited, and the seconds that gsplat's own functions
-    took (the enumeration of pairs left out)."""
+    None if not asked for)."""
 
     color: Tensor
     alpha: Tensor
     normal: Tensor | None
     depth: Tensor | None
-    pairs: int
-    seconds: float
 
 
 def _nerfacc() -> types.ModuleType:
@@ -125,7 +120,6 @@ def render(
     installed = sys.modules.get("nerfacc")
     sys.modules["nerfacc"] = _nerfacc()
     try:
-        start = time.perf_counter()
         if splats.kind == "3d":
             covariances, _ = _quat_scale_to_covar_preci(
                 splats.quats, splats.scales, compute_preci=False
@@ -151,7 +145,6 @@ def render(
             boxes = means2d
             if true_center:
                 means2d = table[..., :2, 2] / table[..., 2:, 2]
-        seconds = time.perf_counter() - start
         limits = (
             torch.cat([boxes[0] - radii[0], boxes[0] + radii[0]], dim=-1).detach() / TILE
             if box
@@ -172,7 +165,6 @@ def render(
         images = torch.zeros_like(ids)
         if depth:
             colors = torch.cat([colors, depths[0][:, None]], dim=1)
-        start = time.perf_counter()
         if splats.kind == "3d":
             picture, alpha = accumulate(
                 means2d, table, opacities[None], colors[None], ids, pixels, images, width, height
@@ -192,7 +184,6 @@ def render(
                 height,
             )
             normal = in_camera[0] @ view[0, :3, :3]
-        seconds += time.perf_counter() - start
     finally:
         if installed is None:
             del sys.modules["nerfacc"]
@@ -205,7 +196,7 @@ def render(
         expected = torch.where(
             drawn, picture[0, ..., 3] / torch.where(drawn, covered, 1.0), torch.nan
         )
-    return Judged(picture[0, ..., :3], covered, normal, expected, len(ids), seconds)
+    return Judged(picture[0, ..., :3], covered, normal, expected)
 
 
 def _pairs(
