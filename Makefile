@@ -11,7 +11,7 @@ JOBS ?= $(shell awk -v n=$$(nproc) '/MemAvailable/ { m = int($$2 / 3e6); print m
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal --durations=25 --durations-min=1
 
 # Left to `make test-all` (CONTRIBUTING.md).
-THOROUGH := slow or door or damage or training or scripts
+THOROUGH := slow or door or training or scripts
 
 # Of the gate: the run, and what it says.
 GATE := build/gate

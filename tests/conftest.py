@@ -47,8 +47,6 @@ def pytest_collection_modifyitems(items):
         room = item.path.relative_to(ROOT).parts[0]
         if room in {"training", "scripts"}:
             item.add_marker(room)
-        if item.path.stem == "test_damage":
-            item.add_marker("damage")
         if any(item.iter_markers("slow")) and not any(item.iter_markers("timeout")):
             item.add_marker(pytest.mark.timeout(SLOW_LIMIT))
 

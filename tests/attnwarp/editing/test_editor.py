@@ -620,3 +620,24 @@ def test_a_folder_of_another_scheduler_that_says_nothing_of_clipping_clips_nothi
     assert told.pop("clip_sample", None) in (None, False)
     file.write_text(json.dumps(told))
     assert InstructPix2Pix.from_folder(tmp_path).scheduler.config.clip_sample is False
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_not_finite_are_refused_by_name(value, tmp_path):
+    pipe = pix2pix()
+    pipe.unet.conv_in.weight.data[0, 0, 0, 0] = value
+    pipe.save_pretrained(tmp_path)
+    with pytest.raises(InputError, match=r"unet: its weights have NaN or inf.* in conv_in\.weight"):
+        load_parts(tmp_path, dtype=torch.float32)
+
+
+@pytest.mark.parametrize(
+    "name", ["unet/diffusion_pytorch_model.safetensors", "tokenizer/tokenizer.json"]
+)
+def test_half_a_file_of_a_model_is_refused_in_one_line(name, tmp_path):
+    pix2pix().save_pretrained(tmp_path)
+    whole = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError) as refusal:
+        load_parts(tmp_path, dtype=torch.float32)
+    assert "\n" not in str(refusal.value)
