@@ -1,4 +1,4 @@
-"""A training's log: a JSON line for each epoch beside its checkpoint, and a table of stages from their logs.
+"""A training's log: a JSON line for each epoch beside its checkpoint.
 
 A checkpoint tells what its weights took, a log how the losses fell.
 """
@@ -6,16 +6,11 @@ A checkpoint tells what its weights took, a log how the losses fell.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
-
 from attnwarp.io.file import write_atomically
-
-LAST_EPOCHS = 10
-"""Number of the last epochs whose mean loss a table gives."""
 
 
 @dataclass(frozen=True)
@@ -69,30 +64,3 @@ def append(path: Path, entry: Entry) -> None:
 
 def _line(entry: Entry) -> str:
     return json.dumps(asdict(entry)) + "\n"
-
-
-def table(paths: Iterable[Path]) -> str:
-    """A Markdown table with a row for each log that has an entry.
-
-    Milliseconds a step are those of the epochs after the first, which compiles and warms up.
-    Losses are those of training, means of the last :data:`LAST_EPOCHS` epochs; "unedited" is the
-    loss of the picture before the edit.
-    """
-    lines = ["| stage | steps | seconds | ms a step | losses |", "|---|---|---|---|---|"]
-    for path in paths:
-        entries = read_log(path)
-        if not entries:  # of a training that was stopped in its first epoch
-            continue
-        first, last = entries[0], entries[-1]
-        steps, each = "–", "–"
-        if last.steps is not None:
-            steps = f"{last.steps:,}"
-            if first.steps is not None and first.steps < last.steps:
-                each = f"{1000 * (last.seconds - first.seconds) / (last.steps - first.steps):.1f}"
-        values: dict[str, list[float]] = {}
-        for entry in entries[-LAST_EPOCHS:]:
-            for name, value in entry.losses.items():
-                values.setdefault(name, []).append(value)
-        losses = ", ".join(f"{name} {np.mean(values[name]):.4f}" for name in sorted(values))
-        lines.append(f"| `{last.stage}` | {steps} | {last.seconds:,.0f} | {each} | {losses} |")
-    return "\n".join(lines)

@@ -24,9 +24,6 @@ from training.worlds.editing_pairs import GROUPS, load_pairs
 
 STEPS = 20
 
-SHEETS = "../../../../reports/editor"
-"""Folder in which a card finds the pictures of ``python -m training.editors sheet``."""
-
 SHAPES = 10
 """Masks among which a picture has to show its own."""
 
@@ -170,8 +167,4 @@ def depth_card(name: str, results: Sequence[tuple[Figure, Figure]], facts: dict[
             f"| {own.what} | **{100 * own.value:.0f} %** ({100 * own.low:.0f} to {100 * own.high:.0f}) | {100 * control.value:.0f} %"
             f" | {100 * (own.chance or 0):.0f} % | {own.count} |"
         )
-    lines += [
-        "",
-        f"[A sheet]({SHEETS}/{name}.png) shows eight of these worlds with six prompts each.",
-    ]
     return "\n".join([*lines, ""])

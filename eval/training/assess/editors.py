@@ -14,11 +14,10 @@ import torch
 
 from attnwarp.editing.editor import Image, edit
 from attnwarp_eval.drawn.worlds import COLORS
-from training.assess.card_sections import asked_for, percent, short_of, with_section
+from training.assess.card_sections import asked_for, percent, short_of
 from training.assess.figures import Figure, figure
 from training.assess.judge import Answer, nearest, outside_psnr
 from training.assess.pictures import Pictures, Row
-from training.assess.scenes import scene_figures
 from training.worlds.editing_pairs import (
     AMBIGUOUS,
     GROUPS,
@@ -142,14 +141,12 @@ def draw_row(pairs: Pictures, world: int, kind: str, rng: np.random.Generator) -
 
 
 def editor_card(
-    name: str, figures: Sequence[Figure], control: Sequence[Figure], facts: dict[str, Any],
-    scenes: Sequence[Figure] = (),
-) -> str:  # fmt: skip
+    name: str, figures: Sequence[Figure], control: Sequence[Figure], facts: dict[str, Any]
+) -> str:
     """A bundled editor's card in Markdown.
 
     Args:
         figures, control: of it and of an editor that changes nothing.
-        scenes: figures of :mod:`training.assess.scenes`.
     """
     learned, missing = "", "parts of things (a jacket, a pot), "
     if facts["parts"]:
@@ -182,33 +179,16 @@ def editor_card(
             f"| {own.what} | {percent(own)} | {100 * other.value:.0f} % | {chance} | {asked_for(own)} | {own.count} |"
         )
     lines += short_of(figures)
-    card = "\n".join([*lines, ""])
-    if scenes:
-        card = with_section(card, _scenes_section(scenes))
-    return card
-
-
-def _scenes_section(scenes: Sequence[Figure]) -> str:
-    lines = [
-        "## On the package's own scenes and sentences", "",
-        "Six scenes of the studies, three views each, every sentence of theirs (`training/assess/scenes.py`). Intervals are over scenes.",
-        "", "| question | share | chance | asked for | answers |", "|---|---|---|---|---|",
-    ]  # fmt: skip
-    for f in scenes:
-        lines.append(
-            f"| {f.what} | {percent(f)} | {100 * (f.chance or 0):.0f} % | {asked_for(f)} | {f.count} |"
-        )
-    return "\n".join(lines + short_of(scenes))
+    return "\n".join([*lines, ""])
 
 
 def assess_editor(
-    folder: Path, data: Path, facts: dict[str, Any], *, worlds: int | None = None, scenes: bool = False,
-) -> str:  # fmt: skip
+    folder: Path, data: Path, facts: dict[str, Any], *, worlds: int | None = None
+) -> str:
     """The card of an exported editor.
 
     Args:
         worlds: of each test split; all if left out.
-        scenes: whether to judge it on the package's own scenes too.
     """
     from attnwarp.editing.small import IMAGE_GUIDANCE, TEXT_GUIDANCE, load_editor
 
@@ -238,5 +218,4 @@ def assess_editor(
         "unet": millions(editor.unet), "text": millions(editor.text_encoder), "size": size, "tested": tested,
         "text_guidance": TEXT_GUIDANCE, "image_guidance": IMAGE_GUIDANCE,
     }  # fmt: skip
-    seen = scene_figures(answers_of(editor), size=size) if scenes else []
-    return editor_card(folder.name, own, control, {**given, **facts}, seen)
+    return editor_card(folder.name, own, control, {**given, **facts})

@@ -1,4 +1,4 @@
-"""Figures of an encoder about parts: surfaces by name, edits by direction, on held-out worlds and the package's own scenes."""
+"""Figures of an encoder about parts: surfaces by name, edits by direction, on held-out worlds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from attnwarp.encoders.base import TextImageEncoder
 from attnwarp_eval.drawn.assemblies import KINDS, WHOLE_NOUNS
 from attnwarp_eval.drawn.worlds import draw_look
 from training.assess.figures import Figure, as_float, figure, unit
-from training.assess.scenes import SCENES
 from training.encoders.clip_parts import surface_choices, surface_number
 from training.worlds.part_captions import (
     Caption,
@@ -26,10 +25,6 @@ Array = npt.NDArray[np.float64]
 
 LEAST_SHARE = 0.02
 """Least share of a picture that a part covers where it is asked about."""
-
-SCENE_SIZE = 256
-SCENE_SAMPLES = 32
-SCENE_VIEWS = 3
 
 
 def part_figures(encoder: TextImageEncoder, pictures: PartPictures) -> list[Figure]:
@@ -122,41 +117,3 @@ def _directions(encoder: TextImageEncoder, images: Array, pictures: PartPictures
     return figure(
         "the edit of a part among 8, by directional similarity", right, worlds, chance=1 / 8
     )
-
-
-def scene_figure(encoder: TextImageEncoder) -> Figure:
-    """Choice of the edit that was made among a scene's own, by directional similarity.
-
-    Each answer of an ambiguous edit is an edit of its own. Their true pictures are the package's.
-    """
-    from attnwarp_eval.study.edit_truth import ONLY, edit_truth
-    from attnwarp_eval.world import world
-
-    right, names, chance = [], [], []
-    for name in SCENES:
-        of = world(name, SCENE_SIZE)
-        views = tuple(
-            list(of.targets)[k]
-            for k in np.linspace(0, len(of.targets) - 1, SCENE_VIEWS).round().astype(int)
-        )
-        sources, targets, pictures = [], [], []
-        for edit in of.scene.spec.edits:
-            truth = edit_truth(name, SCENE_SIZE, SCENE_SAMPLES, edit.name, views)
-            words = {answer.name: answer.target for answer in edit.answers} or {ONLY: edit.target}
-            for answer, shown in truth.answers.items():
-                sources.append(edit.source)
-                targets.append(words[answer])
-                pictures.append(
-                    [(truth.originals[v], shown[v], truth.union[v].mean()) for v in views]
-                )
-        away = unit(unit(encoder.texts(targets)) - unit(encoder.texts(sources)))
-        for k, row in enumerate(pictures):
-            for before, after, share in row:
-                if share < 0.01:
-                    continue
-                change = unit(encoder.images([after])) - unit(encoder.images([before]))
-                right.append(int((away @ change[0]).argmax()) == k)
-                names.append(name)
-                chance.append(1 / len(pictures))
-    what = "the edit among a scene's own, by directional similarity"
-    return figure(what, right, names, chance=float(np.mean(chance)), asked=0.85)

@@ -86,7 +86,7 @@ def assess(
 
     import training.assess.figures
     from attnwarp.encoders.bundled import load
-    from training.assess.parts import part_figures, scene_figure
+    from training.assess.parts import part_figures
     from training.encoders.cards import card
     from training.worlds import part_pictures
 
@@ -99,7 +99,6 @@ def assess(
             results = training.assess.figures.clip_figures(encoder, sets)
         if name == "clip-parts":
             results += part_figures(encoder, part_pictures.load(data, "parts-test"))
-            results.append(scene_figure(encoder))
         if name == "dino-small":
             results = training.assess.figures.dino_figures(encoder, sets)
         if name == "perceptual-small":

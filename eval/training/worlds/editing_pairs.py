@@ -86,8 +86,6 @@ class PairSplit:
 PAIR_SPLITS = {
     "edit-train": PairSplit(10_000_000, 1800),
     "edit-test": PairSplit(11_000_000, 40, test=True),
-    # For choices: what is chosen on them is reported on others.
-    "edit-choice": PairSplit(11_050_000, 40, test=True),
     "parts-train": PairSplit(12_000_000, 1190, parts=True),
     "parts-test": PairSplit(13_000_000, 51, test=True, parts=True),
 }

@@ -33,14 +33,14 @@ def place(tmp_path_factory):
 def run(place, *words):
     given = [
         "--ply", place / "splats.ply", "--editor", place / "editor", "--instruction", "a bear",
-        "--out", place / "out", "--threads", 1, "--set", "size=32", "--set", "steps=1",
+        "--out", place / "out", "--threads", 1, "--size", 32,
     ]  # fmt: skip
     arguments = ["edit", place / "data", "--method", *words, *given]
     return CliRunner().invoke(app, [str(word) for word in arguments])
 
 
 def test_the_command_gives_what_the_library_gives_and_says_where(place):
-    result = run(place, "by_view", "--iterations", 1)
+    result = run(place, "by_view", "--steps", 1, "--iterations", 1)
     assert result.exit_code == 0, result.stderr
     out = place / "out"
     assert str(out / "edited.ply") in result.stdout
@@ -64,14 +64,14 @@ def test_the_command_gives_what_the_library_gives_and_says_where(place):
     ("words", "message"),
     [
         (("dge", "--preset", "relesed"), "preset: got 'relesed'"),
-        (("dge", "--set", "steps=9", "--set", "starts=[998, 3]"), "starts: 3 leaves too few"),
+        (("dge", "--steps", 9, "--set", "starts=[998, 3]"), "starts: 3 leaves too few"),
         (("dge", "--store", "disk"), "--store: is of attention_warping, not of dge; leave it out"),
         (("igs2gs",), 'holds an edit of other method ("by_view", now "igs2gs")'),
     ],
 )
 def test_mistakes_end_in_one_line_and_exit_code_2(place, words, message):
     if "holds" in message:
-        assert run(place, "by_view", "--set", "iterations=1").exit_code == 0
+        assert run(place, "by_view", "--steps", 1, "--iterations", 1).exit_code == 0
     result = run(place, *words)
     assert result.exit_code == 2
     (line,) = [line for line in result.stderr.splitlines() if line.startswith("attnwarp: ")]

@@ -1,6 +1,5 @@
 """Oracles: diffusers' own pipeline, worlds of plain colours, closed forms, a run that was not stopped."""
 
-import contextlib
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,8 +12,6 @@ from attnwarp.editing.editor import edit
 from attnwarp.editing.small import DEPTH_GUIDANCE, load_editor
 from attnwarp_eval.drawn.worlds import COLORS, HUES
 from training import steps
-from training.assess import inverts as depth_inverts
-from training.assess.card_sections import Kept
 from training.assess.depth import assess_depth, depth_card, separation
 from training.assess.pictures import Row
 from training.editors import depth as depth_editor
@@ -186,36 +183,3 @@ def test_an_editor_that_knows_every_answer_gets_all(worlds, monkeypatch):
     }  # fmt: skip
     card = depth_card("small-depth", results, facts)
     assert card.count("**100 %**") == len(results) == 5
-    assert "(../../../../reports/editor/small-depth.png)" in card
-
-
-def test_pictures_rebuilt_from_their_inversion_are_told_from_others(worlds, monkeypatch, tmp_path):
-    """Oracle: an error of e everywhere is -20 log10(e) dB; 0.01 is 40 dB, 0.1 is 20."""
-    prompts, inverted = Prompts(worlds, 64), []
-
-    def invert(editor, depth, picture, prompt, *, steps):
-        inverted.append((depth, picture, prompt))
-        return steps
-
-    def draw(editor, guides, prompt, *, steps, latents=None, seed=None):
-        depth, picture, text = inverted[-1]
-        assert guides[0] is depth and prompt == text
-        error = {None: 0.1, 20: 0.01, 50: 0.001}[latents]
-        return SimpleNamespace(images=[picture.astype(np.float64) + error])
-
-    monkeypatch.setattr(depth_inverts, "invert_view", invert)
-    monkeypatch.setattr(depth_inverts, "edit", draw)
-    monkeypatch.setattr(depth_inverts, "guided", lambda editor, guidance: contextlib.nullcontext())
-    monkeypatch.setattr(
-        depth_inverts, "prompt_of", lambda editor, prompts, row, rng: str(row.world)
-    )
-    kept = Kept(tmp_path / "kept.json")
-    results = depth_inverts.inverts(None, prompts, kept, steps=(20, 50))
-    assert [r.inverted.value for r in results] == pytest.approx([40, 60], abs=1e-4)
-    assert [r.control.value for r in results] == pytest.approx([20, 20], abs=1e-4)
-    assert [r.enough for r in results] == [len(worlds)] * 2
-    asked = len(inverted)
-    assert depth_inverts.inverts(None, prompts, kept, steps=(20, 50)) == results
-    assert len(inverted) == asked  # nothing twice
-    section = depth_inverts.inverts_section(results, size=64)
-    assert "| 20 | **40.0** (40.0 to 40.0) | 20.0 (20.0 to 20.0) |" in section
