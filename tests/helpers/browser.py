@@ -79,11 +79,15 @@ class Tab:
 
 
 @asynccontextmanager
-async def opened(url, size=(900, 600)):
-    """A tab at an address, in a browser of its own that ends with it."""
+async def opened(url, size=(900, 600), profile=None):
+    """A tab at an address, in a browser of its own that is killed behind it; ``profile`` is a
+    folder that outlives it.
+    """
     import aiohttp
 
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as passing:
+        folder = profile or passing
+        Path(folder, "DevToolsActivePort").unlink(missing_ok=True)  # of the browser before
         process = subprocess.Popen(
             [
                 executable(), "--headless", "--no-sandbox", "--disable-gpu-sandbox",

@@ -7,17 +7,20 @@
   const TURN = 450; // ms a view
   const REST = 250; // ms in which a tap still belongs to the choice before
 
-  // What a browser keeps: one object a page. Private windows may refuse it.
-  const kept = (() => {
-    try {
-      localStorage.setItem(`${KEY}-test`, "1");
-      localStorage.removeItem(`${KEY}-test`);
-      return localStorage;
-    } catch {
-      element("memory").hidden = false;
-      return null;
-    }
-  })();
+  // What a browser keeps: one object a page. In IndexedDB, which says when it has it: localStorage is written seconds later, and where a
+  // page asks for it before the browser has noted that the page is there, what it writes is lost without an error.
+  const forgets = () => (element("memory").hidden = false);
+  const answered = (request) =>
+    new Promise((resolve, reject) => {
+      request.onsuccess = () => resolve(request.result);
+      request.onerror = () => reject(request.error);
+    });
+  const open = async () => {
+    const request = indexedDB.open(KEY);
+    request.onupgradeneeded = () => request.result.createObjectStore(KEY);
+    return answered(request);
+  };
+  const opened = open();
 
   const random = (count) => {
     const numbers = crypto.getRandomValues(new Uint32Array(count));
@@ -29,21 +32,26 @@
     const person = random(2).map((n) => n.toString(16).padStart(8, "0")).join("");
     return { person, plan: plan % study.plans.length, made: [], saved: 0 };
   };
-  const read = () => {
+  const read = async () => {
     try {
-      const state = JSON.parse(kept?.getItem(KEY) ?? "null");
-      if (study.plans[state?.plan]?.length >= state.made.length) return state;
+      const kept = await answered((await opened).transaction(KEY).objectStore(KEY).get(KEY));
+      if (study.plans[kept?.plan]?.length >= kept.made.length) return kept;
     } catch {
-      // Not what this page has written.
+      forgets(); // a private window may refuse it
     }
     return fresh();
   };
-  let state = read();
-  const keep = () => {
+  let state;
+  const keep = async () => {
     try {
-      kept?.setItem(KEY, JSON.stringify(state));
+      const transaction = (await opened).transaction(KEY, "readwrite");
+      transaction.objectStore(KEY).put(state, KEY);
+      await new Promise((resolve, reject) => {
+        transaction.oncomplete = resolve;
+        transaction.onabort = reject;
+      });
     } catch {
-      element("memory").hidden = false;
+      forgets();
     }
   };
   const plan = () => study.plans[state.plan];
@@ -57,7 +65,7 @@
   };
   document.addEventListener("visibilitychange", () => clock(!document.hidden && at === "trial"));
 
-  let at = "start";
+  let at = "reading";
   const go = (name) => {
     at = name;
     for (const id of ["start", "trial", "paused", "end"]) element(id).hidden = id !== name;
@@ -120,18 +128,16 @@
     ready = performance.now() + (number ? REST : 0);
     go("trial");
   };
-  const choose = (side) => {
+  const choose = async (side) => {
     if (at !== "trial" || performance.now() < ready) return;
     clock(false);
     state.made.push([side, Math.round(spent)]);
-    keep();
     const button = element(side);
     button.classList.add("chosen");
     at = "between";
-    setTimeout(() => {
-      button.classList.remove("chosen");
-      next();
-    }, 120);
+    await Promise.all([keep(), new Promise((shown) => setTimeout(shown, 120))]);
+    button.classList.remove("chosen");
+    next();
   };
   const back = () => {
     if (at !== "trial" || !state.made.length) return;
@@ -231,5 +237,8 @@
     event.preventDefault();
     act();
   });
-  start();
+  read().then((found) => {
+    state = found;
+    start();
+  });
 })();

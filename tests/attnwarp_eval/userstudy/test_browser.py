@@ -31,7 +31,7 @@ def built(root, folder):
 
 
 async def begin(tab):
-    await tab.until("document.querySelector('#begin')?.textContent.length > 1")
+    await tab.until(f"document.querySelector('#start') && {shows('start')}")
     await tab.press("Enter", 13)
     await tab.until(shows("trial"))
     await asyncio.sleep(0.3)  # after a reload, too, a pair rests before it takes a choice
@@ -81,7 +81,6 @@ def test_twenty_answers_with_a_reload_in_the_middle_are_all_saved(page, tmp_path
                 assert await place(tab) == k + 1
                 await answer(tab, side)
             await tab.send("Page.reload")
-            await asyncio.sleep(1)
             await begin(tab)
             assert await place(tab) == 12
             for side in sides[11:]:
@@ -100,6 +99,17 @@ def test_twenty_answers_with_a_reload_in_the_middle_are_all_saved(page, tmp_path
     path = next(tmp_path.glob("answers-*.json"))
     done = CliRunner().invoke(app, ["userstudy", "score", str(path)])
     assert done.exit_code in (0, 3), done.output  # checks fall where they fall
+
+
+def test_no_answer_is_lost_where_the_browser_is_killed_once_the_next_pair_is_shown(page, tmp_path):
+    async def person():
+        for number in (1, 2):
+            async with browser.opened(page, profile=tmp_path / "profile") as tab:
+                await begin(tab)
+                assert await place(tab) == number
+                await answer(tab, "left")
+
+    asyncio.run(person())
 
 
 def test_the_last_choice_can_be_taken_back_and_a_pause_stops_the_clock(page, tmp_path):
@@ -188,12 +198,8 @@ def test_what_a_person_has_chosen_is_not_shown_to_the_next_one(page, tmp_path):
             await tab.run("document.querySelector('#again').click()")
             await tab.until(shows("start"))
             await begin(tab)
-            key = "Object.keys(localStorage).find(k => k.startsWith('userstudy-'))"
-            return (
-                first,
-                await place(tab),
-                json.loads(await tab.run(f"localStorage.getItem({key})")),
-            )
+            number = await place(tab)
+            return first, number, json.loads((await saved(tab, tmp_path / "next")).read_text())
 
-    first, number, state = asyncio.run(person())
-    assert number == 1 and state["made"] == [] and state["person"] != first
+    first, number, second = asyncio.run(person())
+    assert number == 1 and second["choices"] == [] and second["person"] != first
