@@ -92,14 +92,7 @@ def run(
         bool, typer.Option("--keep-going/--fail-fast", help="After a failed cell.")
     ] = True,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Count what would be measured, and run nothing.")
-    ] = False,
-    plan: Annotated[
-        bool,
-        typer.Option(
-            "--plan",
-            help="Run a pilot on 8 scenes of another seed; say how many scenes each claim needs.",
-        ),
+        bool, typer.Option("--dry-run", help="Count what would be measured, and plan the rest.")
     ] = False,
     *,
     capture: Capture,
@@ -124,7 +117,6 @@ def run(
     without_data = {
         "--scenes": scenes is not None,
         "--dry-run": dry_run,
-        "--plan": plan,
         "--jobs": jobs > 1,
         "--scheduler": scheduler is not None,
         "--fail-fast": not keep_going,
@@ -139,8 +131,6 @@ def run(
         _run_on_capture(lambda: load_study(study, seeds=drawn), capture, capture.data, out, size)
     elif dry_run:
         _print_plan(load, out)
-    elif plan:
-        _run_pilot(load, out, jobs, scheduler, keep_going)
     else:
         run_study(load, out, jobs, scheduler, keep_going)
 
@@ -211,55 +201,31 @@ def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
         f" {len(planned.cells)} cells, {planned.reused} done in {store.root}"
     )
 
-    _print_cost(planned, store)
+    _print_needed(planned, store)
 
 
-def _pilot_folder(store: Store) -> Path:
-    return store.root.with_name(f"{store.root.name}-pilot")
-
-
-def _print_cost(planned: Plan, store: Store) -> None:
-    """Hours and gigabytes of the cells that are still to do, from cells of their kind."""
-    from attnwarp_eval.report import read_results
-    from attnwarp_eval.report.planning import cost_of
-    from attnwarp_eval.study.store import Store
-
-    stores = (store, Store(_pilot_folder(store)))
-    measured = [(read_results(s), s.root) for s in stores if (s.root / "study.json").is_file()]
-    cost = cost_of([(cell.probe, cell.labels) for cell in planned.todo], measured)
-    if planned.todo and cost.unknown == len(planned.todo):
-        typer.echo("hours: not known before some cells are done; --plan measures them on a pilot")
-        return
-    unknown = f"; {cost.unknown} cells of kinds that none was measured of" if cost.unknown else ""
-    typer.echo(f"to do: {cost.hours:.2g} hours of one worker, {cost.gigabytes:.2g} GB{unknown}")
-
-
-def _run_pilot(
-    load: Callable[[], Study],
-    out: Path | None,
-    jobs: int,
-    scheduler: str | None,
-    keep_going: bool,
-) -> None:
-    """Run a study on a few scenes of another seed, and say how many each of its claims needs."""
+def _print_needed(planned: Plan, store: Store) -> None:
+    """By the cells that are done: scenes that each claim needs, hours and gigabytes of the rest."""
     from rich.console import Console
 
     from attnwarp_eval.document.write import terminal
-    from attnwarp_eval.report.planning import PILOT_SCENES, plan_table
-    from attnwarp_eval.study.store import Store
-    from attnwarp_eval.study.study import pilot_of
+    from attnwarp_eval.report import read_results
+    from attnwarp_eval.report.planning import cost_of, plan_scenes
 
-    with clear_errors():
-        loaded = load()
-        folder = _pilot_folder(Store(out or Path("runs") / loaded.name))
-        pilot = pilot_of(loaded, PILOT_SCENES)
-    results = run_study(lambda: pilot, folder, jobs, scheduler, keep_going)
-    Console(width=150).print(terminal(plan_table(results)))
-    typer.echo(
-        f"from {pilot.sampled}: so many scenes tell the difference of interest in 80 % of studies,"
-        " by one test at 5 %; more are needed where many claims are adjusted for"
-    )
-    _print_plan(load, out)
+    results = read_results(store) if (store.root / "study.json").is_file() else None
+    measured = None if results is None else (results, store.root)
+    cost = cost_of([(cell.probe, cell.labels) for cell in planned.todo], measured)
+    if results is not None and (table := plan_scenes(results)).rows:
+        Console(width=150).print(terminal(table))
+        typer.echo(
+            "so many scenes tell the difference of interest in 80 % of studies, by one test at 5 %;"
+            " more are needed where many claims are adjusted for"
+        )
+    if planned.todo and cost.unknown == len(planned.todo):
+        typer.echo("hours: not known before some cells are done")
+        return
+    unknown = f"; {cost.unknown} cells of kinds that none was measured of" if cost.unknown else ""
+    typer.echo(f"to do: {cost.hours:.2g} hours of one worker, {cost.gigabytes:.2g} GB{unknown}")
 
 
 def _name_notices(planned: Plan) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 
 @dataclass
@@ -126,33 +125,8 @@ class Section:
 
 
 @dataclass
-class Finding:
-    """First thing that a reader of a page sees: a sentence, a number with its interval, and a
-    picture.
-
-    Attributes:
-        text: one sentence.
-        value: the number.
-        about: what the number is of.
-        outcome: "holds" or "fails", which colour it.
-        picture: that shows it best.
-
-    Example:
-        >>> Finding("The mask helps.", "+0.10 ± 0.02 share", "precision", "holds").picture is None
-        True
-    """
-
-    text: str
-    value: str
-    about: str
-    outcome: Literal["holds", "fails"]
-    picture: Picture | Slider | None = None
-
-
-@dataclass
 class Report:
-    """The whole report: its answer, if it has one, before everything else. Findings stand on a page
-    alone.
+    """The whole report: its answer, if it has one, before everything else.
 
     Example:
         >>> from attnwarp_eval.document.write import markdown
@@ -163,5 +137,4 @@ class Report:
     title: str
     lead: list[str]
     sections: list[Section]
-    findings: list[Finding] = field(default_factory=list)
     answer: Section | None = None

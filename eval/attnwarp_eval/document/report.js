@@ -34,7 +34,7 @@
     enlarged.querySelector("figcaption").textContent = copy.alt;
     enlarged.showModal();
   };
-  for (const picture of all(".grid img, .gallery figure > img, .findings figure > img, .plots > img, .plots > svg")) {
+  for (const picture of all(".grid img, .gallery figure > img, .plots > img, .plots > svg")) {
     if (picture.closest(".slider")) continue;
     picture.tabIndex = 0;
     picture.addEventListener("click", () => enlarge(picture));

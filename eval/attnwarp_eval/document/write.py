@@ -19,7 +19,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from attnwarp.io.picture import encode_picture
-from attnwarp_eval.document.model import Gallery, Report, Slider, Table
+from attnwarp_eval.document.model import Gallery, Picture, Report, Slider, Table
 from attnwarp_eval.files import write_atomic
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ LARGEST = 5_400_000
 
 def _pictures(report: Report) -> set[str]:
     """The files of all pictures of a report."""
-    entries = [finding.picture for finding in report.findings if finding.picture is not None]
+    entries: list[Picture | Slider] = []
     for section in [*([report.answer] if report.answer else []), *report.sections]:
         entries += [entry for _, row in (section.gallery or Gallery([])).rows for entry in row]
         for grid in section.grids:

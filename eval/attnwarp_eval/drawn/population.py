@@ -20,9 +20,6 @@ from attnwarp_eval.drawn.scenes import Drawn, draw
 from attnwarp_eval.scene.base import Spec
 from attnwarp_eval.scene.explain import explain
 
-OTHER_SEED = 1_000_003
-"""Added to a population's seed for its pilot, which must have other scenes."""
-
 Count = Annotated[int, Field(ge=1, le=10_000)]
 
 
@@ -82,10 +79,6 @@ class _Scenes(Spec, ABC):
         """Places of a scene on the axes that are fixed or spread."""
         spreads = {name: spread(name, self.count, self.seed)[number] for name in self.stratify}
         return {**self.axes, **spreads}
-
-    def pilot(self, count: int) -> Self:
-        """A few scenes of another seed, drawn in the same way."""
-        return self.sized(count).model_copy(update={"seed": (self.seed + OTHER_SEED) % 2**32})
 
     def sized(self, count: int) -> Self:
         """The population of another number of scenes."""

@@ -12,13 +12,11 @@ from attnwarp_eval.report.answer import answer, by_claims, measured_in_words, qu
 from attnwarp_eval.report.claims import load_claims
 from attnwarp_eval.report.commands import add_commands
 from attnwarp_eval.report.controls import controls
-from attnwarp_eval.report.findings import findings
 from attnwarp_eval.report.fronts import TITLE as FRONTS
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.galleries import galleries
 from attnwarp_eval.report.judging import claims_section, judge
 from attnwarp_eval.report.measured import failures, measured
-from attnwarp_eval.report.settling import settling
 from attnwarp_eval.study.probe_report import Layout, Place, reports
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Study
@@ -84,7 +82,6 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
             if judged or any(claim.study == study.name for claim in claims)
             else []
         ),
-        *(settling(results, judged, timings) if len(study.scenes) >= FEWEST_SCENES else []),
         *(galleries(results) if pictures else []),
         *of_probes[Place.INSTRUMENT],
         *controls(results),
@@ -108,9 +105,11 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
         for section in sections:
             section.folded = True
         answered.figures += _front(study, sections)
-    first = findings(results, problems(results), judged, compared, pictures=pictures)
-    add_commands(results, sections, first)
-    return Report(study.title or study.name, lead, sections, first, answered)
+    if faults := problems(results):
+        told = "**The instrument is not calibrated; nothing below can be trusted:** "
+        answered.text.insert(0, f"{told}{'; '.join(faults)}.")
+    add_commands(results, sections)
+    return Report(study.title or study.name, lead, sections, answered)
 
 
 def _front(study: Study, sections: Sequence[Section]) -> list[Picture]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
-from attnwarp_eval.document.model import Finding, Gallery, Picture, Section, Slider
+from attnwarp_eval.document.model import Gallery, Picture, Section, Slider
 from attnwarp_eval.inspect.command import inspect_command
 from attnwarp_eval.study.results import Results
 
@@ -22,14 +22,11 @@ COLORS = {
 command's own choice."""
 
 
-def add_commands(
-    results: Results, sections: Sequence[Section], findings: Iterable[Finding]
-) -> None:
+def add_commands(results: Results, sections: Sequence[Section]) -> None:
     """Give pictures of a variant in a target view their command; the others have none.
 
     Args:
         sections: whose galleries also get one command a scene, for plain text.
-        findings: with pictures.
     """
     commands = {path: (scene, command) for path, scene, command in _commands(results)}
     for gallery in (section.gallery for section in sections):
@@ -45,12 +42,6 @@ def add_commands(
         for shown in (shown for _, row in grid.rows for shown in row):
             if shown is not None and shown.path in commands:
                 shown.command = commands[shown.path][1]
-    for finding in findings:
-        entry = finding.picture
-        pair = [entry.before, entry.after] if isinstance(entry, Slider) else [entry]
-        for one in pair:
-            if one is not None and one.path in commands:
-                one.command = commands[one.path][1]
 
 
 def _commands(results: Results) -> Iterator[tuple[str, str, str]]:

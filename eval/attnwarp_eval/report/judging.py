@@ -21,7 +21,7 @@ from attnwarp_eval.statistics.intervals import (
     common,
     paired,
 )
-from attnwarp_eval.statistics.planning import MOST_SCENES, Parts, parts
+from attnwarp_eval.statistics.planning import MOST_SCENES
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.results import Results
 
@@ -42,7 +42,6 @@ class JudgedClaim:
         agreement: views with the expected sign, and all of them.
         here: what is seen on the run's scenes.
         below_floor: scenes in which both sides disagree less than true views do.
-        parts: of the plain difference's spread between scenes.
         judges: whether the run is of the study that judges the claim, on a sample.
         p: adjusted p-value; that of its own test before :func:`decided`.
         verdict: None where another study judges.
@@ -53,7 +52,6 @@ class JudgedClaim:
     agreement: tuple[int, int]
     here: Here
     below_floor: tuple[str, ...]
-    parts: Parts
     judges: bool
     p: float
     verdict: Verdict | None = None
@@ -152,7 +150,6 @@ def found(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
                 agreement(measured.a, measured.b, claim.sign),
                 _here(claim, measured, len(results.study.scenes)),
                 _below_floor(measured),
-                parts(measured.a, measured.b),
                 bool(results.study.sampled) and results.study.name == claim.study,
                 measured.contrast.flips.p,
             )

@@ -1,4 +1,4 @@
-"""Scenes that each claim of a study needs, by a pilot on other scenes, and the study's cost."""
+"""Scenes that each claim of a study needs, by those that a run has, and what the rest costs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 from attnwarp_eval.document.model import Table
 from attnwarp_eval.document.numbers import number
@@ -14,16 +15,14 @@ from attnwarp_eval.metrics.registry import Metric
 from attnwarp_eval.report.claims import load_claims
 from attnwarp_eval.report.compared import between
 from attnwarp_eval.report.judging import count_of, found
-from attnwarp_eval.report.settling import seconds_of
 from attnwarp_eval.statistics.contrasts import Contrast
 from attnwarp_eval.statistics.planning import scenes_needed
 from attnwarp_eval.statistics.scales import Scale
 from attnwarp_eval.statistics.signflips import FEWEST
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
+from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
-
-PILOT_SCENES = 8
 
 INTEREST = {
     "ratio": math.log(1.1),
@@ -37,7 +36,7 @@ INTEREST = {
 
 COLUMNS = (
     "claim or row", "metric", "difference of interest", "spread between scenes", "scenes needed",
-    "for the pilot's own difference",
+    "for the difference seen here",
 )  # fmt: skip
 
 
@@ -56,14 +55,16 @@ def needed(value: Contrast, difference: float) -> int:
     """Scenes with which a test at 5 % tells a true difference in 80 % of studies, at least six.
 
     Args:
-        value: of the pilot, whose spread between scenes counts.
+        value: whose spread between scenes counts.
         difference: on the contrast's scale.
     """
     return max(FEWEST, scenes_needed(difference, value.deviation))
 
 
-def plan_table(results: Results) -> Table:
-    """For each claim, and each row of the study's tables of differences, the scenes it needs."""
+def plan_scenes(results: Results) -> Table:
+    """For each claim, and each row of the study's tables of differences, the scenes it needs; no
+    row where fewer than three scenes are done.
+    """
     rows = []
     for title, name, metric, value in _contrasts(results):
         if len(value.by_scene) < 3:
@@ -112,30 +113,40 @@ class Cost:
 
 
 def cost_of(
-    kinds: Iterable[tuple[str, tuple[str, ...]]], measured: Iterable[tuple[Results, Path]]
+    kinds: Iterable[tuple[str, tuple[str, ...]]], measured: tuple[Results, Path] | None
 ) -> Cost:
     """Cost of cells, from the means of finished cells of their kind.
 
     Args:
         kinds: probe and variants of each cell to do.
-        measured: finished runs with the same variants, such as the part that is done and the pilot,
-            each with its folder.
+        measured: the part that is done, with its folder; None for none.
     """
     seconds: dict[tuple[str, tuple[str, ...]], list[float]] = {}
-    sizes = []
-    for results, folder in measured:
+    size = 0.0
+    if measured is not None:
+        results, folder = measured
         for cell in results.cells:
             if cell.record is not None:
                 kind = (cell.probe, cell.variants)
                 seconds.setdefault(kind, []).append(seconds_of(cell.record))
-        if results.measured:
-            sizes.append(_bytes(folder) / results.measured)
+        size = _bytes(folder) / max(1, results.measured)
     todo = list(kinds)
     known = [fmean(seconds[kind]) for kind in todo if kind in seconds]
-    size = fmean(sizes) if sizes else 0.0
     return Cost(sum(known) / 3600, size * len(known) / 1e9, len(todo) - len(known))
 
 
 def _bytes(folder: Path) -> int:
     parts = (folder / name for name in ("cells", "pictures"))
     return sum(path.stat().st_size for part in parts for path in part.rglob("*") if path.is_file())
+
+
+def seconds_of(record: Record[Any]) -> float:
+    """Seconds of a cell, each counted once: the first view and the others are within the rest, and
+    parts of an edit within its whole.
+    """
+    inner = ("warm", "steady", "method: ") if "whole" in record.cost.seconds else ("warm", "steady")
+    return sum(
+        seconds or 0.0
+        for stage, seconds in record.cost.seconds.items()
+        if not stage.startswith(inner)
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -62,15 +62,6 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
         each = {Path(name).stem: edits[wanted.word] for name in result["scenes"]}
         result["editing"] = {**editing, "edits": {**each, **own}}
     return result
-
-
-def with_edits_of(data: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """A study's data with the edits of some scenes alone."""
-    editing = data.get("editing")
-    if not (editing and editing.get("edits")):
-        return dict(data)
-    kept = {name: edits for name, edits in editing["edits"].items() if name in names}
-    return {**data, "editing": {**editing, "edits": kept}}
 
 
 def _is_one_of(path: Path, files: Mapping[str, Path]) -> bool:

@@ -1,4 +1,4 @@
-"""Report of a probe: columns, contrasts, findings and sections of what it measured.
+"""Report of a probe: columns, contrasts and sections of what it measured.
 
 >>> report_of("depth").columns["AbsRel"]
 'depth.abs_rel'
@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
-from attnwarp_eval.document.model import Finding, Grid, Picture, Section, Table
+from attnwarp_eval.document.model import Grid, Picture, Section, Table
 from attnwarp_eval.document.numbers import pooled, spread
 from attnwarp_eval.study.probe import Probe, probe, probes
 from attnwarp_eval.study.results import Results
@@ -112,10 +112,6 @@ class ProbeReport:
     def problems(self, results: Results) -> list[str]:
         """Faults of the instrument by this probe's records, one line each."""
         return []
-
-    def findings(self, results: Results) -> Iterator[Finding]:
-        """Findings that a reader should know first, where no table of variants tells it."""
-        return iter(())
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """Sections of the report; none where the run has no record of this probe."""

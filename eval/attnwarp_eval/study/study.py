@@ -18,7 +18,7 @@ from attnwarp_eval.scene.file import is_scene_file, scene_name
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.yaml import Place, YamlError, line_of, read_yaml
 from attnwarp_eval.study.cell import Cell, merged
-from attnwarp_eval.study.populations import expanded, with_edits_of
+from attnwarp_eval.study.populations import expanded
 from attnwarp_eval.study.probe import Probe, probe, probes
 from attnwarp_eval.study.schema import (
     FIGURE,
@@ -218,26 +218,6 @@ def _models(joined: tuple[Probe[Any], ...]) -> tuple[type[Study], type[Variant]]
     fields: dict[str, Any] = {"variants": (dict[str, variant], Field(default_factory=dict))}
     study: Any = create_model("Study", __base__=(_Joined, *study_parts), **fields)
     return study, variant
-
-
-def pilot_of(study: Study, count: int) -> Study:
-    """A study on a few scenes of another seed of its population.
-
-    Raises:
-        InputError: its scenes are of no population.
-    """
-    if study.population is None:
-        raise InputError(
-            f"--plan: study {study.name!r} names its scenes one by one; a pilot needs a population"
-            " such as scenes: {drawn: 48, seed: 7}"
-        )
-    data = study.model_dump(mode="json", exclude_unset=True)
-    other = study.population.pilot(count)
-    data = with_edits_of(data, other.names)
-    scenes = other.model_dump(mode="json")
-    return parse_study(
-        {**data, "name": f"{study.name}-pilot", "population": None, "scenes": scenes}
-    )
 
 
 def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:

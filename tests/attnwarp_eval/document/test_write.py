@@ -15,7 +15,6 @@ import pytest
 
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import (
-    Finding,
     Gallery,
     Picture,
     Report,
@@ -89,9 +88,8 @@ def test_a_page_holds_every_picture_and_nothing_from_elsewhere_in_8_mb(tmp_path)
             [],
             [
                 Section("a", figures=[Picture("figure.svg", "one"), Picture("figure.svg", "two")]),
-                Section("b", gallery=Gallery(rows, picker=True)),
+                Section("b", gallery=Gallery([("", [slider]), *rows], picker=True)),
             ],
-            [Finding("It is so.", "1 ± 0 px", "about", "holds", slider)],
         ),
         tmp_path,
     )

@@ -180,7 +180,7 @@ def test_a_name_that_an_answer_does_not_have_is_refused(change, message):
 
 def test_an_answer_stands_first_and_what_is_folded_is_closed_in_markdown():
     first = Section("Answer", ["**Why?**"], [Table(["a"], [["1"]])])
-    text = markdown(Report("Title", ["Lead."], [Section("Rest", ["x"], folded=True)], [], first))
+    text = markdown(Report("Title", ["Lead."], [Section("Rest", ["x"], folded=True)], first))
     order = [text.index(part) for part in ("# Title", "**Why?**", "| 1 |", "Lead.", "<details>")]
     assert order == sorted(order)
     # The heading stays, so that links to it hold.

@@ -1,4 +1,4 @@
-"""Oracles: sums worked out by hand, the noncentral t distribution, a pilot that was run."""
+"""Oracles: sums worked out by hand, the noncentral t distribution."""
 
 import math
 from types import SimpleNamespace
@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.report.planning import cost_of, needed
 from attnwarp_eval.statistics.contrasts import contrast
-from attnwarp_eval.study.study import load_study, pilot_of
 
 STUDY = """\
 name: mine
@@ -37,11 +36,11 @@ def test_the_cost_of_cells_is_the_mean_of_those_of_their_kind(tmp_path):
     done = [_cell("warp", ("a",), 10.0), _cell("warp", ("a",), 20.0), _cell("depth", ("a",), 2.0)]
     results = SimpleNamespace(cells=done, measured=3)
     kinds = [("warp", ("a",))] * 4 + [("depth", ("a",))] + [("warp", ("b",))]
-    cost = cost_of(kinds, [(results, tmp_path)])
+    cost = cost_of(kinds, (results, tmp_path))
     # Seconds of the first view and of the others are within the rest.
     assert cost.hours == pytest.approx((4 * 15 + 2) / 3600)
     assert cost.gigabytes == pytest.approx(5 * 1000 / 1e9) and cost.unknown == 1
-    nothing = cost_of(kinds, [])
+    nothing = cost_of(kinds, None)
     assert (nothing.hours, nothing.unknown) == (0, 6)
 
 
@@ -59,29 +58,18 @@ def test_scenes_needed_have_the_power_of_the_noncentral_t_and_are_at_least_six()
     assert needed(contrast(a, b, "plain"), 100.0) == 6
 
 
-def test_a_pilot_has_other_scenes_of_the_same_population(tmp_path):
-    path = tmp_path / "mine.yaml"
-    path.write_text(STUDY)
-    study = load_study(str(path))
-    pilot = pilot_of(study, 8)
-    assert len(pilot.scenes) == 8 and pilot.variants == study.variants
-    assert pilot.population.seed != study.population.seed and not set(pilot.scenes) & set(
-        study.scenes
-    )
-
-
-def test_a_study_of_single_scenes_has_no_pilot(tmp_path):
-    done = CliRunner().invoke(app, ["run", "quick", "--plan", "--out", str(tmp_path / "run")])
-    assert done.exit_code == 2 and "needs a population" in done.stderr
-
-
 @pytest.mark.slow
-def test_a_plan_says_scenes_hours_and_gigabytes_before_the_study_starts(tmp_path):
+def test_a_dry_run_says_scenes_hours_and_gigabytes_from_the_cells_that_are_done(tmp_path):
     path, out = tmp_path / "mine.yaml", tmp_path / "run"
     path.write_text(STUDY)
-    before = CliRunner().invoke(app, ["run", str(path), "--out", str(out), "--dry-run"])
-    assert "hours: not known before" in before.output
-    done = CliRunner().invoke(app, ["run", str(path), "--out", str(out), "--plan"])
-    assert done.exit_code == 0, done.output
-    assert "scenes needed" in done.output and "slipped against corrected" in done.output
-    assert "hours of one worker" in done.output and not out.exists()
+
+    def run(*options):
+        done = CliRunner().invoke(app, ["run", str(path), "--out", str(out), *options])
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    assert "hours: not known before" in run("--dry-run")
+    run("--scenes", "drawn-0,drawn-1,drawn-2")
+    planned = run("--dry-run")
+    assert "scenes needed" in planned and "slipped against corrected" in planned
+    assert "hours of one worker" in planned

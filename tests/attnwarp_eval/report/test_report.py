@@ -21,7 +21,6 @@ from attnwarp_eval.report.claims import Claim, load_claims
 from attnwarp_eval.report.compared import between
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.judging import claims_section, decided, found, judge, together
-from attnwarp_eval.report.settling import settling
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.edit_truth import EditTruth, Judgement
 from attnwarp_eval.study.probe import probe
@@ -32,10 +31,6 @@ from attnwarp_eval.study.study import load_study, parse_variant
 
 SCENES = ("one", "two", "three")
 SLIP = "warp.epe_median_layer.64"
-
-
-def settled(run, timings=True):
-    return settling(run, judge(run, load_claims()), timings)
 
 
 def tabulated(run):
@@ -378,96 +373,14 @@ def test_a_claim_that_only_some_scenes_show_is_mixed_and_says_how_many_scenes_wo
     assert power(needed, effect) >= 0.8 > power(needed - 1, effect)
 
 
-def test_what_would_settle_a_claim_is_worked_out_from_the_scenes_differences():
-    """Oracle: scipy's power of the t test for the number shown, and for one scene less."""
-    run = drawn(HALF_TOLD)
-    (section,) = settling(run, judge(run, [SLIP_CLAIM]))
-    row = dict(zip(section.tables[0].columns, section.tables[0].rows[0], strict=True))
-    needed, fewest, most = re.fullmatch(r"(\d+) \((\d+) to (.+)\)", row["scenes needed"]).groups()
-    needed, effect = int(needed), np.log(UNSURE).mean() / np.log(UNSURE).std(ddof=1)
-    assert power(needed, effect) >= 0.8 > power(needed - 1, effect)
-    assert int(fewest) < needed
-    # An effect that may be 0: the observed t is within the middle 80 % of Student's t, or it is not.
-    assert (most == "over 1000") == (stats.t.cdf(effect * math.sqrt(8), 7) < 0.9)
-    assert row["scenes"] == "8"
-    assert "share of seeds" not in row
-    assert "hours" not in section.tables[0].without_timings().columns
-    # A claim with a verdict needs nothing, nor does one that another study judges.
-    clear = {"good": [[0.1] * 8], "slipped": [[0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.6]]}
-    for other in (drawn(clear), drawn(HALF_TOLD, name="other")):
-        assert settling(other, judge(other, [SLIP_CLAIM])) == []
-
-
-def test_hours_to_settle_a_claim_are_those_of_the_studys_cells_without_what_others_contain():
-    def settled(cells, timings=True):
-        run = written_runs.results(study(scenes={"drawn": 8, "seed": 7}), cells)
-        (section,) = settling(run, judge(run, [SLIP_CLAIM]), timings)
-        return section
-
-    def timed(scene, value, variant, seconds):
-        return cell(variant, scene, [("v0", 0.0, {SLIP: value})], seconds=seconds)
-
-    seconds = {"truth": 3000.0, "whole": 600.0, "method: edit": 500.0, "warm": 9.0, "steady": None}
-    cells = [timed(scene, 0.1, "good", seconds) for scene in DRAWN]
-    cells += [
-        timed(scene, 0.1 * factor, "slipped", {"truth": 0.0})
-        for scene, factor in zip(DRAWN, UNSURE, strict=True)
-    ]
-    section = settled(cells)
-    row = dict(zip(section.tables[0].columns, section.tables[0].rows[0], strict=True))
-    assert row["hours"] == row["scenes needed"].split()[0]  # 3600 s a scene
-    assert "1.00 a scene, as here" in section.text[1]
-    # An edit that has no whole is the sum of its parts; a scene that is not done does not count.
-    parts_alone = {"truth": 3100.0, "method: edit": 500.0}
-    cells[0] = timed(DRAWN[0], 0.1, "good", parts_alone)
-    cells[1] = written_runs.outcome("warp", DRAWN[1], ["good"], None, "good-two")
-    cells.append(timed(DRAWN[1], 0.1, "good", {"truth": 1e6}))
-    assert "1.00 a scene, as here" in settled(cells).text[1]
-    assert "hours" not in settled(cells, False).text[1].lower()
-    # Hard cases are no scenes: however many there are, a scene takes as long.
-    case = timed("thin_disc", 0.1, "good", {"truth": 1.0})
-    cells.append(dataclasses.replace(case, probe="stability"))
-    assert "1.00 a scene, as here" in settled(cells).text[1]
-
-
-def test_hours_are_not_said_where_splats_were_fitted():
-    run = drawn(HALF_TOLD)
-    record = run.cells[0].record
-    fitted = dataclasses.replace(record, spec={**record.spec, "fit": {"iterations": 9}})
-    cells = [dataclasses.replace(run.cells[0], record=fitted), *run.cells[1:]]
-    run = dataclasses.replace(run, cells=cells)
-    (section,) = settling(run, judge(run, [SLIP_CLAIM]))
-    assert "hours" not in section.tables[0].columns
-
-
 def test_more_scenes_are_needed_where_more_claims_are_told_apart():
     """Oracle: the level that Benjamini and Hochberg leave the larger of two p-values, and scipy."""
-    run = drawn(HALF_TOLD)
-    (finding,) = judge(run, [SLIP_CLAIM])
+    (finding,) = judge(drawn(HALF_TOLD), [SLIP_CLAIM])
     adjusted = dataclasses.replace(finding, p=min(1.0, 4 * finding.p))
     level = 1 - 0.05 * finding.p / adjusted.p
-    (section,) = settling(run, [adjusted])
-    needed = int(section.tables[0].rows[0][3].split()[0])
+    needed = int(re.fullmatch(r"can't tell: (\d+) scenes would", adjusted.in_words)[1])
     effect = np.log(UNSURE).mean() / np.log(UNSURE).std(ddof=1)
     assert power(needed, effect, level) >= 0.8 > power(needed - 1, effect, level)
-
-
-def test_a_claim_without_a_spread_has_none_to_plan_with():
-    run = drawn({"good": [[0.1] * 8], "slipped": [[0.1] * 8]})
-    (finding,) = judge(run, [SLIP_CLAIM])
-    assert finding.verdict == "can't tell"
-    assert settling(run, [finding]) == []
-
-
-def test_the_share_of_seeds_is_shown_where_scenes_have_several():
-    """Oracle: variances by hand. Seeds of a scene differ by 0.2 about its difference."""
-    middle = np.array([0.6, -0.5, 0.6, -0.4, 0.3, 0.0, 0.2, -0.1])
-    table = {"good": [[1.0] * 8] * 2, "slipped": [1.0 + middle - 0.2, 1.0 + middle + 0.2]}
-    run = drawn(table, seeds=(0, 1))
-    (section,) = settling(run, judge(run, [SLIP_CLAIM]))
-    row = dict(zip(section.tables[0].columns, section.tables[0].rows[0], strict=True))
-    between, within = middle.var(ddof=1), np.var([-0.2, 0.2], ddof=1) / 2
-    assert row["share of seeds"] == f"{100 * within / between:.0f} %"
 
 
 def test_a_claim_about_the_editors_working_needs_every_editor_to_agree():
@@ -925,7 +838,8 @@ def test_an_instrument_that_is_off_is_reported(tmp_path, changes, says):
     assert says in problem
     (_, section), *_ = report_of("calibration").sections(calibrated(**changes), Layout(tmp_path))
     assert section.tables[0].rows[0][1] == "FAILED"
-    assert "not calibrated" in section.text[0]
+    told = build(calibrated(**changes), tmp_path).answer.text[0]
+    assert "not calibrated" in told and says in told
 
 
 def test_a_front_of_a_figure_that_no_view_has_says_so(tmp_path):

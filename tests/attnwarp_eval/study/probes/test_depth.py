@@ -41,11 +41,8 @@ def test_views_in_which_no_splat_is_drawn_are_named(tmp_path):
         " bead / far (b)."
     )
     assert f"{sentence} That is 3 of 8 views." in markdown(made)
-    first = next(finding for finding in made.findings if finding.text == sentence)
-    assert (first.value, first.outcome) == ("3 of 8 views", "fails")
 
 
 def test_nothing_is_said_where_every_view_has_a_depth(tmp_path):
     made = report(tmp_path, {("house", "near"): (1.0, 0.9), ("house", "far"): (1.0, 0.01)})
     assert "Views without depth" not in markdown(made)
-    assert not any("No splat" in finding.text for finding in made.findings)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from attnwarp_eval.document import charts
-from attnwarp_eval.document.model import Finding, Picture, Section, Table
+from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.metrics.registry import metric
 from attnwarp_eval.statistics.auroc import Auroc, auroc
@@ -203,21 +203,6 @@ class AuditReport(ProbeReport):
 
     name = "audit"
     measures = "which flaws of an edit each consistency metric sees"
-
-    def findings(self, results: Results) -> Iterator[Finding]:
-        """Find the metric without truth that sees the flaws that matter most best."""
-        records = [(cell.scene, record) for cell, record in results.finished(self.name)]
-        pairs = Pairs(records) if records else None
-        best = pairs.best() if pairs else None
-        if pairs is None or best is None:
-            return
-        value = pairs.counted(best, pairs.near)
-        yield Finding(
-            f"Of the metrics without truth, {best.title!r} tells flawed from right pairs best.",
-            area_text(value),
-            f"AUROC of {len(COUNTED)} flaws, up to {max(pairs.near):g} degrees; 0.5 is blind",
-            "holds" if value.value >= SEES else "fails",
-        )
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """The answer, a sentence a metric, yaw, size, cost, and all figures."""

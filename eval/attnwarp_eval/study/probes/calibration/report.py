@@ -121,13 +121,6 @@ class CalibrationReport(ProbeReport):
                 f" pixel to pixel by more than the {100 * TAP_SPREAD:g} % that these rules let its"
                 " taps spread. So they reject much that is visible, and their F1 is low."
             )
-        if bad:
-            text.insert(
-                0,
-                "**The instrument is not calibrated; nothing below can be trusted:** "
-                + "; ".join(bad)
-                + ".",
-            )
         return Section("Calibration", text, [Table(columns, rows)])
 
     def _transport(self, results: Results) -> list[Section]:

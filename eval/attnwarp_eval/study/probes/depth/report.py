@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import ClassVar
 
-from attnwarp_eval.document.model import Finding, Section, Table
+from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.study.probe_report import (
     Layout,
     Place,
@@ -49,20 +49,10 @@ class DepthReport(ProbeReport):
     )
     stage = "render"
 
-    def findings(self, results: Results) -> Iterator[Finding]:
-        """Views without any depth: in tables their figures are dashes, which do not say why."""
-        sentence, count = self._without_depth(results)
-        if sentence:
-            yield Finding(sentence, count, "their `depth.coverage` is 0", "fails")
-
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """Section on views without depth; none where every view has a depth."""
-        sentence, count = self._without_depth(results)
-        if sentence:
-            yield Place.RESULT, Section("Views without depth", [f"{sentence} That is {count}."])
-
-    def _without_depth(self, results: Results) -> tuple[str, str]:
-        """A sentence that names them, and how many there are; both empty where there are none."""
+        """Views without depth, whose figures are dashes, which do not say why; none where every
+        view has a depth.
+        """
         empty, views, places = 0, 0, []
         for cell, record in results.finished(self.name):
             names = [v.name for v in record.views if v.metrics.get("depth.coverage") == 0]
@@ -70,13 +60,12 @@ class DepthReport(ProbeReport):
             if names:
                 which = "every view" if len(names) == len(record.views) else ", ".join(names)
                 places.append(f"{cell.scene} / {cell.variants[0]} ({which})")
-        if not empty:
-            return "", ""
-        listed = "; ".join(dict.fromkeys(places))
-        return (
-            f"No splat is drawn on any surface, so depth is undefined, in {listed}.",
-            f"{empty} of {views} views",
-        )
+        if empty:
+            text = (
+                "No splat is drawn on any surface, so depth is undefined, in"
+                f" {'; '.join(dict.fromkeys(places))}. That is {empty} of {views} views."
+            )
+            yield Place.RESULT, Section("Views without depth", [text])
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
         """Inside surfaces and at edges apart."""

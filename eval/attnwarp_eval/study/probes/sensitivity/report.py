@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
 from attnwarp_eval.document import charts
-from attnwarp_eval.document.model import Finding, Picture, Section, Table
+from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.metrics import registry
 from attnwarp_eval.statistics.intervals import Interval, interval
@@ -96,31 +96,6 @@ class SensitivityReport(ProbeReport):
 
     name = "sensitivity"
     measures = "which flaws each metric sees"
-
-    def findings(self, results: Results) -> Iterator[Finding]:
-        """Find what the metrics that need no truth see best, and what they miss most, of the flaws
-        that each is meant to see.
-        """
-        records = [(cell.scene, record) for cell, record in results.finished(self.name)]
-        seen = [
-            (value, row, flaw)
-            for row in ROWS
-            for flaw in FLAWS
-            if row.meant != _ALL and flaw.name in row.meant
-            if math.isfinite((value := share(records, row.key, flaw.name)).mean)
-        ]
-        if not seen:
-            return
-        about = "right results ranked above those with the flaw; 0.5 is blind"
-        best, worst = (pick(seen, key=lambda item: item[0].mean) for pick in (max, min))
-        for (value, row, flaw), text in ((best, "the most"), (worst, "the least")):
-            yield Finding(
-                f"Of what metrics without a truth are meant to see, {row.title} sees"
-                f" {flaw.title!r} {text} often.",
-                f"{spread(replace(value, undefined=0))} share",
-                about,
-                "holds" if value.mean > 0.5 else "fails",
-            )
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """Sections on what each metric sees, how it follows the strength of an edit, and what it
