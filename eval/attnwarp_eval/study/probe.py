@@ -4,8 +4,8 @@ probes by name.
 How a report shows one is in :mod:`attnwarp_eval.study.probe_report`.
 
 >>> [probe.name for probe in probes()]
-['audit', 'calibration', 'carry', 'depth', 'editing', 'editing-timing', 'fit', 'ideal', 'labels',
- 'masks', 'reconstruction', 'sensitivity', 'stability', 'surfaces', 'timing', 'warp']
+['audit', 'calibration', 'carry', 'depth', 'editing', 'fit', 'ideal', 'labels', 'masks',
+ 'reconstruction', 'sensitivity', 'stability', 'surfaces', 'timing', 'warp']
 >>> probe("depth").metric("depth.abs_rel").direction
 'lower'
 """
@@ -141,7 +141,7 @@ class Probe(ABC, Generic[E]):
         judges_variants: whether it has cells for each variant.
         always: whether every run has its cells, with or without the study's asking.
         main: whether tables of a report speak of it where they name no probe.
-        times_in_turn: stages of the :class:`InTurn` that its records have.
+        times_in_turn: stages of the :class:`InTurn` that its records may have.
         edits: whether it measures methods that edit, whose presets are their own.
     """
 

@@ -147,7 +147,8 @@ class _Joined(Study):
 
     def _check_each_variant(self) -> None:
         for name, variant in self.variants.items():
-            measuring = [p for p in probes() if name in p.measured(self)]
+            # Seconds are of whatever else is measured of a variant.
+            measuring = [p for p in probes() if name in p.measured(self) and not p.times_in_turn]
             try:
                 if not measuring or not all(p.edits for p in measuring):
                     variant.settings()

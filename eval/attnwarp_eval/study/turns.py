@@ -106,7 +106,7 @@ def timed_in_turn(results: Results, stage: str) -> Timed | None:
         turn
         for cell in results.cells
         if cell.record is not None
-        and stage in probe(cell.probe).times_in_turn
         and (turn := probe(cell.probe).in_turn(cell, cell.record)) is not None
+        and stage in turn.seconds
     ]
     return Timed(turns, stage) if turns else None

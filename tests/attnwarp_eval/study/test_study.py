@@ -216,7 +216,7 @@ def test_a_view_that_a_scene_lacks_is_named(tmp_path):
             {
                 "scenes": ["bear", "dinosaur"],
                 "editing": {"edits": {"baer": {"snow": None}}},
-                "probes": SMALL["probes"] | {"editing-timing": ["again"]},
+                "probes": SMALL["probes"] | {"editing": ["again"]},
             },
             "editing.edits: the study has no scene 'baer'; did you mean 'bear'",
         ),
@@ -240,7 +240,7 @@ def test_keys_may_name_scenes_that_are_left_out(tmp_path):
         "editing": {"edits": {"dinosaur": {"stone": None}}},
         "pictures": {"variants": ["again"], "views": ["yaw030", "yaw165", "orbit_000_of_9"]},
     }  # yaw165 is a view of opposed alone, orbit_000_of_9 one of the fits
-    probes = {"warp": ["again"], "fit": ["again"], "editing-timing": ["again"]}
+    probes = {"warp": ["again"], "fit": ["again"], "editing": ["again"]}
     path = write(tmp_path, scenes=["bear", "opposed", "dinosaur"], views=[], probes=probes,
                  fit={"views": 9}, variants={"again": {}}, **named)  # fmt: skip
     planned = plan(load_study(path, scenes=["bear"]), Store(tmp_path / "run"))
@@ -251,7 +251,7 @@ def test_keys_may_name_scenes_that_are_left_out(tmp_path):
 def test_scenes_that_are_left_out_are_not_loaded_for_their_names(tmp_path, monkeypatch):
     own = {"editing": {"edits": {"drawn-1": {"recolor": None}}}, "variants": {"again": {}}}
     path = write(tmp_path, scenes=["bear", "elsewhere/drawn-1.yaml"], views=["yaw030"],
-                 probes={"editing-timing": ["again"]}, **own)  # fmt: skip
+                 probes={"editing": ["again"]}, **own)  # fmt: skip
     loaded = []
     monkeypatch.setattr(
         "attnwarp_eval.study.run.load_scene", lambda name: loaded.append(name) or load_scene(name)

@@ -1,36 +1,69 @@
-"""Seconds of variants taken in turn in one process, for accuracy against time."""
+"""Seconds of variants taken in turn in one process, for accuracy against time: of whole edits where
+the study's probe ``editing`` measures the variants too, else of warps.
+
+Seconds of separate cells come from other times of a machine whose speed drifts.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Annotated
+
+from pydantic import Field
 
 from attnwarp.warp import WarpSettings, render_surface, warp_view
-from attnwarp_eval.cost import in_turn
+from attnwarp_eval.cost import AGAIN, Meter, in_turn
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.probe import InTurn, Probe, Work, register
+from attnwarp_eval.study.edit_truth import planned_truth
+from attnwarp_eval.study.probe import InTurn, Probe, Work, probe, register
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Outcome
-from attnwarp_eval.study.schema import Study
+from attnwarp_eval.study.schema import Part, Study, Whole
+from attnwarp_eval.study.shared.edits import VariantPart, editor_of, edits_of, scene_seed
+from attnwarp_eval.study.shared.method_run import PARTS, WHOLE, run_method
 from attnwarp_eval.study.shared.splats import check_splats, splats_of, surface_spec
+
+OF_A_WARP = ("render", "pair")
+"""Stages: the target's surface; render, correspondence, mask and feature grids together."""
+
+OF_AN_EDIT = (WHOLE, *PARTS)
+
+COUNTERS = ("network_rows", "iterations")
+"""Work of an edit, which no machine changes."""
+
+
+class StudyPart(Part):
+    """Keys of a study that only this probe reads; ``timing_rounds`` are those of every timing."""
+
+    timed_scenes: Annotated[Whole, Field(ge=1)] | None = Field(
+        default=None, description="how many scenes are timed, from the first on; all if left out"
+    )
 
 
 @dataclass(frozen=True)
 class Rounds:
-    """Seconds by contestant and round; the first contestant's second run comes last.
+    """Seconds and work of the contestants.
 
     Attributes:
-        render: of the target's surface.
-        pair: of render, correspondence, mask and feature grids.
+        seconds: stage -> contestant -> round; the first contestant's second run comes last.
+        work: of each contestant, counters of one edit; empty for warps.
     """
 
-    render: list[list[float]]
-    pair: list[list[float]]
+    seconds: Mapping[str, list[list[float]]]
+    work: Sequence[Mapping[str, int]] = ()
 
     def to_json(self) -> Json:
-        """The entry ``rounds`` of the record's cost."""
-        return {"cost": {"rounds": asdict(self)}}
+        """Entries of the record's cost."""
+        work = {"work": [dict(row) for row in self.work]} if self.work else {}
+        return {"cost": {"rounds": dict(self.seconds), **work}}
+
+
+def _edited(study: Study) -> Sequence[str]:
+    """Variants that are timed as whole edits."""
+    return study.probes.get("editing", ())
 
 
 @register
@@ -38,19 +71,37 @@ class Timing(Probe[Rounds]):
     """One cell for all contestants: seconds of separate cells cannot be compared."""
 
     name = "timing"
-    times_in_turn = ("render", "pair")
+    study_part = StudyPart
+    times_in_turn = (*OF_A_WARP, *OF_AN_EDIT)
 
     def check(self, study: Study) -> None:
-        """A variant without splats renders nothing."""
+        """Every contestant renders, edits, and runs to its end by what it sees itself."""
         check_splats(study, self.name, "time to take")
+        for name in study.probes.get(self.name, []):
+            own = study.variants[name].part(VariantPart)
+            if name not in _edited(study):
+                continue
+            why = "has a budget, which may cut it short" if own.budget is not None else ""
+            why = "takes its mask from the scene's truth" if own.mask == "truth" else why
+            why = "edits nothing" if own.method == "true pictures" else why
+            if why:
+                raise ValueError(
+                    f"probes.timing: {name!r} {why}, so there is no time to take; leave it out"
+                )
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
-        """One for each scene and seed, of the view in the middle."""
-        for name, scene in scenes.items():
-            views = study.views_of(scene)
-            for seed in study.seeds:
+        """One for each scene and seed, of the view in the middle; of edits one for each scene, of
+        its first edit and the first seed.
+        """
+        edited = [name for name in names if name in _edited(study)]
+        warped = [name for name in names if name not in edited]
+        for name, scene in islice(scenes.items(), study.part(StudyPart).timed_scenes):
+            if edited:
+                yield self._of_edits(study, edited, name, scene)
+            for seed in study.seeds if warped else ():
+                views = study.views_of(scene)
                 spec = {
                     **self.common_spec(study, scene, seed),
                     "views": [views[len(views) // 2]],
@@ -61,59 +112,120 @@ class Timing(Probe[Rounds]):
                             "settings": study.variants[label].settings().to_dict(),
                             **surface_spec(study, study.variants[label], seed),
                         }
-                        for label in names
+                        for label in warped
                     ],
                 }
-                yield Cell(spec, name, "all", self.name, seed, tuple(names))
+                yield Cell(spec, name, "all", self.name, seed, tuple(warped))
+
+    def _of_edits(self, study: Study, names: Sequence[str], scene: str, of: Scene) -> Cell:
+        seed, editing = study.seeds[0], probe("editing")
+        variants = [study.variants[label] for label in names]
+        spec = {
+            **self.common_spec(study, of, seed),
+            "spp": study.spp,
+            "edit": next(iter(edits_of(study, of))),
+            "rounds": study.timing_rounds,
+            "contestants": [
+                editing.variant_spec(study, v, scene_seed(study, scene, seed)) for v in variants
+            ],
+        }
+        editors = {f"editor {k}": editor_of(study, v).name for k, v in enumerate(variants)}
+        return Cell(spec, scene, "all", self.name, seed, tuple(names), sources=editors)
 
     def compute(self, work: Work) -> Rounds:
         """Time every contestant in every round; see :func:`attnwarp_eval.cost.in_turn`."""
-        spec, world = work.spec, work.world
-        target = world.targets[spec["views"][0]]
-        contestants = [
-            (
-                splats_of(work, {**spec, **contestant}),
-                WarpSettings.from_dict(contestant["settings"]),
-            )
-            for contestant in spec["contestants"]
-        ]
-        sources = [render_surface(model, world.source, settings) for model, settings in contestants]
-
-        def render(index: int) -> None:
-            model, settings = contestants[index]
-            render_surface(model, target, settings)
-
-        def pair(index: int) -> None:
-            model, settings = contestants[index]
-            surface = sources[index]
-            view = warp_view(
-                model, world.source, target, settings, source_surface=surface, warn_empty=False
-            )
-            for layer in spec["feature_sizes"]:
-                view.at((layer, layer))
-
-        def timed(stage: Callable[[int], None]) -> list[list[float]]:
-            works = [lambda _, index=index: stage(index) for index in range(len(contestants))]
-            turns = in_turn(works, spec["rounds"], seed=spec["seed"])
-            return [*turns.seconds, turns.again]
-
-        work.meter.count(rounds=spec["rounds"], contestants=len(contestants) + 1)
-        return Rounds(timed(render), timed(pair))
+        spec = work.spec
+        work.meter.count(rounds=spec["rounds"], contestants=len(spec["contestants"]) + 1)
+        return _edits(work) if "edit" in spec else _warps(work)
 
     def read_extra(self, data: Json) -> Rounds:
         """Read from the record's cost."""
-        rounds = data["cost"]["rounds"]
-        return Rounds(
-            **{s: [[float(v) for v in row] for row in rounds[s]] for s in ("render", "pair")}
-        )
+        cost = data["cost"]
+        seconds = {
+            stage: [[float(v) for v in row] for row in rounds]
+            for stage, rounds in cost["rounds"].items()
+        }
+        return Rounds(seconds, [dict(row) for row in cost.get("work", ())])
 
     def in_turn(self, cell: Outcome, record: Record[Rounds]) -> InTurn:
         """The seconds of a cell."""
         spec = record.spec
-        return InTurn(
-            cell.variants,
-            asdict(record.extra),
-            spec["rounds"],
-            record.cost.threads,
-            f"view {spec['views'][0]} of each scene",
+        of = (
+            f"the edit {spec['edit']['name']} of {cell.scene}"
+            if "edit" in spec
+            else f"view {spec['views'][0]} of each scene"
         )
+        return InTurn(cell.variants, record.extra.seconds, spec["rounds"], record.cost.threads, of)
+
+
+def _warps(work: Work) -> Rounds:
+    """Seconds of renders and of warps of a target."""
+    spec, world = work.spec, work.world
+    target = world.targets[spec["views"][0]]
+    contestants = [
+        (splats_of(work, {**spec, **contestant}), WarpSettings.from_dict(contestant["settings"]))
+        for contestant in spec["contestants"]
+    ]
+    sources = [render_surface(model, world.source, settings) for model, settings in contestants]
+
+    def render(index: int) -> None:
+        model, settings = contestants[index]
+        render_surface(model, target, settings)
+
+    def pair(index: int) -> None:
+        model, settings = contestants[index]
+        surface = sources[index]
+        view = warp_view(
+            model, world.source, target, settings, source_surface=surface, warn_empty=False
+        )
+        for layer in spec["feature_sizes"]:
+            view.at((layer, layer))
+
+    def timed(stage: Callable[[int], None]) -> list[list[float]]:
+        works = [lambda _, index=index: stage(index) for index in range(len(contestants))]
+        turns = in_turn(works, spec["rounds"], seed=spec["seed"])
+        return [*turns.seconds, turns.again]
+
+    return Rounds({"render": timed(render), "pair": timed(pair)})
+
+
+def _edits(work: Work) -> Rounds:
+    """Seconds of whole edits: of the method's own parts, without files and renders for people."""
+    spec, world = work.spec, work.world
+    names = [world.source.name, *spec["views"]]
+    with work.meter.stage("truth"):
+        truth = planned_truth(work.cell, names)
+    contestants = [_contestant(work, k) for k in range(len(spec["contestants"]))]
+    with work.meter.stage("splats"):
+        scenes = [splats_of(contestant) for contestant in contestants]
+    rows: list[list[Mapping[str, float]]] = [[] for _ in range(len(contestants) + 1)]
+    counters: list[dict[str, int]] = [{} for _ in contestants]
+
+    def run(index: int, turn: int) -> None:
+        result = run_method(contestants[index], truth, names, scenes[index])
+        rows[-1 if turn >= AGAIN else index].append(result.seconds)
+        counters[index] = {key: int(result.counters.get(key, 0)) for key in COUNTERS}
+
+    works = [lambda turn, index=index: run(index, turn) for index in range(len(contestants))]
+    in_turn(works, spec["rounds"], seed=spec["seed"])
+    parts = {WHOLE: PARTS, **{part: (part,) for part in PARTS}}
+    seconds = {
+        stage: [
+            # The first round compiles.
+            [sum(row.get(part, 0.0) for part in own) for row in taken[1:]]
+            for taken in rows
+        ]
+        for stage, own in parts.items()
+    }
+    return Rounds(seconds, counters)
+
+
+def _contestant(work: Work, number: int) -> Work:
+    """A contestant as the work of a cell of the probe ``editing``."""
+    spec = {k: v for k, v in work.spec.items() if k not in ("contestants", "rounds")}
+    cell = replace(
+        work.cell,
+        spec={**spec, **work.spec["contestants"][number]},
+        sources={**work.cell.sources, "editor": work.cell.sources[f"editor {number}"]},
+    )
+    return Work(cell, work.root, work.scene_world, Meter())

@@ -33,7 +33,7 @@ STUDY = {
         "other": {"options": {"stages": 1, "steps": 3, "sources": 2}},
         "oracle": {"geometry": "truth"},
     },
-    "probes": {"editing-timing": ["full", "other"]},
+    "probes": {"editing": ["full", "other"], "timing": ["full", "other"]},
 }  # fmt: skip
 BRANCHES = 2
 """Rows through the network for a view and a step; image guidance of 1 drops a branch."""
@@ -60,7 +60,7 @@ def test_a_stored_study_times_the_edit_that_was_timed(tmp_path):
     study = load(tmp_path, editing={**STUDY["editing"], "edits": {"ball": dict.fromkeys(order)}})
     store = Store(tmp_path / "run")
     planned = plan(study, store)
-    (cell,) = (c for c in planned.cells if c.probe == "editing-timing")
+    (cell,) = (c for c in planned.cells if c.probe == "timing")
     assert order != sorted(order) and cell.spec["edit"]["name"] == order[0]
     store.write_study(expected(planned))
     assert not verify(store).damaged
@@ -71,14 +71,14 @@ def test_every_setting_runs_once_a_round_with_the_network_passes_of_its_plan(
 ):
     study = load(tmp_path)
     scenes = {name: load_scene(name) for name in study.scenes}
-    (cell,) = (c for c in cells_of(study, scenes) if c.probe == "editing-timing")
+    (cell,) = (c for c in cells_of(study, scenes) if c.probe == "timing")
     rows = []
     network = method_run.load(cell.sources["editor 0"], cell.spec["contestants"][0]["editor"]).unet
     hook = network.register_forward_pre_hook(
         lambda _, args, kwargs: rows.append(len(args[0])), with_kwargs=True
     )
     try:
-        record = compute(probe("editing-timing"), cell, tmp_path)
+        record = compute(probe("timing"), cell, tmp_path)
     finally:
         hook.remove()
 
@@ -101,35 +101,33 @@ def test_every_setting_runs_once_a_round_with_the_network_passes_of_its_plan(
         for turn in range(ROUNDS):
             parts = [seconds[part][index][turn] for part in ("source", "warp", "edit", "tune")]
             assert seconds["whole"][index][turn] == pytest.approx(sum(parts))
-            assert seconds["editing"][index][turn] == pytest.approx(sum(parts[:3]))
-    assert probe("editing-timing").read(record.to_json()).extra == record.extra
-
-
-LIMITED = {"limited": {"method": "by_view", "budget": {"network_rows": 4}}}
+    assert probe("timing").read(record.to_json()).extra == record.extra
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("variant", "says"),
     [
-        ({"probes": {"editing-timing": ["full", "oracle"]}}, "'oracle' warps by the scene's truth"),
-        (
-            {"editing": {}, "variants": LIMITED, "probes": {"editing-timing": ["limited"]}},
-            "'limited' has a budget",
-        ),
-        (
-            {
-                "editing": {},
-                "variants": {"ceiling": {"method": "true pictures"}},
-                "probes": {"editing-timing": ["ceiling"]},
-            },
-            "'ceiling' edits nothing",
-        ),
-        ({"editing_timing": {"scenes": 0}}, "editing_timing.scenes"),
+        ({"geometry": "truth"}, "'odd' renders nothing, so there is no time to take"),
+        ({"mask": "truth"}, "'odd' takes its mask from the scene's truth"),
+        ({"method": "by_view", "budget": {"network_rows": 4}}, "'odd' has a budget"),
+        ({"method": "true pictures"}, "'odd' edits nothing"),
     ],
 )
-def test_what_has_no_seconds_of_its_own_is_refused(tmp_path, changes, says):
+def test_what_has_no_seconds_of_its_own_is_refused(tmp_path, variant, says):
+    probes = {"editing": ["full", "odd"], "timing": ["full", "odd"]}
     with pytest.raises(StudyError, match=says):
-        load(tmp_path, **changes)
+        load(tmp_path, editing={}, variants={"full": {}, "odd": variant}, probes=probes)
+
+
+def test_a_variant_of_warps_is_timed_as_a_warp_beside_whole_edits_on_the_first_scenes(tmp_path):
+    probes = {"editing": ["full"], "warp": ["slow"], "timing": ["full", "slow"]}
+    study = load(tmp_path, scenes=["ball.yaml", "bear", "dinosaur"], views=["yaw030"], probes=probes,
+                 variants={"full": {}, "slow": {"set": {"opaque": 0.9}}}, seeds=[0, 1],
+                 timed_scenes=2)  # fmt: skip
+    cells = cells_of(study, {path: load_scene(path) for path in study.scenes})
+    timed = [(c.scene, c.labels, c.seed) for c in cells if c.probe == "timing"]
+    warps = [(scene, ("slow",), seed) for scene in ("ball", "bear") for seed in (0, 1)]
+    assert sorted(timed) == sorted([*warps, ("ball", ("full",), 0), ("bear", ("full",), 0)])
 
 
 ERROR = "multiview.delta_e_above.edit_inside"
@@ -160,23 +158,19 @@ def in_turn(scene, names, drift=DRIFT):
         rows = [[share * 2.0 * RATIOS[name] * slow for slow in drift] for name in names]
         return [*rows, rows[0]]
 
-    shares = {"whole": 1.0, "editing": 0.5, "source": 0.1, "warp": 0.1, "edit": 0.3, "tune": 0.5}
-    alone = {"alone": {"method": "each view alone"}}
+    shares = {"whole": 1.0, "source": 0.1, "warp": 0.1, "edit": 0.3, "tune": 0.5}
     data = written_runs.record(
         [],
         spec={
             "rounds": len(drift),
             "edit": {"name": "red"},
-            "contestants": [
-                {"method": "attention_warping", "settings": alone.get(name, {})} for name in names
-            ],
         },
         cost={
             "rounds": {stage: rounds(share) for stage, share in shares.items()},
             "work": [{"network_rows": 8, "iterations": 2}] * len(names),
         },
     )
-    return written_runs.outcome("editing-timing", scene, names, data)
+    return written_runs.outcome("timing", scene, names, data)
 
 
 def results(timed=(), more=(), drift=DRIFT):
@@ -211,13 +205,13 @@ def test_the_front_has_the_seconds_of_one_pass_in_turn_where_they_are_there(tmp_
     assert {row[0]: row[2] for row in section.tables[0].rows} == {
         name: f"{1000 * BY_CELLS[name]:.0f}" if BY_CELLS[name] >= 1 else "100" for name in VARIANTS
     }
-    assert "a study with a `editing-timing` probe" in section.text[1]
+    assert "a study with a `timing` probe" in section.text[1]
 
 
 def test_few_rounds_call_nothing_faster_and_say_how_few_they_are(tmp_path):
     for rounds in (3, 5):
         run = results(VARIANTS, drift=DRIFT[:rounds])
-        ((_, section),) = report_of("editing-timing").sections(run, Layout(tmp_path))
+        ((_, section),) = report_of("timing").sections(run, Layout(tmp_path))
         (front,) = fronts(run, Layout(tmp_path))
         for table in (section.tables[0], front.tables[0]):
             verdicts = {row[0]: row[table.columns.index("verdict")] for row in table.rows}
@@ -263,16 +257,14 @@ def test_one_pass_has_the_same_seconds_in_the_front_the_choice_and_the_table_of_
 
 
 def test_the_section_of_seconds_holds_medians_spreads_and_ratios(tmp_path):
-    ((_, section),) = report_of("editing-timing").sections(results(VARIANTS), Layout(tmp_path))
+    ((_, section),) = report_of("timing").sections(results(VARIANTS), Layout(tmp_path))
     table = section.tables[0]
     rows = {row[0]: dict(zip(table.columns, row, strict=True)) for row in table.rows}
     fast = rows["fast"]
     assert (fast["s, median"], fast["lowest to highest"]) == ("1.00", "0.500 to 8.00")
     assert fast["ratio to 'full'"] == "0.250 [0.250, 0.250]"
-    assert rows["full"]["editing, ratio to control"] == "1.25 [1.25, 1.25]"
-    assert rows["alone"]["editing, ratio to control"] == "–"
     assert fast["network rows"] == "8"
     assert math.isclose(float(rows["full"]["tune, s"]), 2.0)
     assert not list(
-        report_of("editing-timing").sections(results(VARIANTS), Layout(tmp_path, timings=False))
+        report_of("timing").sections(results(VARIANTS), Layout(tmp_path, timings=False))
     )

@@ -7,19 +7,19 @@ from collections.abc import Iterator, Sequence
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, ratio_text
-from attnwarp_eval.statistics.intervals import RATIO_INTERVAL, time_ratio
+from attnwarp_eval.statistics.intervals import RATIO_INTERVAL
 from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
-from attnwarp_eval.study.probes.editing_timing.measure import COUNTERS, EDITING
+from attnwarp_eval.study.probes.timing.measure import COUNTERS
 from attnwarp_eval.study.results import Results
-from attnwarp_eval.study.shared.method_run import EDITING_PARTS, PARTS, WHOLE, is_alone
+from attnwarp_eval.study.shared.method_run import PARTS, WHOLE
 from attnwarp_eval.study.turns import Timed, timed_in_turn
 
 
 @register_report
-class EditingTimingReport(ProbeReport):
-    """Seconds of whole edits by variant."""
+class TimingReport(ProbeReport):
+    """Seconds of whole edits by variant; those of warps stand beside the fronts."""
 
-    name = "editing-timing"
+    name = "timing"
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """Seconds of each contestant, their spread, and ratios to the first."""
@@ -28,30 +28,15 @@ class EditingTimingReport(ProbeReport):
             yield Place.RESULT, self._section(results, timed)
 
     def _section(self, results: Results, timed: Timed) -> Section:
-        own = timed.of(EDITING)
-        _, record = results.finished(self.name)[0]
-        names = timed.turns[0].names
-        work = dict(zip(names, record.extra.work, strict=True))
-        contestants = zip(names, record.spec["contestants"], strict=True)
-        alone = [name for name, spec in contestants if is_alone(spec)]
-        control = alone[0] if alone else None
+        counted = next(record for _, record in results.finished(self.name) if record.extra.work)
         columns = [
-            "variant",
-            "s, median",
-            "lowest to highest",
-            f"ratio to {timed.baseline!r}",
-            "verdict",
-            *(f"{part}, s" for part in PARTS),
-            "editing, ratio to control",
-            *(counter.replace("_", " ") for counter in COUNTERS),
-        ]
+            "variant", "s, median", "lowest to highest", f"ratio to {timed.baseline!r}", "verdict",
+            *(f"{part}, s" for part in PARTS), *(counter.replace("_", " ") for counter in COUNTERS),
+        ]  # fmt: skip
         rows = []
-        for name in names:
+        for name, work in zip(timed.turns[0].names, counted.extra.work, strict=True):
             ratio = timed.ratio(name)
             base = name == timed.baseline
-            to_control = "–"
-            if control is not None and name != control:
-                to_control = ratio_text(time_ratio(own.rounds(name), own.rounds(control)))
             rows.append(
                 [
                     name,
@@ -59,23 +44,18 @@ class EditingTimingReport(ProbeReport):
                     "1" if base else ratio_text(ratio),
                     "baseline" if base else timed.judge(ratio),
                     *(_spread(timed.of(part).rounds(name))[0] for part in PARTS),
-                    to_control,
-                    *(str(work[name][counter]) for counter in COUNTERS),
+                    *(str(work[counter]) for counter in COUNTERS),
                 ]
             )
-        rest = ["–"] * (len(PARTS) + 1 + len(COUNTERS))
+        rest = ["–"] * (len(PARTS) + len(COUNTERS))
         rows.append(["again", *_spread(timed.rounds(None)), ratio_text(timed.noise), "–", *rest])
-        editing_text = (
-            f" Editing is {', '.join(EDITING_PARTS)}, without tuning; {control!r} is its control."
-        )
         text = [
             (
                 f"Seconds of one whole edit, {timed.turns[0].rounds} rounds of each variant in one"
                 f" process, in turn: {', '.join(turn.of for turn in timed.turns)}. Ratios are"
-                f" medians over rounds of the ratio within a round; {RATIO_INTERVAL} The"
-                " row `again` is the first variant against itself: inside that band, or its mirror"
-                " image about 1, nothing is called faster or"
-                f" slower.{editing_text if control is not None else ''}"
+                f" medians over rounds of the ratio within a round; {RATIO_INTERVAL} The row"
+                " `again` is the first variant against itself: inside that band, or its mirror"
+                " image about 1, nothing is called faster or slower."
             ),
         ]
         return Section("Seconds of an edit, taken in turn", text, [Table(columns, rows)])

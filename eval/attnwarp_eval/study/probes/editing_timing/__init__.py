@@ -1,1 +1,0 @@
-"""Seconds of whole edits taken in turn in one process."""
