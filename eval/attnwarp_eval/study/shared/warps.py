@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from attnwarp import Gaussians
 from attnwarp.warp import WarpedView, WarpSettings, parts_read, render_surface, warp_view
-from attnwarp_eval import metrics
-from attnwarp_eval.ideal.parts import token_parts
-from attnwarp_eval.metrics.labels import Labels
-from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Probe, Work
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Study, Variant
@@ -21,7 +14,6 @@ from attnwarp_eval.study.shared.splats import (
     surface_meaning,
     surface_spec,
 )
-from attnwarp_eval.study.shared.things import thing_of
 from attnwarp_eval.study.warping import warp_truth
 from attnwarp_eval.two_view import TwoView
 
@@ -42,36 +34,20 @@ class WarpProbe(Probe[NoExtra]):
         return surface_meaning(study, variant)
 
 
-class ThingWarpProbe(WarpProbe):
-    """Base of probes that carry labels of a scene's thing along the warp."""
-
-    def cells(
-        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
-    ) -> Iterator[Cell]:
-        """One for each scene, variant and seed."""
-        things = {name: thing_of(study, scene) for name, scene in scenes.items()}
-        for cell in super().cells(study, names, scenes):
-            yield replace(cell, spec={**cell.spec, "thing": things[cell.scene]}, pictures=())
-
-
-def warped_views(
-    work: Work, grids: Sequence[int], model: Gaussians | None = None
-) -> Iterator[tuple[str, TwoView, WarpedView]]:
+def warped_views(work: Work, grids: Sequence[int]) -> Iterator[tuple[str, TwoView, WarpedView]]:
     """Each target of a cell with its truth and its warp, which counts as the cell's work.
 
     Args:
         work: of the cell, whose spec has ``settings`` and the source of depth.
         grids: sides of the feature grids that are warped too.
-        model: the cell's splats, where they are at hand.
     """
     spec, world, meter = work.spec, work.world, work.meter
     size, spp = spec["size"], spec["spp"]
     settings = WarpSettings.from_dict(spec["settings"])
-    source_surface = None
+    source_surface = model = None
     if spec.get("geometry") != "truth":
-        if model is None:
-            with meter.stage("splats"):
-                model = splats_of(work)
+        with meter.stage("splats"):
+            model = splats_of(work)
         # One source serves every target, so its render is no part of what a target costs.
         with meter.stage("source"):
             source_surface = render_surface(model, world.source, settings)
@@ -102,20 +78,3 @@ def warped_views(
                 view.at((grid, grid))
         meter.count(**view.target.counters)
         yield name, truth, view
-
-
-def label_figures(
-    work: Work, truth: TwoView, view: WarpedView, labels: tuple[Labels, Labels], grid: int
-) -> dict[str, float]:
-    """Figures of the part labels that a warp carries.
-
-    Args:
-        truth: of the pair, (H, W).
-        labels: (H, W) part of each pixel of the source and of the target.
-        grid: side of the token grid, a divisor of the image's.
-    """
-    source, target = (token_parts(of, (grid, grid)) for of in labels)
-    with work.meter.stage("carry"):
-        carried = metrics.carried_labels(view.at((grid, grid)), source)
-    with work.meter.stage("checks"):
-        return metrics.label_transport(carried, target, labels[1], truth.visible, truth.unseen)

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated
 
 from pydantic import Field
 
+from attnwarp.warp import WarpedView
+from attnwarp_eval import metrics
 from attnwarp_eval.ideal.editor import FACTOR
+from attnwarp_eval.ideal.parts import token_parts
 from attnwarp_eval.ideal.thing import labels_of
+from attnwarp_eval.metrics.labels import Labels as LabelMap
 from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Part, Study, Variant, Whole
-from attnwarp_eval.study.shared.things import ThingsPart
-from attnwarp_eval.study.shared.warps import ThingWarpProbe, label_figures, warped_views
+from attnwarp_eval.study.shared.things import ThingsPart, thing_of
+from attnwarp_eval.study.shared.warps import WarpProbe, warped_views
+from attnwarp_eval.two_view import TwoView
 
 GRIDS = (8, 16, 32, 64)
 """Sides of the token grids that are measured where a study names none."""
@@ -51,7 +58,7 @@ def grids_of(study: Study, size: int) -> list[int]:
 
 
 @register
-class LabelTransport(ThingWarpProbe):
+class LabelTransport(WarpProbe):
     """Labels of a thing's parts, carried along the tokens of a warp."""
 
     name = "labels"
@@ -69,6 +76,14 @@ class LabelTransport(ThingWarpProbe):
     def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
         """A thing of a scene that is not there would be measured nowhere."""
         study.check_scenes(study.part(ThingsPart).things, "things", scenes)
+
+    def cells(
+        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
+    ) -> Iterator[Cell]:
+        """One for each scene, variant and seed."""
+        things = {name: thing_of(study, scene) for name, scene in scenes.items()}
+        for cell in super().cells(study, names, scenes):
+            yield replace(cell, spec={**cell.spec, "thing": things[cell.scene]}, pictures=())
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """Depth, rules, grids and parts."""
@@ -95,9 +110,26 @@ class LabelTransport(ThingWarpProbe):
             for count in spec["parts"]:
                 for grid in grids:
                     pair = labels[count][names[0]], labels[count][name]
-                    one = label_figures(work, truth, view, pair, grid)
+                    one = _figures(work, truth, view, pair, grid)
                     if (count, grid) == (spec["parts"][0], near):
                         figures |= one
                     figures |= {f"{key}.{grid}.{count}": value for key, value in one.items()}
             work.add(name, figures)
         return NoExtra()
+
+
+def _figures(
+    work: Work, truth: TwoView, view: WarpedView, labels: tuple[LabelMap, LabelMap], grid: int
+) -> dict[str, float]:
+    """Figures of the part labels that a warp carries.
+
+    Args:
+        truth: of the pair, (H, W).
+        labels: (H, W) part of each pixel of the source and of the target.
+        grid: side of the token grid, a divisor of the image's.
+    """
+    source, target = (token_parts(of, (grid, grid)) for of in labels)
+    with work.meter.stage("carry"):
+        carried = metrics.carried_labels(view.at((grid, grid)), source)
+    with work.meter.stage("checks"):
+        return metrics.label_transport(carried, target, labels[1], truth.visible, truth.unseen)

@@ -1,1 +1,0 @@
-"""Surfaces of fits against true ones, beside depth, pictures and warps."""
