@@ -152,14 +152,7 @@ def ssim_terms(image: check.Array, target: check.Array) -> tuple[Tensor, Tensor]
     return a1 / b1, a2 / b2
 
 
-def check_sizes(
-    cameras: Sequence[Camera],
-    smallest: int,
-    loss: str,
-    setting: str,
-    *,
-    edited: Sequence[tuple[int, int]] | None = None,
-) -> None:
+def check_sizes(cameras: Sequence[Camera], smallest: int, loss: str, setting: str) -> None:
     """Raise ValueError that names the first view that is too small for a loss.
 
     Args:
@@ -167,7 +160,6 @@ def check_sizes(
         smallest: side in px that the loss takes.
         loss: for the message.
         setting: the loss's weight.
-        edited: (h, w) px of the views' edits, where these are what is compared.
 
     Example:
         >>> import numpy as np
@@ -177,13 +169,11 @@ def check_sizes(
         Traceback (most recent call last):
         ValueError: views: 'a.png' has 16 x 8 px, SSIM needs 11 a side; enlarge it, or set ssim to 0
     """
-    sizes = [(each.height, each.width) for each in cameras] if edited is None else edited
-    has, remedy = ("has", "enlarge it") if edited is None else ("is edited at", "raise size")
-    for camera, (h, w) in zip(cameras, sizes, strict=True):
-        if min(h, w) < smallest:
+    for camera in cameras:
+        if min(camera.height, camera.width) < smallest:
             raise ValueError(
-                f"views: {camera.name!r} {has} {w} x {h} px, {loss} needs {smallest} a side;"
-                f" {remedy}, or set {setting} to 0"
+                f"views: {camera.name!r} has {camera.width} x {camera.height} px, {loss} needs"
+                f" {smallest} a side; enlarge it, or set {setting} to 0"
             )
 
 

@@ -25,6 +25,12 @@ from attnwarp.gaussians import Gaussians
 
 Tensor = torch.Tensor
 
+GROW_SCALE = 0.01
+"""Share of the extent up to which a splat counts as small (published)."""
+
+SPLIT_SHRINK = 1.6
+"""Factor by which the two halves of a split splat are smaller (published)."""
+
 
 def screen_gradient(
     gradient: Tensor, means: Tensor, camera: Camera, origin: np.ndarray, near: float
@@ -138,7 +144,7 @@ class Density:
                 )
                 wanted = torch.zeros_like(wanted)
                 wanted[order[:spare]] = True
-        small = largest <= s.grow_scale * room
+        small = largest <= GROW_SCALE * room
         cloned = torch.nonzero(wanted & small)[:, 0]
         split = torch.nonzero(wanted & ~small)[:, 0]
         keep = torch.nonzero(~gone & ~(wanted & ~small))[:, 0]
@@ -173,7 +179,7 @@ class Density:
             kind, half["means"], half["quats"], scales, half["opacity"].sigmoid(), half["dc"]
         ).rotations()
         half["means"] += (axes @ offset[:, :, None])[:, :, 0]
-        half["scales"] -= float(np.log(self.settings.split_shrink))
+        half["scales"] -= float(np.log(SPLIT_SHRINK))
         return half
 
     def state(self) -> dict[str, Any]:

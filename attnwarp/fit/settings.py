@@ -48,9 +48,6 @@ class FitSettings(Settings):
         densify_until: share of the iterations after which splats are neither added nor removed.
         grow_gradient: mean norm of the loss's gradient in a splat's position on screen above which
             it is cloned or split, the screen being 2 wide and high.
-        grow_scale: share of the extent up to which a splat counts as small: small ones are cloned,
-            large ones split.
-        split_shrink: what the scales of the two halves of a split splat are divided by.
         max_splats: no refinement grows the model beyond this number; those of the largest gradient
             go first. None: without limit.
         prune_opacity: splats below this opacity are removed. None: 0.05 for "2d", 0.005 for "3d"
@@ -105,8 +102,6 @@ class FitSettings(Settings):
     densify_every: Count = 100
     densify_until: Share = 0.5
     grow_gradient: Weight = 2e-4
-    grow_scale: Weight = 0.01
-    split_shrink: Annotated[float, Range(1)] = 1.6
     max_splats: Count | None = None
     prune_opacity: Share | None = None
     prune_scale: Annotated[float, Range(1e-6)] = 0.1

@@ -349,10 +349,7 @@ class _Run:
             work.membership() if self.bound else None, options.get("load", load_encoder),
         )  # fmt: skip
         tuned = sorted({view for part in self.rounds for view in part.training})
-        self.tuning.check_sizes(
-            [work.scene.cameras[view] for view in tuned],
-            None if work.settings.detail == "change" else [work.sizes[view] for view in tuned],
-        )
+        self.tuning.check_sizes([work.scene.cameras[view] for view in tuned])
         self.done, self.rows, self.edits = 0, 0, 0
         self.latest: dict[int, int] = {}  # by the view: the round of its last edit
         self.places = [0] * len(self.rounds)  # groups of each round so far
@@ -548,13 +545,10 @@ class _Run:
         camera = self.work.scene.cameras[view]
         edited = self._edited(view).astype(np.float32) / np.float32(255)
         s, segments = self.work.settings, self.work.scene.segments
-        if s.detail == "change":
-            segment = None if segments is None else segments[view]
-            original = self.work.scene.picture(view)
-            picture = full_size(original, edited, segment, s.composite, s.composite_blur)
-            return TrainingView(view, camera, picture)
-        h, w = self.work.sizes[view]
-        return TrainingView(view, camera.resize(w, h), edited)
+        segment = None if segments is None else segments[view]
+        original = self.work.scene.picture(view)
+        picture = full_size(original, edited, segment, s.composite, s.composite_blur)
+        return TrainingView(view, camera, picture)
 
     # --- results
 

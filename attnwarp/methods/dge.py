@@ -129,7 +129,7 @@ class DGE(Method):
                         if not with_keys:
                             outputs.append(part.predict(x[views], now))
                             continue
-                        nearest = 1 if place == 0 else s.nearest
+                        nearest = 1 if place == 0 else 2
                         of_batch = [cameras[view] for view in views]
                         with attention.view_pass(of_batch, key_cameras, nearest):
                             outputs.append(part.predict(x[views], now))

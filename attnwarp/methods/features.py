@@ -38,12 +38,7 @@ class Features:
         self.editor, self.settings, self.store = editor, settings, store
         self.layers: tuple[Layer, ...] = ()
         if settings.method == "warp":
-            self.layers = choose_layers(
-                editor.unet,
-                fractions=settings.fractions,
-                kinds=settings.kinds,
-                blocks=settings.blocks,
-            )
+            self.layers = choose_layers(editor.unet, kinds=settings.kinds)
             self._check_branches()
 
     def source_guidance(self, *, further: bool) -> float | None:

@@ -17,6 +17,9 @@ from attnwarp.methods.sight import Sight
 from attnwarp.methods.work import Work
 from attnwarp.warp import Surface, WarpedView, parts_read, render_surface, warp_view
 
+CHAIN_COVERAGE = 0.5
+"""Share of its surface that the sources so far must see of the next one."""
+
 Warps = Callable[[int, int], WarpedView]
 """The warp from a source view to a target view, by their numbers."""
 
@@ -116,7 +119,7 @@ class Geometry:
         return digest_each(parts())
 
     def chain(self, source: int) -> tuple[int, ...]:
-        """Further sources by the settings' number and coverage; see :func:`choose_chain`."""
+        """Further sources by the settings' number; see :func:`choose_chain`."""
         s, scene = self.settings, self.work.scene
 
         def seen(first: int, target: int) -> tuple[Mask, Mask]:
@@ -126,7 +129,7 @@ class Geometry:
                 surface = surface & (scene.segments[target] > 0.5)
             return warp.mask.numpy(), surface
 
-        return choose_chain(len(scene.cameras), source, s.sources, s.chain_coverage, seen)
+        return choose_chain(len(scene.cameras), source, s.sources, CHAIN_COVERAGE, seen)
 
 
 def choose_chain(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from attnwarp import check
-from attnwarp.editing.layers import Block, Kind
+from attnwarp.editing.layers import Kind
 from attnwarp.editing.schedule import PUBLISHED_STEPS, Grid
 from attnwarp.errors import Named
 from attnwarp.settings import Count, Number, Range, Seed, Settings, Share, Weight
@@ -17,7 +17,6 @@ from attnwarp.warp.settings import WarpSettings
 Noise = Literal["fresh", "shared"]
 Latents = Literal["inversion", "random"]
 Background = Literal["black", "white", "random"]
-Detail = Literal["change", "none"]
 Composite = Literal["none", "black", "original"]
 
 Steps = Annotated[int, Range(1, 1000)]
@@ -50,11 +49,8 @@ class MethodSettings(Settings):
             1 - SSIM, that of distortion the form that :func:`attnwarp.losses.distortion_form`
             chooses.
         perceptual_encoder: :func:`attnwarp.encoders.load_encoder`'s name of the perceptual loss.
-        color_rate, geometry_rate: factors of the published learning rates, of the colours and of
-            everything else.
+        color_rate: factor of the published learning rates of the colours.
         background: behind the splats while tuning.
-        detail: where the editor works at a smaller size than the pictures', "change" adds the
-            edit's change, enlarged, to the full picture; "none" tunes at the editor's size.
         composite: what stands outside the segments, where they are given: the edit ("none"),
             "black", or the "original" picture.
         composite_blur: sigma in px that the segments are blurred with before compositing.
@@ -82,9 +78,7 @@ class MethodSettings(Settings):
     distortion: Weight = 0.0
     perceptual_encoder: str = "perceptual-small"
     color_rate: Weight = 1.0
-    geometry_rate: Weight = 1.0
     background: Background = "black"
-    detail: Detail = "change"
     composite: Composite = "original"
     composite_blur: Annotated[float, Range(0, 1000)] = 0.0
 
@@ -160,8 +154,6 @@ class AttentionWarpingSettings(MethodSettings):
         sources: views whose features are recorded and warped. Those after the first are edited in
             a chain outward from it, each covered by those before; a target's pixel takes the source
             that sees it best (:mod:`attnwarp.methods.sight`).
-        chain_coverage: share of its surface that the sources so far must see of the next one. The
-            view they see least of is taken among those.
         confidence: weigh the features by how well the source sees the surface (foreshortening and
             the margin of depth agreement) instead of by the mask alone.
         estimate: weight at the first step of the source's warped estimate of the clean latents, in
@@ -177,7 +169,7 @@ class AttentionWarpingSettings(MethodSettings):
         depth_from: the model before the edit ("frozen") or as tuned so far ("current").
         a0: weight of the injected features at the first step.
         decay: "linear", a_t = a0 (T - t) / T, or "constant".
-        fractions, kinds, blocks: layers, :func:`attnwarp.editing.layers.choose_layers`.
+        kinds: of attention, :func:`attnwarp.editing.layers.choose_layers`.
         feature_steps: (from, until) shares of the steps whose features are recorded and injected.
             The others leave every view its own: [0, 0.5] halves the memory.
         branches: guidance branches that get features. None: text and image of InstructPix2Pix,
@@ -229,7 +221,6 @@ class AttentionWarpingSettings(MethodSettings):
     mask: bool = True
     outside: Literal["border", "zeros"] = "border"
     sources: Count = 1
-    chain_coverage: Share = 0.5
     confidence: bool = False
     estimate: Share = 0.0
     estimate_until: Weight = 0.5
@@ -238,9 +229,7 @@ class AttentionWarpingSettings(MethodSettings):
     depth_from: Literal["frozen", "current"] = "frozen"
     a0: Share = 0.9
     decay: Literal["linear", "constant"] = "linear"
-    fractions: tuple[float, ...] = (1.0, 0.5)
     kinds: tuple[Kind, ...] = ("self", "cross")
-    blocks: tuple[Block, ...] = ("up",)
     feature_steps: tuple[float, float] = (0.0, 1.0)
     branches: tuple[str, ...] | None = None
     feature_type: Literal["float32", "float16", "bfloat16"] = "float32"
@@ -394,7 +383,6 @@ class DGESettings(MethodSettings):
         starts: timestep that a round starts from; the last also serves all further rounds.
         grid: of the steps below it, :data:`attnwarp.editing.schedule.Grid`.
         plain_below: timestep below which every view has its own attention.
-        nearest: key views that a token is matched in; one for the first batch.
         epipolar: distance in px of the layer from the epipolar line beyond which matches are
             excluded; None excludes none.
 
@@ -414,7 +402,6 @@ class DGESettings(MethodSettings):
     starts: tuple[int, ...] = (998, 299)
     grid: Grid = "even"
     plain_below: Annotated[int, Range(0, 1000)] = 100
-    nearest: Annotated[int, Range(1, 2)] = 2
     epipolar: Weight | None = 1.0
 
     def __post_init__(self) -> None:

@@ -199,18 +199,13 @@ class Tuning:
     ) -> None:
         self.settings, self.iterations, self.backend = settings, iterations, backend
         rates = FitSettings(kind=start.kind)
-        c, g = settings.color_rate, settings.geometry_rate
+        rate = settings.color_rate
         self.fit = FitSettings(
             kind=start.kind,
             sh_degree=start.sh_degree,
             antialiased=start.antialiased,
-            lr_means=g * rates.lr_means,
-            lr_means_final=g * rates.lr_means_final,
-            lr_dc=c * rates.lr_dc,
-            lr_rest=c * rates.lr_rest,
-            lr_opacity=g * rates.lr_opacity,
-            lr_scales=g * rates.lr_scales,
-            lr_quats=g * rates.lr_quats,
+            lr_dc=rate * rates.lr_dc,
+            lr_rest=rate * rates.lr_rest,
         )
         self.model = Model(start, self.fit, extent_of(cameras, start.world_means()))
         self.membership = (
@@ -234,18 +229,10 @@ class Tuning:
         self.perceptual = None if net is None else DistanceToViews(net)
         self.weights = {} if net is None else {"perceptual": net.about.weights_sha256}
 
-    def check_sizes(
-        self, cameras: Sequence[Camera], edited: Sequence[tuple[int, int]] | None
-    ) -> None:
-        """Raise ValueError that names a view whose picture is too small for a loss.
-
-        Args:
-            cameras: of the views that are tuned on.
-            edited: (h, w) px of their edits where these are tuned on as they are; None where an
-                edit's change is put onto a picture of the camera's size.
-        """
+    def check_sizes(self, cameras: Sequence[Camera]) -> None:
+        """Raise ValueError that names a view to tune on that is too small for a loss."""
         for loss, smallest, setting in self._smallest:
-            losses.check_sizes(cameras, smallest, loss, setting, edited=edited)
+            losses.check_sizes(cameras, smallest, loss, setting)
 
     def gaussians(self) -> Gaussians:
         """The splats as they stand, outside autograd."""
@@ -331,7 +318,7 @@ class Tuning:
         if not math.isfinite(value):
             raise RuntimeError(
                 f"tuning, iteration {self.iteration}: the loss is {value} on view"
-                f" {view.camera.name!r}; lower geometry_rate"
+                f" {view.camera.name!r}; lower color_rate"
             )
         loss.backward()
         self.iteration += 1

@@ -214,13 +214,11 @@ def _edited(result: Any) -> EditedScene:
 def _true_pictures(job: Job) -> EditedScene:
     """The first answer's true pictures in every view, and splats tuned on them: the ceiling.
 
-    Stages, their views and their tuning are those of ``attention_warping``. Where the change of an
-    edit is added to the picture, edits are as large as it; else they have ``size``.
+    Stages, their views and their tuning are those of ``attention_warping``.
     """
     from attnwarp.methods import AttentionWarpingSettings
     from attnwarp.methods.attention_warping import AttentionWarping
     from attnwarp.methods.base import ViewEdit, run
-    from attnwarp.methods.pictures import resized
 
     pictures = next(iter(job.truth.values()))
 
@@ -231,10 +229,7 @@ def _true_pictures(job: Job) -> EditedScene:
             return self.edit_targets(0, [self.sources[number]])
 
         def edit_targets(self, stage: int, batch: Sequence[int], *_: Any) -> list[ViewEdit]:
-            edits = {view: pictures[view] for view in batch}
-            if self.settings.detail == "none":
-                edits = {view: resized(edits[view], self.work.sizes[view]) for view in batch}
-            return [ViewEdit(edits[view], {"injected": 0.0}) for view in batch]
+            return [ViewEdit(pictures[view], {"injected": 0.0}) for view in batch]
 
     def make(work: Any, settings: Any) -> TruePictures:
         return TruePictures(work, settings, 0, None, None, "cpu")

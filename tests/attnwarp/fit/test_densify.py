@@ -70,7 +70,7 @@ def test_gradient_on_screen_of_what_is_behind_the_camera_is_zero():
 
 def test_small_splats_are_cloned_and_large_ones_split():
     start = splats(4)
-    start.scales[1] = 0.5  # grow_scale is 0.01 of an extent of 2
+    start.scales[1] = 0.5  # small is up to 0.01 of an extent of 2
     start.scales[0] = 0.01
     model, density = model_and_density(start, reset_every=1000, prune_scale=1.0)
     wanting(density, [0, 1])

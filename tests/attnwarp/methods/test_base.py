@@ -318,7 +318,7 @@ def test_splats_that_no_segment_marks_keep_their_bytes(run, scene, tmp_path):
     left = np.zeros((32, 32), dtype=bool)
     left[:, :16] = True
     before = scene[0]
-    settings = ByViewSettings(steps=1, iterations=6, geometry_rate=1.0)
+    settings = ByViewSettings(steps=1, iterations=6)
     x = before.world_means()[:, 0]  # the cameras look at -0.2 to 0.2
     for folder, outside in (("kept", {}), ("tuned", {"tune_outside": True})):
         result = run("by_view", settings, segments=[left] * 3, folder=tmp_path / folder, **outside)

@@ -94,18 +94,6 @@ def test_a_splat_takes_the_share_of_a_step_that_it_belongs():
     assert parts["dc"][share == 1].abs().max() > 1e-4
 
 
-def test_without_a_geometry_rate_only_colours_move():
-    start, views = splats(), cameras()
-    settings = replace(SETTINGS, geometry_rate=0.0)
-    tuning = Tuning(start, views, settings, 1)
-    tuning.advance(0, 5, views_of(3))
-    result = tuning.gaussians()
-    assert torch.equal(result.means, start.means)
-    assert torch.equal(result.quats, start.quats)
-    assert torch.allclose(result.scales, start.scales, rtol=1e-6, atol=0)  # through a logarithm
-    assert not torch.equal(result.sh, start.sh)
-
-
 def test_the_perceptual_loss_is_the_distance_and_its_gradient_is_the_slope():
     net = load_encoder("perceptual-small", "perceptual")
     random = torch.Generator().manual_seed(0)
@@ -192,15 +180,6 @@ def test_views_from_one_place_are_drawn_and_tuned_alike_in_any_unit(unit):
     assert float((one.sh - splats().sh).abs().max()) > 1e-3
     torch.testing.assert_close(other.sh, one.sh, rtol=0, atol=1e-5)
     torch.testing.assert_close(other.means / unit, one.means, rtol=0, atol=1e-5)
-
-
-def test_geometry_of_rate_0_stays_however_large():
-    start, (view, *_) = replace(splats(), scales=splats().scales.clone()), views_of(1)
-    start.scales[0] = 1e7
-    settings = replace(SETTINGS, geometry_rate=0.0, perceptual=0.0)
-    tuning = Tuning(start, cameras(), settings, 2)
-    tuning.advance(0, 2, [view])
-    torch.testing.assert_close(tuning.gaussians().scales, start.scales, rtol=1e-5, atol=0)
 
 
 FAR = np.array([1e6, -2e6, 5e5])
