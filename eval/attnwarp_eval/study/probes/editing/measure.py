@@ -225,8 +225,10 @@ def _compile(kind: Literal["2d", "3d"]) -> None:
     """Compile what renders, tunes and warps, so that a first edit's seconds do not hold it."""
     compile_kernels(kind)
     axes = 3 if kind == "3d" else 2
-    shapes = ((1, 3), (1, 4), (1, axes), (1,), (1, 1, 3))  # centre, rotation, scales, opacity, sh
-    splats = Gaussians(kind, *(torch.ones(shape, dtype=torch.float32) for shape in shapes))
+    one = torch.ones(1, 1, 3, dtype=torch.float32)
+    splats = Gaussians(
+        kind, one[0], torch.eye(1, 4, dtype=torch.float32), one[0, :, :axes], one[0, :, 0], one
+    )
     camera = Camera.look_at((0, 0, 3), (0, 0, 0), width=16, height=16, fov_y=40, up=(0, 1, 0))
     warp_view(splats, camera, camera).at((4, 4)).warp_tokens(
         torch.zeros(1, 16, 4, dtype=torch.float32)
