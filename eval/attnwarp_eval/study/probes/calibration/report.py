@@ -9,7 +9,7 @@ from typing import Any
 from attnwarp.warp import TAP_SPREAD
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
-from attnwarp_eval.effects.table import USUAL, plan_words
+from attnwarp_eval.effects.table import plan_words
 from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
@@ -124,32 +124,27 @@ class CalibrationReport(ProbeReport):
         return Section("Calibration", text, [Table(columns, rows)])
 
     def _transport(self, results: Results) -> list[Section]:
-        rows = []
+        alike: dict[tuple[str, ...], list[str]] = {}
         for cell, record in results.finished(self.name):
             transport = record.extra.transport
-            beyond = [
-                f"{name} ({words})" for name, words in transport.needed.items() if name not in USUAL
-            ]
-            rows.append(
-                [
-                    cell.scene,
-                    ", ".join(name for name in transport.needed if name in USUAL) or "–",
-                    "; ".join(beyond) or "–",
-                    ", ".join(transport.not_simulated) or "–",
-                    plan_words(transport.plan),
-                    transport.everything_on,
-                    "; ".join(transport.plan["reasons"]),
-                ]
+            light = (
+                ", ".join(transport.needed) or "–",
+                ", ".join(transport.not_simulated) or "–",
+                plan_words(transport.plan),
+                transport.everything_on,
             )
-        if not rows:
+            alike.setdefault(light, []).append(cell.scene)
+        if not alike:
             return []
+        rows = [[", ".join(dict.fromkeys(names)), *light] for light, names in alike.items()]
         text = [
             (
                 "Depth, visibility and correspondences are cast with rays, without any light. The"
                 " true pictures are rendered as each scene's plan says: only what it calls for is"
                 " simulated. A run does not prove its plans; `attnwarp-eval scenes effects NAME"
-                " --prove` holds one against a rendering with everything on, and reports/effects"
-                " in the repository has that for every scene that ships."
+                " --prove` says why each effect is needed and holds the plan against a rendering"
+                " with everything on; reports/effects in the repository has that for every scene"
+                " that ships."
             ),
         ]
         variants = sorted(
@@ -160,15 +155,7 @@ class CalibrationReport(ProbeReport):
             " Another variant draws other noise, and an editor of pictures that differ by noise"
             " makes edits that differ too."
         )
-        columns = [
-            "scene",
-            "effects",
-            "and",
-            "not simulated",
-            "plan",
-            "everything on would be",
-            "because",
-        ]
+        columns = ["scenes", "effects", "not simulated", "plan", "everything on would be"]
         title = "What light does in these scenes, and what of it is simulated"
         return [Section(title, text, [Table(columns, rows)])]
 

@@ -23,30 +23,25 @@ class LabelReport(ProbeReport):
         "painted, hidden": "labels.painted_hidden",
         "painted, outside": "labels.painted_outside",
     }
-    contrasts = tuple(columns.values())
+    contrasts = ("labels.right", "labels.painted_hidden")
     stage = "pair"
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
-        """Figures by the grid's side, a table for each number of parts."""
+        """Labels that arrive right by the grid's side and the number of parts."""
         specs = [record.spec for _, record in results.finished(self.name)]
         if not specs:
             return []
-        grids, counts = specs[0]["grids"], specs[0]["parts"]
-        tables = []
-        for count in counts:
-            rows = [
-                [
-                    name,
-                    title,
-                    *mean_values(
-                        results, self.name, name, [f"{key}.{grid}.{count}" for grid in grids]
-                    ),
-                ]
-                for name in names
-                for title, key in self.columns.items()
+        grids = specs[0]["grids"]
+        rows = [
+            [
+                name,
+                str(count),
+                *mean_values(
+                    results, self.name, name, [f"labels.right.{grid}.{count}" for grid in grids]
+                ),
             ]
-            caption = f"{count} parts, by tokens along a side"
-            tables.append(
-                Table(["variant", "labels", *map(str, grids)], rows, caption, folded=True)
-            )
-        return tables
+            for name in names
+            for count in specs[0]["parts"]
+        ]
+        caption = "Right labels by tokens along a side"
+        return [Table(["variant", "parts", *map(str, grids)], rows, caption, folded=True)]

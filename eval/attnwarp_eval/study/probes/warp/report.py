@@ -104,7 +104,7 @@ class WarpReport(ProbeReport):
             for metric, caption in RATES.items()
         ]
         places = {"": "everywhere", ".interior": "inside surfaces", ".edge": "at edges"}
-        for metric in ("precision", "recall", "f1", "false_positive_rate", "false_negative_rate"):
+        for metric in ("precision", "recall"):
             rows = [
                 [
                     name,
@@ -114,7 +114,7 @@ class WarpReport(ProbeReport):
                 for name in names
                 for region, place in places.items()
             ]
-            caption = f"{metric.replace('_', ' ').capitalize()}, inside surfaces and at edges apart"
+            caption = f"{metric.capitalize()}, inside surfaces and at edges apart"
             tables.append(Table([columns[0], "where", *columns[1:]], rows, caption, folded=True))
         rows = [[name, *(number(_ambiguous(b.counts)) for b in bins[name, ""])] for name in names]
         caption = "Of ambiguous pixels, which are not scored, accepted"
