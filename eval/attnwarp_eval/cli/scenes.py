@@ -4,9 +4,8 @@ effects, cost.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -345,49 +344,6 @@ def accuracy(
         with reporter() as report, resumable(lambda: "finished panels are kept"):
             panels = list(measure(scenes or (), out=out, rounds=rounds, report=report))
         for path in write(panels, out):
-            typer.echo(path)
-
-
-@app.command()
-def flow(
-    scenes: Annotated[
-        list[str] | None, typer.Argument(help="bear, dinosaur, person; all if left out.")
-    ] = None,
-    yaws: Annotated[
-        str, typer.Option(help="Degrees from the source (comma-separated).")
-    ] = "2,5,10,20,30,60",
-    size: Annotated[int, typer.Option(min=16, max=4096, help="Of the pictures, px.")] = 256,
-    spp: Annotated[int, typer.Option(min=1, help="Samples a pixel.")] = 32,
-    method: Annotated[str, typer.Option(help="Of OpenCV's flow: dis or farneback.")] = "dis",
-    out: Annotated[
-        Path, typer.Option(help="Folder for the report, its figures, flow.json and pictures.")
-    ] = Path("runs/flow"),
-    pictures: Annotated[bool, typer.Option(help="Keep the pictures of each pair.")] = True,
-) -> None:
-    """Measure how far consistency along optical flow is from that at exact correspondences."""
-    with clear_errors():
-        from attnwarp.errors import InputError
-        from attnwarp_eval.document.write import markdown_table
-        from attnwarp_eval.experiments import flow, flow_report
-
-        try:
-            angles = [float(yaw) for yaw in names(yaws) or []]
-        except ValueError as error:
-            raise InputError(f"--yaws: {error}; expected degrees such as 5,20") from None
-        for angle in angles:
-            if not math.isfinite(angle):
-                raise InputError(f"--yaws: got {angle}, expected degrees such as 5,20")
-        options = flow.Options(size, spp, cast(flow.Method, method), pictures)
-        with (
-            reporter(every=True) as report,
-            resumable(lambda: "finished pairs are kept"),
-        ):
-            chosen = scenes or list(flow.SCENES)
-            rows = list(flow.measure(chosen, angles, out, options, report=report))
-        if not rows:
-            raise InputError("--yaws: got none, expected degrees such as 5,20")
-        typer.echo(markdown_table(flow_report.table(rows)))
-        for path in flow_report.write(rows, out, size=size, spp=spp):
             typer.echo(path)
 
 

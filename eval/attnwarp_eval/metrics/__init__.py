@@ -11,10 +11,8 @@ from __future__ import annotations
 from attnwarp_eval.metrics.consistency import (
     Disagreement,
     Flow,
-    approximation_error,
     cross_view,
     flow_consistency,
-    flow_error,
     optical_flow,
     view_dependent,
 )
@@ -82,7 +80,6 @@ __all__ = [
     "YawBin",
     "above_floor",
     "answers_by_view",
-    "approximation_error",
     "at_size",
     "by_yaw",
     "carried_labels",
@@ -102,7 +99,6 @@ __all__ = [
     "feature_error",
     "fidelity",
     "flow_consistency",
-    "flow_error",
     "image_error",
     "image_similarity",
     "label_tokens",

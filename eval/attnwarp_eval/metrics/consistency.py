@@ -4,8 +4,7 @@ approximates it.
 Exactly: :func:`cross_view` compares the colours that two pictures give the same surface point, at
 correspondences known from the scene itself. Published work has no such correspondences and takes
 optical flow between the unedited pictures instead (Lai et al. 2018, Learning Blind Video Temporal
-Consistency). :func:`optical_flow` and :func:`flow_consistency` do that. :func:`flow_error` measures
-the flow's error, and :func:`approximation_error` its effect on the figure. Both paths differ in the
+Consistency). :func:`optical_flow` and :func:`flow_consistency` do that. Both paths differ in the
 positions alone.
 
 Pictures are sRGB in [0, 1]. Sampling is in linear light, since a pixel is a mean of light, and at
@@ -293,84 +292,6 @@ def flow_consistency(
     source = picture(source_srgb, "source_srgb", shape=shape)
     selected = region(mask, shape)
     return disagreement(source, target, flow.xy, selected & flow.accepted, int(selected.sum()))
-
-
-def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, float]:
-    """Distance of a flow from the exact correspondences.
-
-    Args:
-        flow: from :func:`optical_flow` on the pictures of ``pair``.
-        pair: their exact relation.
-        mask: (H, W) bool of the target, pixels to compare; all if left out.
-
-    Returns:
-        ``consistency.flow_epe_median``, ``_p95`` and ``flow_below_1px`` over all pixels that the
-        source certainly shows, away from edges; ``flow_epe_median_accepted`` and ``_p95_accepted``
-        over those of them that pass the forward-backward check; ``flow_recall``, the share that
-        passes; and ``flow_false``, of all that pass the share that the source certainly does not
-        show. NaN where there is nothing to measure.
-
-    Raises:
-        ValueError: a flow of another size than the pair's.
-
-    Example:
-        >>> from attnwarp_eval import metrics
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> from attnwarp_eval.truth import Geometry, two_view
-        >>> scene = load_scene("spheres").with_size(32, 32)
-        >>> pair = two_view(Geometry(scene), scene.source, scene.targets[0])
-        >>> exact = metrics.Flow(pair.xy + [3, 4], pair.visible, "dis")  # 5 px off everywhere
-        >>> error = metrics.flow_error(exact, pair)
-        >>> round(error["consistency.flow_epe_median"], 9), error["consistency.flow_recall"]
-        (5.0, 1.0)
-    """
-    shape = pair.label.shape
-    if flow.accepted.shape != shape:
-        raise ValueError(
-            f"flow: got {flow.accepted.shape} pixels (H x W), expected {shape}, those of pair's"
-            " target"
-        )
-    selected = region(mask, shape)
-    scored = selected & pair.visible & ~pair.edge & np.isfinite(flow.xy).all(axis=-1)
-    offset = np.hypot(*np.moveaxis(flow.xy - pair.xy, -1, 0))
-    every, accepted_offset = offset[scored], offset[scored & flow.accepted]
-    accepted = selected & flow.accepted
-    wrong = accepted & pair.unseen
-    return {
-        "consistency.flow_epe_median": quantile(every, 0.5),
-        "consistency.flow_epe_p95": quantile(every, 0.95),
-        "consistency.flow_below_1px": share(int((every < 1).sum()), every.size),
-        "consistency.flow_epe_median_accepted": quantile(accepted_offset, 0.5),
-        "consistency.flow_epe_p95_accepted": quantile(accepted_offset, 0.95),
-        "consistency.flow_recall": share(accepted_offset.size, every.size),
-        "consistency.flow_false": share(int(wrong.sum()), int(accepted.sum())),
-    }
-
-
-def approximation_error(exact: Disagreement, flow: Disagreement) -> dict[str, float]:
-    """Effect on the figures of flow in place of exact correspondences: flow minus exact, and mean
-    DeltaE as a ratio.
-
-    NaN where either side counted nothing; the ratio too where the exact one is 0.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp_eval import metrics
-        >>> y, x = np.mgrid[:16, :16]
-        >>> still = metrics.Flow(np.stack([x + 0.5, y + 0.5], -1), np.ones((16, 16), bool), "dis")
-        >>> grey = np.full((16, 16, 3), 0.5)
-        >>> difference = metrics.flow_consistency(grey, grey + 0.1, still)
-        >>> metrics.approximation_error(difference, difference)["consistency.flow_ratio_delta_e"]
-        1.0
-    """
-    one, other = exact.figures(), flow.figures()
-    gaps = {
-        f"consistency.flow_gap_{name}": other[f"consistency.{name}"] - one[f"consistency.{name}"]
-        for name in ("mae_linear", "rmse_srgb", "delta_e")
-    }
-    truth = one["consistency.delta_e"]
-    ratio = other["consistency.delta_e"] / truth if truth > 0 else float("nan")
-    return gaps | {"consistency.flow_ratio_delta_e": ratio}
 
 
 def _pictures(source_srgb: Any, target_srgb: Any, pair: TwoView) -> tuple[Array, Array]:

@@ -169,39 +169,9 @@ _SPECS = (
         for prefix, pixels in (
             ("", "at exact correspondences"),
             ("flow_", "along optical flow"),
-            ("flow_same_", "along optical flow at the pixels of the exact figure"),
             ("rendered_", "at correspondences of rendered depth"),
         )
         for name, unit, direction, atol, rtol, what in _DISAGREEMENT
-    ),
-    Metric("consistency.flow_gap_mae_linear", "ratio", "zero", 1e-5, 1e-2, "flow's figure minus the exact one"),
-    Metric("consistency.flow_gap_rmse_srgb", "ratio", "zero", 1e-5, 1e-2, "flow's figure minus the exact one"),
-    Metric("consistency.flow_gap_delta_e", "dE00", "zero", 1e-3, 1e-2, "flow's figure minus the exact one"),
-    Metric("consistency.flow_ratio_delta_e", "ratio", "none", 1e-3, 1e-2, "flow's figure over the exact one"),
-    Metric("consistency.flow_epe_median", "px", "lower", 1e-2, 1e-2, "median endpoint error of the optical flow"),
-    Metric(
-        "consistency.flow_epe_p95", "px", "lower", 1e-1, 1e-2, "95th percentile of the optical flow's endpoint error"
-    ),
-    Metric("consistency.flow_below_1px", "share", "higher", 1e-3, 0, "visible pixels with flow to within 1 px"),
-    Metric(
-        "consistency.flow_epe_median_accepted",
-        "px",
-        "lower",
-        1e-2,
-        1e-2,
-        "median endpoint error where flow's check passes",
-    ),
-    Metric(
-        "consistency.flow_epe_p95_accepted",
-        "px",
-        "lower",
-        1e-1,
-        1e-2,
-        "95th percentile of it where flow's check passes",
-    ),
-    Metric("consistency.flow_recall", "share", "higher", 1e-3, 0, "of the visible pixels, flow's check passes"),
-    Metric(
-        "consistency.flow_false", "share", "lower", 1e-3, 0, "of what flow's check passes, not visible in the source"
     ),
     Metric("consistency.tsed_1px", "share", "higher", 1e-4, 0, "view pairs with 10 SIFT matches, the median within 1 px of epipolar lines"),
     Metric("consistency.tsed_2px", "share", "higher", 1e-4, 0, "the same within 2 px"),

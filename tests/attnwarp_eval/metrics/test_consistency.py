@@ -172,8 +172,6 @@ def test_nothing_co_visible_is_undefined_and_counted():
     figures = result.figures()
     assert figures.pop("consistency.pixels") == 0 and result.candidates == 0
     assert all(math.isnan(value) for value in figures.values())
-    gaps = metrics.approximation_error(result, result)
-    assert all(math.isnan(value) for value in gaps.values())
     assert not metrics.view_dependent(flat, flat, pair).any()
 
 
@@ -216,8 +214,6 @@ def test_wrong_input_is_refused_by_name(spheres):
         metrics.view_dependent(flat, flat, pair, tolerance=-1)
     with pytest.raises(ValueError, match="method: got 'diss'.*did you mean 'dis'"):
         metrics.optical_flow(flat, flat, "diss")
-    with pytest.raises(ValueError, match=r"flow: got \(16, 16\) pixels"):
-        metrics.flow_error(metrics.optical_flow(flat[:16, :16], flat[:16, :16]), pair)
 
 
 def sideways(shift, size=128):
@@ -248,14 +244,13 @@ def test_flow_finds_a_small_sideways_step_and_is_judged_so(method, shift):
     moved = pair.xy - pair.target.pixel_centers()
     assert np.abs(moved[pair.visible]).max(axis=0) == pytest.approx((abs(shift), 0), abs=1e-9)
     flow = metrics.optical_flow(source, target, method)
-    error = metrics.flow_error(flow, pair)
+    offset = np.linalg.norm(flow.xy - pair.xy, axis=-1)[pair.visible]
     # OpenCV's flow of a smooth translation is good to a tenth of a pixel or so.
-    assert error["consistency.flow_epe_median"] < 0.15
-    assert error["consistency.flow_below_1px"] > 0.9 and error["consistency.flow_recall"] > 0.9
-    exact = metrics.cross_view(source, target, pair)
-    along = metrics.flow_consistency(source, target, flow)
-    gap = metrics.approximation_error(exact, along)
-    assert abs(gap["consistency.flow_gap_delta_e"]) < 1
+    assert np.median(offset) < 0.15 and (offset < 1).mean() > 0.9
+    assert flow.accepted[pair.visible].mean() > 0.9
+    exact = metrics.cross_view(source, target, pair).figures()["consistency.delta_e"]
+    along = metrics.flow_consistency(source, target, flow).figures()["consistency.delta_e"]
+    assert abs(along - exact) < 1
     # Another colour in one view is seen by both.
     tinted = to_srgb(to_linear(target) * [1.0, 0.6, 0.6])
     by_both = [
@@ -263,17 +258,6 @@ def test_flow_finds_a_small_sideways_step_and_is_judged_so(method, shift):
         metrics.flow_consistency(source, tinted, flow).figures("flow_")["consistency.flow_delta_e"],
     ]
     assert by_both[0] == pytest.approx(by_both[1], rel=0.1) and by_both[0] > 10
-
-
-def test_a_flow_that_is_off_by_a_known_step_errs_by_that_step():
-    pair, *_ = sideways(4.0, size=32)
-    wrong = metrics.Flow(pair.xy + np.array([3.0, -4.0]), np.ones(pair.label.shape, bool), "dis")
-    error = metrics.flow_error(wrong, pair)
-    for name in ("median", "p95", "median_accepted", "p95_accepted"):
-        assert error[f"consistency.flow_epe_{name}"] == pytest.approx(5, abs=1e-9)
-    assert error["consistency.flow_below_1px"] == 0 and error["consistency.flow_recall"] == 1
-    # What the source does not show: the target's columns beyond its border.
-    assert error["consistency.flow_false"] == pair.unseen.mean() > 0
 
 
 def test_the_check_refuses_flow_that_does_not_come_back():
@@ -301,7 +285,6 @@ def test_every_figure_is_registered():
     pair, source, target = sideways(2.0, size=32)
     exact, flow = metrics.cross_view(source, target, pair), metrics.optical_flow(source, target)
     along = metrics.flow_consistency(source, target, flow)
-    names = [*exact.figures(), *along.figures("flow_"), *along.figures("flow_same_")]
-    names += [*metrics.flow_error(flow, pair), *metrics.approximation_error(exact, along)]
-    assert len(names) == len(set(names)) == 3 * 7 + 7 + 4
+    names = [*exact.figures(), *along.figures("flow_")]
+    assert len(names) == len(set(names)) == 2 * 7
     assert all(metric(name).name == name for name in names)
