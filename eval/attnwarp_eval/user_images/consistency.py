@@ -47,7 +47,7 @@ from attnwarp_eval.user_images.measure import (
 LONGEST = 256
 """Longest side in px of the pictures that all but keypoints are computed on; smaller ones stay."""
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Raised whenever the same pictures would give other figures."""
 
 _TSED = tuple(
@@ -131,7 +131,7 @@ def measure_consistency(
             another shape than its camera.
     """
     done = Measured(inputs)
-    cameras, edited, originals = _files(inputs, done)
+    cameras, posed, edited, originals = _files(inputs, done)
     names = list(edited)
     given = {
         "poses": True, "ply": inputs.ply is not None, "originals": bool(originals),
@@ -153,7 +153,7 @@ def measure_consistency(
     wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
     together = [figure for figure in wanted if figure in _COLMAP]
     wanted = [figure for figure in wanted if figure not in _COLMAP]
-    pairs = _Pairs(inputs, cameras, edited, originals, wanted, loaded)
+    pairs = _Pairs(inputs, cameras, posed, edited, originals, wanted, loaded)
     tasks = (_task(pairs, inputs, one, two, device) for one, two in itertools.pairwise(names))
     values: dict[Figure, dict[str, float]] = {figure: {} for figure in wanted}
     for (one, two), found in zip(
@@ -197,8 +197,10 @@ def _installed(package: str) -> bool:
 
 def _files(
     inputs: Inputs, done: Measured
-) -> tuple[dict[str, Camera], dict[str, Path], dict[str, Path]]:
-    """Cameras, pictures after the edit, and those before it, by name in natural order."""
+) -> tuple[dict[str, Camera], dict[str, Path], dict[str, Path], dict[str, Path]]:
+    """Cameras and their pictures by name; pictures after the edit and before it likewise, in
+    natural order.
+    """
     from attnwarp.io import read_dataset
     from attnwarp.io.names import file_stems
 
@@ -240,7 +242,8 @@ def _files(
             f" 2; cameras are named {', '.join(list(cameras)[:3])}, pictures"
             f" {', '.join(list(edited)[:3])}"
         )
-    return cameras, {n: edited[n] for n in names}, {n: originals[n] for n in names if originals}
+    originals = {name: originals[name] for name in names if originals}
+    return cameras, posed, {name: edited[name] for name in names}, originals
 
 
 class _Pairs:
@@ -250,12 +253,13 @@ class _Pairs:
         self,
         inputs: Inputs,
         cameras: Mapping[str, Camera],
+        posed: Mapping[str, Path],
         edited: Mapping[str, Path],
         originals: Mapping[str, Path],
         wanted: Sequence[Figure],
         loaded: Mapping[Kind, Any],
     ) -> None:
-        self.inputs, self.cameras = inputs, cameras
+        self.inputs, self.cameras, self.posed = inputs, cameras, posed
         self.edited, self.originals = edited, originals
         self.wanted, self.loaded = tuple(wanted), loaded
         self._view: Callable[[str], _View] = lru_cache(maxsize=2)(self._read)
@@ -337,10 +341,13 @@ class _Pairs:
         return values
 
     def _read(self, name: str) -> _View:
-        edited = read_picture(self.edited[name], self.inputs.background)
-        original = None
-        if name in self.originals:
-            original = read_picture(self.originals[name], self.inputs.background)
+        edited, original = (
+            read_picture(files[name], self.inputs.background, beside=self.posed.get(name))
+            if name in files
+            else None
+            for files in (self.edited, self.originals)
+        )
+        assert edited is not None
         camera, (height, width) = self.cameras[name], edited.shape[:2]
         for path, image in ((self.edited[name], edited), (self.originals.get(name), original)):
             if image is not None:
@@ -413,6 +420,7 @@ def _reconstruction(pairs: _Pairs, names: Sequence[str]) -> Task[dict[str, float
         "probe": "user reconstruction",
         "protocol": PROTOCOL,
         "edited": [_sha256(pairs.edited[name]) for name in names],
+        "posed": [_sha256(pairs.posed[name]) for name in names if name in pairs.posed],
         "intrinsics": [pairs.cameras[name].K.tolist() for name in names],
         "background": list(pairs.inputs.background),
     }
@@ -434,6 +442,7 @@ def _task(pairs: _Pairs, inputs: Inputs, one: str, two: str, device: str) -> Tas
         "protocol": PROTOCOL,
         "edited": hashed(pairs.edited),
         "originals": hashed(pairs.originals),
+        "posed": hashed(pairs.posed),
         "cameras": [pairs.cameras[name].to_dict() for name in (one, two)],
         "ply": None if inputs.ply is None else _sha256(inputs.ply),
         "figures": [figure.key for figure in pairs.wanted],

@@ -311,11 +311,19 @@ def normal_maps(folder: Path) -> list[str]:
     return sorted(p.name for p in maps if (folder / f"{p.name[:-11]}.png").is_file())
 
 
-def read_picture(path: Path, background: Sequence[float] = (0.0, 0.0, 0.0)) -> Picture:
+def read_picture(
+    path: Path, background: Sequence[float] = (0.0, 0.0, 0.0), *, beside: Path | None = None
+) -> Picture:
     """(H, W, 3) float32 sRGB in [0, 1].
 
     8 and 16 bits are divided by their largest value; grey becomes three equal channels; transparent
     pixels are laid over ``background``. A picture is turned as its EXIF tag asks, as in viewers.
+
+    Args:
+        path: picture.
+        background: sRGB in [0, 1].
+        beside: picture of the pose that this one belongs to, which may be the picture itself; see
+            :func:`attnwarp.io.read_upright`.
 
     Raises:
         InputError: not a picture, one that is damaged, or one of other than 8 or 16 bits.
@@ -324,7 +332,7 @@ def read_picture(path: Path, background: Sequence[float] = (0.0, 0.0, 0.0)) -> P
 
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; check the path")
-    image = read_upright(path, damaged="error")
+    image = read_upright(path, beside=beside, damaged="error")
     values = image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
     if image.shape[2] == 3:
         return values

@@ -5,6 +5,7 @@ renders of repainted splats.
 import importlib.util
 import itertools
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import small_capture
 import torch
 from few_splats import few_splats
+from PIL import Image
 from torch_threads import on_one_thread
 from typer.testing import CliRunner
 
@@ -111,6 +113,28 @@ def test_a_repainted_view_is_seen_and_a_second_call_computes_nothing(capture, tm
     assert call(*options, "--out", tmp_path / "b").exit_code == 0
     changed = [path.name for path, time in cells.items() if path.stat().st_mtime_ns != time]
     assert changed == ["metrics.json"]
+
+
+@pytest.mark.filterwarnings("ignore:.*EXIF")
+@pytest.mark.parametrize(
+    "tagged", ["images", pytest.param("images renders", marks=pytest.mark.door)]
+)
+def test_tags_of_posed_pictures_change_no_figure(capture, tmp_path, tagged):
+    """Oracle: the same pixels without tags. Posed pictures are taken as stored, and so is a picture
+    that has the tag of its pose's.
+    """
+    tags = Image.Exif()
+    tags[0x112] = 3  # half a turn, which no shape gives away
+    for name in ("images", "renders"):
+        (tmp_path / name).mkdir()
+        for path in (capture / name).iterdir():
+            exif = tags if name in tagged else None
+            Image.open(path).save(tmp_path / name / path.name, exif=exif)
+    shutil.copy(capture / "transforms.json", tmp_path)
+    options = ("--ply", capture / "scene.ply", "--dino=none", "--clip=none", "--perceptual=none")
+    plain, _ = measured(capture, tmp_path / "plain", *options)
+    turned, _ = measured(tmp_path, tmp_path / "turned", *options)
+    assert plain["metrics"] == turned["metrics"]
 
 
 def test_what_is_missing_is_named_with_its_figures(capture, tmp_path, monkeypatch):
