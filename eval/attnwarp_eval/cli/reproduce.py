@@ -62,6 +62,7 @@ def reproduce(
     from attnwarp.devices import device_of
     from attnwarp_eval.reproduce import cells, check
     from attnwarp_eval.reproduce.manifest import lacking, load_manifest, shipped
+    from attnwarp_eval.reproduce.seal import open_seal, write_seal
     from attnwarp_eval.study.store import Store
 
     if scheduler is not None and jobs is not None:
@@ -100,13 +101,17 @@ def reproduce(
                 typer.echo(line)
             return
         with store.lock(), resumable(lambda: f"{len(store.done())} cells are kept"):
+            if broken := open_seal(store, planned.cells):
+                report.log(
+                    f"{len(broken)} sealed files are missing or changed and are made anew:"
+                    f" {', '.join(broken[:8])}{' ...' * (len(broken) > 8)}"
+                )
             store.write_study(cells.expected(planned))
             with scheduler_lost(scheduler, lambda: len(store.done())):
                 failures = cells.execute(
                     planned, store, jobs=jobs or len(devices), scheduler=scheduler, report=report
                 )
             from attnwarp_eval.reproduce.report import write_report
-            from attnwarp_eval.reproduce.seal import write_seal
 
             paths = [*write_report(planned, store), write_seal(store)]
         for path in paths:

@@ -191,7 +191,9 @@ class Job:
             "views": len(capture.cameras), "edited": len(result.edited),
             **{k: result.counters[k] for k in COUNTED if k in result.counters},
         }  # fmt: skip
-        files = self._files(folder / "renders", folder / "edited", folder / "run" / "edited.ply")
+        files = self._files(
+            folder / "renders", folder / "edited", folder / "run" / "edited.ply", originals
+        )
         return Made(
             self.figures(result, originals), self.figures(result, originals, authors=True),
             counts, result.seconds, _gpu(self.device), files,
@@ -289,6 +291,18 @@ class Job:
 def cell_folder(run: Path, cell_id: str) -> Path:
     """Folder of a cell's files."""
     return run / "made" / cell_id[:16]
+
+
+def rests_on(cell: Cell, name: str) -> bool:
+    """Return True for a cell that made a file or reads it.
+
+    Args:
+        cell: a cell of the run.
+        name: path of the file in the run's folder.
+    """
+    part, place, *_ = (*name.split("/"), "")
+    of_scene = part in ("originals", "fits") and cell.scene in (place, place.rpartition("-")[0])
+    return of_scene or cell.id[:16] in name
 
 
 def _reset_gpu(device: str) -> None:

@@ -13,11 +13,13 @@ from attnwarp_eval.canonical_json import digest, write_json
 from attnwarp_eval.cost import environment
 from attnwarp_eval.document.model import Table
 from attnwarp_eval.document.numbers import number
+from attnwarp_eval.reproduce.cells import rests_on
 from attnwarp_eval.reproduce.manifest import FIGURES
 from attnwarp_eval.reproduce.report import RESULTS, difference
 from attnwarp_eval.statistics.contrasts import contrast
 from attnwarp_eval.statistics.intervals import over_scenes
-from attnwarp_eval.study.store import Problems, Store
+from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.store import Problems, Store, StoreError
 
 SEAL = "seal.json"
 """File of hashes: of the code and its packages, of what went in, and of every other file."""
@@ -60,6 +62,35 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def _read_seal(store: Store) -> dict[str, Any]:
+    """Content of a seal.
+
+    Raises:
+        StoreError: it is damaged.
+    """
+    path = store.root / SEAL
+    try:
+        seal: dict[str, Any] = json.loads(path.read_bytes())
+        whole = seal.pop("sha256") == digest(seal)
+    except (ValueError, KeyError, AttributeError):
+        whole = False
+    if not whole:
+        raise StoreError(
+            f"{path}: is damaged, so nothing says what the files were; remove it to have the folder"
+            " sealed as it is"
+        )
+    return seal
+
+
+def _broken(store: Store, seal: Mapping[str, Any]) -> dict[str, str]:
+    """What happened to a sealed file, by the name of each that is not as it was."""
+    return {
+        name: "changed since it was sealed" if (store.root / name).is_file() else "is missing"
+        for name, sha256 in seal["files"].items()
+        if not (store.root / name).is_file() or _sha256(store.root / name) != sha256
+    }
+
+
 def verify(store: Store) -> Problems:
     """Compute the hashes of a sealed run again.
 
@@ -67,25 +98,38 @@ def verify(store: Store) -> Problems:
         StoreError: the folder is no run.
     """
     found = store.verify()
-    path = store.root / SEAL
     try:
-        seal = json.loads(path.read_bytes())
-        sealed = seal.pop("sha256")
-        files: Mapping[str, str] = seal["files"]
-    except (ValueError, KeyError, AttributeError):
-        found.damaged.append(f"{path}: is no seal; run the command again, which writes it")
+        seal = _read_seal(store)
+    except StoreError as error:
+        found.damaged.append(str(error))
         return found
-    if digest(seal) != sealed:
-        found.damaged.append(f"{path}: its checksum does not fit its content")
     if store.read_study()["inputs"] != seal["inputs"]:
-        found.damaged.append(f"{path}: has other inputs than study.json")
-    for name, sha256 in files.items():
-        file = store.root / name
-        if not file.is_file():
-            found.damaged.append(f"{file}: is sealed, and missing")
-        elif _sha256(file) != sha256:
-            found.damaged.append(f"{file}: changed since it was sealed")
+        found.damaged.append(f"{store.root / SEAL}: has other inputs than study.json")
+    found.damaged += [f"{store.root / name}: {what}" for name, what in _broken(store, seal).items()]
     return found
+
+
+def open_seal(store: Store, cells: Sequence[Cell]) -> list[str]:
+    """Compare a run with its seal and take the seal off; return the sealed files that are missing
+    or changed.
+
+    These are removed, with the records of the cells that rest on them, so that the run makes them
+    anew. A folder without a seal is left alone.
+
+    Raises:
+        StoreError: the seal is damaged.
+    """
+    if not is_reproduction(store.root):
+        return []
+    broken = list(_broken(store, _read_seal(store)))
+    for name in broken:
+        for cell in cells:
+            if rests_on(cell, name):
+                store.path(cell.id).unlink(missing_ok=True)
+        (store.root / name).unlink(missing_ok=True)
+    # Last: a run that is killed before finds the same ones again.
+    (store.root / SEAL).unlink()
+    return broken
 
 
 def side_by_side(one: Path, two: Path) -> tuple[list[str], Table]:

@@ -161,6 +161,14 @@ def test_a_sealed_run_is_verified_and_held_beside_another(folder, run):
         assert bad.exit_code == 3 and name.split("/")[-1] in bad.stdout
         assert call("compare", run, other).exit_code == 2
         path.write_bytes(whole_file)
+    lost = other / "originals/spheres/view-0001.png"
+    measured = next((other / "made").glob("*/measured/cells/*/*.json"))
+    lost.unlink()
+    measured.write_bytes(measured.read_bytes()[:-30])
+    assert "2 sealed files are missing or changed" in whole(folder, other).stderr
+    assert "every hash fits" in call("verify", other).stdout
+    assert files(other / "originals") == files(run / "originals")
+    assert (other / "results.json").read_bytes() == (run / "results.json").read_bytes()
 
 
 @pytest.fixture(scope="module")

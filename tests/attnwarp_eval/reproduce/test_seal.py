@@ -5,8 +5,9 @@ import json
 import pytest
 
 from attnwarp_eval.reproduce.manifest import FIGURES
-from attnwarp_eval.reproduce.seal import side_by_side, write_seal
-from attnwarp_eval.study.store import Store
+from attnwarp_eval.reproduce.seal import open_seal, side_by_side, verify, write_seal
+from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.store import Store, StoreError
 
 CLIP = FIGURES["CLIP"]
 
@@ -25,6 +26,32 @@ def sealed(folder, figures):
     (folder / "results.json").write_text(json.dumps({"cells": cells}))
     write_seal(store)
     return folder
+
+
+def test_a_seal_is_compared_before_it_is_taken_off(tmp_path):
+    """Oracle: by hand, the cells that rest on each damaged file; one of another scene stays."""
+    cells = [Cell({"name": name}, name, "DGE", "reproduction", 0) for name in ("a", "b", "c")]
+    a, b, c = cells
+    files = ("originals/a/view-0000.png", f"made/{b.id[:16]}/measured/x.json",
+             f"made/{c.id[:16]}/renders/view-0000.png", "notes.txt")  # fmt: skip
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("whole")
+    store = Store(sealed(tmp_path, {}))
+    assert open_seal(store, cells) == []
+    for cell in cells:
+        store.write({"id": cell.id, "spec": cell.spec})
+    write_seal(store)
+    (tmp_path / files[0]).unlink()
+    (tmp_path / files[1]).write_text("cut")
+    assert len(verify(store).damaged) == 2
+    assert open_seal(store, cells) == sorted(files[:2])
+    assert store.done() == {c.id}
+    there = [(tmp_path / name).exists() for name in (*files, "seal.json")]
+    assert there == [False, False, True, True, False]
+    (tmp_path / "seal.json").write_text('{"files": {}}')
+    with pytest.raises(StoreError, match="is damaged"):
+        open_seal(store, cells)
 
 
 @pytest.mark.parametrize(
