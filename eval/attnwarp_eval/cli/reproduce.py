@@ -100,6 +100,7 @@ def reproduce(
             for line in estimate(planned, left, devices, report):
                 typer.echo(line)
             return
+        store.refuse_strangers()
         with store.lock(), resumable(lambda: f"{len(store.done())} cells are kept"):
             if broken := open_seal(store, planned.cells):
                 report.log(

@@ -169,24 +169,28 @@ def _say_open_bounces(scene: Scene) -> None:
 
 
 def _check_no_capture(folder: Path) -> None:
-    """Refuse to write over the poses of a capture, which nothing could bring back.
+    """Refuse to write over the poses or the points of a capture, which nothing could bring back.
 
     Raises:
-        InputError: the folder's transforms.json names other views than an export does.
+        InputError: the folder's transforms.json names other views than an export does, or there are
+            points without a view of an export.
     """
     import json
 
     from attnwarp.errors import InputError
     from attnwarp_eval.splats.export import EXPORTED
 
-    path = folder / "transforms.json"
-    if not path.is_file():
-        return
-    try:
-        frames = json.loads(path.read_bytes())["frames"]
-        exported = all(EXPORTED.fullmatch(PurePath(frame["file_path"]).name) for frame in frames)
-    except (ValueError, LookupError, TypeError):
-        exported = False
+    path, points = folder / "transforms.json", folder / "points.ply"
+    if path.is_file():
+        try:
+            frames = json.loads(path.read_bytes())["frames"]
+            views = [PurePath(frame["file_path"]).name for frame in frames]
+        except (ValueError, LookupError, TypeError):
+            views = [""]
+        exported = all(EXPORTED.fullmatch(view) for view in views)
+    else:  # the export did not end
+        path, pictures = points, (folder / "images").glob("*")
+        exported = not points.exists() or any(EXPORTED.fullmatch(p.name) for p in pictures)
     if not exported:
         raise InputError(
             f"{path}: is of a capture that this command did not write; name another folder"

@@ -8,6 +8,7 @@ from typing import Any
 
 import yaml
 
+from attnwarp.errors import InputError
 from attnwarp_eval.drawn.scenes import Drawn
 from attnwarp_eval.files import write_atomic
 
@@ -81,10 +82,21 @@ class _Dumper(yaml.SafeDumper):
 
 
 def write(scene: Drawn, folder: Path) -> Path:
-    """Write a scene into a folder, as ``NAME.yaml`` with its meshes; each file appears when whole."""
-    for name, source in scene.files.items():
-        if not (folder / name).is_file():
-            write_atomic(folder / name, source.read_bytes(), durable=False)
+    """Write a scene into a folder, as ``NAME.yaml`` with its meshes; each file appears when whole.
+
+    Raises:
+        InputError: one of the files is there with other content; nothing is written.
+    """
     path = folder / f"{scene.spec.name}.yaml"
-    write_atomic(path, to_text(scene.data).encode(), durable=False)
+    contents = {folder / name: source.read_bytes() for name, source in scene.files.items()}
+    contents[path] = to_text(scene.data).encode()
+    missing = [file for file in contents if not file.exists()]
+    for file, content in contents.items():
+        if file not in missing and file.read_bytes() != content:
+            raise InputError(
+                f"{file}: is not the file that would be drawn here, and would be lost; name another"
+                " folder, or move it away"
+            )
+    for file in missing:
+        write_atomic(file, contents[file], durable=False)
     return path

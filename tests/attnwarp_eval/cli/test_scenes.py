@@ -26,21 +26,25 @@ def test_a_value_that_makes_no_sense_is_told_in_a_line(tmp_path, arguments, says
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("name", "text"),
     [
-        json.dumps({"frames": [{"file_path": "images/IMG_0001.jpg"}]}),
-        json.dumps(
-            {"frames": [{"file_path": "images/orbit_000_of_1.png"}, {"file_path": "b.png"}]}
+        ("transforms.json", json.dumps({"frames": [{"file_path": "images/IMG_0001.jpg"}]})),
+        (
+            "transforms.json",
+            json.dumps(
+                {"frames": [{"file_path": "images/orbit_000_of_1.png"}, {"file_path": "b.png"}]}
+            ),
         ),
-        "{",
+        ("transforms.json", "{"),
+        ("points.ply", "ply"),
     ],
 )
-def test_an_export_leaves_the_poses_of_a_capture_alone(tmp_path, text):
-    (tmp_path / "transforms.json").write_text(text)
+def test_an_export_leaves_the_poses_and_points_of_a_capture_alone(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
     done = CliRunner().invoke(app, [*EXPORT, str(tmp_path)])
     assert done.exit_code == 2 and "of a capture that this command did not write" in done.stderr
-    assert (tmp_path / "transforms.json").read_text() == text
-    assert [path.name for path in tmp_path.iterdir()] == ["transforms.json"]
+    assert (tmp_path / name).read_text() == text
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_a_scene_is_shown_before_how_its_pictures_are_made():

@@ -110,6 +110,26 @@ def test_a_drawn_file_loads_with_every_edit_and_sees_its_first_thing_from_everyw
             assert np.isin(geometry.trace(camera).object_id, first).mean() > 0.01, camera.name
 
 
+def test_a_file_that_was_changed_by_hand_is_not_drawn_over(tmp_path):
+    meshes, out = tmp_path / "meshes", tmp_path / "out"
+    meshes.mkdir()
+    for name, height in (("a", 1), ("b", 2)):
+        text = f"v 0 0 0\nv 1 0 0\nv 0 {height} 0\nv 0 0 1\nf 1 2 3\nf 1 3 4\nf 1 2 4\nf 2 3 4\n"
+        (meshes / f"{name}.obj").write_text(text)
+    command = ["scenes", "draw", "1", "--seed", "3", "--out", str(out), "--meshes", str(meshes)]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    written = {path: path.read_bytes() for path in out.rglob("*.*")}
+    assert CliRunner().invoke(app, command).exit_code == 0
+    for changed in written:
+        for path in written:
+            path.unlink(missing_ok=True)
+        changed.write_bytes(written[changed] + b"# mine\n")
+        done = CliRunner().invoke(app, command)
+        assert done.exit_code == 2 and f"{changed}: is not the file" in done.output
+        assert list(out.rglob("*.*")) == [changed]
+        assert changed.read_bytes() == written[changed] + b"# mine\n"
+
+
 def test_the_four_answers_of_the_parts_give_each_of_twelve_parts_each_colour_once():
     scene = draw(4, seed=7)
     answers = next(e for e in scene.spec.edits if e.name == "parts").answers
