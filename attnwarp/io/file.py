@@ -68,6 +68,33 @@ def check_other(out: Path, source: Path, what: str) -> None:
         raise InputError(f"{out}: is {what}; choose another name for the result")
 
 
+def inside(folder: Path, name: str | os.PathLike[str]) -> Path:
+    """Return the path of a name in a folder, for names that a file or another person gives.
+
+    Args:
+        folder: the folder that the path has to stay in.
+        name: path from there.
+
+    Raises:
+        InputError: it leads out of the folder, by ``..``, as an absolute path or by a link.
+
+    Example:
+        >>> inside(Path("run"), "pictures/a.png").as_posix()
+        'run/pictures/a.png'
+        >>> inside(Path("run"), "../a.png")
+        Traceback (most recent call last):
+        attnwarp.errors.InputError: '../a.png': leads out of run, expected a path inside it
+    """
+    path = folder / name
+    try:
+        stays = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):  # a name or links that lead nowhere
+        stays = False
+    if not stays:
+        raise InputError(f"{str(name)!r}: leads out of {folder}, expected a path inside it")
+    return path
+
+
 def existing_file(path: str | os.PathLike[str]) -> Path:
     """``path`` as a Path.
 

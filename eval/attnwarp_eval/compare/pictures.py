@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from attnwarp.io.file import inside
 from attnwarp_eval.compare.snapshot import Figure, Measured, Snapshot, definition
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.gates import Margin, margin
@@ -84,7 +85,7 @@ def write_pictures(baseline: Path, pictures: Pictures) -> None:
             shutil.rmtree(left)
     for (cell, seed, view), files in pictures.items():
         for content, file in files.items():
-            path = _folder(new, cell, seed, view) / f"{content}.jpg"
+            path = inside(_folder(new, cell, seed, view), f"{content}.jpg")
             write_atomic(path, file.read_bytes())
     if folder.is_dir():
         folder.rename(former)
@@ -98,7 +99,7 @@ def _folder(pictures: Path, cell: str, seed: int, view: str) -> Path:
     """Folder of the pictures of a view, which may have a slash in its name, such as
     ``edit/yaw030``.
     """
-    return pictures / f"{cell}-{seed}" / view.replace("/", "__")
+    return inside(pictures, f"{cell}-{seed}/{view.replace('/', '__')}")
 
 
 def _views(cell: Measured) -> list[str]:

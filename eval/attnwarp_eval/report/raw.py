@@ -120,7 +120,9 @@ def _study(data: Any) -> Study:
 
 
 def _outcome(cell: dict[str, Any], record: dict[str, Any] | None) -> Outcome:
-    return Outcome.of(cell, None if record is None else probe(cell["probe"]).read(record))
+    if record is None:
+        return Outcome.of(cell, None)
+    return Outcome.of(cell, probe(cell["probe"]).read({**record, "pictures": []}))
 
 
 def read_parts(folder: Path) -> Results:

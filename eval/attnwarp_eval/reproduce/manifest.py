@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationError, field_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, field_validator
 
 from attnwarp.errors import InputError, suggest
 from attnwarp_eval.files import write_atomic
@@ -34,6 +34,18 @@ KEYS = "docs/measuring/reproducing.md"
 """File that says what each key means."""
 
 Words = Annotated[str, Field(min_length=1), BeforeValidator(lambda v: v.strip() if v else v)]
+
+
+def _file_name(name: str) -> str:
+    if name in ("", "..") or PurePath(name).name != name or not name.isprintable():
+        raise ValueError(
+            f"got the name {name!r}, expected one that a file can have, without a slash"
+        )
+    return name
+
+
+Name = Annotated[str, AfterValidator(_file_name)]
+"""Name that becomes part of the paths of files."""
 
 
 class Edit(Part):
@@ -76,7 +88,7 @@ class Capture(Part):
     source: str | None = None
     splats: dict[Literal["2d", "3d"], str] = Field(default_factory=dict)
     mask: MaskPart | None = None
-    edits: Annotated[dict[str, Edit], Field(min_length=1)]
+    edits: Annotated[dict[Name, Edit], Field(min_length=1)]
 
 
 class Weights(Part):
@@ -138,7 +150,7 @@ class Manifest(Part):
     title: str
     size: Annotated[Whole, Field(ge=16, le=4096)] = 512
     max_size: Annotated[Whole, Field(ge=16)] | None = None
-    captures: Annotated[dict[str, Capture], Field(min_length=1)]
+    captures: Annotated[dict[Name, Capture], Field(min_length=1)]
     fit: dict[str, Any] = Field(default_factory=dict)
     seeds: Annotated[list[Whole], Field(min_length=1)] = Field(default_factory=lambda: [0])
     editors: Annotated[dict[str, Weights], Field(min_length=1)]

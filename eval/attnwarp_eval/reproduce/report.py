@@ -382,7 +382,8 @@ def _ask_people(results: Results) -> Path | None:
     if not folders:
         return None
     try:
-        text = build_page(read_items(folders), Design(), "Which edit do you prefer?")
+        items = read_items(folders, within=results.root)
+        text = build_page(items, Design(), "Which edit do you prefer?")
     except InputError:  # views of different numbers
         return None
     write_atomic(results.root / PAGE, text.encode())

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from attnwarp.errors import InputError
+from attnwarp.io.file import inside
 from attnwarp_eval.canonical_json import digest, write_json
 from attnwarp_eval.cost import environment
 from attnwarp_eval.document.model import Table
@@ -72,7 +73,9 @@ def _read_seal(store: Store) -> dict[str, Any]:
     try:
         seal: dict[str, Any] = json.loads(path.read_bytes())
         whole = seal.pop("sha256") == digest(seal)
-    except (ValueError, KeyError, AttributeError):
+        for name in seal["files"]:
+            inside(store.root, name)
+    except (InputError, ValueError, LookupError, TypeError, AttributeError):
         whole = False
     if not whole:
         raise StoreError(

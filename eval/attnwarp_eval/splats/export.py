@@ -16,6 +16,7 @@ import numpy.typing as npt
 from attnwarp.camera import Camera
 from attnwarp.fit.views import HELD_OUT_EVERY
 from attnwarp.gaussians import SH_C0
+from attnwarp.io.file import inside
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.scene import Scene, SceneError
@@ -239,6 +240,7 @@ def export(
     from attnwarp_eval.files import write_picture
 
     folder = Path(folder)
+    mask_folders = [inside(folder / "masks", name) for name in scene.object_names]
     # It is written last: until then nothing may pass for the cameras of what is written here.
     (folder / "transforms.json").unlink(missing_ok=True)
     report.step(0, views, "points")
@@ -254,10 +256,9 @@ def export(
         shown.append(geometry.trace(camera).object_id)
     masks = []
     for number in sorted({*np.unique(shown)} - {-1}):
-        of = folder / "masks" / scene.object_names[number]
         for camera, ids in zip(cameras, shown, strict=True):
             white = np.repeat(255 * (ids == number)[..., None].astype(np.uint8), 3, axis=-1)
-            masks.append(write_picture(of / f"{camera.name}.png", white))
+            masks.append(write_picture(mask_folders[number] / f"{camera.name}.png", white))
     splits: list[str | None] = ["test" if out else "train" for out in held_out(views)]
     dataset = Dataset(cameras, paths, cloud.points, cloud.colors, splits)
     write_transforms(folder, dataset, points_name="points.ply")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from attnwarp.errors import InputError
+from attnwarp.io.file import inside
 from attnwarp_eval.cost import environment, source_hash
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.scene.scene import Scene
@@ -170,7 +171,7 @@ def _unpack_scene(scene: SceneFiles, folder: Path) -> Path:
 def unpack(parcel: Parcel, store: Store) -> Failure | None:
     """Write a cell that came back into the run's folder: its pictures first, then its record."""
     for name, content in parcel.pictures.items():
-        write_atomic(store.root / name, content)
+        write_atomic(inside(store.root, name), content)
     # The worker's source is this one's, byte for byte; its copy need not know the revision.
     here = environment()
     own = {**parcel.record["environment"], "git": here["git"], "source": here["source"]}

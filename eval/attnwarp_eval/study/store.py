@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from attnwarp.errors import InputError
-from attnwarp.io.file import remove_abandoned
+from attnwarp.io.file import inside, remove_abandoned
 from attnwarp.io.lock import locked
 from attnwarp_eval.canonical_json import digest, write_json
 
@@ -204,12 +204,21 @@ class Store:
             ) from None
         if record.get("format") != FORMAT:
             raise StoreError(f"{path}: {OLDER}")
-        problem = _seal_problem(record)
+        problem = _seal_problem(record) or self._path_problem(record)
         if _digest(record.get("spec")) != cell_id:
             problem = "the hash of its spec is not its id"
         if problem:
             raise StoreError(f"{path}: {problem}; run again, which computes it anew")
         return record
+
+    def _path_problem(self, record: Mapping[str, Any]) -> str | None:
+        """What is wrong with the files that a record names: it may come from elsewhere."""
+        try:
+            for entry in (*record.get("pictures", ()), *record.get("files", ())):
+                inside(self.root, entry["path"])
+        except (InputError, LookupError, TypeError) as error:
+            return f"names a file that is not of the run ({error})"
+        return None
 
     def read_as(self, cell_id: str, read: Callable[[dict[str, Any]], T]) -> T:
         """Apply ``read`` to the record of a finished cell.

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from attnwarp.errors import InputError, suggest
+from attnwarp.io.file import inside
 from attnwarp.io.picture import encode_picture
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.report import read_results
@@ -71,22 +72,26 @@ def _along_the_orbit(view: str) -> tuple[float, str]:
     return (float(yaw[1].replace("m", "-").replace("p", ".")) if yaw else 0.0, view)
 
 
-def read_items(runs: Sequence[Path], methods: Sequence[str] | None = None) -> list[Item]:
+def read_items(
+    runs: Sequence[Path], methods: Sequence[str] | None = None, *, within: Path | None = None
+) -> list[Item]:
     """The edited scenes of runs of which at least two methods have pictures.
 
     Args:
         runs: folders.
         methods: variants to compare, or the parts between commas of such names; all that have
             pictures if None.
+        within: folder that holds the pictures of captures; that of each run if None.
 
     Raises:
-        InputError: there is none, a method that no run has, or runs that contradict each other.
+        InputError: there is none, a picture that lies elsewhere, a method that no run has, or runs
+            that contradict each other.
     """
     items: dict[tuple[str, str, int], Item] = {}
     first: dict[tuple[str, str], tuple[str, Path]] = {}  # item and method -> how, and the run
     for run in runs:
         captured = (run / CAPTURED).is_file()
-        for key, one, method, how in _captured(run) if captured else _edited(run):
+        for key, one, method, how in _captured(run, within or run) if captured else _edited(run):
             item = items.setdefault(key, one)
             if item.content != one.content:
                 raise InputError(
@@ -167,12 +172,14 @@ def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
             )
 
 
-def _captured(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
+def _captured(run: Path, within: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
     """The edited capture of a run with ``--data``, as :func:`_edited` gives a study's cells."""
     try:
         data = json.loads((run / CAPTURED).read_text(encoding="utf-8"))
         instruction, count = data["words"]["instruction"], len(data["views"])
-        folders = {name: run / row["folder"] for name, row in data["variants"].items()}
+        rows = data["variants"].items()
+        folders = {name: run / row["folder"] for name, row in rows}
+        originals = run / data.get("originals", "originals")
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{run / CAPTURED}: damaged ({error!r}); run the study again, finished edits are kept"
@@ -180,7 +187,8 @@ def _captured(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]
     views = sorted({k * count // MOST_VIEWS for k in range(MOST_VIEWS)} if count > MOST_VIEWS
                    else range(count))  # fmt: skip
     files = [f"view-{view:04d}.png" for view in views]
-    originals = run / data.get("originals", "originals")
+    for folder in (originals, *folders.values()):
+        inside(within, folder.absolute())
     before = {Path(name).stem: originals / name for name in files}
     key = (run.resolve().name, "edit", 0)
     for method, folder in folders.items():

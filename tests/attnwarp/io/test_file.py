@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
+from attnwarp.errors import InputError
 from attnwarp.io import file, write_points
-from attnwarp.io.file import write_atomically
+from attnwarp.io.file import inside, write_atomically
 
 KILLED = """
 import os, signal, sys
@@ -106,3 +107,17 @@ def test_a_process_of_another_namespace_is_of_another_place(tmp_path, monkeypatc
         assert file._host() != own and file.remove_abandoned(tmp_path) == 0
     file._host.cache_clear()
     assert file._host() == own and file.remove_abandoned(tmp_path) == 1
+
+
+@pytest.mark.parametrize(
+    "name", ["../b", "a/../../b", "/etc/passwd", "link", "link/b", "loop", "a\0b"]
+)
+def test_a_name_that_leads_out_of_its_folder_is_refused(tmp_path, name):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "link").symlink_to(tmp_path)
+    (folder / "loop").symlink_to(folder / "loop")
+    with pytest.raises(InputError, match="leads out of"):
+        inside(folder, name)
+    for own in ("a", "a/../b", "...", "a/b..png", str(folder / "a")):
+        assert inside(folder, own) == folder / own

@@ -4,6 +4,7 @@ import pathlib
 
 import pytest
 
+from attnwarp.errors import InputError
 from attnwarp_eval.compare import Snapshot
 from attnwarp_eval.compare import pictures as module
 from attnwarp_eval.compare.pictures import folder_of, pictures_of_baseline, write_pictures
@@ -32,6 +33,17 @@ def test_views_are_found_again_whatever_their_names(tmp_path):
     baseline = tmp_path / "base.jsonl"
     write_pictures(baseline, written(tmp_path, *views, text="of"))
     assert read(baseline, *views, "unpictured") == {view: f"of {view}" for view in views}
+
+
+def test_no_picture_leads_out_of_the_baselines_folder(tmp_path):
+    """A baseline or a run may come from elsewhere."""
+    baseline = tmp_path / "gate.jsonl"
+    (key, files), *_ = written(tmp_path, "a", text="new").items()
+    with pytest.raises(InputError, match="leads out of"):
+        write_pictures(baseline, {key: {"../../../evil": files["mask"]}})
+    with pytest.raises(InputError, match="leads out of"):
+        write_pictures(baseline, {("../../evil", *key[1:]): files})
+    assert not list(tmp_path.glob("evil*")) + list(tmp_path.parent.glob("evil*"))
 
 
 def test_former_pictures_stay_until_all_of_the_new_ones_are_there(tmp_path, monkeypatch):

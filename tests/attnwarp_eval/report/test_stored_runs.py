@@ -7,7 +7,10 @@ new report.md there. The runs' two scenes have direct light, so they are given t
 the format is changed on purpose, run the studies in their study.json again and put the new folders there.
 """
 
+import base64
+import hashlib
 import json
+import lzma
 import shutil
 
 import pytest
@@ -17,6 +20,7 @@ from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import write_report
+from attnwarp_eval.report.raw import write_raw
 from attnwarp_eval.study import Store
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import Layout, report_of
@@ -63,6 +67,48 @@ def test_a_run_of_an_older_version_is_refused_in_one_line(folder, tmp_path):
         assert done.exit_code == 2, done.output
         assert done.stderr.endswith(f"{path}: made by an older version; run it again\n")
         assert done.stderr.count("\n") == 1 and not done.stdout
+
+
+SECRET = b"nobody's but mine"
+
+
+def shown(data, path):
+    """The JSON of a record, with a file in the place of each picture."""
+    views, sha256 = [view["view"] for view in data["views"]], hashlib.sha256(SECRET).hexdigest()
+    named = [{"view": v, "what": w, "path": path, "sha256": sha256}
+             for v in views for w in ("mask", "warped", "truth", "depth")]  # fmt: skip
+    return data | {"pictures": named}
+
+
+@pytest.mark.parametrize("how", ["above", "absolute", "link"])
+def test_a_run_from_elsewhere_shows_no_file_outside_its_folder(folder, tmp_path, how):
+    """Oracle: the bytes of a file beside the run, which a record names with its right hash."""
+    secret, store = tmp_path / "secret.jpg", Store(tmp_path / "run")
+    shutil.copytree(folder / "variants", store.root)
+    secret.write_bytes(SECRET)
+    (store.root / "pictures").mkdir()
+    (store.root / "pictures/linked.jpg").symlink_to(secret)
+    path = {"above": "../secret.jpg", "absolute": str(secret), "link": "pictures/linked.jpg"}[how]
+    for cell in store.done():
+        store.write(shown(store.read(cell), path))
+    done = CliRunner().invoke(app, ["verify", str(store.root)])
+    assert done.exit_code == 3 and "names a file that is not of the run" in done.stdout
+    done = CliRunner().invoke(app, ["report", str(store.root)])
+    assert done.exit_code == 3
+    assert base64.b64encode(SECRET) not in (store.root / "report.html").read_bytes()
+
+
+@pytest.mark.door
+def test_raw_results_from_elsewhere_show_no_file(folder, tmp_path):
+    (tmp_path / "secret.jpg").write_bytes(SECRET)
+    raw = write_raw(Store(folder / "variants"), tmp_path / "raw/results.jsonl.xz")
+    head, *lines = lzma.decompress(raw.read_bytes()).decode().splitlines()
+    cells = [json.loads(line) for line in lines]
+    changed = [json.dumps(c | {"record": shown(c["record"], "../secret.jpg")}) for c in cells]
+    raw.write_bytes(lzma.compress("\n".join([head, *changed]).encode()))
+    done = CliRunner().invoke(app, ["report", str(raw.parent)])
+    assert done.exit_code == 0, done.output
+    assert base64.b64encode(SECRET) not in (raw.parent / "report.html").read_bytes()
 
 
 @pytest.mark.parametrize(("size", "small"), [(255, True), (256, False)])

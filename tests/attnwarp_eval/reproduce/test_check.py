@@ -104,6 +104,10 @@ def no_prompt(folder, manifest):
     del manifest["captures"]["two"]["edits"]["red"]["source"]
 
 
+def outside(folder, manifest):
+    manifest["captures"]["../../evil"] = manifest["captures"].pop("two")
+
+
 def empty_prompt(folder, manifest):
     manifest["captures"]["two"]["edits"]["red"]["target"] = None
 
@@ -156,6 +160,7 @@ def wrong_editor(folder, manifest):
 MISTAKES = {
     two_names: "the key 'one' stands here and on line 5; keep one",
     other_version: "format: got 2, expected 1: the manifest is of another version",
+    outside: "captures.../../evil.[key]: got the name '../../evil', expected one that a file can have",
     no_prompt: "captures.two.edits.red.source: is missing, expected the words",
     empty_prompt: "captures.two.edits.red.target: is empty, expected the words",
     other_checkpoint: "editors.pix2pix.probe: weights/pix2pix gives",
@@ -172,7 +177,10 @@ MISTAKES = {
 
 @pytest.mark.parametrize(
     "mistake",
-    [pytest.param(m, marks=() if m is other_checkpoint else pytest.mark.door) for m in MISTAKES],
+    [
+        pytest.param(m, marks=() if m in (other_checkpoint, outside) else pytest.mark.door)
+        for m in MISTAKES
+    ],
 )
 def test_a_planted_mistake_is_refused_by_name_before_anything_runs(copied, mistake):
     folder, manifest = copied

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from attnwarp_eval.canonical_json import digest, write_json
 from attnwarp_eval.reproduce.manifest import FIGURES
 from attnwarp_eval.reproduce.seal import open_seal, side_by_side, verify, write_seal
 from attnwarp_eval.study.cell import Cell
@@ -31,7 +32,7 @@ def sealed(folder, figures):
 def test_a_seal_is_compared_before_it_is_taken_off(tmp_path):
     """Oracle: by hand, the cells that rest on each damaged file; one of another scene stays."""
     cells = [Cell({"name": name}, name, "DGE", "reproduction", 0) for name in ("a", "b", "c")]
-    a, b, c = cells
+    _, b, c = cells
     files = ("originals/a/view-0000.png", f"made/{b.id[:16]}/measured/x.json",
              f"made/{c.id[:16]}/renders/view-0000.png", "notes.txt")  # fmt: skip
     for name in files:
@@ -52,6 +53,12 @@ def test_a_seal_is_compared_before_it_is_taken_off(tmp_path):
     (tmp_path / "seal.json").write_text('{"files": {}}')
     with pytest.raises(StoreError, match="is damaged"):
         open_seal(store, cells)
+    seal = {"files": {"../mine.txt": "0" * 64}}  # of a run from elsewhere
+    write_json(tmp_path / "seal.json", {**seal, "sha256": digest(seal)})
+    (tmp_path.parent / "mine.txt").write_text("mine")
+    with pytest.raises(StoreError, match="is damaged"):
+        open_seal(store, cells)
+    assert (tmp_path.parent / "mine.txt").exists()
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,12 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi
 from typer.testing import CliRunner
 
+from attnwarp.errors import InputError
 from attnwarp.io import read_dataset
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats import export, fitted
 from attnwarp_eval.study.run import execute, plan
 from attnwarp_eval.study.store import Store
@@ -109,6 +111,15 @@ def test_an_exported_scene_reads_back_as_it_is(spheres, tmp_path):
         np.testing.assert_allclose(theirs.K, ours.K, rtol=1e-15)
         image = cv2.imread(str(path))[..., ::-1]
         np.testing.assert_array_equal(image, export.picture(spheres, ours, 1))
+
+
+def test_an_object_whose_name_leads_elsewhere_is_exported_nowhere(spheres, tmp_path):
+    first, *others = spheres.spec.objects
+    objects = (first.model_copy(update={"name": "../../evil"}), *others)
+    scene = Scene(spheres.spec.model_copy(update={"objects": objects}))
+    with pytest.raises(InputError, match="leads out of"):
+        export.export(scene, tmp_path / "out", views=2, size=16, spp=1, points=20)
+    assert not list(tmp_path.iterdir())
 
 
 def test_exported_masks_are_the_pixels_whose_rays_meet_the_object_first(spheres, tmp_path):
