@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Hashable, Sequence
 
 from attnwarp.reporting import Reporter
@@ -26,23 +27,26 @@ class CellReporter:
 
     def __init__(self, todo: Sequence[Cell], done: int, report: Reporter) -> None:
         self.report, self.done, self.total = report, done, done + len(todo)
-        self._rest = {cell.id: cell for cell in todo}
-        self._since: dict[str, float] = {}
+        self._waiting = Counter(_kind(cell) for cell in todo)
+        self._working: dict[str, tuple[Kind, float]] = {}
         self._most = 1  # cells at work at a time
-        self._spent: dict[Hashable, list[float]] = {}
+        self._spent: dict[Hashable, tuple[int, float]] = {}
 
     def start(self, cell: Cell) -> None:
-        """Report that a cell begins."""
-        self._since[cell.id] = time.perf_counter()
-        self._most = max(self._most, len(self._since))
+        """Report that a cell begins, or begins once more."""
+        if cell.id not in self._working:
+            self._waiting[_kind(cell)] -= 1
+        self._working[cell.id] = _kind(cell), time.perf_counter()
+        self._most = max(self._most, len(self._working))
         self._step(cell)
 
     def end(self, cell: Cell, failure: Failure | None) -> None:
         """Report that a cell ended, and what went wrong."""
-        seconds = time.perf_counter() - self._since.pop(cell.id)
-        for group in _groups(cell):
-            self._spent.setdefault(group, []).append(seconds)
-        del self._rest[cell.id]
+        kind, since = self._working.pop(cell.id)
+        seconds = time.perf_counter() - since
+        for group in _groups(kind):
+            count, total = self._spent.get(group, (0, 0.0))
+            self._spent[group] = count + 1, total + seconds
         self.done += 1
         if failure is not None:
             self.report.log(f"{cell.title} FAILED: {failure.error}")
@@ -52,22 +56,33 @@ class CellReporter:
         self.report.step(self.done, self.total, cell.title, self.left())
 
     def left(self) -> float:
-        """Seconds; NaN while they cannot be told."""
-        rest = self._rest.values()
-        unseen = sum(cell.probe not in self._spent for cell in rest)
-        if not self._spent or 2 * unseen > len(rest) or not rest:
+        """Seconds; NaN while they cannot be told.
+
+        Cells of a kind are counted together, so that a step of a study of many cells costs as
+        little as one of few.
+        """
+        now, rest = time.perf_counter(), self.total - self.done
+        parts = [(kind, count, 0.0) for kind, count in self._waiting.items()]
+        parts += [(kind, 1, now - since) for kind, since in self._working.values()]
+        unseen = sum(count for kind, count, _ in parts if kind[0] not in self._spent)
+        if not self._spent or 2 * unseen > rest or not rest:
             return math.nan
-        now = time.perf_counter()
-        seconds = sum(
-            max(0.0, self._expected(cell) - (now - self._since.get(cell.id, now))) for cell in rest
-        )
-        return seconds / min(self._most, len(rest))
+        seconds = sum(count * max(0.0, self._expected(kind) - gone) for kind, count, gone in parts)
+        return seconds / min(self._most, rest)
 
-    def _expected(self, cell: Cell) -> float:
-        spent = next(self._spent[group] for group in _groups(cell) if group in self._spent)
-        return sum(spent) / len(spent)
+    def _expected(self, kind: Kind) -> float:
+        count, total = next(self._spent[g] for g in _groups(kind) if g in self._spent)
+        return total / count
 
 
-def _groups(cell: Cell) -> tuple[Hashable, ...]:
+Kind = tuple[str, str]
+"""Probe and variant of a cell."""
+
+
+def _kind(cell: Cell) -> Kind:
+    return cell.probe, cell.variant
+
+
+def _groups(kind: Kind) -> tuple[Hashable, ...]:
     """Groups that a cell's seconds belong to, the narrowest first."""
-    return (cell.probe, cell.variant), cell.probe, None
+    return kind, kind[0], None

@@ -69,6 +69,36 @@ def test_workers_share_what_is_left_and_what_they_are_at_is_partly_done(clock):
                     (6, 9, todo[0].title, 9.0)]  # fmt: skip
 
 
+def test_a_step_among_many_cells_costs_what_one_among_few_costs(clock):
+    """Oracle: looks at cells, which follow their number and not its square."""
+
+    class Counted(Cell):
+        looks = 0
+
+        def __getattribute__(self, name):
+            Counted.looks += name == "probe"
+            return super().__getattribute__(name)
+
+    def looks(count):
+        todo = [Counted({"k": k}, "a", f"v{k % 3}", "warp", 0) for k in range(count)]
+        Counted.looks = 0
+        lefts(clock, todo, {("warp", f"v{k}"): 1 for k in range(3)})
+        return Counted.looks
+
+    assert looks(200) == 2 * looks(100)
+
+
+def test_a_cell_that_is_tried_once_more_counts_once(clock):
+    todo = cells("warp x", scenes="ab")
+    said = []
+    reporter = CellReporter(todo, 0, Watched(lambda *step: said.append(step)))
+    for seconds in (3, 5):  # a worker is lost after 3
+        reporter.start(todo[0])
+        clock.seconds += seconds
+    reporter.end(todo[0], None)
+    assert said[-1] == (1, 2, todo[0].title, 5.0)
+
+
 def test_a_cell_that_fails_is_told_in_a_line(clock):
     (cell,) = cells("warp x", scenes="a")
     lines = []
