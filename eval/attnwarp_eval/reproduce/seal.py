@@ -86,7 +86,7 @@ def _read_seal(store: Store) -> dict[str, Any]:
 
 
 def _broken(store: Store, seal: Mapping[str, Any]) -> dict[str, str]:
-    """What happened to a sealed file, by the name of each that is not as it was."""
+    """Name of each sealed file that is not as it was, and what happened to it."""
     return {
         name: "changed since it was sealed" if (store.root / name).is_file() else "is missing"
         for name, sha256 in seal["files"].items()

@@ -11,6 +11,9 @@ from attnwarp.reporting import Reporter
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.record import Failure
 
+LEFT_SECONDS = 0.1
+"""Least time between two workings of the time left: cells may take less, and have many kinds."""
+
 
 class CellReporter:
     """Reports cells as they begin and end.
@@ -31,6 +34,7 @@ class CellReporter:
         self._working: dict[str, tuple[Kind, float]] = {}
         self._most = 1  # cells at work at a time
         self._spent: dict[Hashable, tuple[int, float]] = {}
+        self._told = -math.inf, math.nan
 
     def start(self, cell: Cell) -> None:
         """Report that a cell begins, or begins once more."""
@@ -56,12 +60,14 @@ class CellReporter:
         self.report.step(self.done, self.total, cell.title, self.left())
 
     def left(self) -> float:
-        """Seconds; NaN while they cannot be told.
+        """Seconds; NaN while they cannot be told."""
+        now = time.perf_counter()
+        if now - self._told[0] >= LEFT_SECONDS or self.done == self.total:
+            self._told = now, self._left(now)
+        return self._told[1]
 
-        Cells of a kind are counted together, so that a step of a study of many cells costs as
-        little as one of few.
-        """
-        now, rest = time.perf_counter(), self.total - self.done
+    def _left(self, now: float) -> float:
+        rest = self.total - self.done
         parts = [(kind, count, 0.0) for kind, count in self._waiting.items()]
         parts += [(kind, 1, now - since) for kind, since in self._working.values()]
         unseen = sum(count for kind, count, _ in parts if kind[0] not in self._spent)

@@ -212,7 +212,7 @@ class Store:
         return record
 
     def _path_problem(self, record: Mapping[str, Any]) -> str | None:
-        """What is wrong with the files that a record names: it may come from elsewhere."""
+        """Fault of the files that a record names, which may come from elsewhere, or None."""
         try:
             for entry in (*record.get("pictures", ()), *record.get("files", ())):
                 inside(self.root, entry["path"])
