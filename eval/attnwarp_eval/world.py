@@ -141,6 +141,27 @@ def _world(scene: str, size: int, content: bytes) -> World:
     return World(load_scene(scene), size)
 
 
+def turned(scene: Scene, yaw: float) -> Camera:
+    """The scene's source camera, taken around the point that it looks at by ``yaw`` degrees, at the
+    same height.
+    """
+    spec = scene.spec.cameras
+    angle = np.radians(spec.source.yaw + yaw)
+    position = (
+        spec.look_at[0] + spec.radius * float(np.cos(angle)),
+        spec.look_at[1] + spec.radius * float(np.sin(angle)),
+        float(scene.source.position[2]),
+    )
+    return Camera.look_at(
+        position,
+        spec.look_at,
+        width=spec.size[0],
+        height=spec.size[1],
+        fov_y=spec.fov,
+        name=f"turned{yaw:g}",
+    )
+
+
 def changed(what: str) -> InputError:
     """The error of a scene that is no longer what a cell was planned for."""
     return InputError(f"{what} has changed since the run was planned; start the run again")
