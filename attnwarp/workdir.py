@@ -179,7 +179,7 @@ class Workdir:
         remedy = "name another folder" if name == MANIFEST else "remove it, it is made anew"
         try:
             return json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise FileFormatError(path, f"not JSON ({error}); {remedy}") from None
 
     def write_picture(self, name: str, pixels: npt.NDArray[np.uint8]) -> None:
@@ -294,6 +294,8 @@ class Workdir:
         if checksum != hashlib.sha256(data).hexdigest().encode():
             raise FileFormatError(path, f"its checksum does not match, so it is damaged; {remedy}")
         state: dict[str, Any] = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        if not isinstance(state, dict):
+            raise FileFormatError(path, f"not a checkpoint; {remedy}")
         return state
 
 

@@ -223,7 +223,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """A JSON file that holds an object. Raises InputError naming the file."""
     try:
         value = json.loads(read_text(path))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error}); fetch the file again") from None
     if not isinstance(value, dict):
         raise InputError(f"{path}: holds a {type(value).__name__}, expected an object")

@@ -398,7 +398,7 @@ def _read_json(path: Path) -> Any:
         raise FileFormatError(
             path, "not JSON, and no text; name a transforms.json, its folder or a COLMAP folder"
         ) from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         first = str(error).splitlines()[0]
         raise FileFormatError(path, f"not JSON: {first}; write the file again") from None
 
@@ -527,7 +527,10 @@ def number(value: Any) -> float | None:
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
-    return float(value) if math.isfinite(value) else None
+    try:
+        return float(value) if math.isfinite(value) else None
+    except OverflowError:  # a whole number beyond 1.8e308
+        return None
 
 
 class _Values:

@@ -54,9 +54,11 @@ def test_every_flipped_bit_and_every_end_is_refused(tmp_path):
         refused(path)
 
 
-def test_a_checkpoint_of_an_earlier_version_is_refused(tmp_path):
+def test_a_checkpoint_of_an_earlier_version_or_of_no_names_is_refused(tmp_path):
     path = tmp_path / "c.pt"
     torch.save(state(), path)
+    refused(path, "not a checkpoint")
+    folder_of(path).save(path.name, list(state().values()))
     refused(path, "not a checkpoint")
     folder_of(path).save(path.name, state())
     path.write_bytes(path.read_bytes().replace(b" %d " % FORMAT, b" %d " % (FORMAT - 1), 1))

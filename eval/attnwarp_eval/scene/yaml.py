@@ -8,6 +8,12 @@ from contextlib import suppress
 from typing import Any, TypeVar
 
 import yaml
+from yaml.composer import Composer
+
+DEEPEST = 100
+"""Levels of lists and keys within each other, within Python's stack; a scene has 8."""
+
+TOO_DEEP = f"nested deeper than {DEEPEST} levels, or in itself; write it flat"
 
 
 class YamlError(ValueError):
@@ -40,10 +46,16 @@ for _kind, _pattern, _first in (
 
 if yaml.__with_libyaml__:
 
-    class _Quick(yaml.CSafeLoader):
-        """libyaml's parser, four times as fast."""
+    class _Quick(Composer, yaml.CSafeLoader):
+        """libyaml's parser, four times as fast, with PyYAML's composer: libyaml's own ends the
+        process where a text is nested too deep.
+        """
 
         yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
+
+        def __init__(self, text: str) -> None:
+            yaml.CSafeLoader.__init__(self, text)
+            Composer.__init__(self)
 
 
 def _root(text: str) -> yaml.Node | None:
@@ -78,8 +90,8 @@ def read_yaml(text: str) -> tuple[dict[Place, int], Any]:
     are words; so are dates, and ``yes``, ``no``, ``on`` and ``off``. Every key is a word.
 
     Raises:
-        YamlError: the text is empty or no YAML; a key stands twice or is no word; or a value is
-            not what its tag says.
+        YamlError: the text is empty, no YAML or too deep; a key stands twice or is no word; or a
+            value is not what its tag says.
 
     Example:
         >>> lines, data = read_yaml("fov: 045\\nsize: [3e2, 0256]")
@@ -102,6 +114,8 @@ def read_yaml(text: str) -> tuple[dict[Place, int], Any]:
             f"{_bare_color(text)}",
             mark.line + 1 if mark else None,
         ) from error
+    except RecursionError:
+        raise YamlError(TOO_DEEP) from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # an escape such as \\UFFFFFFFF
         raise YamlError(f"not valid YAML: {_line(error)}") from error
 
@@ -114,6 +128,8 @@ class _Reading:
 
     def value(self, node: yaml.Node, place: Place) -> Any:
         line = node.start_mark.line + 1
+        if len(place) > DEEPEST:
+            raise YamlError(TOO_DEEP, line)
         if isinstance(node, yaml.MappingNode):
             return self._mapping(node, place)
         if isinstance(node, yaml.SequenceNode):

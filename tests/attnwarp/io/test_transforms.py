@@ -476,6 +476,8 @@ def test_keys_that_change_nothing_pass_and_unknown_ones_are_named(tmp_path):
         ("-0.25", "true", "holds True"),
         ("-0.25", "null", "holds None"),
         ("-0.25", "1e999", "holds inf"),
+        pytest.param("-0.25", "9" * 309, "holds 99999", id="309 digits"),
+        pytest.param("-0.25", "[" * 100_000, "transforms.json: not JSON", id="brackets"),
         ('"w": 8', '"w": true', "w: got True"),
         ('"w": 8', '"w": "8"', "w: got '8'"),
         ('"w": 8', '"w": 8, "w": 9', "w: stands twice"),

@@ -66,6 +66,10 @@ edits:
         ("a: \x07\n", None, "not valid YAML: .*special characters"),
         ("a: [1\nb: 2\n", 2, "check indentation and quotes"),
         ("", None, "the file is empty"),
+        pytest.param("[" * 100_000, None, "nested deeper than", id="100,000 levels"),
+        pytest.param("a: " + "[" * 150 + "]" * 150, 1, "nested deeper than", id="150 levels"),
+        ("x: &x [*x]\n", 1, "nested .* in itself"),
+        ("x: &x {<<: *x}\n", None, "nested .* in itself"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_with_its_line(text, line, message):
