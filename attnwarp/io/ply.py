@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import io
 import os
-import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,7 +25,7 @@ from attnwarp import check
 from attnwarp.errors import InputWarning
 from attnwarp.gaussians import LARGEST_FILTER, LEAST_FILTER, SCREEN_FILTER, Gaussians, Kind
 from attnwarp.io.file import FileFormatError, existing_file, write_atomically
-from attnwarp.io.text import is_text, plain_ply, split_ply
+from attnwarp.io.text import is_text, overstated, plain_ply, split_ply
 
 Array = npt.NDArray[np.float64]
 Columns = dict[str, npt.NDArray[Any]]
@@ -469,16 +468,14 @@ def _check_header(path: Path) -> tuple[bytes, bool]:
     if found is None:
         return b"", False
     lines, start = found
-    for name, digits in re.findall(
-        rb"^\s*element\s+(\S+)\s+(\d+)", b"\n".join(lines), re.MULTILINE
-    ):
-        if len(digits) > 18 or int(digits) > size:
-            raise FileFormatError(
-                path,
-                f"the header announces {digits[:30].decode()} rows, but the file has {size} bytes;"
-                " get the file again, whole",
-                field=name.decode("ascii", "replace"),
-            )
+    if (beyond := overstated(lines, size)) is not None:
+        name, count = beyond
+        raise FileFormatError(
+            path,
+            f"the header announces {count} rows, but the file has {size} bytes; get the file again,"
+            " whole",
+            field=name,
+        )
     return begin[:start], is_text(lines)
 
 

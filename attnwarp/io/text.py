@@ -70,6 +70,25 @@ def plain_ply(data: bytes) -> bytes:
     return b"\n".join(lines) + b"\n" + body
 
 
+def overstated(lines: list[bytes], size: int) -> tuple[str, str] | None:
+    """The first element of which a PLY header announces more rows than the file has bytes, and the
+    number that it announces; None where there is none. Readers take memory for announced rows.
+
+    Args:
+        lines: of the header.
+        size: of the file, in bytes.
+
+    Example:
+        >>> overstated([b"ply", b"element vertex 8", b"element face 200000000"], 300)
+        ('face', '200000000')
+    """
+    found = re.findall(rb"^\s*element\s+(\S+)\s+(\d+)", b"\n".join(lines), re.MULTILINE)
+    for name, digits in found:
+        if len(digits) > 18 or int(digits) > size:
+            return name.decode("ascii", "replace"), digits[:30].decode()
+    return None
+
+
 def is_text(lines: list[bytes]) -> bool:
     """True for a PLY header that announces a body of text."""
     return any(line.split()[:2] == [b"format", b"ascii"] for line in lines)

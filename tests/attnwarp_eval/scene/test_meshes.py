@@ -1,5 +1,6 @@
 """Mesh files from people: what other programs write comes in whole, and what is damaged does not."""
 
+import cProfile
 import json
 import struct
 import warnings
@@ -246,6 +247,13 @@ p 1
             "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n",
             "holds no faces",
         ),
+        pytest.param(
+            "a.ply",
+            "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\n"
+            "element face 200000000\nproperty list uchar int vertex_indices\nend_header\n",
+            "announces 200000000 face, but the file has 143 bytes",
+            id="a header that announces what would take gigabytes",
+        ),
         ("a.glb", "glTF", "begins with no glTF header"),
         ("a.step", "", "mesh format '.step' is not read; use one of .ply, .obj"),
     ],
@@ -402,6 +410,33 @@ def test_a_file_of_gltfpack_is_read_when_quantised_and_refused_by_name_when_comp
         ValueError, match="needs the glTF extension 'EXT_meshopt_compression', which is not read"
     ):
         read_mesh(FILES / "gltfpack-meshopt.glb")
+
+
+def test_colours_beyond_one_are_clamped_as_gltf_says(tmp_path):
+    """Oracle: glTF 2.0, section 3.7.2.1. The colours are the positions, from -2 to 1.5."""
+
+    def change(document):
+        document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = 0
+
+    mesh = read_glb(tmp_path, change)
+    assert CUBE.vertices.min() < 0 and CUBE.vertices.max() > 1
+    assert np.array_equal(mesh.tint, np.clip(mesh.vertices, 0, 1))
+
+
+@pytest.mark.parametrize("node", [{}, {"translation": [1, 0, 0]}])
+def test_a_node_costs_few_calls(tmp_path, node):
+    """Counted, as seconds vary; deep copies of each node's defaults took 100."""
+
+    def calls(count):
+        def change(document):
+            document["nodes"] += [node] * count
+            document["scenes"][0]["nodes"] = list(range(1 + count))
+
+        with cProfile.Profile() as profile:
+            read_glb(tmp_path, change)
+        return sum(entry.callcount for entry in profile.getstats())
+
+    assert calls(300) - calls(0) < 300 * 30
 
 
 def test_textures_and_animations_are_told(tmp_path):

@@ -23,6 +23,8 @@ READ = ("KHR_mesh_quantization",)
 LOOKS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_animation_")
 """Beginnings of the names of extensions that no geometry depends on."""
 
+POSE = frozenset(("matrix", "translation", "rotation", "scale"))
+
 POINTS, LINES, TRIANGLES, STRIP, FAN = 0, (1, 2, 3), 4, 5, 6
 
 
@@ -66,13 +68,13 @@ class _Mesh(_Part):
 
 
 class _Node(_Part):
-    children: list[Index] = []
+    children: tuple[Index, ...] = ()
     mesh: Index | None = None
     skin: int | None = None
     matrix: list[Number] | None = Field(None, min_length=16, max_length=16)
-    translation: list[Number] = Field([0, 0, 0], min_length=3, max_length=3)
-    rotation: list[Number] = Field([0, 0, 0, 1], min_length=4, max_length=4)
-    scale: list[Number] = Field([1, 1, 1], min_length=3, max_length=3)
+    translation: tuple[Number, Number, Number] = (0, 0, 0)
+    rotation: tuple[Number, Number, Number, Number] = (0, 0, 0, 1)
+    scale: tuple[Number, Number, Number] = (1, 1, 1)
 
 
 class _Scene(_Part):
@@ -206,9 +208,11 @@ class _Reader:
             if index in visited:
                 raise ValueError(f"glTF: node {index} is reached twice, expected a tree")
             visited.add(index)
-            pose = above @ _pose(node)
-            if not np.isfinite(pose).all():
-                raise ValueError(f"glTF: the transform of node {index} is not finite")
+            pose = above
+            if not node.model_fields_set.isdisjoint(POSE):
+                pose = above @ _pose(node)
+                if not np.isfinite(pose).all():
+                    raise ValueError(f"glTF: the transform of node {index} is not finite")
             yield node, pose
             waiting += [(child, pose) for child in reversed(node.children)]
 
@@ -230,8 +234,9 @@ class _Reader:
         tint = None
         if "COLOR_0" in primitive.attributes:
             tint = self._values(primitive.attributes["COLOR_0"], "VEC3", "VEC4")[:, :3]
-            if len(tint) != len(points) or not ((tint >= 0) & (tint <= 1)).all():
-                raise ValueError("glTF: COLOR_0 is not a colour from 0 to 1 for each vertex")
+            if len(tint) != len(points):
+                raise ValueError("glTF: COLOR_0 is not a colour for each vertex")
+            tint = tint.clip(0, 1)  # section 3.7.2.1
         if np.linalg.det(pose[:3, :3]) < 0:
             triangles = triangles[:, ::-1]  # a mirror turns triangles over
         return points @ pose[:3, :3].T + pose[:3, 3], triangles, tint

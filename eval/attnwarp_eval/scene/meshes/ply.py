@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 
-from attnwarp.io.text import plain_ply, split_ply
+from attnwarp.io.text import overstated, plain_ply, split_ply
 from attnwarp_eval.scene.meshes.surface import Surface, unit_colors
 
 
@@ -20,12 +20,14 @@ def read_ply(data: bytes) -> Surface:
 
     data = plain_ply(data)
     found = split_ply(data)
-    header = b"" if found is None else data[: found[1]]
+    head, start = found or ([], 0)
+    if (beyond := overstated(head, len(data))) is not None:
+        raise ValueError(f"announces {beyond[1]} {beyond[0]}, but the file has {len(data)} bytes")
     stream = io.BytesIO(data)
     try:
         ply = PlyData.read(stream)
         if ply.text:
-            lines = sum(bool(line.strip()) for line in data[len(header) :].splitlines())
+            lines = sum(bool(line.strip()) for line in data[start:].splitlines())
             announced = sum(element.count for element in ply.elements)
             if lines != announced:
                 raise ValueError(f"announces {announced} items, but {lines} lines follow")
