@@ -1,4 +1,4 @@
-"""Beginning and end of both commands: Ctrl-C is one line from the first moment to the last."""
+"""Beginning and end of both commands: a stop is one line from the first moment to the last."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import os
 import signal
 import sys
 from typing import Any
+
+from attnwarp.process import STOPS, heeded
 
 STOPPED = 130
 """Exit code after Ctrl-C, a polite kill or the terminal's end, as shells have it for Ctrl-C."""
@@ -37,8 +39,10 @@ def enter(name: str, module: str) -> None:
 
     before = signal.getsignal(signal.SIGINT)
     heeds = before is signal.default_int_handler  # a shell's background job ignores Ctrl-C
-    if heeds:
-        signal.signal(signal.SIGINT, leave)
+    # Before its import's end, a command has nothing to keep.
+    early = [*heeded(STOPS), *([signal.SIGINT] if heeds else [])]
+    for number in early:
+        signal.signal(number, leave)
     sys.argv[1:] = [expanded(argument) for argument in sys.argv[1:]]
     main = importlib.import_module(module).main
     if heeds:
@@ -54,8 +58,8 @@ def enter(name: str, module: str) -> None:
             os._exit(done.code)
         raise
     finally:
-        if heeds:
-            signal.signal(signal.SIGINT, lambda *_: os._exit(STOPPED))
+        for number in early:
+            signal.signal(number, lambda *_: os._exit(STOPPED))
 
 
 def expanded(argument: str) -> str:

@@ -171,8 +171,9 @@ def write_atomically(
                 os.fsync(stream.fileno())
         temporary.replace(path)
     except BaseException as error:
-        # A full disk is found by write(), which does not know what it wrote to.
-        if isinstance(error, OSError) and error.errno is not None and error.filename is None:
+        # A full disk is found by write(), which does not know what it wrote to, and a folder that
+        # cannot be written to by the temporary file, which means nothing to a person.
+        if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
             error.filename = str(path)
         temporary.unlink(missing_ok=True)
         raise

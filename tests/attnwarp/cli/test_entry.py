@@ -40,6 +40,19 @@ def test_a_path_that_no_shell_expanded_is_in_the_home_folder(tmp_path):
     assert not (tmp_path / "~").exists()
 
 
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_stop_while_a_command_is_imported_is_one_line(name, tmp_path):
+    (tmp_path / "imported.py").write_text(
+        f"import os, signal, time\nos.kill(os.getpid(), signal.{name})\ntime.sleep(9)"
+    )
+    program = "from attnwarp.cli.entry import enter; enter('attnwarp', 'imported')"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=tmp_path, check=False
+    )
+    assert done.returncode == 130
+    assert done.stderr == "attnwarp: stopped; nothing was written\n"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seconds", [0.1, 0.3])
 @pytest.mark.parametrize(

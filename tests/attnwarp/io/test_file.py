@@ -90,6 +90,13 @@ def test_a_folder_in_a_files_place_is_named_and_nothing_is_left(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
+def test_a_folder_that_takes_no_files_is_named_by_the_file_that_was_asked_for():
+    """Linux's /proc, where root can write nothing either."""
+    with pytest.raises(OSError, match="No such file") as caught:
+        write_atomically("/proc/a.txt", lambda stream: stream.write(b"whole"))
+    assert caught.value.filename == "/proc/a.txt"
+
+
 @pytest.mark.parametrize("name", [255 * "n", 63 * "\N{GRINNING FACE}"], ids=["1 byte", "4 bytes"])
 def test_a_name_as_long_as_the_file_system_takes_can_be_written(tmp_path, name):
     write_atomically(tmp_path / name, lambda stream: stream.write(b"whole"))
