@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import os
-import tempfile
-from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
-from attnwarp.process import cache_dir
+from attnwarp.process import kernel_folders
 
 HERE = Path(__file__).parent
 
@@ -23,19 +20,7 @@ def kernel_folder() -> Path | None:
         return Path(os.environ["NUMBA_CACHE_DIR"])
     if os.access(HERE, os.W_OK):
         return None
-    return next(_writable(), None)
-
-
-def _writable() -> Iterator[Path]:
-    folders = [cache_dir() / "numba"]
-    with suppress(FileNotFoundError):  # no temporary folder either
-        folders.append(Path(tempfile.gettempdir()) / f"attnwarp-{os.getuid()}" / "numba")
-    for folder in folders:
-        with suppress(OSError):
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            # What lies there is run: in a shared folder another user may have made it.
-            if os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid():
-                yield folder
+    return next(kernel_folders("numba"), None)
 
 
 def _chosen() -> bool:

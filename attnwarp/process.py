@@ -7,9 +7,10 @@ import gc
 import os
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,26 @@ def cache_dir() -> Path:
     # Not Path.home(), which raises where a container's user has none.
     home = os.path.expanduser("~/.cache")  # noqa: PTH111
     return Path(os.environ.get("XDG_CACHE_HOME") or home) / "attnwarp"
+
+
+def kernel_folders(name: str) -> Iterator[Path]:
+    """Folders for compiled kernels that belong to this user, made if need be: in the cache, then in
+    the temporary folder.
+
+    What lies there is run, and in a shared place another user may have made the folder, or one
+    between it and the temporary folder: there is none.
+
+    Args:
+        name: of the compiler, such as "numba".
+    """
+    folders = [cache_dir() / name]
+    with suppress(FileNotFoundError):  # no temporary folder either
+        folders.append(Path(tempfile.gettempdir()) / f"attnwarp-{os.getuid()}-{name}")
+    for folder in folders:
+        with suppress(OSError):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK) and folder.lstat().st_uid == os.getuid():
+                yield folder
 
 
 def resend_lost_interrupts() -> None:

@@ -34,6 +34,7 @@ from typing import Any
 import torch
 
 from attnwarp.errors import optional_imports
+from attnwarp.process import kernel_folders
 from attnwarp.render.exact import outputs_of
 from attnwarp.render.interface import OUTPUTS, PICTURES, Inputs, Outputs
 
@@ -57,7 +58,7 @@ def _cache_folder() -> str | None:
         folder = folder.parent
     if own or os.access(folder, os.W_OK):
         return None
-    return str(Path(tempfile.gettempdir()) / f"attnwarp-warp-{os.getuid()}")
+    return str(next(kernel_folders("warp"), None) or tempfile.mkdtemp())
 
 
 wp.config.log_level = wp.LOG_WARNING

@@ -51,12 +51,27 @@ def test_a_cache_that_cannot_be_written_is_left_for_a_temporary_folder(monkeypat
     monkeypatch.setenv("ATTNWARP_CACHE", "/proc/none")
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
     deny(monkeypatch, numba_cache.HERE)
-    own = tmp_path / f"attnwarp-{os.getuid()}" / "numba"
+    own = tmp_path / f"attnwarp-{os.getuid()}-numba"
     assert numba_cache.kernel_folder() == own
     # A folder that somebody else made in a shared place holds code of theirs.
     monkeypatch.setattr("os.getuid", lambda: own.stat().st_uid + 1)
-    (tmp_path / f"attnwarp-{os.getuid()}" / "numba").mkdir(parents=True)
+    (tmp_path / f"attnwarp-{os.getuid()}-numba").mkdir()
     assert numba_cache.kernel_folder() is None
+
+
+def test_warp_takes_no_folder_of_another_user_either(monkeypatch, tmp_path):
+    gpu = pytest.importorskip("attnwarp.render.gpu", exc_type=ImportError)
+    monkeypatch.delenv("WARP_CACHE_PATH", raising=False)
+    monkeypatch.setenv("ATTNWARP_CACHE", "/proc/none")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "home" / ".cache").mkdir(parents=True)
+    deny(monkeypatch, tmp_path / "home" / ".cache")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("os.getuid", lambda: tmp_path.stat().st_uid + 1)
+    theirs = tmp_path / f"attnwarp-{os.getuid()}-warp"
+    theirs.mkdir()
+    chosen = Path(gpu._cache_folder())
+    assert chosen.parent == tmp_path and chosen != theirs
 
 
 @pytest.mark.slow
@@ -75,5 +90,5 @@ def test_a_read_only_installation_without_a_home_renders(tmp_path):
     )
     # The nearest pixel lies half a pixel off the disc's centre in both directions.
     offset = 3 * math.tan(math.radians(20)) / 16 / 0.5
-    expected = [f"{temporary}/attnwarp-{os.getuid()}/numba", f"{math.exp(-(offset**2)):.4f}"]
+    expected = [f"{temporary}/attnwarp-{os.getuid()}-numba", f"{math.exp(-(offset**2)):.4f}"]
     assert done.stdout.split() == expected, done.stderr
