@@ -56,9 +56,9 @@ def install_command(*extras: str) -> str:
 
     Example:
         >>> print(install_command("edit", "eval"))
-        in the checkout: pip install -c constraints.txt '.[edit,eval]'
+        in the checkout: pip install -c constraints.txt -e '.[edit,eval]'
     """
-    return f"in the checkout: pip install -c constraints.txt '.[{','.join(extras)}]'"
+    return f"in the checkout: pip install -c constraints.txt -e '.[{','.join(extras)}]'"
 
 
 class InputError(ValueError):

@@ -107,13 +107,14 @@ def test_the_library_alone_works_and_names_the_extra_that_is_missing(environment
     assert Path(place).is_relative_to(environment.parent)
     assert shape == "(1, 192)"
     assert len(missing) == 2
-    assert all("pip install -c constraints.txt '.[edit]'" in line for line in missing)
+    assert all("pip install -c constraints.txt -e '.[edit]'" in line for line in missing)
     for program in ("attnwarp", "attnwarp-eval"):
         assert "Usage" in run(environment / program, "--help", cwd=tmp_path, check=True).stdout
     done = run(environment / "attnwarp-eval", "scenes", "list", cwd=tmp_path)
     assert done.returncode == 2
     assert (
-        done.stderr.count("\n") == 1 and "pip install -c constraints.txt '.[eval]'" in done.stderr
+        done.stderr.count("\n") == 1
+        and "pip install -c constraints.txt -e '.[eval]'" in done.stderr
     )
 
 

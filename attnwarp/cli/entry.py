@@ -22,7 +22,7 @@ def enter(name: str, module: str) -> None:
     """Import a command and run its ``main``.
 
     Args:
-        name: of the command, for its messages.
+        name: of the command, with which its messages begin.
         module: where its ``main`` is.
     """
 
@@ -48,7 +48,7 @@ def enter(name: str, module: str) -> None:
     if heeds:
         signal.signal(signal.SIGINT, interrupt)
     try:
-        main()
+        main(name)
     except KeyboardInterrupt:
         leave()
     except SystemExit as done:

@@ -27,5 +27,6 @@ def inspect(
     if find_spec("attnwarp_eval") is None:
         raise fail(f"inspect: needs the package attnwarp_eval; {install_command('inspect')}")
     # The library does not import the instrument: this process becomes its command.
-    command = [sys.executable, "-m", "attnwarp_eval", "inspect", str(splats)]
-    os.execv(sys.executable, [*command, "--data", str(data), *context.args])
+    become = "from attnwarp.cli.entry import enter; enter('attnwarp', 'attnwarp_eval.cli.main')"
+    command = [sys.executable, "-c", become, "inspect", str(splats), "--data", str(data)]
+    os.execv(sys.executable, [*command, *context.args])

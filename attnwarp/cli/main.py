@@ -38,9 +38,9 @@ app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options"
 app.command("edit-image")(shell.clear_errors()(edit_image))
 
 
-def main() -> None:
+def main(name: str = "attnwarp") -> None:
     """Entry point of the console script."""
-    shell.run(app)
+    shell.run(app, name)
 
 
 if __name__ == "__main__":

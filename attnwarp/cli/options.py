@@ -316,4 +316,4 @@ def program_options(
     ] = False,
 ) -> None:
     """Options without a command, of either program."""
-    begin(str(context.command.name))
+    begin(str(context.info_name))

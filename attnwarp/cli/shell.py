@@ -185,14 +185,19 @@ def assignments(changes: list[str], options: dict[str, str]) -> dict[str, Any]:
     return values
 
 
-def run(app: typer.Typer) -> None:
-    """Run a command line to its exit code: the entry point of either program."""
+def run(app: typer.Typer, name: str) -> None:
+    """Run a command line to its exit code: the entry point of either program.
+
+    Args:
+        app: the command line.
+        name: with which its messages begin.
+    """
     skip_last_collection()
     resend_lost_interrupts()
-    begin(str(app.info.name))
+    begin(name)
     try:
         try:
-            app()
+            app(prog_name=name)
         finally:
             sys.stdout.flush()
     except BrokenPipeError:

@@ -39,7 +39,7 @@ def test_the_extras_of_the_errors_are_those_of_the_package(extra):
 
 
 def test_a_missing_package_is_an_input_error_that_names_its_extra():
-    named = pytest.raises(MissingExtraError, match=r"pip install -c constraints.txt '\.\[gpu\]'")
+    named = pytest.raises(MissingExtraError, match=r"pip install -c constraints.txt -e '\.\[gpu\]'")
     with named as caught, optional_imports():
         raise ModuleNotFoundError("No module named 'warp'", name="warp")
     assert isinstance(caught.value, InputError)
@@ -98,7 +98,7 @@ def test_a_command_without_its_extra_ends_in_one_line_and_code_2(argv, module, e
     assert done.returncode == 2, done.stderr
     assert done.stderr == (
         f"attnwarp-eval: needs the package {module}, which comes with the extra '{extra}';"
-        f" in the checkout: pip install -c constraints.txt '.[{extra}]'\n"
+        f" in the checkout: pip install -c constraints.txt -e '.[{extra}]'\n"
     )
 
 

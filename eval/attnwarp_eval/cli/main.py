@@ -54,9 +54,9 @@ app.add_typer(userstudy.app, name="userstudy")
 app.add_typer(cache.app, name="cache")
 
 
-def main() -> None:
+def main(name: str = "attnwarp-eval") -> None:
     """Entry point of the console script."""
-    shell.run(app)
+    shell.run(app, name)
 
 
 if __name__ == "__main__":

@@ -236,5 +236,5 @@ def test_a_missing_extra_is_one_clear_line(folder, photo, tmp_path, monkeypatch)
     assert result.exit_code == 2
     assert (
         "editors need diffusers, which is not installed; in the checkout: pip install -c"
-        " constraints.txt '.[edit]'" in result.output
+        " constraints.txt -e '.[edit]'" in result.output
     )

@@ -27,7 +27,7 @@ def test_a_polite_kill_says_what_is_kept_as_ctrl_c_does(name):
     program = "import typer\nfrom attnwarp.cli.options import program_options\napp = typer.Typer(name='attnwarp-eval')\napp.callback()(program_options)\n@app.command()\ndef main():\n"
     program += "".join(f"    {line}\n" for line in INTERRUPTED.format(name=name).splitlines())
     done = subprocess.run(
-        [sys.executable, "-c", f"{program}\napp(['main'])"],
+        [sys.executable, "-c", f"{program}\napp(['main'], prog_name='attnwarp-eval')"],
         capture_output=True,
         text=True,
         timeout=60,

@@ -277,6 +277,11 @@ def test_the_librarys_command_becomes_the_instruments(folders, tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "pixel (16, 16)" in done.stdout and out.stat().st_size > 1000
+    done = subprocess.run(
+        [sys.executable, "-m", "attnwarp", "inspect", folders / "no.ply", folders],
+        env=environment(), capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2 and done.stderr.startswith("attnwarp: ")
 
 
 def test_the_first_picture_of_a_large_scene_fits_in_memory(tmp_path):
