@@ -6,7 +6,6 @@ import struct
 import warnings
 from pathlib import Path
 
-import damage_files
 import matplotlib.path
 import numpy as np
 import pytest
@@ -546,29 +545,6 @@ def test_a_stray_triangle_is_told_by_a_scene_and_its_truth(tmp_path):
     with pytest.warns(ExtentNotice, match=r"makes the scene 1e\+05 wide instead of 2 \(thing\)"):
         Geometry(strayed)
     assert "a thousandth of the surface" in contents(strayed)
-
-
-@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
-@damage_files.seeds_of(12, 120)
-def test_damaged_meshes_are_refused_in_one_line_or_are_meshes(tmp_path, suffix, seeds):
-    ball = trimesh.creation.icosphere(1)
-    ball.visual.vertex_colors = np.tile([[200, 100, 50, 255]], (len(ball.vertices), 1))
-    path = tmp_path / f"ball{suffix}"
-    ball.export(path)
-
-    def read(data):
-        path.write_bytes(data)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MeshNotice)
-            mesh = read_mesh(path)
-        assert np.isfinite(corners(mesh)).all() and len(mesh.faces)
-        assert mesh.tint is None or ((mesh.tint >= 0) & (mesh.tint <= 1)).all()
-
-    failed = damage_files.failures(
-        suffix, path.read_bytes(), read, seeds, refusals=(ValueError,),
-        text=suffix in (".obj", ".off"),
-    )  # fmt: skip
-    assert not failed, "\n".join(failed)
 
 
 def test_a_mesh_turned_inside_out_is_told(tmp_path):
