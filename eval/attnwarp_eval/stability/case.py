@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from importlib import resources
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+
+from attnwarp_eval.scene.yaml import read_yaml
 
 if TYPE_CHECKING:
     import torch
@@ -261,6 +265,42 @@ class Outcome:
         """Verdict in one word; what must be refused and is holds."""
         margin = self.margin
         return "refused" if math.isnan(margin) else "holds" if margin >= 0 else "breaks"
+
+
+@cache
+def _rows() -> dict[str, dict[str, Any]]:
+    """The rows of cases.yaml by the case's name."""
+    text = (resources.files("attnwarp_eval.stability") / "cases.yaml").read_text("utf-8")
+    return {
+        name: {key: tuple(v) if isinstance(v, list) else v for key, v in row.items()}
+        for name, row in read_yaml(text)[1].items()
+    }
+
+
+def hard(
+    name: str,
+    measure: Callable[[float, Way], float],
+    ways: tuple[Way, ...],
+    *,
+    bounds: Mapping[Direction, Bound],
+    must_refuse: Callable[[float, Way], bool] = lambda level, way: False,
+) -> Case:
+    """The case whose texts and levels stand in a row of cases.yaml.
+
+    Args:
+        name: row of the table.
+        measure, ways, bounds, must_refuse: as in :class:`Case`.
+
+    Example:
+        >>> from attnwarp_eval.stability.case import exact, hard, ways
+        >>> bounds = {"forward": exact("hidden pixels accepted")}
+        >>> hard("opposed_views", lambda level, way: 0.0, ways("cpu"), bounds=bounds).required
+        180
+    """
+    return Case(
+        name=name, measure=measure, ways=ways, bounds=bounds, must_refuse=must_refuse,
+        **_rows()[name],
+    )  # fmt: skip
 
 
 def level_name(level: float) -> str:

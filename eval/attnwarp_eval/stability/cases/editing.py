@@ -17,7 +17,7 @@ from attnwarp.editing.schedule import Prediction, Schedule
 from attnwarp.warp import FeatureWarp, Surface, WarpedView, warp_surfaces
 from attnwarp_eval.ideal.editor import Answers, IdealUNet
 from attnwarp_eval.stability.bilinear import Extended, extended, sampling_matrix
-from attnwarp_eval.stability.case import Bound, Case, Way, exact, ways
+from attnwarp_eval.stability.case import Bound, Way, exact, hard, ways
 from attnwarp_eval.stability.cases.warps import (
     BOUNDS_ONLY,
     HALVES,
@@ -319,138 +319,49 @@ def _ideal(tokens: int, alpha: float, way: Way) -> float:
 IDEAL = Bound("of 1", 1e-3, "a quarter of a step of an 8-bit picture is 1e-3")
 
 CASES = [
-    Case(
-        41,
+    hard(
         "half_attention",
-        "Attention features in half precision",
-        input="tokens of a 16 x 16 layer, blended at a = 0.7",
-        oracle="torch's grid_sample and the blend's formula in float64",
-        hardness="magnitude of the features",
-        levels=(1e-3, 1, 1e2, 1e4, 6e4, 1e30),
-        required=6e4,
-        quick=(1, 6e4),
+        _magnitude,
+        ways("reference", "cpu", precisions=HALVES),
         bounds={"forward": ROUNDED},
-        ways=ways("reference", "cpu", precisions=HALVES),
-        measure=_magnitude,
-        limit="1e30 has no float16",
     ),
-    Case(
-        42,
+    hard(
         "blend_weight",
-        "Blends of weight 0 and 1",
-        input="tokens of a 16 x 16 layer",
-        oracle="the formula in float64; at 0 and 1 the bits of the two sides",
-        hardness="a",
-        levels=(0.5, 0.9, 0.1, 0.999999, 1e-6, 1e-12, 1, 0),
-        required=0,
-        quick=(0.5, 1, 0),
+        _weight,
+        tuple(way for way in EVERY_TYPE if way.precision != "float64"),
         bounds={
             "forward": Bound(
                 "steps of the type", 4, "four taps and two products, each rounded in float32"
             )
         },
-        ways=tuple(way for way in EVERY_TYPE if way.precision != "float64"),
-        measure=_weight,
     ),
-    Case(
-        43,
-        "empty_mask_of_tokens",
-        "Masks of a few tokens, and of none",
-        input="tokens of a 16 x 16 layer, blended at a = 1",
-        oracle="the target's own bits outside the mask",
-        hardness="share of tokens in the mask",
-        levels=(1, 0.5, 0.1, 0.01, 0.004, 0),
-        required=0,
-        quick=(0.5, 0),
-        bounds={"forward": exact("changed values")},
-        ways=EVERY_TYPE,
-        measure=_outside,
-    ),
-    Case(
-        44,
-        "one_view",
-        "Views edited together, and one alone",
-        input="recorded features injected into batches of views",
-        oracle="the layer, the hat functions of the taps and the blend in long double",
-        hardness="views in a batch",
-        levels=(4, 3, 2, 1),
-        required=1,
-        quick=(2, 1),
-        bounds={"forward": ONE_VIEW},
-        ways=ways("reference", "cpu"),
-        measure=_views_of_a_batch,
-        version=3,
-    ),
-    Case(
-        45,
-        "views_apart",
-        "Views that share little, and nothing",
-        input="a camera with a field of view of 45 degrees that turns away",
-        oracle="azimuths of the rays, in closed form; the target's own bits elsewhere",
-        hardness="turn, degrees",
-        levels=(0, 20, 40, 44, 46, 90, 135, 180),
-        required=180,
-        quick=(20, 46, 180),
-        bounds={"forward": exact("wrong tokens")},
-        ways=EVERY_TYPE,
-        measure=_apart,
-    ),
-    Case(
-        46,
+    hard("empty_mask_of_tokens", _outside, EVERY_TYPE, bounds={"forward": exact("changed values")}),
+    hard("one_view", _views_of_a_batch, ways("reference", "cpu"), bounds={"forward": ONE_VIEW}),
+    hard("views_apart", _apart, EVERY_TYPE, bounds={"forward": exact("wrong tokens")}),
+    hard(
         "one_latent",
-        "Latents of a few pixels, and of one",
-        input="a step along the axis by half of the depth, at 64 px",
-        oracle="offsets from the middle double; constant tokens stay",
-        hardness="side of the latents, px",
-        levels=(64, 16, 8, 4, 2, 1),
-        required=1,
-        quick=(8, 1),
+        _latents,
+        EVERY_TYPE,
         bounds={"forward": Bound("px of the layer", 1e-4, "numerics of the warp")},
-        ways=EVERY_TYPE,
-        measure=_latents,
     ),
-    Case(
-        60,
+    hard(
         "alpha_bar",
-        "Steps of denoising where alpha-bar is almost 0, and almost 1",
-        input="a DDIM step half of the way to 1, for each kind of prediction",
-        oracle="the formula in mpmath with 50 digits",
-        hardness="alpha-bar",
-        levels=(0.5, 0.01, 0.99, 1e-4, 0.9999, 1e-8, 0.999999, 0.9999999, 0),
-        required=0,
-        quick=(0.5, 0.9999, 0),
+        _step,
+        ways("schedule", precisions=("float64", "float32", *HALVES)),
         bounds={
             "forward": Bound("steps of the type", 4, "eight roundings of its terms, each by half")
         },
-        ways=ways("schedule", precisions=("float64", "float32", *HALVES)),
-        measure=_step,
     ),
-    Case(
-        60,
+    hard(
         "ideal_alpha_bar",
-        "The ideal editor where alpha-bar is almost 0, and almost 1",
-        input="a part of 16 tokens with three answers, noised from one of them",
-        oracle="Bayes' rule over the answers in mpmath",
-        hardness="alpha-bar",
-        levels=(0.01, 1e-4, 0.5, 1e-8, 0.9999, 0.9999999, 0),
-        required=0,
-        quick=(0.01, 0.9999, 0),
+        lambda alpha, way: _ideal(16, alpha, way),
+        ways("ideal"),
         bounds={"forward": IDEAL},
-        ways=ways("ideal"),
-        measure=lambda alpha, way: _ideal(16, alpha, way),
     ),
-    Case(
-        61,
+    hard(
         "part_of_one_token",
-        "The ideal editor and parts of a few tokens, and of one",
-        input="a part with three answers among 64 tokens, at an alpha-bar of 0.01",
-        oracle="Bayes' rule over the answers in mpmath",
-        hardness="tokens of the part",
-        levels=(64, 16, 4, 2, 1),
-        required=1,
-        quick=(16, 1),
+        lambda tokens, way: _ideal(int(tokens), 0.01, way),
+        ways("ideal"),
         bounds={"forward": IDEAL},
-        ways=ways("ideal"),
-        measure=lambda tokens, way: _ideal(int(tokens), 0.01, way),
     ),
 ]

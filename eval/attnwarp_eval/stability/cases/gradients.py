@@ -14,7 +14,7 @@ from attnwarp.editing.layers import Layer
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.warp import Correspondence, FeatureWarp, Surface, preset, warp_surfaces
 from attnwarp_eval.stability.bilinear import Extended, extended, sampling_matrix
-from attnwarp_eval.stability.case import Bound, Case, Way
+from attnwarp_eval.stability.case import Bound, Way, hard
 from attnwarp_eval.stability.cases.editing import Unet, layer_weights
 from attnwarp_eval.stability.cases.warps import HALVES, engine_of, random_features
 from attnwarp_eval.stability.closed_forms import orbit
@@ -240,45 +240,12 @@ WARPED = Bound(STEPS, 3.5, "three roundings of a weight, one of its product, thr
 BLENDED = Bound(STEPS, 4, "as for a warp, and the product with a")
 
 CASES = [
-    Case(
-        47,
-        "gradient_of_taps",
-        "Gradients of features read near the centres of pixels",
-        input="positions beside pixel centres; what no position reads is NaN or infinite",
-        oracle="the transpose of the hat functions in long double",
-        hardness="distance from the centre, px",
-        levels=(0.5, 0.1, 1e-3, 1e-6, 1e-8, 0),
-        required=0,
-        quick=(0.5, 1e-6, 0),
-        bounds={"backward": WARPED},
-        ways=WHOLE,
-        measure=_taps,
-    ),
-    Case(
-        48,
-        "half_gradient",
-        "Gradients of warped features in half precision",
-        input="gradients between half of a magnitude and the whole",
-        oracle="the transpose of the hat functions in long double",
-        hardness="magnitude",
-        levels=(1e-3, 1, 1e2, 1e4, 6e4, 1e30),
-        required=6e4,
-        quick=(1, 6e4),
-        bounds={"backward": ROUNDED_ONCE},
-        ways=HALF,
-        measure=_magnitude,
-        limit="1e30 has no float16",
-    ),
-    Case(
-        49,
+    hard("gradient_of_taps", _taps, WHOLE, bounds={"backward": WARPED}),
+    hard("half_gradient", _magnitude, HALF, bounds={"backward": ROUNDED_ONCE}),
+    hard(
         "many_readers",
-        "Gradients of a pixel that many positions read",
-        input="positions between four pixels, whose gradients sum to less than 1",
-        oracle="the transpose of the hat functions in long double",
-        hardness="positions",
-        levels=(1, 4, 16, 64, 256, 1024, 4096),
-        required=4096,
-        quick=(16, 4096),
+        _readers,
+        HALF,
         bounds={
             "backward": Bound(
                 STEPS,
@@ -286,89 +253,18 @@ CASES = [
                 "rounded once, after as many sums in float32, each off by 2^-14 steps of float16",
             )
         },
-        ways=HALF,
-        measure=_readers,
     ),
-    Case(
-        50,
-        "gradient_of_holes",
-        "Gradients of features where positions are NaN",
-        input="positions of which some are NaN; the gradient that comes to those is NaN",
-        oracle="the transpose of the hat functions in long double",
-        hardness="share of positions that are NaN",
-        levels=(0, 0.1, 0.5, 0.9, 1),
-        required=1,
-        quick=(0.5, 1),
-        bounds={"backward": WARPED},
-        ways=WHOLE + HALF,
-        measure=_holes,
+    hard("gradient_of_holes", _holes, WHOLE + HALF, bounds={"backward": WARPED}),
+    hard("blend_gradient", _blend_weight, WHOLE, bounds={"backward": BLENDED}),
+    hard("half_blend_gradient", _blend_weight, HALF, bounds={"backward": ROUNDED_ONCE}),
+    hard("gradient_of_masks", _mask, WHOLE + HALF, bounds={"backward": BLENDED}),
+    hard(
+        "gradient_near_equal_depth", _near_equal_depth, WHOLE + HALF, bounds={"backward": BLENDED}
     ),
-    Case(
-        51,
-        "blend_gradient",
-        "Gradients of blends whose weight goes to 0 and 1",
-        input="tokens of a 16 x 16 layer, half of them in the mask",
-        oracle="a M and 1 - a M, and the transpose of the hat functions, in long double",
-        hardness="a",
-        levels=(0.5, 0.9, 0.1, 0.999999, 1e-6, 1e-12, 1, 0),
-        required=0,
-        quick=(0.5, 0.999999, 1, 0),
-        bounds={"backward": BLENDED},
-        ways=WHOLE,
-        measure=_blend_weight,
-    ),
-    Case(
-        51,
-        "half_blend_gradient",
-        "Gradients of blends in half precision whose weight goes to 0 and 1",
-        input="tokens of a 16 x 16 layer, half of them in the mask",
-        oracle="a M and 1 - a M, and the transpose of the hat functions, in long double",
-        hardness="a",
-        levels=(0.5, 0.9, 0.1, 0.999999, 1e-6, 1e-12, 1, 0),
-        required=0,
-        quick=(0.5, 0.999999, 1, 0),
-        bounds={"backward": ROUNDED_ONCE},
-        ways=HALF,
-        measure=_blend_weight,
-    ),
-    Case(
-        52,
-        "gradient_of_masks",
-        "Gradients under masks of a few tokens, and of none",
-        input="tokens of a 16 x 16 layer, blended at a = 1",
-        oracle="M and 1 - M, and the transpose of the hat functions, in long double",
-        hardness="share of tokens in the mask",
-        levels=(1, 0.5, 0.1, 0.01, 0.004, 0),
-        required=0,
-        quick=(0.5, 0),
-        bounds={"backward": BLENDED},
-        ways=WHOLE + HALF,
-        measure=_mask,
-    ),
-    Case(
-        53,
-        "gradient_near_equal_depth",
-        "Gradients where one surface hides another that almost touches it",
-        input="a wall before the target's, seen by the source; blended at a = 1",
-        oracle="the agreement of depths in fractions, and the transpose of the hat functions",
-        hardness="gap, share of the depth",
-        levels=(0.1, 1e-2, 1e-3, 2e-4, 1.01e-4, 9.9e-5, 1e-5, 1e-9, 0),
-        required=0,
-        quick=(1e-2, 1.01e-4, 9.9e-5, 0),
-        bounds={"backward": BLENDED},
-        ways=WHOLE + HALF,
-        measure=_near_equal_depth,
-    ),
-    Case(
-        54,
+    hard(
         "injected_gradient",
-        "Gradients through injected attention features",
-        input="latents of a layer whose features are replaced in half of the tokens",
-        oracle="(1 - a M) times the layer's matrix, in long double",
-        hardness="a",
-        levels=(0.5, 0.9, 0.1, 0.999999, 1e-6, 1e-12, 1, 0),
-        required=0,
-        quick=(0.5, 1, 0),
+        _injected,
+        WHOLE,
         bounds={
             "backward": Bound(
                 "steps of the type at the sum of magnitudes",
@@ -376,7 +272,5 @@ CASES = [
                 "1 - a, its product, the product with the matrix, the sum of three channels",
             )
         },
-        ways=WHOLE,
-        measure=_injected,
     ),
 ]

@@ -9,7 +9,7 @@ import torch
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
 from attnwarp.warp import lift_masks
-from attnwarp_eval.stability.case import Case, Way, exact, ways
+from attnwarp_eval.stability.case import Way, exact, hard, ways
 from attnwarp_eval.stability.closed_forms import orbit, plane_depth, sphere
 from attnwarp_eval.stability.rendered import splats
 
@@ -139,61 +139,8 @@ WAYS = ways("cpu")
 FAR = exact("pixels more than 3 px off")
 
 CASES = [
-    Case(
-        55,
-        "lifted_touching",
-        "A mask lifted of a thing that touches another of its colour",
-        input="a ball of grey discs before a grey wall, from one mask to a view 40 degrees away",
-        oracle="rays that meet the sphere, in closed form",
-        hardness="gap, radii",
-        levels=(1, 0.3, 0.1, 0.03, 0),
-        required=0,
-        quick=(0.3, 0),
-        bounds={"forward": FAR},
-        ways=WAYS,
-        measure=_touching,
-    ),
-    Case(
-        56,
-        "lifted_thin",
-        "A mask lifted of a thin thing",
-        input="an upright strip of grey discs before a grey wall",
-        oracle="rays that meet the strip, in closed form",
-        hardness="width in the source, px",
-        levels=(16, 8, 4, 2, 1.5),
-        required=1.5,
-        quick=(4, 1.5),
-        bounds={"forward": FAR},
-        ways=WAYS,
-        measure=_thin,
-    ),
-    Case(
-        57,
-        "lifted_size",
-        "A mask lifted that has another size than its view",
-        input="a ball of grey discs before a grey wall, in a view of 64 px",
-        oracle="rays that meet the sphere, in closed form",
-        hardness="side of the mask, px",
-        levels=(64, 128, 512, 32, 16, 8, 4),
-        required=4,
-        quick=(128, 4),
-        bounds={"forward": FAR},
-        ways=WAYS,
-        measure=_size,
-    ),
-    Case(
-        58,
-        "lifted_part",
-        "A mask lifted of a part, of nothing and of everything",
-        input="a square on a wall of grey discs",
-        oracle="rays that meet the square, in closed form",
-        hardness="side of the square, px of 64",
-        levels=(48, 64, 0, 32, 16, 8, 4),
-        required=16,
-        quick=(64, 0, 16),
-        bounds={"forward": FAR},
-        ways=WAYS,
-        measure=_part,
-        limit="a few splats that show little of themselves follow neighbours of the same look",
-    ),
+    hard("lifted_touching", _touching, WAYS, bounds={"forward": FAR}),
+    hard("lifted_thin", _thin, WAYS, bounds={"forward": FAR}),
+    hard("lifted_size", _size, WAYS, bounds={"forward": FAR}),
+    hard("lifted_part", _part, WAYS, bounds={"forward": FAR}),
 ]

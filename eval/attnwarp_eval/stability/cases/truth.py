@@ -10,7 +10,7 @@ import numpy as np
 
 from attnwarp.camera import Camera
 from attnwarp_eval.scene.shapes import Mesh, Rectangle, Sphere
-from attnwarp_eval.stability.case import Bound, Case, Way, exact
+from attnwarp_eval.stability.case import Bound, Way, exact, hard
 from attnwarp_eval.truth import Geometry
 
 DIGITS = 60
@@ -107,16 +107,10 @@ def _shared_edge(offset: float, way: Way) -> float:
 
 
 CASES = [
-    Case(
-        1,
+    hard(
         "grazing_plane",
-        "A plane seen at a grazing angle",
-        input="a ground of 100 m, met 6 m ahead of the ray's start",
-        oracle="height over slope, in mpmath",
-        hardness="incidence, degrees",
-        levels=(60, 80, 89, 89.9, 89.99, 89.999, 89.9999, 89.99999, 89.999999),
-        required=89.999,
-        quick=(60, 89.9),
+        _grazing,
+        BOTH,
         bounds={
             "forward": Bound(
                 "relative",
@@ -124,48 +118,18 @@ CASES = [
                 "1e-6 over the cosine: a hair's height moves the hit that far",
             )
         },
-        ways=BOTH,
-        measure=_grazing,
     ),
-    Case(
-        3,
+    hard(
         "coplanar",
-        "Depth of surfaces in the same place",
-        input="two squares of 4 m, one above the other, 3 m from the camera",
-        oracle="the upper one's plane",
-        hardness="gap, m",
-        levels=(0.1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-9, 0),
-        required=0,
-        quick=(1e-2, 0),
+        _coplanar,
+        BOTH,
         bounds={"forward": Bound("relative", 1e-6, "which of the two is hit does not show")},
-        ways=BOTH,
-        measure=_coplanar,
     ),
-    Case(
-        3,
-        "coplanar_ties",
-        "Owners of surfaces in the same place",
-        input="the squares of `coplanar`",
-        oracle="the upper one, or a tie that names the lower one",
-        hardness="gap, m",
-        levels=(0.1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-9, 0),
-        required=1e-6,
-        quick=(1e-2, 1e-6),
-        bounds={"forward": exact("wrong owners")},
-        ways=BOTH,
-        measure=_ties,
-        limit="Open3D lists one of two triangles that coincide in float32",
-    ),
-    Case(
-        37,
+    hard("coplanar_ties", _ties, BOTH, bounds={"forward": exact("wrong owners")}),
+    hard(
         "tangent_ray",
-        "A ray that just touches a sphere",
-        input="a sphere of radius 0.7 at distance 3",
-        oracle="the quadratic in mpmath with 60 digits",
-        hardness="distance from the tangent, radii",
-        levels=(0.1, 1e-3, 1e-6, 1e-9, 1e-12, 1e-14, 1e-15),
-        required=1e-9,
-        quick=(0.1, 1e-9),
+        _tangent,
+        RAYS,
         bounds={
             "forward": Bound(
                 "scene",
@@ -173,22 +137,11 @@ CASES = [
                 "1e-4 of half the chord, and 1e-13 of the distance",
             )
         },
-        ways=RAYS,
-        measure=_tangent,
-        limit="the distance from the axis has 16 digits, and its square root 8",
     ),
-    Case(
-        38,
+    hard(
         "shared_edge",
-        "Rays through the edge of two triangles",
-        input="a square of two triangles in a world that is moved",
-        oracle="the distance of its plane",
-        hardness="offset of the world, m",
-        levels=(0, 1e2, 1e4, 1e6, 1e8, 1e10),
-        required=1e6,
-        quick=(0, 1e4),
+        _shared_edge,
+        (Way("embree"),),
         bounds={"forward": Bound("m", 3e-6, "1e-6 of the distance")},
-        ways=(Way("embree"),),
-        measure=_shared_edge,
     ),
 ]

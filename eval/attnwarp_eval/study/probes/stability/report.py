@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from itertools import groupby
-from typing import Any
 
-from attnwarp_eval.document import charts
-from attnwarp_eval.document.model import Picture, Section, Table
+from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.stability import DECADES, Outcome, level_name
 from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
@@ -18,18 +15,17 @@ from attnwarp_eval.study.results import Results
 
 @register_report
 class StabilityReport(ProbeReport):
-    """Verdicts, errors against hardness, and every error."""
+    """Verdicts, and every error."""
 
     name = "stability"
     measures = "hard cases of the numerics"
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """The verdicts, the errors against hardness, and every error."""
+        """The verdicts, and every error."""
         swept = read_sweeps(results)
         if not swept:
             return
         yield Place.RESULT, _verdicts(swept)
-        yield Place.RESULT, _figures(swept, layout)
         yield Place.APPENDIX, _every_error(swept)
 
 
@@ -78,31 +74,17 @@ def _verdicts(swept: Sequence[Swept]) -> Section:
             else "**Required levels that do not hold:** " + "; ".join(failed) + "."
         ),
     ]
-    ending: list[list[str]] = []
-    whole: list[list[str]] = []
-    for name in dict.fromkeys(sweep.case.name for sweep in swept):
-        own = [sweep for sweep in swept if sweep.case.name == name]
-        for direction in ("forward", "backward"):
-            part = [sweep for sweep in own if sweep.way.direction == direction]
-            if part:
-                (ending if any(sweep.end for sweep in part) else whole).append(_row(part))
+    parts: dict[tuple[str, str], list[Swept]] = {}
+    for sweep in swept:
+        parts.setdefault((sweep.case.name, sweep.way.direction), []).append(sweep)
+    # Those that end somewhere come first.
+    ordered = sorted(parts.values(), key=lambda part: not any(sweep.end for sweep in part))
     columns = [
-        "#",
-        "case",
-        "direction",
-        "swept",
-        "must hold to",
-        "worst margin up to there",
-        "its error",
-        "tolerance",
-        "what ends it",
-        "why",
-    ]
-    tables = [
-        Table(columns, ending, "Cases that break, or are refused, at some level."),
-        Table(columns[:-2], [row[:-2] for row in whole], "Cases that hold at every level."),
-    ]
-    return Section("Where hard inputs break the numerics", text, [t for t in tables if t.rows])
+        "#", "case", "direction", "swept", "must hold to", "worst margin up to there", "its error",
+        "tolerance", "what ends it", "why",
+    ]  # fmt: skip
+    table = Table(columns, [_row(part) for part in ordered])
+    return Section("Where hard inputs break the numerics", text, [table])
 
 
 def _row(swept: Sequence[Swept]) -> list[str]:
@@ -130,91 +112,13 @@ def _row(swept: Sequence[Swept]) -> list[str]:
         number(worst.margin, 2),
         "refused, as it must be" if worst.must_refuse else _error(worst.error),
         _tolerance(bound.unit, worst.tolerance),
-        "; ".join(f"{level}: {', '.join(who)}" for level, who in ends.items()),
-        hard.limit,
+        "; ".join(f"{level}: {', '.join(who)}" for level, who in ends.items()) or "–",
+        hard.limit if ends else "–",
     ]
 
 
 def _tolerance(unit: str, tolerance: float) -> str:
     return f"no {unit}" if tolerance == 0.5 else f"{number(tolerance, 2)} {unit}"
-
-
-def _figures(swept: Sequence[Swept], layout: Layout) -> Section:
-    """Errors in units of their tolerance against hardness, a panel a case that ends somewhere."""
-    pictures = []
-    panels = [
-        list(of_case)
-        for _, of_case in groupby(
-            sorted(swept, key=lambda sweep: (sweep.case.number, sweep.case.name)),
-            key=lambda sweep: sweep.case.name,
-        )
-    ]
-    ending = [panel for panel in panels if any(sweep.end for sweep in panel)]
-    for group in dict.fromkeys(panel[0].case.group for panel in ending):
-        members = [panel for panel in ending if panel[0].case.group == group]
-        path = layout.figure(f"stability-{group}.svg")
-        columns = min(3, len(members))
-        rows = -(-len(members) // columns)
-        width = 3.3 * columns
-        with charts.drawing(path, columns, 2.3 * rows, rows=rows, width=width) as axes:
-            for index, axis in enumerate(axes):
-                if index < len(members):
-                    _panel(axis, members[index])
-                else:
-                    axis.set_visible(False)
-            labelled: list[list[str]] = []
-            for axis in axes[: len(members)]:
-                handles, labels = axis.get_legend_handles_labels()
-                if labels not in labelled:
-                    labelled.append(labels)
-                    axis.legend(handles, labels, fontsize=5, loc="upper left")
-        caption = f"Hard cases of {group} that break, or are refused, at some level."
-        pictures.append(Picture(f"figures/{path.name}", caption))
-    text = [
-        (
-            "Decades of error over tolerance, from -3 to 3, against hardness: the first wrong digit"
-            " is where a line crosses 0. What must hold is left of the dotted line (of the dashed"
-            " one for gradients). Solid lines are values, dashed ones gradients; a cross at the top"
-            f" is a refusal. {len(panels) - len(ending)} other cases hold at every level."
-        ),
-    ]
-    return Section("Error against hardness", text, figures=pictures)
-
-
-def _panel(axes: Any, swept: Sequence[Swept]) -> None:
-    hard = swept[0].case
-    # Where a case has values and gradients, the legend names the values.
-    named = swept[0].way.direction
-    levels = [outcome.level for outcome in swept[0].outcomes]
-    sides = list(dict.fromkeys((s.way.backend, s.way.precision) for s in swept))
-    for sweep in swept:
-        side = (sweep.way.backend, sweep.way.precision)
-        index = sides.index(side)
-        forward = sweep.way.direction == "forward"
-        # Lines that lie on each other stand side by side.
-        x = [0.06 * (index - (len(sides) - 1) / 2) + k for k in range(len(levels))]
-        axes.plot(
-            x,
-            [math.nan if o.refusal else -o.margin for o in sweep.outcomes],
-            color=charts.PALETTE[index],
-            linestyle="-" if forward else "--",
-            marker=charts.MARKERS[index],
-            markersize=3 if forward else 2,
-            linewidth=1,
-            label=" ".join(side) if sweep.way.direction == named else None,
-        )
-        refused = [place for place, o in zip(x, sweep.outcomes, strict=True) if o.refusal]
-        axes.plot(refused, [DECADES] * len(refused), "x", color=charts.PALETTE[index], markersize=5)
-    axes.axhline(0, color="black", linewidth=0.7)
-    for way in {s.way.direction: s.way for s in swept}.values():
-        last = sum(hard.is_required(level, way.direction) for level in levels)
-        style = ":" if way.direction == "forward" else "--"
-        axes.axvline(last - 0.5, color="black", linewidth=0.7, linestyle=style)
-    axes.set_ylim(-DECADES - 0.3, DECADES + 0.3)
-    axes.set_yticks([-DECADES, 0, DECADES])
-    axes.set_xticks(range(len(levels)), [level_name(v) for v in levels], rotation=40, ha="right")
-    axes.tick_params(labelsize=6)
-    axes.set_title(f"{hard.number} {hard.name}: {hard.hardness}", loc="left", fontsize=7)
 
 
 def _every_error(swept: Sequence[Swept]) -> Section:
