@@ -66,6 +66,8 @@ def _block(text: str) -> Markup:
 def _css(cell: str) -> Markup:
     if cell in _CLASSES:
         return Markup(f' class="{_CLASSES[cell]}"')
+    if cell.endswith("no verdict"):
+        return Markup(' class="untold"')
     if len(cell) > 40:
         return Markup(' class="wide"')
     return Markup(' class="text"') if len(cell) > 12 and cell[0].isalpha() else Markup("")

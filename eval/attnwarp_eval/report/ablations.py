@@ -10,7 +10,7 @@ from functools import partial
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
 from attnwarp_eval.metrics.registry import Metric
-from attnwarp_eval.report.compared import between, detectable_text, difference_text
+from attnwarp_eval.report.compared import between, detectable_text, difference_text, no_verdict
 from attnwarp_eval.report.controls import BLIND, blind
 from attnwarp_eval.report.judging import Comparison, JudgedClaim, of_comparisons
 from attnwarp_eval.statistics.contrasts import EQUAL_LEVEL, Contrast
@@ -58,15 +58,9 @@ class Row:
 
     @property
     def outcome(self) -> str:
-        """The verdict; of fewer than six scenes, what all of them say: better, worse or mixed."""
-        if not 1 < self.difference.scenes < FEWEST_SCENES or not self.verdict:
-            return self.verdict
-        rounding = self.difference.flips.rounding
-        values = self.difference.by_scene.values()
-        for word, sign in (("higher", 1), ("lower", -1)):
-            if all(sign * value > rounding for value in values):
-                return "better" if word == self.specification.direction else "worse"
-        return "mixed"
+        """The verdict; of fewer than six scenes, how many agree."""
+        few = self.verdict and self.difference.scenes < FEWEST_SCENES
+        return no_verdict(self.difference) if few else self.verdict
 
 
 def ablations(results: Results, compared: Sequence[Sequence[Row]]) -> list[Section]:
@@ -107,7 +101,7 @@ def _section(results: Results, ablation: Ablation, compared: Sequence[Row]) -> S
     section.tables.append(Table(["variant", *columns, *pairs, time], rows, timed=(time,)))
     section.tables += own.details(results, names)
     if len(names) > 1:
-        untold = {r.metric for r in compared if r.verdict == "can't tell" and r.difference.views}
+        untold = {r.metric for r in compared if r.outcome == "can't tell"}
         unseen = {m for m in untold if own.probe.edits and blind(results, own.name, m, baseline)}
         section.tables.append(_table(compared, ablation.baseline, unseen))
         if unseen:

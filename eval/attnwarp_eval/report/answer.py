@@ -303,13 +303,15 @@ def _in_turn(results: Results, asked: Answer) -> dict[str, float]:
 
 
 def _advice(results: Results, asked: Answer, leaders: list[str]) -> str:
-    """The variant to use, by the column that decides."""
+    """The variant to use, by the column that decides; of fewer than six scenes, the best one."""
     if not leaders:
         return f"No variant is better than the others in {asked.decides}."
     column = asked.columns[asked.decides]
     value, key = _figure(results, column, leaders[0])
     figure = in_words(value.mean, probe(column.probe).metric(key), key)
     several = " or ".join(f"`{name}`" for name in leaders)
+    if len(results.study.scenes) < FEWEST_SCENES:
+        return f"Of these variants {several} has the best {asked.decides} here: {figure}."
     return f"Use {several} because of these variants it has the best {asked.decides}: {figure}."
 
 

@@ -61,8 +61,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
         )
         if alone and study.variants:
             lead.append(
-                '**One scene says nothing of others: every test says "can\'t tell". Name six'
-                " scenes or more for a verdict.**"
+                "**One scene says nothing of others. Name six scenes or more for a verdict.**"
             )
     for scene, lines in results.notices.items():
         # As code: names of files may have asterisks.

@@ -152,6 +152,20 @@ def scene_texts(value: Contrast, unit: str, scenes: Sequence[str]) -> list[str]:
     return [difference_text(alone(scene), unit) for scene in scenes]
 
 
+def no_verdict(value: Contrast) -> str:
+    """Count of the scenes that have the sign of their mean, where fewer than six give no verdict.
+
+    Example:
+        >>> tables = [{f"s{k}": {"v": v + 0.01 * k} for k in range(2)} for v in (1.0, 0.6)]
+        >>> no_verdict(contrast(*tables, "ratio"))
+        '2 of 2 scenes lower; no verdict'
+    """
+    sign = -1 if value.flips.mean < 0 else 1
+    alike = sum(sign * one > value.flips.rounding for one in value.by_scene.values())
+    scenes = f"{value.scenes} scene{'' if value.scenes == 1 else 's'}"
+    return f"{alike} of {scenes} {'lower' if sign < 0 else 'higher'}; no verdict"
+
+
 def detectable_text(value: Contrast) -> str:
     """The smallest difference that one test at 5 % would tell in 80 % of studies.
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Literal
 
 from attnwarp_eval.document.model import Section, Table
+from attnwarp_eval.document.numbers import FEWEST_SCENES
 from attnwarp_eval.report.compared import between
 from attnwarp_eval.study.controls import OTHER_SEED
 from attnwarp_eval.study.probe import probe
@@ -68,7 +69,11 @@ def blind(results: Results, name: str, metric: str, baseline: str) -> bool:
 
 
 def controls(results: Results) -> list[Section]:
-    """The section on controls, one table for each baseline that has some."""
+    """The section on controls, one table for each baseline that has some; none of fewer than six
+    scenes, on which no test sees anything.
+    """
+    if len(results.study.scenes) < FEWEST_SCENES:
+        return []
     pairs = {(one.probe, one.baseline): None for one in results.study.ablations}
     tables = [
         table

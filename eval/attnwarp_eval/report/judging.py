@@ -11,7 +11,7 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number, spread
 from attnwarp_eval.metrics.multiview import ABOVE_FLOOR, BELOW_FLOOR
 from attnwarp_eval.report.claims import Claim, Measured, load_claims
-from attnwarp_eval.report.compared import difference_text, scene_texts
+from attnwarp_eval.report.compared import difference_text, no_verdict, scene_texts
 from attnwarp_eval.statistics.contrasts import EQUAL_LEVEL, Contrast
 from attnwarp_eval.statistics.intervals import (
     ROUNDING,
@@ -88,19 +88,19 @@ class JudgedClaim:
 
     @property
     def in_words(self) -> str:
-        """The verdict; of what cannot be told also how many scenes would tell it, and of what
-        another study judges its name.
+        """The verdict; of what cannot be told also how many scenes would tell it, of fewer than six
+        scenes how many agree, and of what another study judges its name.
         """
         if self.verdict is None:
             return f"judged by `{self.claim.study}`"
+        if self.contrast.scenes < FEWEST_SCENES:
+            return no_verdict(self.contrast)
         if self.verdict == "equal":
             return f"equal within {_bound(self.claim)}"
         if self.verdict != "can't tell":
             return self.verdict
         if self.measured.control == "not measured":
             return "can't tell: its control was not measured"
-        if self.contrast.scenes < 2:
-            return self.verdict
         needed = self.contrast.needed(self.p, self.claim.bound)
         return f"can't tell: {count_of(needed)} scenes would"
 
@@ -249,9 +249,6 @@ def _scenes(finding: JudgedClaim, scenes: int) -> str:
 
 
 HEAD = (
-    "- **Here** speaks of these scenes alone. `seen`: the difference has the expected sign in every"
-    " scene of the study. `seen where defined`: in every scene that has values, and some have none."
-    " `not seen`: in no scene.\n"
     "{columns}"
     " **Views that agree** have the expected sign.\n"
     "- **Measured** are means. Those of two variants are over the views that both have, so that the"
@@ -263,6 +260,9 @@ SCALE = (
 )
 
 MANY = (
+    "- **Here** speaks of these scenes alone. `seen`: the difference has the expected sign in every"
+    " scene of the study. `seen where defined`: in every scene that has values, and some have none."
+    " `not seen`: in no scene.\n"
     "- **In general**: one study judges each claim, on scenes that were drawn. Other reports show"
     " the same difference without a verdict.\n"
     f"- **Difference**: {SCALE}\n"
@@ -271,8 +271,9 @@ MANY = (
 """Meaning of the columns of six scenes and more."""
 
 FEW = (
-    f"- Each scene's column has its difference: {SCALE} A dash: undefined. So few scenes give no"
-    " verdict; one study judges each claim, on scenes that were drawn."
+    "- **Here** says how many scenes have the sign of their mean. So few give no verdict; one study"
+    " judges each claim, on scenes that were drawn.\n"
+    f"- Each scene's column has its difference: {SCALE} A dash: undefined."
 )
 """Meaning of the columns of fewer scenes."""
 
@@ -306,16 +307,17 @@ def claims_section(results: Results, findings: Sequence[JudgedClaim]) -> Section
             own = scene_texts(finding.contrast, unit, names)
             below = finding.below_floor
             own = [t + " (below)" * (n in below) for n, t in zip(names, own, strict=True)]
-        rows.append([claim.text, finding.here, *own, f"{agree} of {views}", sides, finding.metric])
+        here = no_verdict(finding.contrast) if few else finding.here
+        rows.append([claim.text, here, *own, f"{agree} of {views}", sides, finding.metric])
         editors = declared[claim.id].editors if claim.id in declared else ()
         alike = [other for other in findings if other.claim.id == claim.id]
         if editors and finding is alike[-1]:
-            here, verdict = together(alike, editors)
+            of_both, verdict = together(alike, editors)
             text = f"**{declared[claim.id].text}: both editors together**"
             dashes = ["–"] * len(own)
             if not few:
                 dashes[0] = verdict or finding.in_words
-            rows.append([text, here, *dashes, "–", "–", finding.metric])
+            rows.append([text, "–" if few else of_both, *dashes, "–", "–", finding.metric])
     made = Section("What was expected, and what was seen")
     if not rows:
         made.text = ["Nothing that a claim speaks of was measured."]

@@ -147,7 +147,7 @@ def test_an_ablation_table_shows_means_differences_and_verdicts():
     logs = [np.log(np.array(values) / 0.1).mean() for values in CLEAR["slipped"]]
     mean, low, high = (number(math.exp(x)) for x in (np.mean(logs), min(logs), max(logs)))
     assert row[2] == f"× {mean} ({low} to {high})"
-    assert row[3] == "worse"
+    assert row[3] == "3 of 3 scenes higher; no verdict"
     assert row[6] == "3, 6"
 
 
@@ -732,6 +732,22 @@ def test_cells_of_more_than_one_state_of_the_code_are_told_apart(tmp_path):
     assert f"{local} (source `dddddddddddd`)" in text
 
 
+def test_two_scenes_that_agree_give_no_word_and_no_colour_of_a_verdict(tmp_path):
+    cells = [
+        written_runs.outcome("warp", scene, [name], record([value, value]), f"{scene}-{name}")
+        for scene in ("one", "two")
+        for name, value in (("good", 0.9), ("slipped", 0.1))
+    ]
+    made = build(written_runs.results(study(scenes=["one", "two"]), cells), tmp_path)
+    row = next(r for s in made.sections for t in s.tables for r in t.rows if r[1] == SLIP)
+    assert row[3] == "2 of 2 scenes lower; no verdict"
+    words = re.compile(r"^(seen|not seen|mixed|better|worse|holds|can't tell|blind)$")
+    cells = [
+        c for s in made.sections for t in s.tables if not t.glossary for r in t.rows for c in r
+    ]
+    assert not [cell for cell in cells if words.match(cell)]
+
+
 def test_a_study_of_one_scene_says_at_its_top_that_no_verdict_is_possible(tmp_path):
     cells = [
         written_runs.outcome("warp", "one", [name], record([value, value + 0.1]), name)
@@ -744,7 +760,7 @@ def test_a_study_of_one_scene_says_at_its_top_that_no_verdict_is_possible(tmp_pa
     assert "means over the views of one scene, which has no interval" in lead and "±" not in lead
     # It is true: a difference of 0.8 in every view stays undecided.
     row = next(line for line in text.splitlines() if line.startswith(f"| slipped | {SLIP}"))
-    assert "can't tell" in row and "| in general |" not in text
+    assert "1 of 1 scene higher; no verdict" in row and "| in general |" not in text
     assert "One scene says" not in markdown(build(results(CLEAR), tmp_path))
 
 
