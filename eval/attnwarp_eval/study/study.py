@@ -316,15 +316,22 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         place = _place(error.errors()[0])
         file, line = line_of(lines, place) if place else (path, None)
         at = f"{file}:{line}" if line else str(file)
-        raise StudyError(f"{at}: {explain_errors(error)}") from None
+        lacks = ""
+        if ("extends",) in lines and file == path and error.errors()[0].get("input", 0) is None:
+            lacks = "; null takes a key of the extended study away, which has none of this name"
+        raise StudyError(f"{at}: {explain_errors(error)}{lacks}") from None
     measured = set[str]().union(*(p.measured(study) for p in probes()))
-    for name in (name for name in study.variants if name not in measured):
-        file, line = line_of(lines, ("variants", name))
-        inherited = "" if file == path else f", or take it away with null in {path.name}"
-        raise StudyError(
-            f"{file}:{line}: variants.{name}: no probe measures it; name it under probes, or leave"
-            f" it out{inherited}"
-        )
+    if idle := study.variants.keys() - measured:
+        for name in (name for name in study.variants if name in idle):
+            file, line = line_of(lines, ("variants", name))
+            if file == path:
+                raise StudyError(
+                    f"{file}:{line}: variants.{name}: no probe measures it; name it under probes,"
+                    " or leave it out"
+                )
+        # Those of an extended study, of which this one measures fewer.
+        kept = {name: value for name, value in data["variants"].items() if name not in idle}
+        study = parse_study({**data, "variants": kept})
     if isinstance(every, list):
         called = {scene_name(name) for name in study.scenes}
         study._left_out = tuple(name for name in every if scene_name(name) not in called)

@@ -438,6 +438,8 @@ def test_paths_of_an_extended_study_count_from_its_own_folder(tmp_path):
         ("extends: base.yaml\nviews: [yaw030]\nspp: none\n", r"child.yaml:3: spp"),
         ("extends: base.yaml\nname: null\n", r"child.yaml:2: name"),
         ("extends: base.yaml\nsplats:\n  kind: 4d\n", r"child.yaml:3: splats.kind"),
+        ("extends: base.yaml\nprobes: {wrap: null}\n", r"child.yaml:2: .* has none of this name"),
+        ("extends: base.yaml\nvariants:\n  x: null\n", r"child.yaml:3: .* has none of this name"),
     ],
 )
 def test_a_mistake_in_a_study_that_extends_another_has_its_file_and_line(tmp_path, child, told):
@@ -485,7 +487,10 @@ def test_a_variant_that_cannot_be_measured_is_refused_with_its_line(
 def test_a_variant_that_no_probe_measures_is_refused_with_its_line(tmp_path):
     with pytest.raises(StudyError, match=r"study.yaml:\d+: variants.slipped: no probe measures it"):
         load_study(write(tmp_path, probes={"warp": ["again", "corrected"]}))
+
+
+def test_a_study_of_fewer_probes_leaves_out_the_variants_that_it_does_not_measure(tmp_path):
     child = "extends: base.yaml\nname: a\nprobes: {warp: null}\nyaw: null\n"
-    told = "base.yaml:9: variants.slipped: .*, or take it away with null in child.yaml"
-    with pytest.raises(StudyError, match=told):
-        load_study(extending(tmp_path, child))
+    assert list(load_study(extending(tmp_path, child)).variants) == ["corrected"]
+    with pytest.raises(StudyError, match=r"child.yaml:5: variants.own: no probe measures it"):
+        load_study(extending(tmp_path, f"{child}variants: {{own: {{}}}}\n"))
