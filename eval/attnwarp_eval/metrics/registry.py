@@ -27,6 +27,11 @@ class Metric:
         atol, rtol: a change of at most ``atol + rtol * |value|`` between two runs is no change.
         description: one line for a reader of a report.
         version: raised when the figure's numbers change meaning.
+        column: head of a column in the table of the probe that measures it, and of its row in ``attnwarp-eval
+            metrics``; one without stands in tables that name it.
+        pictures: folders of ``attnwarp-eval metrics`` that it is computed from, of "renders", "edited", "originals".
+        function: what computes it from a view's pictures, (H, W, 3) sRGB in [0, 1] in the order of ``pictures``, such
+            as "attnwarp_eval.metrics.image:psnr".
     """
 
     name: str
@@ -36,6 +41,9 @@ class Metric:
     rtol: float
     description: str
     version: int = 1
+    column: str = ""
+    pictures: tuple[str, ...] = ()
+    function: str = ""
 
     @property
     def is_count(self) -> bool:

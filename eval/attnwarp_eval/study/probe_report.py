@@ -66,7 +66,8 @@ class ProbeReport:
     Attributes:
         name: of the probe.
         columns: of the table of variants, title -> metric; ``{layer}`` stands for a feature grid.
-            Every metric of the probe under its own name where there are none.
+            Every metric of the probe under its own name where there are none. Metrics with a
+            ``column`` in the registry stand behind them.
         tabulates_all: whether its own section has every variant, in a study's tables or not.
         contrasts: metrics in which a variant is tested against a baseline.
         stage: of :class:`~attnwarp_eval.study.probe.InTurn`, the one whose seconds its figures
@@ -104,9 +105,10 @@ class ProbeReport:
         columns = self.columns or {
             name: name for name, metric in self.probe.metrics.items() if not metric.is_count
         }
+        own = {m.column: name for name, m in self.probe.metrics.items() if m.column}
         return {
             title.format(layer=layer): metric.format(layer=layer)
-            for title, metric in columns.items()
+            for title, metric in {**columns, **own}.items()
         }
 
     def problems(self, results: Results) -> list[str]:

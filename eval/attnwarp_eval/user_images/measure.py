@@ -12,8 +12,9 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,7 @@ from attnwarp.io.find import name_key
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.task import Task, results
@@ -151,7 +153,7 @@ class Figure:
     encoder: Kind | None = None
 
 
-_EDIT, _CLIP, _DIRECTION, _NEIGHBOURS, _DINO, _CLIP_IMAGE, _PERCEPTUAL = FIGURES = (
+_EDIT, _CLIP, _DIRECTION, _NEIGHBOURS, _DINO, _CLIP_IMAGE, _PERCEPTUAL = _OF_PAPER = (
     Figure("edit.psnr_mean", "Edit PSNR", ("renders", "edited")),
     Figure("embedding.clip_similarity", "CLIP similarity", ("renders", "prompt"), "clip"),
     Figure(
@@ -174,6 +176,13 @@ _EDIT, _CLIP, _DIRECTION, _NEIGHBOURS, _DINO, _CLIP_IMAGE, _PERCEPTUAL = FIGURES
     ),
     Figure("perceptual.distance", "Perceptual distance", ("renders", "edited"), "perceptual"),
 )
+
+
+def figures() -> tuple[Figure, ...]:
+    """Figures of the paper's table, then those that the registry computes of pictures."""
+    own = (m for m in METRICS.values() if m.pictures)
+    return (*_OF_PAPER, *(Figure(m.name, m.column or m.name, m.pictures) for m in own))
+
 
 _MASKED = (_EDIT, _PERCEPTUAL)
 """Figures that masks act on; the others are of whole pictures."""
@@ -353,7 +362,7 @@ def _possible(
 ) -> list[Figure]:
     """The figures that the inputs allow; the others' reasons go to ``done``."""
     wanted = []
-    for figure in FIGURES:
+    for figure in figures():
         absent = [_option(name) for name in figure.needs if getattr(inputs, name) is None]
         if absent:
             done.missing[figure.title] = f"needs {' and '.join(absent)}"
@@ -489,6 +498,7 @@ class _Gathered:
     clip: dict[str, Embedding] = field(default_factory=dict)
     dino: dict[str, Embedding] = field(default_factory=dict)
     before: dict[str, Embedding] = field(default_factory=dict)  # CLIP, of the originals
+    own: dict[str, dict[str, float]] = field(default_factory=dict)  # by the figure's key
 
     def to_json(self) -> dict[str, Any]:
         """Values as JSON, where an undefined number is null; an infinite PSNR follows from its MSE,
@@ -498,6 +508,7 @@ class _Gathered:
             "errors": without_nan({name: mse for name, (mse, _) in self.errors.items()}),
             "psnr": without_nan({name: psnr for name, (_, psnr) in self.errors.items()}),
             "distances": without_nan(self.distances),
+            "own": {view: without_nan(values) for view, values in self.own.items()},
             **{
                 name: {view: row.tolist() for view, row in getattr(self, name).items()}
                 for name in ("clip", "dino", "before")
@@ -515,6 +526,7 @@ class _Gathered:
                 {v: np.array(data[name][v], np.float64) for v in views if v in data[name]}
                 for name in ("clip", "dino", "before")
             ),
+            {view: with_nan(values) for view, values in data["own"].items()},
         )
 
     def add(self, other: _Gathered) -> None:
@@ -535,7 +547,7 @@ def _tasks(
 
     A batch's files are hashed when its task is taken, just before they are read.
     """
-    members = {figure: set(views.get(figure, ())) for figure in FIGURES}
+    members = {figure: set(views.get(figure, ())) for figure in figures()}
 
     def read(group: str, names: Iterable[str]) -> dict[str, Picture]:
         # Transparent parts of a mask count as little as black ones, whatever lies behind pictures.
@@ -582,7 +594,17 @@ def _tasks(
                     )
                 except ValueError as error:
                     raise InputError(f"{folders['edited'][name]}: {error}") from None
+        for figure, function in own.items():
+            names = [name for name in batch if name in members[figure]]
+            shown = [
+                renders if g == "renders" else partners(g, names, renders) for g in figure.needs
+            ]
+            for name in names:
+                value = float(function(*(pictures[name] for pictures in shown)))
+                result.own.setdefault(name, {})[figure.key] = value
         return result
+
+    own = {f: _function(f) for f in members if f not in _OF_PAPER and members[f]}
 
     def task(batch: Sequence[str]) -> Task[_Gathered]:
         spec = {
@@ -594,8 +616,9 @@ def _tasks(
             },
             "figures": {
                 figure.title: [name for name in batch if name in members[figure]]
-                for figure in FIGURES
+                for figure in members
             },
+            "versions": {figure.key: METRICS[figure.key].version for figure in own},
             "encoders": {kind: loaded[kind].about.to_dict() for kind in sorted(loaded)},
             "background": list(inputs.background),
             "device": device,
@@ -641,6 +664,12 @@ def _rows(
                 Row(figure.key, figure.title, value, gathered.distances, figure.encoder)
             )
             continue
+        if figure not in _OF_PAPER:
+            values = {name: gathered.own[name][figure.key] for name in names}
+            defined = [value for value in values.values() if not np.isnan(value)]
+            value = float(np.mean(defined)) if defined else float("nan")
+            done.rows.append(Row(figure.key, figure.title, value, values))
+            continue
         if figure is _CLIP:
             similarity = metrics.clip_similarity(_stack(gathered.clip, names), texts["prompt"])
         elif figure is _DIRECTION:
@@ -662,6 +691,12 @@ def _rows(
             )
         values = dict(zip(names, map(float, similarity.values), strict=True))
         done.rows.append(Row(figure.key, figure.title, similarity.mean, values, figure.encoder))
+
+
+def _function(figure: Figure) -> Callable[..., float]:
+    """Function of the registry that computes a figure from a view's pictures."""
+    module, _, name = METRICS[figure.key].function.partition(":")
+    return cast(Callable[..., float], getattr(import_module(module), name))
 
 
 def _edit_rows(errors: Mapping[str, tuple[float, float]], done: Measured) -> None:

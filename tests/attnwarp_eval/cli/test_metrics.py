@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from typer.testing import CliRunner
 
 from attnwarp.encoders import load_encoder
 from attnwarp_eval.cli.main import app
-from attnwarp_eval.metrics.registry import metric
+from attnwarp_eval.metrics.registry import METRICS, metric
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.user_images import measure
 from attnwarp_eval.user_images.measure import BATCH, inside, read_picture
@@ -248,6 +249,30 @@ def test_pixels_alone_need_no_encoder(data):
         and saved(folder)["encoders"] == {}
     )
     assert saved(folder)["not_computed"]["Perceptual distance"] == "left out by --perceptual none"
+
+
+def test_a_metric_of_ones_own_is_a_row_of_the_registry(data, monkeypatch):
+    """Oracle: the mean squared difference of the arrays that were written."""
+    folder, arrays = data
+    own = replace(
+        METRICS["image.mse"], column="Mean squared change", pictures=("originals", "renders"),
+        function="attnwarp_eval.metrics.image:mse",
+    )  # fmt: skip
+    monkeypatch.setitem(METRICS, own.name, own)
+    (folder / "originals/view2.PNG").unlink()
+    options = ["--originals", folder / "originals", "--clip=none", "--dino=none"]
+    for _ in range(2):  # computed, then read from its cell
+        done = pixels(folder, "--perceptual=none", *options)
+        assert done.exit_code == 0 and "Mean squared change" in done.output
+        row = saved(folder)["metrics"]["image.mse"]
+        expected = {
+            view: ((arrays["renders"][view] / 255 - arrays["originals"][view] / 255) ** 2).mean()
+            for view in ("view1", "view10")
+        }
+        assert row["views"] == pytest.approx(expected, rel=1e-5)
+        assert row["value"] == pytest.approx(np.mean([*expected.values()]), rel=1e-5)
+    done = pixels(folder, "--perceptual=none", out="less")
+    assert "Mean squared change: needs --originals" in done.output
 
 
 @pytest.mark.door
