@@ -90,13 +90,34 @@ assert figures["warp.epe_max"] == 5 and metrics.METRICS["warp.epe_max"].unit == 
 study = {
     "name": "own", "size": 32, "scenes": ["spheres"], "views": ["yaw030"], "spp": 1,
     "splats": {"count": 500}, "feature_sizes": [8],
-    "variants": {"plain": {}}, "probes": {"warp": ["plain"]},
+    "variants": {"plain": {}, "slipped": {"set": {"pixel_centers": "integer"}}},
+    "probes": {"warp": ["plain", "slipped"]},
+    "ablations": [{"title": "Slip", "probe": "warp", "baseline": "plain", "variants": ["slipped"]}],
 }
 json.dump(study, open("own.yaml", "w"))
 subprocess.run([sys.executable, "-m", "attnwarp_eval", "run", "own.yaml", "--out", "run"], check=True)
-rows = map(json.loads, open("run/results.jsonl"))
+rows = [row for row in map(json.loads, open("run/results.jsonl")) if row["variant"] == "plain"]
 found = {row["metric"]: row["value"] for row in rows if row["metric"].startswith("warp.epe_")}
 assert found["warp.epe_max"] >= found["warp.epe_p95"] > 0
+lines = [line.split("|") for line in open("run/report.md")]
+(head,) = [k for k, cells in enumerate(lines) if " EPE max " in cells]
+shown = lines[head + 2][lines[head].index(" EPE max ")].split()[0]
+assert lines[head + 2][1].strip() == "plain" and abs(float(shown) / found["warp.epe_max"] - 1) < 0.02
+""",
+    "picture-metric": """
+import json, subprocess, sys
+import numpy as np
+from attnwarp_eval.files import write_picture
+
+for name, value in (("renders", 51), ("edited", 0)):
+    picture = np.zeros((16, 16, 3), np.uint8)
+    picture[3, 4, 1] = value
+    write_picture(__import__("pathlib").Path(name) / "a.png", picture)
+command = [sys.executable, "-m", "attnwarp_eval", "metrics", "--renders=renders", "--edited=edited"]
+subprocess.run([*command, "--perceptual=none", "--out=out"], check=True)
+row = json.load(open("out/metrics.json"))["metrics"]["image.largest"]
+assert abs(row["value"] - 51 / 255) < 1e-6
+assert "Largest difference" in open("out/metrics.md").read()
 """,
     "probe": """
 import json, subprocess, sys
