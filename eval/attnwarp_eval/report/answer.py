@@ -91,8 +91,8 @@ def by_claims(
     own.sort(key=lambda one: (kinds.index(str(one.verdict)), one.claim.headline or math.inf, one.p))
     counts = {kind: sum(one.verdict == kind for one in own) for kind in kinds}
     counted = " ".join(f"{OUTCOMES[kind]}: {n}." for kind, n in counts.items() if n)
-    written = f"{len(own)} expectation{'s were' if len(own) > 1 else ' was'} written down"
-    text = [f"{written} before the study ran. {counted}"]
+    several = len(own) > 1
+    text = [f"{len(own)} expectation{'s are' if several else ' is'} judged. {counted}"]
     # The headlines, then what nobody expected; shown in their order, since one speaks of another.
     chosen = sorted(
         (one for one in judged if one.told),
@@ -106,10 +106,8 @@ def by_claims(
         )
     )
     sure = [
-        f"This is said of {results.study.sampled}, and scenes like these. Each verdict allows for"
-        f" all {len(own)} being asked at once."
-        if len(own) > 1
-        else f"This is said of {results.study.sampled}, and scenes like these."
+        f"Of {results.study.sampled}, each test has those in which its difference is defined."
+        + f" Each verdict allows for all {len(own)} being asked at once." * several
     ]
     if timings:
         sure += _time_of_pair(results)

@@ -44,6 +44,7 @@ class Claim:
     editors: tuple[str, ...] = ()
     settings: Literal["complete", "own"] = "complete"
     headline: int = 0
+    plain: str = ""
 
     def of_each_editor(self) -> list[Claim]:
         """The claim for each of its editors; itself where it has none."""

@@ -7,18 +7,22 @@ from __future__ import annotations
 import os
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from attnwarp.errors import InputError
 from attnwarp_eval.document.model import Table
+from attnwarp_eval.document.numbers import number as rounded
 from attnwarp_eval.document.numbers import ratio_text
 from attnwarp_eval.document.write import markdown_table
 from attnwarp_eval.report.answer import against
 from attnwarp_eval.report.claims import Claim, load_claims
+from attnwarp_eval.report.compared import difference_text
 from attnwarp_eval.report.judging import JudgedClaim, decided, found
 from attnwarp_eval.report.raw import PARTS, read_raw, together
+from attnwarp_eval.statistics.contrasts import contrast
 from attnwarp_eval.statistics.intervals import time_ratio
+from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.turns import Timed, timed_in_turn
@@ -36,14 +40,15 @@ class Judged:
         judged: None where its study has no raw results, or lacks a side.
         time: ratio of the last side's seconds to the first one's, taken in turn; a dash without.
         report: folder of the report.
-        population: of its scenes, in words.
+        by_answers: difference in words of edits with several right answers and of edits with one,
+            where the study has both.
     """
 
     claim: Claim
     judged: JudgedClaim | None = None
     time: str = "–"
     report: Path | None = None
-    population: str = ""
+    by_answers: str = ""
 
     @property
     def measured(self) -> str:
@@ -90,7 +95,35 @@ def _judged(
     if one is None:
         return Judged(claim)
     folder, results = studies[claim.study]
-    return Judged(claim, one, _time(results, one), folder, results.study.sampled)
+    return Judged(claim, one, _time(results, one), folder, _by_answers(results, one))
+
+
+def _by_answers(results: Results, one: JudgedClaim) -> str:
+    if not probe(one.claim.probe).edits:
+        return ""
+    answers = {
+        record.spec["edit"]["name"]: len(record.spec["edit"]["answers"])
+        for _, _, record in results.records(one.claim.probe, next(iter(one.sides)))
+        if "edit" in record.spec
+    }
+    if len(set(answers.values())) < 2:
+        return ""
+    texts = []
+    for several, what in ((True, "several right answers"), (False, "one")):
+        a, b = (
+            {
+                scene: {v: x for v, x in views.items() if (answers[v.split("/")[0]] > 1) == several}
+                for scene, views in side.items()
+            }
+            for side in (one.measured.a, one.measured.b)
+        )
+        metric = probe(one.claim.probe).metric(one.metric)
+        found = replace(contrast(a, b, metric.scale), undefined=0)
+        if found.by_scene:
+            texts.append(
+                f"{difference_text(found, metric.unit)} over {found.scenes} scenes with {what}"
+            )
+    return ", ".join(texts) if len(texts) > 1 else ""
 
 
 def _time(results: Results, one: JudgedClaim) -> str:
@@ -147,11 +180,22 @@ def headlines(judged: list[Judged]) -> list[str]:
         assert each.judged is not None
         verdict, _, needed = each.judged.in_words.partition(": ")
         needed = f" ({needed})" if needed else ""
-        lines.append(
-            f"{number}. **{each.claim.text}.** {verdict[0].upper()}{verdict[1:]}{needed}:"
-            f" {each.measured}, over {each.population}."
+        told = (
+            each.by_answers or f"{_plainly(each.judged)}, over {each.judged.contrast.scenes} scenes"
         )
+        text = each.claim.plain or each.claim.text
+        lines.append(f"{number}. **{text}.** {verdict[0].upper()}{verdict[1:]}{needed}: {told}.")
     return lines
+
+
+def _plainly(one: JudgedClaim) -> str:
+    """Difference as a person tells it: shares side by side, errors in percent or as a factor."""
+    factor, _, _ = one.contrast.shown()
+    if one.contrast.scale != "ratio":
+        return against(one)
+    if factor > 2:
+        return f"{rounded(factor, 2)} times the error"
+    return f"{rounded(100 * abs(factor - 1), 2)} % {'less' if factor < 1 else 'more'} error"
 
 
 def filled(text: str, judged: list[Judged], beside: Path) -> str:

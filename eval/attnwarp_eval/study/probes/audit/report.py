@@ -77,7 +77,7 @@ ROWS = (
 """Metrics, those that need no truth first."""
 
 COUNTED = tuple(flaw for flaw in FLAWS if flaw.counts)
-"""Flaws that matter most, fixed before the study ran."""
+"""Flaws that matter most."""
 
 Values = dict[str, list[float]]
 
@@ -302,7 +302,7 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
             " over scenes."
         ),
         (
-            f"Five flaws were named as those that matter most before the study ran, and are"
+            f"Five flaws are named as those that matter most, and are"
             f" framed: {what}. The first table is of yaws up to {max(pairs.near):g} degrees."
             f" A pair without a value is left out and counted. False alarms: right pairs whose"
             f" object is varnished, so that highlights move over its paint, or of metal, so that it"
