@@ -152,8 +152,6 @@ def run_on_workers(
     Yields:
         Each cell as it ends, with what went wrong.
     """
-    import dask
-
     threads = max(1, core_count() // jobs)
     # dask has workers give freed memory back at once; image-sized arrays then cost more page faults
     # than arithmetic.
@@ -172,6 +170,8 @@ def run_on_workers(
     with contextlib.ExitStack() as stack:
         # First, so that it ends last: a cluster that closes lets dask speak of broken connections.
         stack.enter_context(_silent())
+        import dask
+
         stack.enter_context(dask.config.set(settings))
         client = stack.enter_context(_local_client(jobs))
         yield from _Runner(client, cells, _Local(root, threads), report).run()
@@ -204,7 +204,8 @@ def _local_client(jobs: int) -> Iterator[Client]:
         try:
             try:
                 client = Client(starting.result())
-            except (OSError, RuntimeError) as error:  # dask's have no file
+            # dask's have no file; values of its configuration end in any of them.
+            except (OSError, RuntimeError, ValueError, TypeError, LookupError) as error:
                 text = " ".join(str(error).split()) or type(error).__name__
                 raise ClusterError(
                     f"the worker processes could not be started ({text}); run again, or with"
@@ -269,7 +270,7 @@ def _connect(scheduler: str) -> Client:
     try:
         get_backend(address.partition("://")[0])  # a Client of an unknown one cannot be closed
         return Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError, LookupError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
         raise ClusterError(
             f"--scheduler: no scheduler at {address} ({text}); start one with: dask scheduler"
@@ -290,9 +291,20 @@ def _address_in(file: Path) -> str:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """dask's log stays away from the command's lines: what matters of it ends in one of these."""
-    import distributed  # makes its loggers
+    """Keep dask's log away from the command's lines: what matters of it ends in one of these.
 
+    Raises:
+        ClusterError: dask cannot read its own configuration, of files or of variables.
+    """
+    try:
+        import distributed  # makes its loggers
+    except ImportError:
+        raise
+    except Exception as error:
+        raise ClusterError(
+            f"dask cannot read its configuration ({' '.join(str(error).split())}); correct the"
+            " file, in ~/.config/dask or where DASK_CONFIG says, or run with --jobs 1"
+        ) from None
     names = [n for n in logging.root.manager.loggerDict if n.split(".")[0] == distributed.__name__]
     levels = {logging.getLogger(name): logging.getLogger(name).level for name in names}
     try:

@@ -311,3 +311,18 @@ def test_a_worker_gets_a_scenes_files_again_when_it_comes_back_or_a_cell_of_it_f
     assert place.receive(cell, failed) is failed
     place.submit(client, "tcp://b:1", cell)
     assert sent[5:] == ["files"]
+
+
+def test_a_malformed_configuration_of_dasks_is_named_in_a_line(tmp_path):
+    """In a process of its own: dask reads it when it is imported."""
+    (tmp_path / "mine.yaml").write_text("distributed: [\n")
+    code = "from attnwarp_eval.study.cluster import _silent\nwith _silent(): pass"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "DASK_CONFIG": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    *_, last = done.stderr.splitlines()
+    assert "ClusterError: dask cannot read its configuration" in last
+    assert f"{tmp_path}/mine.yaml" in last and last.endswith("or run with --jobs 1")
