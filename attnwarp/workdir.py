@@ -178,7 +178,10 @@ class Workdir:
         # Without its manifest, a folder's results are of no known settings.
         remedy = "name another folder" if name == MANIFEST else "remove it, it is made anew"
         try:
-            return json.loads(path.read_text(encoding="utf-8"))
+            value = json.loads(path.read_text(encoding="utf-8"))
+            if not isinstance(value, dict):
+                raise ValueError("expected an object")
+            return value
         except (ValueError, RecursionError) as error:
             raise FileFormatError(path, f"not JSON ({error}); {remedy}") from None
 
@@ -222,9 +225,12 @@ class Workdir:
         """The record of a picture.
 
         Raises:
-            FileFormatError: it is no JSON.
+            FileFormatError: it is no JSON, or no record.
         """
         record: dict[str, Any] = self.read_json(record_of(picture))
+        if "sha256" not in record:
+            path = self.path / record_of(picture)
+            raise FileFormatError(path, "is no record of a picture; remove it, it is made anew")
         return record
 
     def made(self, picture: str) -> bool:

@@ -65,6 +65,13 @@ def test_a_checkpoint_of_an_earlier_version_or_of_no_names_is_refused(tmp_path):
     refused(path, "made by an older version")
 
 
+@pytest.mark.parametrize("text", ['{"sha25": "0"}', "[]", "{"])
+def test_a_record_that_says_nothing_of_its_picture_is_named(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(FileFormatError, match=r"a\.json: .*remove it, it is made anew"):
+        Workdir(tmp_path, "an edit").made("a.png")
+
+
 def test_checkpoints_take_a_twentieth_of_the_time_however_long_one_takes(monkeypatch):
     """Oracle: a clock that only this test moves."""
     now = 0.0
