@@ -6,6 +6,7 @@ files lie in the run's folder, so that workers have to see that folder and the m
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache, lru_cache
@@ -108,6 +109,8 @@ class Reproduction(Probe[Made]):
 
 def _own_device(devices: Sequence[str]) -> str:
     """The device of this process: the one with the number of its worker, in turn."""
+    if "distributed" not in sys.modules:  # the command itself, which needs no dask
+        return devices[0]
     from distributed import get_worker
 
     try:
