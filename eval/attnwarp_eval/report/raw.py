@@ -31,8 +31,8 @@ NAME = "results.jsonl.xz"
 PARTS = "results*.jsonl.xz"
 """Files of raw results in a folder; several are parts of one study."""
 
-DIGITS = 9
-"""Significant digits of a figure: more than any tolerance asks for."""
+DIGITS = 6
+"""Significant digits of a figure: what is lost is below every tolerance of a metric."""
 
 
 def write_raw(store: Store, path: Path) -> Path:
