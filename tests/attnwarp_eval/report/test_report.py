@@ -2,6 +2,7 @@
 hand."""
 
 import dataclasses
+import functools
 import itertools
 import math
 import re
@@ -634,10 +635,16 @@ def test_the_comparison_has_both_sides_of_the_claims_about_methods(claim, sides)
         assert alike[0] == labels[0]  # the first of them is the claim's
 
 
+@functools.cache
+def shipped(name):
+    """A study that claims name, whose scenes are drawn once."""
+    return load_study(name)
+
+
 @pytest.mark.parametrize("claim", load_claims(), ids=lambda claim: claim.id)
 def test_the_study_that_judges_a_claim_measures_its_sides_and_its_control(claim):
     """Oracle: the study's YAML; a claim without a side or a control can never be told."""
-    study, asked = load_study(claim.study), probe(claim.probe)
+    study, asked = shipped(claim.study), probe(claim.probe)
     control = {} if claim.control is None else claim.control
     for side in (claim.a, claim.b, control.get("worse"), control.get("better")):
         if side is None:
@@ -654,7 +661,7 @@ def test_the_study_that_judges_a_claim_measures_its_sides_and_its_control(claim)
 @pytest.mark.parametrize("name", sorted({claim.study for claim in load_claims()}))
 def test_a_study_without_the_settings_that_a_claim_names_has_no_such_variant(name):
     """A warp from inverted latents goes with no study whose views have noise of their own."""
-    study = load_study(name)
+    study = shipped(name)
     for claim in load_claims():
         labels = study.probes.get(claim.probe, ())
         for side in filter(None, (claim.a, claim.b)):
