@@ -277,6 +277,7 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
                 row.needs,
                 area_text(counted),
                 _two(pairs.lowest(row)),
+                percent(counted.paired),
                 area_text(pairs.shown(row, elsewhere), intervals=False),
                 percent(pairs.alarms(row)),
                 percent(pairs.alarms(row, METAL)),
@@ -286,8 +287,9 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
             ]
         )
     columns = [
-        "metric", "needs", "AUROC, five flaws", "lowest of five", "another scene",
-        "false alarms: varnish", "metal", "AUROC against metal", "undefined", "ms a pair",
+        "metric", "needs", "AUROC, five flaws", "lowest of five", "within a scene",
+        "another scene", "false alarms: varnish", "metal", "AUROC against metal", "undefined",
+        "ms a pair",
     ]  # fmt: skip
     what = "; ".join(flaw.at(flaw.reference) for flaw in COUNTED)
     text = [
@@ -299,7 +301,9 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
             f" (`{spec['edit']}`); in a flawed pair the second view has one flaw of known size."
             " **AUROC: the probability that a metric ranks a flawed pair below a right one of any"
             " scene at the same yaw. 1 sees every flaw, 0.5 is blind.** Intervals are of 95 %,"
-            " over scenes."
+            " over scenes. **Within a scene**: the share of pairs with one of the five flaws that"
+            " rank below the mean of the right pairs of their own scene and yaw, as methods are"
+            " compared on the same scenes."
         ),
         (
             f"Five flaws are named as those that matter most, and are"
