@@ -20,7 +20,7 @@ from attnwarp.errors import InputError, InputWarning
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import read_upright
 from attnwarp.methods.pictures import Segment, check_view_aspect, mask_picture
-from attnwarp.methods.scene import near_of, to_float
+from attnwarp.methods.scene import to_float
 from attnwarp.reporting import Reporter
 from attnwarp.warp import lift_masks, piece_around
 from attnwarp.workdir import Workdir
@@ -208,11 +208,10 @@ def lifted_segments(
     Values are whole 255ths, as the pictures of masks have them. A mask of a point ``at``, in px of
     the source view, is held to the surface around it.
     """
-    near = near_of(cameras, splats)
     if at is not None:
-        mask = mask & piece_around(splats, cameras[source], at, near=near)
+        mask = mask & piece_around(splats, cameras[source], at)
         report.log(f"held to the surface around the point, it marks {mask.mean():.1%}")
-    lifted = lift_masks(splats, [cameras[source]], [mask], near=near)
+    lifted = lift_masks(splats, [cameras[source]], [mask])
     (agreement,) = lifted.agreement
     left_out = int((~lifted.reached).sum())
     alone = f", {left_out} of them left out, as they have none" if left_out else ""

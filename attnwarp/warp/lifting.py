@@ -20,7 +20,8 @@ import torch
 from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.gaussians import SH_C0, Gaussians
-from attnwarp.render import constants, render
+from attnwarp.render import Render, render
+from attnwarp.warp.view import near_plane
 
 NEIGHBORS = 16
 """Splats that each is tied to."""
@@ -67,7 +68,7 @@ class LiftedMask:
     """
 
     gaussians: Gaussians
-    near: float
+    near: float | None
     backend: str
     membership: npt.NDArray[np.float64]
     seen: npt.NDArray[np.bool_]
@@ -88,7 +89,7 @@ def lift_masks(
     cameras: Sequence[Camera],
     masks: Sequence[npt.NDArray[Any]],
     *,
-    near: float = constants.NEAR,
+    near: float | None = None,
     backend: str = "auto",
 ) -> LiftedMask:
     """Lift masks of one or a few views of one thing through splats.
@@ -106,7 +107,9 @@ def lift_masks(
         masks: (h, w) of each view, bool or floating in [0, 1], of the camera's aspect ratio at any
             size. What none of them marks is outside, so a mask marks all of the thing that its view
             shows.
-        near, backend: see :func:`attnwarp.render.render`.
+        near: near-plane depth, in scene units; in each view a hundredth of the splats' median
+            distance if left out.
+        backend: renderer name, as for :func:`attnwarp.render.render`.
 
     Raises:
         ValueError: no masks, another number of cameras, or a mask of another shape, type or range;
@@ -192,7 +195,7 @@ def _votes(
     mask: npt.NDArray[np.float32],
     counted: npt.NDArray[np.bool_],
     camera: Camera,
-    near: float,
+    near: float | None,
     backend: str,
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """(N,) sum over counted pixels of w_i mask, and of w_i."""
@@ -200,7 +203,7 @@ def _votes(
         len(splats), 2, dtype=torch.float32, device=splats.means.device, requires_grad=True
     )
     with torch.enable_grad():
-        picture = render(splats, camera, features=values, near=near, backend=backend)
+        picture = _picture(splats, values, camera, near, backend)
         marks = torch.from_numpy(np.stack([mask * counted, counted], axis=-1))
         (sums,) = torch.autograd.grad((picture.color * marks.to(picture.color)).sum(), values)
     first, second = sums.double().cpu().numpy().T
@@ -226,14 +229,21 @@ def _shown(
     splats: Gaussians,
     membership: npt.NDArray[np.float64],
     camera: Camera,
-    near: float,
+    near: float | None,
     backend: str,
 ) -> npt.NDArray[np.float32]:
     values = torch.from_numpy(membership).to(splats.means)[:, None]
     with torch.no_grad():
-        picture = render(splats, camera, features=values, near=near, backend=backend)
+        picture = _picture(splats, values, camera, near, backend)
         share = picture.color[..., 0] / picture.alpha.clamp_min(1e-6)
     return np.asarray(share.clamp(0, 1).float().cpu().numpy())
+
+
+def _picture(
+    splats: Gaussians, values: torch.Tensor, camera: Camera, near: float | None, backend: str
+) -> Render:
+    plane = near_plane(splats, camera) if near is None else near
+    return render(splats, camera, features=values, near=plane, backend=backend)
 
 
 def footprints(splats: Gaussians, camera: Camera) -> npt.NDArray[np.float64]:
@@ -306,8 +316,15 @@ def _ties(splats: Gaussians) -> Any:
     distance, other = cKDTree(place).query(place, k=k + 1)
     distance, other = distance[:, 1:], other[:, 1:]
     own = np.broadcast_to(np.arange(count)[:, None], other.shape)
-    reach = np.maximum(np.median(distance, axis=1), np.finfo(float).tiny)
-    near = distance**2 / (reach[:, None] * reach[other])
+    reach = np.median(distance, axis=1)
+    crowded = reach == 0
+    if crowded.any():
+        # Copies at one place are spaced as the places are; any length will do where there is one.
+        places = np.unique(place, axis=0)
+        k = min(NEIGHBORS, len(places) - 1)
+        apart, _ = cKDTree(places).query(place[crowded], k=k + 1)
+        reach[crowded] = np.median(apart[:, 1:], axis=1) if k else 1.0
+    near = (distance / reach[:, None]) * (distance / reach[other])
     normal = splats.normals().double().cpu().numpy()
     bend = 1 - (normal[own] * normal[other]).sum(-1) ** 2
     color = splats.sh[:, 0].double().cpu().numpy() * SH_C0

@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
-from attnwarp.render import constants
 from attnwarp.warp.view import render_surface
 
 STEP = 0.02
@@ -28,7 +27,7 @@ def piece_around(
     camera: Camera,
     at: Sequence[float],
     *,
-    near: float = constants.NEAR,
+    near: float | None = None,
 ) -> npt.NDArray[np.bool_]:
     """(H, W) bool: pixels that a path of rendered surface joins to one, and a pixel around them.
 
@@ -39,7 +38,8 @@ def piece_around(
         gaussians: splats of either kind.
         camera: of the picture.
         at: x, y in px of it.
-        near: see :func:`attnwarp.render.render`.
+        near: near-plane depth, in scene units; a hundredth of the splats' median distance if left
+            out.
 
     Example:
         >>> import torch

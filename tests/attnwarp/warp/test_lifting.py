@@ -1,11 +1,13 @@
 """Masks lifted through splats: against rays in float64, a dense solution, and a ball on a plane."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from attnwarp import Camera, Gaussians
-from attnwarp.warp import lift_masks, lifting
+from attnwarp.warp import lift_masks, lifting, piece_around
 
 BALL = 1500
 """Discs on the ball."""
@@ -198,6 +200,36 @@ def test_splats_tied_to_none_that_is_seen_are_left_out():
     assert (
         lifted.membership[: BALL + 3600].min() > 0.99
     )  # everything: all that is tied to what is seen
+
+
+@pytest.mark.parametrize("copies", [10, 40])
+def test_splats_at_one_place_belong_to_what_lies_around_them(copies):
+    """Copies of the ball's top, of its back, which the view does not see, and of the plane's
+    corner."""
+    scene, view = ball_on_plane(), camera((3, 0, 1.0))
+    back = int(scene.means[:BALL, 0].argmin())
+    again = scene.select(torch.tensor([0, back, BALL]).repeat_interleave(copies))
+    lifted = lift_masks(joined(scene, again), [view], [ball_mask(view)])
+    assert lifted.reached.all()
+    top, hidden, corner = lifted.membership[len(scene) :].reshape(3, copies)
+    assert top.min() > 0.9 and hidden.min() > 0.5 and corner.max() < 0.1
+    heap = scene.select(torch.zeros(copies, dtype=torch.long))
+    assert (lift_masks(heap, [view], [np.ones((96, 96))]).membership > 0.99).all()
+
+
+def test_the_scale_of_a_scene_changes_no_mask():
+    """With a near plane of an absolute length a scene of centimetres would show nothing."""
+    scene, view = ball_on_plane(), camera((3, 0, 1.0))
+    small = replace(scene, means=scene.means * 1e-3, scales=scene.scales * 1e-3)
+    pose = view.world_to_camera.copy()
+    pose[:3, 3] *= 1e-3
+    near = Camera(view.K, pose, view.width, view.height)
+    mask = ball_mask(view)
+    first, second = (lift_masks(s, [c], [mask]) for s, c in ((scene, view), (small, near)))
+    # The solver ends at a residual of 1e-4.
+    np.testing.assert_allclose(first.membership, second.membership, atol=0.05)
+    at = (48.0, 48.0)
+    assert (piece_around(scene, view, at) == piece_around(small, near, at)).mean() > 0.999
 
 
 def test_masks_that_contradict_each_other_are_reported():
