@@ -25,7 +25,7 @@ from attnwarp.io.file import is_file
 from attnwarp.io.images import weighted_by_alpha
 
 HELD_OUT_EVERY = 8
-"""One image of so many is held out where a data set names no split (LLFF's habit)."""
+"""One image of so many is held out where a data set names no split (LLFF's share)."""
 
 HELD_BYTES = 2**31
 """Bytes of pictures that a GPU keeps: 650 of 1297 x 840 px in 8 bits."""
@@ -228,7 +228,8 @@ def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Da
     Args:
         dataset: posed images, see :func:`attnwarp.io.read_dataset`.
         every: without splits, one of so many images is held out, in the order of their names,
-            beginning with the first; 0 holds out none.
+            beginning after the data set's first, which edits take as their source; 0 holds out
+            none.
 
     Returns:
         The part to fit on, and the held-out part or None. A view that is fitted on is not held
@@ -250,7 +251,7 @@ def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Da
         ... ]
         >>> train, test = hold_out(Dataset(cameras, [None] * 9))
         >>> len(train), [camera.name for camera in test.cameras]
-        (7, ['00', '08'])
+        (8, ['01'])
     """
     if every < 0 or every == 1:
         raise ValueError(f"every: got {every}, expected 0 or at least 2")
@@ -264,8 +265,9 @@ def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Da
         train = dataset.split("train")
         return train, _apart(train, dataset.split(rest)) if rest else None
     order = sorted(range(len(dataset)), key=lambda i: dataset.cameras[i].name)
-    out = set(order[::every]) if every else set()
-    if not out or len(out) == len(dataset):
+    after = order.index(0) + 1 if order else 0
+    out = set([*order[after:], *order[:after]][:-1:every]) if every else set()
+    if not out:
         return dataset, None
     train = dataset.select([i for i in range(len(dataset)) if i not in out])
     return train, _apart(train, dataset.select(sorted(out)))

@@ -79,7 +79,8 @@ class EditOptions:
     Args:
         marks: what is edited.
         tune_outside: tune splats that are not marked, too.
-        source: name or number of the source view, which marks are of; the first if None.
+        source: name or number of the source view, which marks are of; the first if None, of the
+            split "train" where there is one.
         max_size: larger pictures are averaged down to it.
         device: of the editor and the splats, "auto", "cpu" or "cuda".
         dtype: of the editor; see :func:`attnwarp.devices.type_of`.
@@ -286,8 +287,10 @@ def _fitted(
 
 def view_of(cameras: Any, name: str | None, dataset: Dataset) -> int:
     """The number of a view by its name, its file's name with or without suffix, or its number."""
-    if name is None:
-        return 0
+    if name is None:  # the first that splats were fitted to
+        pairs = zip(dataset.splits, dataset.image_paths, strict=True)
+        splits = [split for split, image in pairs if image is not None]
+        return splits.index("train") if "train" in splits else 0
     names = [camera.name for camera in cameras]
     for candidates in _spellings(names):
         if candidates.count(name) == 1:

@@ -205,7 +205,7 @@ def test_a_fit_writes_over_no_picture_that_it_reads(data, tmp_path):
     path.write_text(path.read_text().replace("images/", "held_out/"))
     before = {p: p.read_bytes() for p in (tmp_path / "data").rglob("*.*")}
     done = in_process("fit", tmp_path / "data", "--out", tmp_path / "data", "--iterations", 1)
-    assert done.exit_code == 2 and "held_out/0.png: is read, and a result" in done.stderr
+    assert done.exit_code == 2 and "held_out/1.png: is read, and a result" in done.stderr
     assert {p: p.read_bytes() for p in (tmp_path / "data").rglob("*.*")} == before
 
 
@@ -285,13 +285,13 @@ def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
 
 def test_views_without_pictures_are_neither_fitted_on_nor_held_out(data, tmp_path):
     shutil.copytree(data, tmp_path / "data")
-    (tmp_path / "data" / "images" / "0.png").unlink()  # the first by name would be held out
+    (tmp_path / "data" / "images" / "1.png").unlink()  # the second by name would be held out
     done = in_process(
         "fit", tmp_path / "data", "--out", tmp_path / "out", "--missing-images", "none",
         "--iterations", "2", "--set", "densify=false",
     )  # fmt: skip
     assert done.exit_code == 0, done.stderr
-    assert [path.name for path in (tmp_path / "out" / "held_out").iterdir()] == ["1.png"]
+    assert [path.name for path in (tmp_path / "out" / "held_out").iterdir()] == ["2.png"]
 
 
 def test_the_number_of_threads_changes_no_bit(data, tmp_path):

@@ -200,10 +200,15 @@ def named(count, splits=None):
     return Dataset(cameras[::-1], [None] * count, splits=splits or [])
 
 
-def test_one_of_eight_is_held_out_in_the_order_of_names():
-    train, test = hold_out(named(17))
-    assert [c.name for c in test.cameras] == ["16.png", "08.png", "00.png"]
-    assert len(train) == 14
+def test_one_of_eight_is_held_out_in_the_order_of_names_and_never_the_first_view():
+    for first in range(17):
+        data = named(17).select([first, *(k for k in range(17) if k != first)])
+        train, test = hold_out(data)
+        # The one after the first in the order of names, and the eighth after that.
+        number = int(data.cameras[0].name[:2])
+        expected = {f"{(number + step) % 17:02d}.png" for step in (1, 9)}
+        assert {c.name for c in test.cameras} == expected
+        assert len(train) == 15 and train.cameras[0] is data.cameras[0]
     everything, nothing = hold_out(named(17), 0)
     assert len(everything) == 17 and nothing is None
 
@@ -296,16 +301,16 @@ def test_views_that_are_alike_and_others_stay_held_out(tmp_path, recwarn):
 
 
 def test_copies_among_pictures_without_splits_are_not_held_out(tmp_path):
-    """The first and the last of 9 pictures are held out, and the last is the second once more."""
-    paths = [tmp_path / f"{k}.png" for k in range(9)]
+    """Of ten pictures the second and the last are held out, and the last is the third once more."""
+    paths = [tmp_path / f"{k}.png" for k in range(10)]
     for k, path in enumerate(paths):
-        seed = 1 if k == 8 else k
+        seed = 2 if k == 9 else k
         pixels = np.random.default_rng(seed).integers(0, 256, (6, 8, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(path)
     cameras = [camera(8, 6, name=path.name).moved([k, 0, 0]) for k, path in enumerate(paths)]
-    with pytest.warns(InputWarning, match=r"'8\.png', which is '1\.png'"):
+    with pytest.warns(InputWarning, match=r"'9\.png', which is '2\.png'"):
         train, test = hold_out(Dataset(cameras, paths))
-    assert len(train) == 7 and [c.name for c in test.cameras] == ["0.png"]
+    assert len(train) == 8 and [c.name for c in test.cameras] == ["1.png"]
 
 
 def test_a_single_picture_is_fitted_on_and_not_held_out():

@@ -194,3 +194,11 @@ def test_image_of_another_form_is_not_read_twice_from_the_disk(tmp_path, monkeyp
 def test_a_source_view_is_found_by_another_spelling_of_its_name(name):
     cameras = views("left/a.png", "right/B.png", "c.png")
     assert view_of(cameras, name, Dataset(cameras, [None] * 3)) == 1
+
+
+def test_the_source_view_is_one_that_splats_are_fitted_to():
+    cameras = views("a.png", "b.png", "c.png", "d.png")
+    paths = ["a.png", None, "c.png", "d.png"]
+    data = Dataset(cameras, paths, splits=["test", "train", "val", "train"])
+    assert view_of([cameras[0], *cameras[2:]], None, data) == 2
+    assert view_of(cameras, None, Dataset(cameras, paths)) == 0
