@@ -222,7 +222,9 @@ def _fit(
 
 
 def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
-    """The settings, the curve, and the held-out views beside their pictures."""
+    """Write the settings, the curve, and the held-out views beside their pictures; print how near
+    each of these comes to its picture.
+    """
     from dataclasses import asdict
 
     from attnwarp.io.file import write_atomically
@@ -244,6 +246,7 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
 
     import torch
 
+    from attnwarp.losses import psnr
     from attnwarp.render import render
 
     folder = out / "held_out"
@@ -256,8 +259,10 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
         zip(held_out.cameras, file_stems(held_out.cameras), strict=True)
     ):
         color = render(result.gaussians, camera, background=background, near=near).color.clamp(0, 1)
-        both = torch.cat([held_out.target(index, background), color], dim=1)
-        write_image(folder / f"{name}.png", both.cpu().numpy())
+        target = held_out.target(index, background)
+        path = folder / f"{name}.png"
+        write_image(path, torch.cat([target, color], dim=1).cpu().numpy())
+        typer.echo(f"{path}: {psnr(color, target):.2f} dB")
 
 
 def _near(settings: FitSettings, extent: float) -> float:

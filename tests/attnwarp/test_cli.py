@@ -152,9 +152,15 @@ def test_fit_and_render_do_what_they_say(data, tmp_path):
     assert json.loads((out / "settings.json").read_text())["iterations"] == 60
     splats = read_ply(out / "splats.ply")
     assert splats.kind == "2d"
-    # 9 views: the first and the ninth are held out; picture and render side by side.
-    assert sorted(p.name for p in (out / "held_out").iterdir()) == ["0.png", "8.png"]
-    assert cv2.imread(str(out / "held_out" / "0.png")).shape == (32, 64, 3)
+    # Of 9 views the second is held out; picture and render side by side.
+    assert [p.name for p in (out / "held_out").iterdir()] == ["1.png"]
+    picture, drawn = np.split(cv2.imread(str(out / "held_out" / "1.png")).astype(float), 2, axis=1)
+    assert picture.shape == (32, 32, 3)
+    # Colours rounded to 8 bits: each off by half a step of 255 at most.
+    said = float(done.stdout.split("held_out/1.png: ")[1].split(" dB")[0])
+    error = np.sqrt(((picture - drawn) ** 2).mean())
+    assert said == pytest.approx(20 * np.log10(255 / error), abs=20 * np.log10(1 + 0.6 / error))
+    assert f"held-out PSNR {said:.2f} dB" in done.stdout  # of all, here of one
 
     pictures = tmp_path / "pictures"
     done = in_process(
