@@ -19,6 +19,7 @@ from attnwarp.fit.densify import Density
 from attnwarp.fit.model import Model
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.start import extent_of
+from attnwarp.fit.time_left import TimeLeft
 from attnwarp.fit.views import Views, warn_of_twins
 from attnwarp.fit.warm import compile_kernels
 from attnwarp.gaussians import Gaussians
@@ -235,6 +236,7 @@ class _Run:
         self.extent = extent_of(views.cameras, start.world_means())
         centers = np.stack([camera.position for camera in views.cameras])
         self.start, self.first_degree = start.digest(), start.used_sh_degree()
+        self.time_left = TimeLeft(settings, len(start), views.images[0][..., 0].size)
         self.model = Model(start, settings, self.extent)
         middle = centers.mean(0) - self.model.origin
         self.density = Density(settings, self.extent, middle, len(start), self.model.device)
@@ -359,7 +361,10 @@ class _Run:
             # The last before it is shown, so that what stays on a screen is the result's.
             if self.iteration % s.evaluate_every == 0 or self.iteration == s.iterations:
                 self.evaluate()
-            report.step(self.iteration, s.iterations, self.figures())
+            left = self.time_left.after(self.iteration, len(self.model))
+            if max_seconds is not None:
+                left = min(left, max_seconds - self.seconds)
+            report.step(self.iteration, s.iterations, self.figures(), left)
             if self.folder is not None and clock.due:
                 with clock.saving():
                     self.save()

@@ -1,0 +1,55 @@
+"""The time that a fit will take: its iterations grow dearer as splats are added."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from attnwarp.fit.settings import FitSettings
+from attnwarp.reporting import Pace
+
+PIXELS_PER_SPLAT = 5
+"""Pixels of a picture that take as long as one splat does, from 14,000 to 112,000 splats at 256 x
+256 px."""
+
+
+class TimeLeft:
+    """Tells the seconds of a fit's iterations to come by the pace of those done.
+
+    The work of an iteration is that of its splats and its pixels. Splats are taken to grow by as
+    many a refinement as so far.
+
+    Args:
+        settings: settings of the fit.
+        first: number of the first splats.
+        pixels: pixels of a picture.
+    """
+
+    def __init__(self, settings: FitSettings, first: int, pixels: int) -> None:
+        self.settings, self.first, self.pixels = settings, first, pixels // PIXELS_PER_SPLAT
+        self._pace, self._done = Pace(), 0
+
+    def after(self, iteration: int, splats: int) -> float:
+        """Seconds left when so many iterations are done; NaN while they cannot be told.
+
+        Called after each iteration.
+        """
+        self._done += splats + self.pixels
+        ahead = self._ahead(iteration, splats)
+        left = self._pace.left(self._done, self._done + round(ahead or 1))
+        return math.nan if ahead is None or left is None else left
+
+    def _ahead(self, iteration: int, splats: int) -> float | None:
+        """Work to come; None before two refinements show how splats grow."""
+        s = self.settings
+        last = int(s.densify_until * s.iterations) if s.densify else 0
+        times = np.arange(0, last, s.densify_every)
+        times = times[times >= max(1, s.densify_from)]
+        past, ahead = times[times < iteration], times[times >= iteration]
+        if len(ahead) and len(past) < 2:
+            return None
+        growth = max(0, splats - self.first) / max(1, len(past))
+        counts = splats + growth * np.arange(len(ahead) + 1)
+        counts = np.minimum(counts, max(splats, s.max_splats or math.inf))
+        return float((np.diff([iteration, *ahead, s.iterations]) * (counts + self.pixels)).sum())
