@@ -318,34 +318,15 @@ def normal_consistency(view: Render) -> Tensor:
     return torch.where(defined, view.alpha - agreement, 0.0).mean()
 
 
-ORDERED_WEIGHT = 0.01
-"""Largest weight of the "ordered" distortion over the extent that fits use of themselves.
-
-Nothing bounds that sum from below: a fit of the scene "bear" with 0.03 made it negative, and lost
-its depth.
-"""
-
-
-def distortion_form(weight: float) -> Distortion:
-    """Choose the form of :func:`depth_distortion` where none is named: "ordered" up to
-    ``ORDERED_WEIGHT``, for its speed, and "l1" above, for its lower bound of 0.
-
-    Example:
-        >>> distortion_form(0.01), distortion_form(0.1)
-        ('ordered', 'l1')
-    """
-    return "ordered" if weight <= ORDERED_WEIGHT else "l1"
-
-
 def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.0) -> Tensor:
     """Mean over pixels of the spread of the splats that share a ray.
 
     Args:
         view: what was rendered.
-        form: "l1", sum_ij w_i w_j |z_i - z_j|, each pair twice (the 2DGS paper). "ordered", the
-            same with z_i - z_j in compositing order, j in front (gsplat): cheaper, and too small
-            where splats intersect. "l2_ndc", sum_{j<i} w_i w_j (m_i - m_j)^2, each pair once, with
-            depths mapped to [0, 1] (the original 2DGS code).
+        form: "l1", sum_ij w_i w_j |z_i - z_j|, each pair twice (the 2DGS paper). "ordered", 2 sum_i
+            w_i |sum_{j<i} w_j (z_i - z_j)|, j composited before i: cheaper, and less where splats
+            intersect. "l2_ndc", sum_{j<i} w_i w_j (m_i - m_j)^2, each pair once, with depths mapped
+            to [0, 1] (the original 2DGS code).
         scale: a length in scene units that "l1" and "ordered" are divided by, so that their weight
             does not depend on the scene's unit.
 

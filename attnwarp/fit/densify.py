@@ -111,7 +111,10 @@ class Density:
             return False
         done = False
         if iteration >= s.densify_from and iteration % s.densify_every == 0:
-            self._grow_and_prune(model, iteration > s.reset_every, random)
+            # Published: after the first reset, which a short fit has none of. By half of the time,
+            # first splats that were too large have been split or have shrunk.
+            sizes_count = iteration > min(s.reset_every, self.last / 2)
+            self._grow_and_prune(model, sizes_count, random)
             done = True
         if iteration % s.reset_every == 0:
             model.lower_opacity(s.reset_opacity)

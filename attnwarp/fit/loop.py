@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
@@ -15,6 +16,7 @@ import numpy as np
 import torch
 
 from attnwarp import check, losses
+from attnwarp.errors import InputWarning
 from attnwarp.fit.densify import Density
 from attnwarp.fit.model import Model
 from attnwarp.fit.settings import FitSettings
@@ -36,6 +38,9 @@ SPLATS = "splats.ply"
 
 NAMED = {"start": "first splats", "held_out": "held-out views"}
 """Names, in messages, of parts of a fit's identity."""
+
+GIANT = 30
+"""Size of a splat, in extents of the scene, that is warned of; skies and far hills have 5 to 20."""
 
 SMOOTHING = 0.98
 """Share of the past in the loss and the PSNR that are shown while a fit runs."""
@@ -164,8 +169,8 @@ def fit(
             message says what to try. The last checkpoint stays.
 
     Warns:
-        InputWarning: held-out pictures that are fitted on; float32 world coordinates would not do
-            for ``splats.ply``.
+        InputWarning: held-out pictures that are fitted on; splats 30 times as large as the scene;
+            float32 world coordinates would not do for ``splats.ply``.
 
     Example:
         >>> import numpy as np
@@ -372,6 +377,7 @@ class _Run:
             self.evaluate()
         self.save()
         gaussians = self.model.gaussians().detach()
+        self.warn_of_giants(gaussians)
         if self.folder is not None:
             # After the checkpoint: splats without one are taken for somebody's own.
             write_ply(self.folder.path / SPLATS, gaussians, third_scale=self.third_scale)
@@ -385,6 +391,19 @@ class _Run:
             stopped,
             self.extent,
         )
+
+    def warn_of_giants(self, gaussians: Gaussians) -> None:
+        """Say whether splats are far larger than the scene: where they show, depth is lost."""
+        sizes = gaussians.scales.amax(dim=1) / self.extent
+        giants = int((sizes > GIANT).sum())
+        if giants:
+            warnings.warn(
+                f"{giants} of {len(gaussians)} splats are more than {GIANT} times as large as the"
+                f" scene, up to {float(sizes.max()):.0f} times: depth may be wrong where they show;"
+                " look at it (attnwarp render --depth), and try another seed",
+                InputWarning,
+                stacklevel=3,
+            )
 
     def _reason_to_stop(self, max_seconds: float | None, stop: Callable[[], bool] | None) -> str:
         if self.iteration >= self.settings.iterations:
@@ -487,7 +506,7 @@ class _Run:
             loss = loss + s.normal_weight * losses.normal_consistency(view)
         if s.distortion_weight and done >= s.distortion_from:
             loss = loss + s.distortion_weight * losses.depth_distortion(
-                view, s.distortion_sum, scale=self.extent
+                view, s.distortion_form, scale=self.extent
             )
         return loss
 

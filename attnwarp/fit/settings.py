@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from attnwarp.gaussians import Kind
-from attnwarp.losses import Distortion, distortion_form
+from attnwarp.losses import Distortion
 from attnwarp.settings import Count, Number, Range, Settings, Share, Weight
 
 Background = Literal["auto", "random", "black", "white"]
@@ -35,8 +35,7 @@ class FitSettings(Settings):
         normal: weight of normal consistency. None: 0.05 for "2d" (published), 0 for "3d".
         distortion: weight of depth distortion. None: 0.01 for "2d", 0 for "3d".
         distortion_form: "l1" or "ordered" (in units of the scene's extent), or "l2_ndc"; see
-            :func:`attnwarp.losses.depth_distortion`. None: "ordered" up to the default weight, "l1"
-            above it, where "ordered" becomes negative and ruins a fit.
+            :func:`attnwarp.losses.depth_distortion`. "l1" takes twice as long.
         normal_from, distortion_from: share of the iterations after which these begin (2DGS: 7,000
             and 3,000 of 30,000).
         background: colour behind the splats and behind transparent pixels of the images: "black",
@@ -52,8 +51,8 @@ class FitSettings(Settings):
             go first. None: without limit.
         prune_opacity: splats below this opacity are removed. None: 0.05 for "2d", 0.005 for "3d"
             (published).
-        prune_scale: splats larger than this share of the extent are removed after the first opacity
-            reset.
+        prune_scale: splats larger than this share of the extent are removed, from the first opacity
+            reset on or the middle of ``densify_until``, whichever is earlier.
         reset_every: iterations after which all opacities are lowered to ``reset_opacity``, as long
             as splats are added.
         reset_opacity: see there.
@@ -93,7 +92,7 @@ class FitSettings(Settings):
     ssim: Share = 0.2
     normal: Weight | None = None
     distortion: Weight | None = None
-    distortion_form: Distortion | None = None
+    distortion_form: Distortion = "ordered"
     normal_from: Share = 0.23
     distortion_from: Share = 0.1
     background: Background = "auto"
@@ -129,11 +128,6 @@ class FitSettings(Settings):
     def distortion_weight(self) -> float:
         """``distortion``, or its default for the kind."""
         return (0.01 if self.kind == "2d" else 0.0) if self.distortion is None else self.distortion
-
-    @property
-    def distortion_sum(self) -> Distortion:
-        """``distortion_form``, or its default for the weight."""
-        return self.distortion_form or distortion_form(self.distortion_weight)
 
     @property
     def opacity_floor(self) -> float:

@@ -46,8 +46,8 @@ class MethodSettings(Settings):
         image_guidance: s_I of InstructPix2Pix; None for the editor's own.
         iterations: of tuning, one view each: in all, or in each stage of attention warping.
         l1, ssim, perceptual, normal, distortion: weights of the losses; that of ssim counts
-            1 - SSIM, that of distortion the form that :func:`attnwarp.losses.distortion_form`
-            chooses.
+            1 - SSIM, that of distortion the form "ordered" of
+            :func:`attnwarp.losses.depth_distortion`.
         perceptual_encoder: :func:`attnwarp.encoders.load_encoder`'s name of the perceptual loss.
         color_rate: factor of the published learning rates of the colours.
         background: behind the splats while tuning.

@@ -357,8 +357,7 @@ class Tuning:
         if s.normal:
             loss = loss + s.normal * losses.normal_consistency(picture)
         if s.distortion:
-            form = losses.distortion_form(s.distortion)
-            distortion = losses.depth_distortion(picture, form, scale=self.model.extent)
+            distortion = losses.depth_distortion(picture, "ordered", scale=self.model.extent)
             loss = loss + s.distortion * distortion
         return loss
 

@@ -39,9 +39,9 @@ class Render:
             splat's.
         normal: (H, W, 3) sum w_i n_i in world axes, each n_i turned to face the camera; its length
             is at most alpha.
-        distortion_ordered: (H, W) 2 sum_{j<i} w_i w_j (z_i - z_j) in compositing order (gsplat):
-            ``distortion_l1`` where depth grows along that order. A pair out of order counts
-            negative. Scene units.
+        distortion_ordered: (H, W) 2 sum_i w_i |sum_{j<i} w_j (z_i - z_j)| in compositing order:
+            ``distortion_l1`` where depth grows along that order, less elsewhere, and 0 only where
+            that is 0. Scene units.
         distortion_l2_ndc: (H, W) sum_{j<i} w_i w_j (m_i - m_j)^2 with m = far / (far - near) (1 -
             near / z) and the planes ``ndc`` (the original 2DGS code). No unit.
         weight: (N,) sum over pixels of w_i: how much of the picture a splat makes up; 0 means it is

@@ -63,6 +63,11 @@ COMPENSATION_MIN = 1e-6
 """Smallest squared opacity factor det S / det (S + 0.3 I) of the antialiased 3DGS mode; keeps its
 square root's slope finite for a splat seen exactly edge-on."""
 
+GAP_MIN = 1e-6
+"""Share of a depth, ten roundings of float32, below which a gap has no sign: |gap| has no slope
+there.
+"""
+
 MEDIAN_TRANSMITTANCE = 0.5
 """The median depth is that of the last splat drawn while the transmittance in front of it is above
 this.

@@ -80,9 +80,9 @@ def _pictures(inputs: Inputs, *, with_state: bool) -> layout.Pictures:
     h, w = inputs.height, inputs.width
     color = _pool.empty((h, w, inputs.channels), np.float32)
     normal = _pool.empty((h, w, 3), np.float32)
-    alpha, depth, median, l1, l2 = (_pool.empty((h, w), np.float32) for _ in range(5))
+    alpha, depth, median, ordered, l2 = (_pool.empty((h, w), np.float32) for _ in range(5))
     state = _pool.empty((len(layout.STATE), h if with_state else 0, w), np.float32)
-    return layout.Pictures(color, alpha, depth, median, normal, l1, l2, state)
+    return layout.Pictures(color, alpha, depth, median, normal, ordered, l2, state)
 
 
 def _workspace(channels: int) -> rasterization.Workspace:

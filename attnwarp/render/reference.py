@@ -7,17 +7,17 @@ between the two means something. Small scenes and small images only: memory is s
 
 Notation. c = R m + t is a splat's centre in camera axes, d = K^-1 (x, y, 1) the ray of a pixel with
 d_z = 1, so that a depth z is the point z d. w_i = alpha_i T_i with T_i = prod_{j<i} (1 - alpha_j),
-front to back by c_z.
+front to back by c_z. Splats whose centre is not beyond the near plane, c_z <= near, are not drawn.
 
 2D splats: the ray meets the plane at z = n.c / n.d in the splat's coordinates (u, v); rho = min(u^2
-+ v^2, 2 |x - x_c|^2) and alpha = o exp(-rho / 2). The first term holds only where near <= z, the
-second only where near < c_z. Where the second decides, z of the plane may lie anywhere: it is
-bounded to the splat's own extent, c_z +- 3.33 sigma_z, and to near. Since |u, v| <= 3.33 wherever
-the first decides, the bound changes nothing there and z is continuous.
++ v^2, 2 |x - x_c|^2) and alpha = o exp(-rho / 2). The first term holds only where near <= z. Where
+the second decides, z of the plane may lie anywhere: it is bounded to the splat's own extent, c_z +-
+3.33 sigma_z, and to near. Since |u, v| <= 3.33 wherever the first decides, the bound changes
+nothing there and z is continuous.
 
-3D splats: EWA, Sigma' = J Sigma_c J^T + 0.3 I with J at x/z clamped on each side of the image;
-centres at or before the near plane are not drawn. "peak" depth is where the 3D Gaussian is largest
-along the ray, z = d.P.c / d.P.d with P = Sigma_c^-1, bounded to the splat's extent in the same way.
+3D splats: EWA, Sigma' = J Sigma_c J^T + 0.3 I with J at x/z clamped on each side of the image.
+"peak" depth is where the 3D Gaussian is largest along the ray, z = d.P.c / d.P.d with P =
+Sigma_c^-1, bounded to the splat's extent in the same way.
 """
 
 from __future__ import annotations
@@ -94,6 +94,7 @@ def render(
     index = torch.from_numpy(
         order.front_to_back(centers[:, 2].detach().numpy().astype("float32"), content)
     )
+    index = index[centers[index, 2] > inputs.near]
     splats = _Splats(
         centers[index],
         axes[index],
@@ -152,8 +153,8 @@ class _Splats:
         """
         inputs, limits = self.inputs, self.limits
         rays = torch.stack(_unproject(x, y, self.K), dim=-1)
-        raw, z, drawn = (self._disc if inputs.kind == "2d" else self._ellipsoid)(x, y, rays)
-        drawn = drawn & (raw >= limits.alpha_min)
+        raw, z = (self._disc if inputs.kind == "2d" else self._ellipsoid)(x, y, rays)
+        drawn = raw >= limits.alpha_min
         alpha = torch.where(drawn, raw.clamp(max=constants.ALPHA_MAX), 0.0)
         before = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], dim=1), dim=1)[
             :, :-1
@@ -179,34 +180,33 @@ class _Splats:
             median = nan
         near, far = inputs.ndc
         m = far / (far - near) * (1 - near / z)
-        ordered = _signed_gaps(w, z)
+        gaps = _gaps(w, z)
+        flat = gaps.detach().abs() <= constants.GAP_MIN * z.detach()
+        ordered = 2 * (w * torch.where(flat, gaps.detach(), gaps).abs()).sum(dim=1)
         # By depth at the pixel, no pair is out of order. Depths that are equal in float32 stay in
         # compositing order: |z_i - z_j| has no slope there, and the sign of rounding is none.
         by_depth = z.detach().float().argsort(dim=1, stable=True)
-        l1 = _signed_gaps(w.gather(1, by_depth), z.gather(1, by_depth))
+        sorted_w = w.gather(1, by_depth)
+        l1 = 2 * (sorted_w * _gaps(sorted_w, z.gather(1, by_depth))).sum(dim=1)
         l2 = (w * (m * m * _before(w) + _before(w * m * m) - 2 * m * _before(w * m))).sum(dim=1)
         return color, total, depth, median, normal, ordered, l2, l1, w.sum(dim=0), drawn.sum()
 
     def _extent(self, variance_z: Tensor) -> tuple[Tensor, Tensor]:
-        near = self.inputs.near
         # Bounded from below: the slope of a square root at zero is infinite, and a disc may lie
         # exactly across the axis.
         reach = constants.EXTENT_SIGMAS * variance_z.clamp(min=1e-300).sqrt()
         z = self.centers[:, 2]
-        return (z - reach).clamp(min=near), (z + reach).clamp(min=near)
+        return (z - reach).clamp(min=self.inputs.near), z + reach
 
-    def _disc(self, x: Tensor, y: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _disc(self, x: Tensor, y: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
         near, c = self.inputs.near, self.centers
         tu, tv, n = self.axes.unbind(-1)
         nc = (n * c).sum(-1)
         floor = constants.EDGE_ON * c.norm(dim=-1)
         tilted = torch.where(nc.abs() < floor, torch.where(nc < 0, -floor, floor), nc)
-        in_front = c[:, 2] > near
         # Tilting an edge-on plane leaves it through the centre, so n.d changes by as much as n.c
         # does.
-        nd = rays @ n.T + torch.where(
-            in_front, (tilted - nc) / torch.where(in_front, c[:, 2], 1.0), 0.0
-        )
+        nd = rays @ n.T + (tilted - nc) / c[:, 2]
         # 1 / z is the linear quantity along a row of pixels; it passes through zero where the plane
         # is parallel to the ray.
         inverse = nd / tilted
@@ -216,27 +216,23 @@ class _Splats:
         u = (hit * tu).sum(-1) / self.scales[:, 0]
         v = (hit * tv).sum(-1) / self.scales[:, 1]
         meets = ahead & (z >= near)
-        far_away = torch.full_like(u, torch.inf)
-        rho = torch.where(meets, u * u + v * v, far_away)
-        xc, yc = _project(c, in_front, self.K)
+        rho = torch.where(meets, u * u + v * v, torch.inf)
+        xc, yc = _project(c, self.K)
         square = (x[:, None] - xc) ** 2 + (y[:, None] - yc) ** 2
-        screen = torch.where(in_front, square / constants.FILTER_SIGMA_2D**2, far_away)
-        rho = torch.minimum(rho, screen)
-        drawn = torch.isfinite(rho)
-        alpha = self.opacities * torch.exp(-0.5 * torch.where(drawn, rho, 0.0))
+        rho = torch.minimum(rho, square / constants.FILTER_SIGMA_2D**2)
+        alpha = self.opacities * torch.exp(-0.5 * rho)
         if self.inputs.depth == "center":
-            return alpha, c[:, 2].clamp(min=near).expand_as(alpha), drawn
+            return alpha, c[:, 2].expand_as(alpha)
         spread = (self.scales[:, 0] * tu[:, 2]) ** 2 + (self.scales[:, 1] * tv[:, 2]) ** 2
         lo, hi = self._extent(spread)
         # On a disc parallel to the image lo = z = hi, but however little it is tilted, z lies
         # inside: the slope is that of z. minimum and maximum would mix it with the bounds'.
         bounded = torch.where(z < lo, lo, torch.where(z > hi, hi, z))
-        return alpha, torch.where(ahead, bounded, hi.expand_as(z)), drawn
+        return alpha, torch.where(ahead, bounded, hi.expand_as(z))
 
-    def _ellipsoid(self, x: Tensor, y: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _ellipsoid(self, x: Tensor, y: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
         inputs, c, K = self.inputs, self.centers, self.K
-        in_front = c[:, 2] > inputs.near
-        depth = torch.where(in_front, c[:, 2], 1.0)
+        depth = c[:, 2]
         half = self.axes * self.scales[:, None, :]
         sigma = half @ half.transpose(1, 2)
         limit = []
@@ -260,25 +256,24 @@ class _Splats:
         opacity = self.opacities
         if inputs.antialiased:
             opacity = opacity * (sharp / det).clamp(min=constants.COMPENSATION_MIN).sqrt()
-        xc, yc = _project(c, in_front, K)
+        xc, yc = _project(c, K)
         dx, dy = x[:, None] - xc, y[:, None] - yc
         across = dx[..., None] * M[:, 1] - dy[..., None] * M[:, 0]
         power = ((across**2).sum(-1) + blur * (dx * dx + dy * dy)) / det
         alpha = opacity * torch.exp(-0.5 * power)
-        drawn = in_front.expand_as(alpha)
         if inputs.depth == "center":
-            return alpha, depth.expand_as(alpha), drawn
+            return alpha, depth.expand_as(alpha)
         # d.P.c and d.P.d in the splat's own axes and scales: P itself spans the scales squared.
         ray = torch.einsum("pi,nij->pnj", rays, self.axes) / self.scales
         center = torch.einsum("ni,nij->nj", c, self.axes) / self.scales
         along, across = (ray * center).sum(-1), (ray * ray).sum(-1)
         lo, hi = self._extent(sigma[:, 2, 2])
-        return alpha, torch.minimum(torch.maximum(along / across, lo), hi), drawn
+        return alpha, torch.minimum(torch.maximum(along / across, lo), hi)
 
 
-def _signed_gaps(w: Tensor, z: Tensor) -> Tensor:
-    """Sum over ordered pairs of w_i w_j (z_i - z_j), each pair with the later one first."""
-    return 2 * (w * (z * _before(w) - _before(w * z))).sum(dim=1)
+def _gaps(w: Tensor, z: Tensor) -> Tensor:
+    """sum_{j<i} w_j (z_i - z_j) for each splat i."""
+    return z * _before(w) - _before(w * z)
 
 
 def _before(values: Tensor) -> Tensor:
@@ -292,6 +287,6 @@ def _unproject(x: Tensor, y: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Tensor]
     return dx, dy, torch.ones_like(dx)
 
 
-def _project(c: Tensor, in_front: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    z = torch.where(in_front, c[:, 2], 1.0)
+def _project(c: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    z = c[:, 2]
     return (K[0, 0] * c[:, 0] + K[0, 1] * c[:, 1]) / z + K[0, 2], K[1, 1] * c[:, 1] / z + K[1, 2]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from attnwarp.render import constants
 from attnwarp.render._gpu.compositing import Past, Plane, pixel_of
 from attnwarp.render._gpu.evaluation import ALPHA_MAX, depth_from, evaluate
 from attnwarp.render._gpu.lanes import (
@@ -22,6 +23,7 @@ from attnwarp.render._gpu.lanes import (
 from attnwarp.render._gpu.layout import DiscSum, EllipsoidSum, Of, Sum, View
 
 f32 = wp.float32
+GAP_MIN = f32(constants.GAP_MIN)
 
 
 @wp.kernel(enable_backward=False)
@@ -60,9 +62,12 @@ def composite_backward(
     exact = past.shape[0] > 0
     last, median_step, at = wp.int32(0), wp.int32(0), wp.int32(0)
     T, A, mean, mean_inverse = f32(1.0), f32(1.0), f32(0.0), f32(0.0)
-    in_depth, in_l2, in_l1, in_exact, in_median = f32(0.0), f32(0.0), f32(0.0), f32(0.0), f32(0.0)
+    in_depth, in_l2, in_median = f32(0.0), f32(0.0), f32(0.0)
+    in_ordered, in_exact = f32(0.0), f32(0.0)
     in_normal, in_color = wp.vec3f(), wp.vec3f()
     behind_alpha, behind_depth = f32(0.0), f32(0.0)
+    # Each splat's part with the sign of its gap.
+    signed_alpha, signed_depth = f32(0.0), f32(0.0)
     # Begins with minus the gradient in alpha times the transmittance, which is all that alpha
     # changes with: where a pixel is opaque, a difference of sums of weights has no digits of it.
     behind_loss = f32(0.0)
@@ -85,10 +90,9 @@ def composite_backward(
         for k in range(3):
             in_normal[k] = d_normal[row, column, k]
         behind_loss = -in_alpha * T
-        in_l1 = f32(2.0) * d_ordered[row, column]
+        in_ordered = f32(2.0) * d_ordered[row, column]
         if exact:
             in_exact = f32(2.0) * d_exact[row, column]
-            in_l1 += in_exact
             at = wp.int32(ends[row, column])
         in_median = d_median[row, column]
     begin = bounds[here.tile, 0]
@@ -116,15 +120,23 @@ def composite_backward(
                     g += in_color[k] * singles[i, Of.values + k]
                 for k in range(3, view.channels):
                     g += d_color[row, column, k] * features[i, k]
-                # In front minus behind, of the weights and of the weighted depths.
+                # In front the weights sum up to ``front``, and the gaps from there, times the
+                # weights, to ``gap``: first moments vanish about the mean.
                 w_depth = w * z[0]
-                lean = A - w - f32(2.0) * behind_alpha
-                g += in_l1 * (z[0] * lean + w_depth + f32(2.0) * behind_depth)
-                in_z = w * (in_depth + in_l1 * lean)
+                front = A - w - behind_alpha
+                gap = z[0] * front + w_depth + behind_depth
+                sign = f32(0.0)
+                if wp.abs(gap) > GAP_MIN * (z[0] + mean):
+                    sign = wp.sign(gap)
+                g += in_ordered * (sign * gap + signed_depth - z[0] * signed_alpha)
+                in_z = w * (in_depth + in_ordered * (sign * front - signed_alpha))
                 if exact:
                     at -= 1
-                    g += f32(2.0) * in_exact * past[at, Past.spread]
-                    in_z += w * f32(2.0) * in_exact * past[at, Past.lean]
+                    spread, lean = past[at, Past.spread], past[at, Past.lean]
+                    g += in_exact * (
+                        gap + behind_depth - z[0] * behind_alpha + f32(2.0) * spread
+                    )  # fmt: skip
+                    in_z += w * in_exact * (front - behind_alpha + f32(2.0) * lean)
                 if step == median_step:
                     in_z += in_median
                 # Chain rule through 1 / z: d(1 / z) / dz = -1 / z^2.
@@ -135,6 +147,8 @@ def composite_backward(
                 behind_loss += w * g
                 behind_alpha += w
                 behind_depth += w_depth
+                signed_alpha += sign * w
+                signed_depth += sign * w_depth
                 for k in range(3):
                     sums[Sum.normal + k] = w * in_normal[k]
                     sums[Sum.values + k] = w * in_color[k]

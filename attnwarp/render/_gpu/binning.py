@@ -135,9 +135,11 @@ def lay_out(
     dy = f64((t / view.across) * TILE) + CENTER - doubles[i, At.center_y]
     if view.discs:
         for k in range(3):
-            column = At.u_x + 3 * k
+            column = At.u_x + 2 * k
             terms[e, k] = f32(
-                doubles[i, column + 2] + doubles[i, column] * dx + doubles[i, column + 1] * dy
+                wp.where(k == 2, f64(1.0), f64(0.0))
+                + doubles[i, column] * dx
+                + doubles[i, column + 1] * dy
             )
         terms[e, 3] = f32(dx)
         terms[e, 4] = f32(dy)

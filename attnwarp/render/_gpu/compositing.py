@@ -100,7 +100,7 @@ def composite(
     """
     here = pixel_of(view, wp.tid())
     T = wp.where(here.inside, f32(1.0), f32(0.0))
-    A, depth_sum, inverse_sum, square_sum, pairs = f32(0.0), f32(0.0), f32(0.0), f32(0.0), f32(0.0)
+    A, depth_sum, inverse_sum, square_sum, gaps = f32(0.0), f32(0.0), f32(0.0), f32(0.0), f32(0.0)
     first_depth, first_inverse, middle = f32(0.0), f32(0.0), f32(0.0)
     n, c = wp.vec3f(), wp.vec3f()
     last, median_step, hits = wp.int32(0), wp.int32(0), wp.int32(0)
@@ -128,7 +128,7 @@ def composite(
                 if T > MEDIAN:
                     middle, median_step = z[0], last
                 w_depth, w_inverse = w * z[0], w * z[1]
-                pairs += w_depth * A - w * depth_sum
+                gaps += wp.abs(w_depth * A - w * depth_sum)
                 A += w
                 depth_sum += w_depth
                 inverse_sum += w_inverse
@@ -160,7 +160,7 @@ def composite(
     depth[here.row, here.column] = wp.where(covered, first_depth + depth_sum * inverse, NAN)
     median[here.row, here.column] = wp.where(covered, first_depth + middle, NAN)
     # Pairs were counted once.
-    ordered[here.row, here.column] = f32(2.0) * pairs
+    ordered[here.row, here.column] = f32(2.0) * gaps
     l2[here.row, here.column] = A * variance * view.ndc_scale
     state[Plane.transmittance, here.row, here.column] = T
     state[Plane.inverse_depth, here.row, here.column] = first_inverse + inverse_sum * inverse

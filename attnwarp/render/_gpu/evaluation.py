@@ -53,10 +53,8 @@ def evaluate(
         r.w = terms[e, 2] + (singles[i, Of.w_x] * x + singles[i, Of.w_y] * y)
         r.inverse_z = wp.min(wp.max(r.w, singles[i, Of.w_low]), singles[i, Of.w_high])
         r.z = f32(1.0) / r.inverse_z
-        screen = FAR
-        if singles[i, Of.filtered] > f32(0.0):
-            ex, ey = x + terms[e, 3], y + terms[e, 4]
-            screen = f32(2.0) * (ex * ex + ey * ey)
+        ex, ey = x + terms[e, 3], y + terms[e, 4]
+        screen = f32(2.0) * (ex * ex + ey * ey)
         if r.w <= singles[i, Of.w_most]:
             rho = (r.u * r.u + r.v * r.v) * (r.z * r.z)
             if rho <= screen:

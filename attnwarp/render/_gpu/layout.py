@@ -12,7 +12,7 @@ PIXELS = TILE * TILE
 MIDDLE = 3.5
 """Middle of a tile, from its first pixel's centre."""
 
-DOUBLES = 11
+DOUBLES = 10
 SINGLES = 32
 TERMS = 5
 NOWHERE = 1e30
@@ -23,24 +23,21 @@ WEIGHT_UNIT = 2.0**36
 class At:
     """Columns of the float64 table: the reference point, and a splat's linear terms about it.
 
-    The reference point is the projected centre, or the principal point for a 2D splat whose centre
-    is not in front. Of a 2D splat u = U / W, v = V / W and z = depth / W, with U, V and W linear in
-    a pixel's position. Of a 3D splat rho = u^2 + v^2 and z = depth l / (l^2 + p^2 + q^2), with u =
-    factor_xx dx + factor_xy dy, v = factor_yy dy, l = 1 + peak_x dx + peak_y dy, p = peak_xx dx +
-    peak_xy dy and q = peak_yy dy: sums of squares, as the forms they equal lose a needle's digits.
+    The reference point is the projected centre. Of a 2D splat u = U / W, v = V / W and z = depth /
+    W, with U = u_x dx + u_y dy, V = v_x dx + v_y dy and W = 1 + w_x dx + w_y dy. Of a 3D splat rho
+    = u^2 + v^2 and z = depth l / (l^2 + p^2 + q^2), with u = factor_xx dx + factor_xy dy, v =
+    factor_yy dy, l = 1 + peak_x dx + peak_y dy, p = peak_xx dx + peak_xy dy and q = peak_yy dy:
+    sums of squares, as the forms they equal lose a needle's digits.
     """
 
     center_x = 0
     center_y = 1
     u_x = 2
     u_y = 3
-    u_0 = 4
-    v_x = 5
-    v_y = 6
-    v_0 = 7
-    w_x = 8
-    w_y = 9
-    w_0 = 10
+    v_x = 4
+    v_y = 5
+    w_x = 6
+    w_y = 7
     factor_xx = 2
     factor_xy = 3
     factor_yy = 4
@@ -71,10 +68,9 @@ class Of:
     w_low = 6  # bounds of W within a 2D splat's extent
     w_high = 7
     cut = 8  # drawn where rho <= cut; -1: nowhere
-    filtered = 9  # 1 if the screen filter draws a 2D splat too, else 0
     w_most = 10  # the plane is nearer than near where W is larger
     opacity = 11
-    depth = 12  # of the centre; for a 2D splat not in front, its distance
+    depth = 12  # of the centre
     inverse_depth = 13
     depth_low = 14  # bounds of z at a pixel: the splat's own extent, and near
     depth_high = 15

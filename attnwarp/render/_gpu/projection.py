@@ -23,7 +23,6 @@ EDGE_ON = f64(constants.EDGE_ON)
 EXTENT = f64(constants.EXTENT_SIGMAS)
 MARGIN = f64(constants.JACOBIAN_MARGIN)
 COMPENSATION_MIN = f64(constants.COMPENSATION_MIN)
-BEHIND = f64(1e-20)
 WIDER = f64(1.0 + 1e-6)
 SLACK = f64(1e-4)
 ROUNDING = f64(1e-6)
@@ -133,17 +132,16 @@ def shortest_axis(s: wp.vec3d) -> wp.int32:
 def disc_side(
     doubles: wp.array2d(dtype=wp.float64), singles: wp.array2d(dtype=wp.float32), i: wp.int32,
     column: wp.int32, single: wp.int32, k: wp.int32, a: wp.mat33d, c: wp.vec3d,
-    s: wp.float64, depth: wp.float64, nc: wp.float64, ahead: wp.bool, step: wp.vec3d,
+    s: wp.float64, nc: wp.float64, step: wp.vec3d,
 ):  # fmt: skip
     """U or V: the tangent in column k of ``a``, less its part along the ray."""
     tc = (a[0, k] * c[0] + a[1, k] * c[1] + a[2, k] * c[2]) / nc
-    scale = depth / s
+    scale = c[2] / s
     gx = scale * (a[0, k] - tc * a[0, 2])
     slope_x = gx * step[0]
     slope_y = scale * (a[1, k] - tc * a[1, 2]) * step[1] + gx * step[2]
     doubles[i, column] = slope_x
     doubles[i, column + 1] = slope_y
-    doubles[i, column + 2] = wp.where(ahead, ZERO, scale * (a[2, k] - tc * a[2, 2]))
     singles[i, single] = f32(slope_x)
     singles[i, single + 1] = f32(slope_y)
 
@@ -151,36 +149,29 @@ def disc_side(
 @wp.func
 def disc(
     doubles: wp.array2d(dtype=wp.float64), singles: wp.array2d(dtype=wp.float32), i: wp.int32,
-    view: View, a: wp.mat33d, c: wp.vec3d, s: wp.vec3d, ahead: wp.bool, length: wp.float64,
-    spread: wp.float64,
-) -> wp.float64:  # fmt: skip
-    """The plane of a 2D splat as U, V and W; returns its column ``depth``."""
+    view: View, a: wp.mat33d, c: wp.vec3d, s: wp.vec3d, length: wp.float64, spread: wp.float64,
+):  # fmt: skip
+    """The plane of a 2D splat as U, V and W."""
     step = wp.vec3d(ONE / view.fx, ONE / view.fy, -view.skew / (view.fx * view.fy))
     nc = a[0, 2] * c[0] + a[1, 2] * c[1] + a[2, 2] * c[2]
     least = length * EDGE_ON
     if wp.abs(nc) < least:
         nc = wp.where(nc < ZERO, -least, least)
-    depth = wp.where(ahead, c[2], length)
-    disc_side(doubles, singles, i, At.u_x, Of.u_x, 0, a, c, s[0], depth, nc, ahead, step)
-    disc_side(doubles, singles, i, At.v_x, Of.v_x, 1, a, c, s[1], depth, nc, ahead, step)
-    scale = depth / nc
+    disc_side(doubles, singles, i, At.u_x, Of.u_x, 0, a, c, s[0], nc, step)
+    disc_side(doubles, singles, i, At.v_x, Of.v_x, 1, a, c, s[1], nc, step)
+    scale = c[2] / nc
     wx = scale * a[0, 2] * step[0]
     wy = scale * (a[1, 2] * step[1] + a[0, 2] * step[2])
     doubles[i, At.w_x] = wx
     doubles[i, At.w_y] = wy
-    doubles[i, At.w_0] = wp.where(ahead, ONE, scale * a[2, 2])
     singles[i, Of.w_x] = f32(wx)
     singles[i, Of.w_y] = f32(wy)
-    singles[i, Of.filtered] = wp.where(ahead, f32(1.0), f32(0.0))
-    singles[i, Of.w_most] = f32(depth / view.near)
-    singles[i, Of.inverse_depth] = f32(ONE / depth)
-    # Where it shows by its intersection, z lies between these; BEHIND: if its centre is not in
-    # front, W must be positive, else it may be anything.
+    singles[i, Of.w_most] = f32(c[2] / view.near)
+    singles[i, Of.inverse_depth] = f32(ONE / c[2])
+    # Where it shows by its intersection, z lies between these.
     reach = spread * EXTENT
-    low, high = wp.max(c[2] - reach, view.near), wp.max(c[2] + reach, view.near)
-    singles[i, Of.w_high] = f32(depth / low)
-    singles[i, Of.w_low] = f32(wp.where(ahead, depth / high, BEHIND))
-    return depth
+    singles[i, Of.w_high] = f32(c[2] / wp.max(c[2] - reach, view.near))
+    singles[i, Of.w_low] = f32(c[2] / (c[2] + reach))
 
 
 @wp.func
@@ -361,17 +352,17 @@ def overlaps(
     y1 = f64(row * SIDE) + HALF - o.y0 - SLACK
     y2 = f64(wp.min(row * SIDE + SIDE, view.height)) - HALF - o.y0 + SLACK
     hx, hy, mx, my = (x2 - x1) * HALF, (y2 - y1) * HALF, (x1 + x2) * HALF, (y1 + y2) * HALF
-    ux, uy, u0 = doubles[i, At.u_x], doubles[i, At.u_y], doubles[i, At.u_0]
-    vx, vy, v0 = doubles[i, At.v_x], doubles[i, At.v_y], doubles[i, At.v_0]
-    wx, wy, w0 = doubles[i, At.w_x], doubles[i, At.w_y], doubles[i, At.w_0]
-    w = w0 + wx * mx + wy * my + wp.abs(wx) * hx + wp.abs(wy) * hy
+    ux, uy = doubles[i, At.u_x], doubles[i, At.u_y]
+    vx, vy = doubles[i, At.v_x], doubles[i, At.v_y]
+    wx, wy = doubles[i, At.w_x], doubles[i, At.w_y]
+    w = ONE + wx * mx + wy * my + wp.abs(wx) * hx + wp.abs(wy) * hy
     shows = wp.bool(False)
     if w > ZERO:
         w = wp.min(w, f64(singles[i, Of.w_most]))
-        u = wp.max(wp.abs(u0 + ux * mx + uy * my) - wp.abs(ux) * hx - wp.abs(uy) * hy, ZERO)
-        v = wp.max(wp.abs(v0 + vx * mx + vy * my) - wp.abs(vx) * hx - wp.abs(vy) * hy, ZERO)
+        u = wp.max(wp.abs(ux * mx + uy * my) - wp.abs(ux) * hx - wp.abs(uy) * hy, ZERO)
+        v = wp.max(wp.abs(vx * mx + vy * my) - wp.abs(vx) * hx - wp.abs(vy) * hy, ZERO)
         shows = u * u + v * v <= o.cut * w * w
-    if not shows and singles[i, Of.filtered] > f32(0.0):
+    if not shows:
         dx, dy = wp.max(wp.abs(mx) - hx, ZERO), wp.max(wp.abs(my) - hy, ZERO)
         shows = TWO * (dx * dx + dy * dy) <= o.cut
     return shows
@@ -419,8 +410,7 @@ def project(
     R = view.rotation
     c = R * wp.vec3d(f64(means[i, 0]), f64(means[i, 1]), f64(means[i, 2])) + view.translation
     opacity = f64(opacities[i])
-    ahead = c[2] > view.near
-    if opacity < ALPHA_MIN or not (ahead or view.discs):
+    if opacity < ALPHA_MIN or c[2] <= view.near:
         return
     q = rotation_of(f64(quats[i, 0]), f64(quats[i, 1]), f64(quats[i, 2]), f64(quats[i, 3]))
     a = R * q
@@ -428,19 +418,12 @@ def project(
     if not view.discs:
         s[2] = f64(scales[i, 2])
     spread = depth_spread(a, s)
-    if c[2] + EXTENT * spread <= view.near:
-        return
-    x0, y0 = f64(view.cx), f64(view.cy)
-    if ahead:
-        x0 += (c[0] * view.fx + c[1] * view.skew) / c[2]
-        y0 += c[1] * view.fy / c[2]
-    doubles[i, At.center_x] = x0
-    doubles[i, At.center_y] = y0
+    doubles[i, At.center_x] = (c[0] * view.fx + c[1] * view.skew) / c[2] + view.cx
+    doubles[i, At.center_y] = c[1] * view.fy / c[2] + view.cy
     length = wp.length(c)
-    depth = c[2]
     axis = wp.int32(2)
     if view.discs:
-        depth = disc(doubles, singles, i, view, a, c, s, ahead, length, spread)
+        disc(doubles, singles, i, view, a, c, s, length, spread)
     else:
         ratio = ellipsoid(doubles, singles, i, view, a, c, s)
         if view.antialiased:
@@ -452,15 +435,15 @@ def project(
         return
     cut = f32(TWO * wp.log(opacity / ALPHA_MIN))
     reach = spread * EXTENT
-    low, high = wp.max(c[2] - reach, view.near), wp.max(c[2] + reach, view.near)
+    low, high = wp.max(c[2] - reach, view.near), c[2] + reach
     if view.by_center:
-        low = wp.max(c[2], view.near)
-        high = low
+        low = c[2]
+        high = c[2]
     n = wp.vec3d(a[0, axis], a[1, axis], a[2, axis])
     flip = wp.where(wp.dot(n, c) > ZERO, -ONE, ONE)
     singles[i, Of.cut] = cut
     singles[i, Of.opacity] = f32(opacity)
-    singles[i, Of.depth] = f32(depth)
+    singles[i, Of.depth] = f32(c[2])
     singles[i, Of.depth_low] = f32(low)
     singles[i, Of.depth_high] = f32(high)
     singles[i, Of.inverse_depth_low] = f32(ONE / low)
@@ -477,7 +460,7 @@ def project(
         B = ux * uy + vx * vy - wider * wx * wy
         C = uy * uy + vy * vy - wider * wy * wy
         solid = A > ZERO and C > ZERO and A * C - B * B > A * C * SOLID
-        if not (solid and ahead and c[2] * FRONT < c[2] - wp.sqrt(wp.max(wider, ZERO)) * spread):
+        if not (solid and c[2] * FRONT < c[2] - wp.sqrt(wp.max(wider, ZERO)) * spread):
             singles[i, Of.is_ellipse] = f32(0.0)
     write_values(singles, i, view, values, wp.transpose(R) * c / length)
     o = outline_of(doubles, singles, i, view)

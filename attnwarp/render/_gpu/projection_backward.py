@@ -62,12 +62,11 @@ class Gradient:
 @wp.func
 def disc_backward(
     g: Gradient, total: wp.array2d(dtype=wp.float64), i: wp.int32, view: View, a: wp.mat33d,
-    c: wp.vec3d, s: wp.vec3d, ahead: wp.bool, length: wp.float64,
+    c: wp.vec3d, s: wp.vec3d, length: wp.float64,
 ) -> Gradient:  # fmt: skip
     """Backward of a disc's plane."""
     kx, ky, kxy = ONE / view.fx, ONE / view.fy, -view.skew / (view.fx * view.fy)
     n = wp.vec3d(a[0, 2], a[1, 2], a[2, 2])
-    depth = wp.where(ahead, c[2], length)
     nc = wp.dot(n, c)
     floor = EDGE_ON * length
     tilted = wp.abs(nc) < floor
@@ -79,12 +78,12 @@ def disc_backward(
         t = wp.vec3d(a[0, k], a[1, k], a[2, k])
         column = DiscSum.u + 3 * k
         tc = wp.dot(t, c) / nc
-        scale = depth / s[k]
+        scale = c[2] / s[k]
         h = t - tc * n
         gh = wp.vec3d(
             total[i, column] * kx + total[i, column + 1] * kxy,
             total[i, column + 1] * ky,
-            wp.where(ahead, ZERO, total[i, column + 2]),
+            ZERO,
         )
         g_scale = wp.dot(gh, h)
         gh = gh * scale
@@ -96,11 +95,11 @@ def disc_backward(
         g_nc -= g_tc * tc / nc
         g_depth += g_scale / s[k]
         g.scales[k] = g.scales[k] - g_scale * scale / s[k]
-    scale = depth / nc
+    scale = c[2] / nc
     gh = wp.vec3d(
         total[i, DiscSum.w] * kx + total[i, DiscSum.w + 1] * kxy,
         total[i, DiscSum.w + 1] * ky,
-        wp.where(ahead, ZERO, total[i, DiscSum.w + 2]),
+        ZERO,
     )
     g_scale = wp.dot(gh, n)
     for r in range(3):
@@ -113,10 +112,7 @@ def disc_backward(
         for r in range(3):
             g.axes[r, 2] = g.axes[r, 2] + g_nc * c[r]
         g.center = g.center + n * g_nc
-    if ahead:
-        g.center[2] = g.center[2] + g_depth
-    else:
-        g.length = g.length + g_depth
+    g.center[2] = g.center[2] + g_depth
     return g
 
 
@@ -257,8 +253,7 @@ def extent_backward(
 ) -> Gradient:  # fmt: skip
     """Backward of the nearest and the farthest depth of a splat."""
     if view.by_center:
-        if c[2] > view.near:
-            g.center[2] = g.center[2] + in_low + in_high
+        g.center[2] = g.center[2] + in_low + in_high
         return g
     square = f64(0.0)
     for k in range(3):
@@ -268,9 +263,8 @@ def extent_backward(
     if c[2] - EXTENT * spread > view.near:
         g.center[2] = g.center[2] + in_low
         g_spread -= EXTENT * in_low
-    if c[2] + EXTENT * spread > view.near:
-        g.center[2] = g.center[2] + in_high
-        g_spread += EXTENT * in_high
+    g.center[2] = g.center[2] + in_high
+    g_spread += EXTENT * in_high
     if spread > ZERO:
         for k in range(3):
             g.scales[k] = g.scales[k] + g_spread * s[k] * a[2, k] * a[2, k] / spread
@@ -390,7 +384,6 @@ def project_backward(
         s = wp.vec3d(f64(scales[i, 0]), f64(scales[i, 1]), ZERO)
         opacity = f64(opacities[i])
         length = wp.length(c)
-        ahead = c[2] > view.near
         in_x, in_y, in_low, in_high = f64(0.0), f64(0.0), f64(0.0), f64(0.0)
         axis = wp.int32(2)
         # The gradient in the exponent is alpha times that in alpha.
@@ -402,7 +395,7 @@ def project_backward(
             in_y = -(doubles[i, At.u_y] * du + doubles[i, At.v_y] * dv + doubles[i, At.w_y] * dw)
             in_x -= total[i, DiscSum.center]
             in_y -= total[i, DiscSum.center + 1]
-            g = disc_backward(g, total, i, view, a, c, s, ahead, length)
+            g = disc_backward(g, total, i, view, a, c, s, length)
         else:
             s[2] = f64(scales[i, 2])
             in_low, in_high = f64(total[i, EllipsoidSum.low]), f64(total[i, EllipsoidSum.high])
@@ -413,12 +406,11 @@ def project_backward(
             if not view.by_center:
                 g = peak_backward(g, total, i, view, a, c, s)
             axis = shortest_axis(s)
-        if ahead:
-            g.center[0] = g.center[0] + in_x * view.fx / c[2]
-            g.center[1] = g.center[1] + (in_x * view.skew + in_y * view.fy) / c[2]
-            offset_x = doubles[i, At.center_x] - view.cx
-            offset_y = doubles[i, At.center_y] - view.cy
-            g.center[2] = g.center[2] - (in_x * offset_x + in_y * offset_y) / c[2]
+        g.center[0] = g.center[0] + in_x * view.fx / c[2]
+        g.center[1] = g.center[1] + (in_x * view.skew + in_y * view.fy) / c[2]
+        offset_x = doubles[i, At.center_x] - view.cx
+        offset_y = doubles[i, At.center_y] - view.cy
+        g.center[2] = g.center[2] - (in_x * offset_x + in_y * offset_y) / c[2]
         g = extent_backward(g, in_low, in_high, view, a, c, s)
         facing = a[0, axis] * c[0] + a[1, axis] * c[1] + a[2, axis] * c[2]
         flip = wp.where(facing > ZERO, -ONE, ONE)

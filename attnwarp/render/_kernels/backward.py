@@ -58,7 +58,7 @@ from attnwarp.render._kernels.layout import (
     TILE,
 )
 from attnwarp.render._kernels.rasterization import prefetch_row, quarter_offset, tile_at
-from attnwarp.render.constants import ALPHA_MAX
+from attnwarp.render.constants import ALPHA_MAX, GAP_MIN
 
 
 class Slots(NamedTuple):
@@ -80,7 +80,7 @@ class Slots(NamedTuple):
     alpha: int = 8
     d_depth: int = 9
     d_l2: int = 10
-    d_l1: int = 11  # of the ordered sum and of the exact one
+    d_ordered: int = 11
     d_median: int = 12
     behind_alpha: int = 13
     behind_depth: int = 14
@@ -88,8 +88,11 @@ class Slots(NamedTuple):
     # changes with: where a pixel is opaque, a difference of sums of weights has no digits of it.
     behind_loss: int = 15
     d_exact: int = 16
-    d_normal: int = 17  # (3)
-    d_color: int = 20  # (channels)
+    # Each splat's part with the sign of its gap; see _blame.
+    signed_alpha: int = 17
+    signed_depth: int = 18
+    d_normal: int = 19  # (3)
+    d_color: int = 22  # (channels)
 
 
 SLOT = Slots()
@@ -161,13 +164,9 @@ def _write_disc_row(work, row, rows, dx, dy, line):
     b = u64(WORK.sums)
     for k in range(3):
         # Terms U, V and W one after another, in their columns as in their sums.
-        term, column = b + u64(DISC_SUM.d_u + 3 * k), DISC.u_x + 3 * k
+        term, column = b + u64(DISC_SUM.d_u + 3 * k), DISC.u_x + 2 * k
         d, d_x, d_y = f64(work[term]), f64(work[term + u64(1)]), f64(work[term + u64(2)])
-        rows[line, column], rows[line, column + 1], rows[line, column + 2] = (
-            d_x + dx * d,
-            d_y + dy * d,
-            d,
-        )
+        rows[line, column], rows[line, column + 1] = d_x + dx * d, d_y + dy * d
     du, dv = f64(work[b + u64(DISC_SUM.d_u)]), f64(work[b + u64(DISC_SUM.d_v)])
     dw = f64(work[b + u64(DISC_SUM.d_w)])
     rows[line, SPLAT.center_x] = (
@@ -179,7 +178,8 @@ def _write_disc_row(work, row, rows, dx, dy, line):
         - work[b + u64(DISC_SUM.d_center + 1)]
     )
     rows[line, SPLAT.depth] = work[b + u64(DISC_SUM.d_depth)]
-    rows[line, ELLIPSOID_GRADIENT.square_last] = f32(0.0)  # unused by this kind
+    for column in (8, 9, 10, ELLIPSOID_GRADIENT.square_last):  # unused by this kind
+        rows[line, column] = f32(0.0)
     rows[line, SPLAT.depth_low] = work[b + u64(DISC_SUM.d_low)]
     rows[line, SPLAT.depth_high] = work[b + u64(DISC_SUM.d_high)]
 
@@ -224,10 +224,9 @@ def _select_drawn(buffer, p, background, scale):
     store(buffer, slot, select(drawn, load(buffer, slot) / A, zero))
     store(buffer, SLOT.d_l2 * PIXELS + p, select(drawn, d_l2 * A, zero))
     slot = SLOT.d_exact * PIXELS + p
-    d_exact = load(buffer, slot) * f32(2.0)
-    store(buffer, slot, select(drawn, d_exact, zero))
-    slot = SLOT.d_l1 * PIXELS + p
-    store(buffer, slot, select(drawn, load(buffer, slot) * f32(2.0) + d_exact, zero))
+    store(buffer, slot, select(drawn, load(buffer, slot) * f32(2.0), zero))
+    slot = SLOT.d_ordered * PIXELS + p
+    store(buffer, slot, select(drawn, load(buffer, slot) * f32(2.0), zero))
     slot = SLOT.d_median * PIXELS + p
     store(buffer, slot, select(drawn, load(buffer, slot), zero))
     slot = SLOT.depth * PIXELS + p
@@ -254,7 +253,7 @@ def _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream):
         copy4(buffer, SLOT.behind_loss * PIXELS + p, upstream.alpha, pixel)
         copy4(buffer, SLOT.d_depth * PIXELS + p, upstream.depth, pixel)
         copy4(buffer, SLOT.d_l2 * PIXELS + p, upstream.l2, pixel)
-        copy4(buffer, SLOT.d_l1 * PIXELS + p, upstream.l1, pixel)
+        copy4(buffer, SLOT.d_ordered * PIXELS + p, upstream.ordered, pixel)
         if upstream.exact.shape[0] > 0:
             copy4(buffer, SLOT.d_exact * PIXELS + p, upstream.exact, pixel)
         copy4(buffer, SLOT.d_median * PIXELS + p, upstream.median, pixel)
@@ -291,12 +290,9 @@ def _load_tile(buffer, tile, background, scale, pictures, upstream):
             buffer[u64(SLOT.behind_loss * PIXELS) + p] = -d_alpha * state[STATE.transmittance, y, x]
             buffer[u64(SLOT.d_depth * PIXELS) + p] = d_depth
             buffer[u64(SLOT.d_l2 * PIXELS) + p] = d_l2 * A
-            d_l1 = f32(2.0) * upstream.l1[y, x]
             if upstream.exact.shape[0] > 0:
-                d_exact = f32(2.0) * upstream.exact[y, x]
-                buffer[u64(SLOT.d_exact * PIXELS) + p] = d_exact
-                d_l1 += d_exact
-            buffer[u64(SLOT.d_l1 * PIXELS) + p] = d_l1
+                buffer[u64(SLOT.d_exact * PIXELS) + p] = f32(2.0) * upstream.exact[y, x]
+            buffer[u64(SLOT.d_ordered * PIXELS) + p] = f32(2.0) * upstream.ordered[y, x]
             buffer[u64(SLOT.d_median * PIXELS) + p] = upstream.median[y, x]
             buffer[u64(SLOT.alpha * PIXELS) + p] = A
 
@@ -321,11 +317,14 @@ def _blame(
     w = alpha * T
     dz = z - load(buffer, SLOT.depth * PIXELS + s)
     di = inverse_z - load(buffer, SLOT.inverse_depth * PIXELS + s)
-    d_depth, d_l1 = load(buffer, SLOT.d_depth * PIXELS + s), load(buffer, SLOT.d_l1 * PIXELS + s)
+    d_depth = load(buffer, SLOT.d_depth * PIXELS + s)
+    d_ordered = load(buffer, SLOT.d_ordered * PIXELS + s)
     d_inverse = load(buffer, SLOT.d_l2 * PIXELS + s) * di
     behind_alpha = load(buffer, SLOT.behind_alpha * PIXELS + s)
     behind_depth = load(buffer, SLOT.behind_depth * PIXELS + s)
     behind_loss = load(buffer, SLOT.behind_loss * PIXELS + s)
+    signed_alpha = load(buffer, SLOT.signed_alpha * PIXELS + s)
+    signed_depth = load(buffer, SLOT.signed_depth * PIXELS + s)
     # The gradient in the weight.
     g = d_depth * dz + d_inverse * di + d_weight
     for c in range(3):
@@ -339,15 +338,20 @@ def _blame(
             d_color = load(buffer, (SLOT.d_color + c) * PIXELS + s)
             g = g + d_color * features[u64(k), u64(c)]
             out[GRADIENTS + 3 + c] += sum_lanes(w * d_color)
-    # In front minus behind, of the weights and of the weighted depths.
+    # In front the weights sum up to ``front``, and the gaps from there, times the weights, to
+    # ``gap``: first moments vanish about the mean.
     w_dz = w * dz
-    lean = load(buffer, SLOT.alpha * PIXELS + s) - w - two * behind_alpha
-    g = g + d_l1 * (dz * lean + w_dz + two * behind_depth)
-    in_z = w * (d_depth + d_l1 * lean)
+    front = load(buffer, SLOT.alpha * PIXELS + s) - w - behind_alpha
+    gap = dz * front + w_dz + behind_depth
+    sign = select(z * f32(GAP_MIN) < gap, one, select(gap < z * f32(-GAP_MIN), -one, zero))
+    g = g + d_ordered * (sign * gap + signed_depth - dz * signed_alpha)
+    in_z = w * (d_depth + d_ordered * (sign * front - signed_alpha))
     if place >= 0:
-        d_twice, past = two * load(buffer, SLOT.d_exact * PIXELS + s), space.pairs.past
-        g = g + d_twice * load(past, place + PAST_AT.spread)
-        in_z = in_z + w * d_twice * load(past, place + PAST_AT.lean)
+        d_exact, past = load(buffer, SLOT.d_exact * PIXELS + s), space.pairs.past
+        spread = two * load(past, place + PAST_AT.spread)
+        lean = two * load(past, place + PAST_AT.lean)
+        g = g + d_exact * (gap + behind_depth - dz * behind_alpha + spread)
+        in_z = in_z + w * d_exact * (front - behind_alpha + lean)
     is_median = step == load(buffer, SLOT.median_step * PIXELS + s)
     in_z = in_z + select(is_median, load(buffer, SLOT.d_median * PIXELS + s), zero)
     # Chain rule through 1/z: d(1/z)/dz = -1/z^2.
@@ -358,6 +362,8 @@ def _blame(
     store(buffer, SLOT.behind_loss * PIXELS + s, behind_loss + w * g)
     store(buffer, SLOT.behind_alpha * PIXELS + s, behind_alpha + w)
     store(buffer, SLOT.behind_depth * PIXELS + s, behind_depth + w_dz)
+    store(buffer, SLOT.signed_alpha * PIXELS + s, signed_alpha + sign * w)
+    store(buffer, SLOT.signed_depth * PIXELS + s, signed_depth + sign * w_dz)
     return w, in_alpha, in_z
 
 

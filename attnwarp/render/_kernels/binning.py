@@ -56,7 +56,7 @@ class Pieces(NamedTuple):
 
 
 @inlined
-def _overlaps(row, x1, x2, y1, y2, cut, w_most, filtered):
+def _overlaps(row, x1, x2, y1, y2, cut, w_most):
     """Return True if a 2D splat of any outline may show in a rectangle, by interval arithmetic.
 
     Args:
@@ -66,17 +66,15 @@ def _overlaps(row, x1, x2, y1, y2, cut, w_most, filtered):
     hx, hy, mx, my = (x2 - x1) / 2, (y2 - y1) / 2, (x1 + x2) / 2, (y1 + y2) / 2
     ux, uy, vx, vy = row[DISC.u_x], row[DISC.u_y], row[DISC.v_x], row[DISC.v_y]
     wx, wy = row[DISC.w_x], row[DISC.w_y]
-    w = row[DISC.w_0] + wx * mx + wy * my + abs(wx) * hx + abs(wy) * hy
+    w = 1.0 + wx * mx + wy * my + abs(wx) * hx + abs(wy) * hy
     if w > 0:
         w = min(w, w_most)
-        u = max(abs(row[DISC.u_0] + ux * mx + uy * my) - abs(ux) * hx - abs(uy) * hy, 0.0)
-        v = max(abs(row[DISC.v_0] + vx * mx + vy * my) - abs(vx) * hx - abs(vy) * hy, 0.0)
+        u = max(abs(ux * mx + uy * my) - abs(ux) * hx - abs(uy) * hy, 0.0)
+        v = max(abs(vx * mx + vy * my) - abs(vx) * hx - abs(vy) * hy, 0.0)
         if u * u + v * v <= cut * w * w:
             return True
-    if filtered:
-        dx, dy = max(abs(mx) - hx, 0.0), max(abs(my) - hy, 0.0)
-        return 2 * (dx * dx + dy * dy) <= cut
-    return False
+    dx, dy = max(abs(mx) - hx, 0.0), max(abs(my) - hy, 0.0)
+    return 2 * (dx * dx + dy * dy) <= cut
 
 
 @inlined
@@ -84,7 +82,7 @@ def _runs_by_intervals(k, table, view, tiles, target, used):
     """The runs of splat k, whose outline is no ellipse; see :func:`find_runs`."""
     row, singles = table.doubles[k], table.singles[k]
     cut = f64(singles[SINGLE + SPLAT.cut]) * (1 + 1e-6)
-    w_most, filtered = singles[SINGLE + DISC.w_most], singles[SINGLE + DISC.filtered] > 0
+    w_most = singles[SINGLE + DISC.w_most]
     x0, y0, slack = row[SPLAT.center_x], row[SPLAT.center_y], 1e-4
     runs, changes = target.runs, target.changes
     for ty in range(tiles.down):
@@ -94,7 +92,7 @@ def _runs_by_intervals(k, table, view, tiles, target, used):
         for tx in range(tiles.across + 1):
             x1 = tx * TILE + 0.5 - x0 - slack
             x2 = min(tx * TILE + TILE, view.width) - 0.5 - x0 + slack
-            if tx < tiles.across and _overlaps(row, x1, x2, y1, y2, cut, w_most, filtered):
+            if tx < tiles.across and _overlaps(row, x1, x2, y1, y2, cut, w_most):
                 length += 1
             elif length > 0:
                 if used < runs.shape[0]:

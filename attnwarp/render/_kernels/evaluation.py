@@ -30,7 +30,6 @@ from attnwarp.render._kernels.layout import (
     ELLIPSOID,
     LINEAR,
     MOMENTS,
-    NO_FILTER,
     NOWHERE,
     ROOT2,
     ROW_DOUBLES,
@@ -97,13 +96,12 @@ def lay_out(work, row, moments, start, table, k, middle_x, middle_y, discs, by_c
     moments[m + u64(LINEAR.x)], moments[m + u64(LINEAR.y)] = dx, dy
     if discs:
         for c in range(3):
-            slope_x, slope_y = doubles[k, DISC.u_x + 3 * c], doubles[k, DISC.u_y + 3 * c]
-            value = doubles[k, DISC.u_0 + 3 * c] + slope_x * dx + slope_y * dy
-            moments[m + u64(LINEAR.u + c)] = value
+            slope_x, slope_y = doubles[k, DISC.u_x + 2 * c], doubles[k, DISC.u_y + 2 * c]
+            constant = 1.0 if c == 2 else 0.0
+            moments[m + u64(LINEAR.u + c)] = constant + slope_x * dx + slope_y * dy
             moments[m + u64(SLOPE_X + LINEAR.u + c)] = slope_x
             moments[m + u64(SLOPE_Y + LINEAR.u + c)] = slope_y
-        filtered = singles[k, u64(SINGLE + DISC.filtered)] > 0
-        moments[m + u64(LINEAR.screen_x)] = ROOT2 * dx if filtered else NO_FILTER
+        moments[m + u64(LINEAR.screen_x)] = ROOT2 * dx
         moments[m + u64(LINEAR.screen_y)] = ROOT2 * dy
     else:
         xx, xy = doubles[k, ELLIPSOID.factor_xx], doubles[k, ELLIPSOID.factor_xy]
@@ -171,12 +169,12 @@ def evaluate(work, row, linear, x, y, screen_x, screen_y, discs, by_center):
 
     A 2D splat's W is clamped to the z that it may have, between w_low and w_high, before anything
     is divided by it. That bounds the z of what its filter draws, and changes nothing that its
-    intersection draws, nor adds to it. For take its centre in front, and the centre's z as 1: at
-    (u, v) = U / W the plane has z = 1 / W = 1 + s u for a slope s, so s U = 1 - W, and w_low = 1 /
-    (1 + E |s|) with E = EXTENT_SIGMAS. Where W is less than w_low, |U| > (1 - w_low) / |s| = E
-    w_low: |U| / w_low is more than E too, where nothing is drawn. Where W is more than w_high,
-    |U| / w_high is more than |U| / W, which is more than E, unless w_high is that of the near
-    plane; this is what w_most is for.
+    intersection draws, nor adds to it. For take the centre's z as 1: at (u, v) = U / W the plane
+    has z = 1 / W = 1 + s u for a slope s, so s U = 1 - W, and w_low = 1 / (1 + E |s|) with E =
+    EXTENT_SIGMAS. Where W is less than w_low, |U| > (1 - w_low) / |s| = E w_low: |U| / w_low is
+    more than E too, where nothing is drawn. Where W is more than w_high, |U| / w_high is more than
+    |U| / W, which is more than E, unless w_high is that of the near plane; this is what w_most is
+    for.
 
     Args:
         row: of ``work``, where the splat's row begins; see :func:`lay_out`.

@@ -90,13 +90,12 @@ GRADIENTS = 16  # columns below this one carry gradients
 class SplatColumns(NamedTuple):
     """Columns of the table that both kinds have. Lengths in pixels or scene units.
 
-    The reference point is the projected centre, or the principal point for a 2D splat whose centre
-    is not in front. Coefficients are per pixel of offset from it.
+    The reference point is the projected centre. Coefficients are per pixel of offset from it.
     """
 
     center_x: int = 0  # the reference point
     center_y: int = 1
-    depth: int = 11  # of the centre; for a 2D splat not in front, its distance
+    depth: int = 11  # of the centre
     depth_low: int = 12  # bounds of z at a pixel: the splat's own extent, and near
     depth_high: int = 13
     opacity: int = 14
@@ -107,18 +106,15 @@ class SplatColumns(NamedTuple):
 
 
 class DiscColumns(NamedTuple):
-    """Columns of a 2D splat: u = U / W, v = V / W, z = depth / W, each of U, V, W linear."""
+    """Columns of a 2D splat: u = U / W, v = V / W, z = depth / W, with U = u_x dx + u_y dy, V = v_x
+    dx + v_y dy and W = 1 + w_x dx + w_y dy."""
 
     u_x: int = 2
     u_y: int = 3
-    u_0: int = 4
-    v_x: int = 5
-    v_y: int = 6
-    v_0: int = 7
-    w_x: int = 8
-    w_y: int = 9
-    w_0: int = 10
-    filtered: int = 15  # 1 if the screen filter draws it too, else 0
+    v_x: int = 4
+    v_y: int = 5
+    w_x: int = 6
+    w_y: int = 7
     w_most: int = 17  # the plane is nearer than near where W is larger
     inverse_depth: int = 19
     w_high: int = 20  # bounds of W within the splat's extent
@@ -179,7 +175,7 @@ class LinearTerms(NamedTuple):
     v: int = 1
     w: int = 2
     along: int = 2
-    screen_x: int = 3  # x and y times the root of 2, or NO_FILTER
+    screen_x: int = 3  # x and y times the root of 2
     p: int = 3
     screen_y: int = 4
     q: int = 4
@@ -192,7 +188,6 @@ class LinearTerms(NamedTuple):
 LINEAR = LinearTerms()
 SLOPE_X, SLOPE_Y = 8, 16
 MOMENTS = 24
-NO_FILTER = 1e15  # screen_x of a splat without a screen filter; its square is NOWHERE
 NOWHERE = 1e30  # rho where nothing is drawn
 
 
@@ -260,7 +255,7 @@ class Pictures(NamedTuple):
     depth: np.ndarray  # (H, W)
     median: np.ndarray  # (H, W)
     normal: np.ndarray  # (H, W, 3)
-    l1: np.ndarray  # (H, W), ordered
+    ordered: np.ndarray  # (H, W)
     l2: np.ndarray  # (H, W)
     state: np.ndarray  # (5, H, W), see STATE; (5, 0, W) if there is no backward pass
 
@@ -297,7 +292,7 @@ class Upstream(NamedTuple):
     depth: np.ndarray  # (H, W)
     median: np.ndarray  # (H, W)
     normal: np.ndarray  # (H, W, 3)
-    l1: np.ndarray  # (H, W), ordered
+    ordered: np.ndarray  # (H, W)
     l2: np.ndarray  # (H, W)
     exact: np.ndarray  # (H, W), or (0, W) if there is none
     weight: np.ndarray  # (M,), in the order of depth

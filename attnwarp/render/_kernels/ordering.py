@@ -3,23 +3,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from attnwarp.render._kernels.compilation import f64, inlined, jit
+from attnwarp.render._kernels.compilation import f64, jit
 from attnwarp.render._kernels.layout import TILE
-from attnwarp.render.constants import ALPHA_MIN, EXTENT_SIGMAS
-
-
-@inlined
-def _disc_reach(quats, scales, i, r0, r1, r2):
-    """Sigma of a 2D splat along the optical axis, (r0, r1, r2) in world axes."""
-    w, x, y, z = f64(quats[i, 0]), f64(quats[i, 1]), f64(quats[i, 2]), f64(quats[i, 3])
-    square = w * w + x * x + y * y + z * z
-    a0 = r0 * (square - 2 * (y * y + z * z)) + r1 * 2 * (x * y + w * z) + r2 * 2 * (x * z - w * y)
-    a1 = r0 * 2 * (x * y - w * z) + r1 * (square - 2 * (x * x + z * z)) + r2 * 2 * (y * z + w * x)
-    return math.sqrt((f64(scales[i, 0]) * a0) ** 2 + (f64(scales[i, 1]) * a1) ** 2) / square
+from attnwarp.render.constants import ALPHA_MIN
 
 
 @jit
@@ -29,8 +17,8 @@ def depths(first, last, view, splats, depth, listed):
     ``listed`` (1,) gets an estimate of how many tiles will list them: rectangles of 5 sigmas, their
     centres in the picture.
     """
-    R, T, near, discs = view.rotation, view.translation, view.near, view.discs
-    means, quats, scales, opacities = splats.means, splats.quats, splats.scales, splats.opacities
+    R, T, near = view.rotation, view.translation, view.near
+    means, scales, opacities = splats.means, splats.scales, splats.opacities
     fx, fy = view.fx / TILE, view.fy / TILE
     wide, tall = view.width / TILE, view.height / TILE
     cx, cy = view.cx / TILE, view.cy / TILE
@@ -38,12 +26,9 @@ def depths(first, last, view, splats, depth, listed):
     r0, r1, r2, t = R[2, 0], R[2, 1], R[2, 2], T[2]
     for i in range(first, last):
         c2 = r0 * f64(means[i, 0]) + r1 * f64(means[i, 1]) + r2 * f64(means[i, 2]) + t
-        shows = c2 > near
-        if discs and not shows:
-            shows = c2 + EXTENT_SIGMAS * _disc_reach(quats, scales, i, r0, r1, r2) > near
-        shows = shows and opacities[i] >= ALPHA_MIN
+        shows = c2 > near and opacities[i] >= ALPHA_MIN
         depth[i] = c2 if shows else np.nan
-        if shows and c2 > near:
+        if shows:
             m0, m1, m2 = f64(means[i, 0]), f64(means[i, 1]), f64(means[i, 2])
             c0 = R[0, 0] * m0 + R[0, 1] * m1 + R[0, 2] * m2 + T[0]
             c1 = R[1, 0] * m0 + R[1, 1] * m1 + R[1, 2] * m2 + T[1]

@@ -206,7 +206,7 @@ def _reaches(view, c0, c1, c2, size, wanted):
     x, y = c0 * ic, c1 * ic
     px, py = fx * x + skew * y + view.cx, fy * y + view.cy
     every = _all_wanted(wanted)
-    if every & (px > 0) & (px < width) & (py > 0) & (py < height) & (c2 > near):
+    if every & (px > 0) & (px < width) & (py > 0) & (py < height):
         return True
     if view.discs:
         # A sphere holds it: (c0 + d0) / (c2 + d2) - c0 / c2 is at most |d| (1 + |c0 / c2|) / (c2 -
@@ -308,49 +308,39 @@ def _axes_in_camera(q, R):
 
 
 @inlined
-def _disc_side(batch, column, t0, t1, t2, n, c, s, depth, inverse_nc, ahead, step):
+def _disc_side(batch, column, t0, t1, t2, n, c, s, inverse_nc, step):
     """U or V, at ``column``: the tangent (t0, t1, t2) of length s, less its part along the ray."""
     tc = (t0 * c.x + t1 * c.y + t2 * c.z) * inverse_nc
-    scale = depth * reciprocal(s)
+    scale = c.z * reciprocal(s)
     gx = scale * (t0 - tc * n.x)
     slope_x, slope_y = gx * step.x, scale * (t1 - tc * n.y) * step.y + gx * step.xy
-    _put(batch, column + 2, select(ahead, 0.0, scale * (t2 - tc * n.z)))
     _put(batch, column, slope_x)
     _put(batch, column + 1, slope_y)
     return slope_x, slope_y
 
 
 @inlined
-def _disc(batch, singles, view, a, c, s, ahead, length, spread, cut, step):
-    """The plane of a 2D splat as U, V and W; see :class:`DiscColumns`. Its depth and outline."""
+def _disc(batch, singles, view, a, c, s, length, spread, cut, step):
+    """The plane of a 2D splat as U, V and W; see :class:`DiscColumns`. Returns its outline."""
     n = Vector(a.m02, a.m12, a.m22)
     nc = n.x * c.x + n.y * c.y + n.z * c.z
     least = length * EDGE_ON
     nc = select(absolute(nc) < least, select(nc < 0.0, -least, least), nc)
-    depth = select(ahead, c.z, length)
     inverse = reciprocal(nc)
-    ux, uy = _disc_side(
-        batch, DISC.u_x, a.m00, a.m10, a.m20, n, c, s.x, depth, inverse, ahead, step
-    )
-    vx, vy = _disc_side(
-        batch, DISC.v_x, a.m01, a.m11, a.m21, n, c, s.y, depth, inverse, ahead, step
-    )
-    scale = depth * inverse
+    ux, uy = _disc_side(batch, DISC.u_x, a.m00, a.m10, a.m20, n, c, s.x, inverse, step)
+    vx, vy = _disc_side(batch, DISC.v_x, a.m01, a.m11, a.m21, n, c, s.y, inverse, step)
+    scale = c.z * inverse
     wx, wy = scale * n.x * step.x, scale * (n.y * step.y + n.x * step.xy)
-    _put(batch, DISC.w_0, select(ahead, 1.0, scale * n.z))
     _put(batch, DISC.w_x, wx)
     _put(batch, DISC.w_y, wy)
-    _put_single(singles, DISC.filtered, select(ahead, 1.0, 0.0))
-    _put_single(singles, DISC.w_most, depth * (1.0 / view.near))
-    _put_single(singles, DISC.inverse_depth, reciprocal(depth))
-    # Where it shows by its intersection, z lies between these; 1e-20: if its centre is not in
-    # front, W must be positive, else it may be anything, see evaluate.
+    _put_single(singles, DISC.w_most, c.z * (1.0 / view.near))
+    _put_single(singles, DISC.inverse_depth, reciprocal(c.z))
+    # Where it shows by its intersection, z lies between these.
     reach = spread * EXTENT_SIGMAS
-    low, high = maximum(c.z - reach, view.near), maximum(c.z + reach, view.near)
-    _put_single(singles, DISC.w_high, depth * reciprocal(low))
-    _put_single(singles, DISC.w_low, select(ahead, depth * reciprocal(high), 1e-20))
+    _put_single(singles, DISC.w_high, c.z * reciprocal(maximum(c.z - reach, view.near)))
+    _put_single(singles, DISC.w_low, c.z * reciprocal(c.z + reach))
     # An ellipse only if the whole disc lies in front of the camera plane.
-    is_ellipse = ahead & (c.z * 1e-3 < c.z - _sqrt(maximum(cut, 0.0)) * spread)
+    is_ellipse = c.z * 1e-3 < c.z - _sqrt(maximum(cut, 0.0)) * spread
     A = ux * ux + vx * vx - cut * wx * wx
     B = ux * uy + vx * vy - cut * wx * wy
     C = uy * uy + vy * vy - cut * wy * wy
@@ -359,7 +349,7 @@ def _disc(batch, singles, view, a, c, s, ahead, length, spread, cut, step):
     inverse = reciprocal(det)
     ex, ey = (C * wx - B * wy) * inverse * cut, (A * wy - B * wx) * inverse * cut
     h = cut * (wx * ex + wy * ey + 1.0)
-    return depth, Footprint(A, B, C, ex, ey, h, h * inverse, cut * 0.5, is_ellipse)
+    return Footprint(A, B, C, ex, ey, h, h * inverse, cut * 0.5, is_ellipse)
 
 
 @inlined
@@ -491,7 +481,7 @@ def _outline(singles, x0, y0, height, drawn, shape):
 
 
 @inlined
-def _project_batch(batch, singles, view, R, c, ic, px, py, ahead, step):
+def _project_batch(batch, singles, view, R, c, ic, x0, y0, step):
     """Project the eight splats of ``batch``, centres c, to its columns of the table."""
     discs, by_center, near = view.discs, view.by_center, view.near
     s = _load3(batch, BATCH.scale)
@@ -501,9 +491,6 @@ def _project_batch(batch, singles, view, R, c, ic, px, py, ahead, step):
     spread = _sqrt(
         s.x * a.m20 * (s.x * a.m20) + s.y * a.m21 * (s.y * a.m21) + s.z * a.m22 * (s.z * a.m22)
     )
-    x0, y0 = px, py
-    if discs:
-        x0, y0 = select(ahead, px, view.cx), select(ahead, py, view.cy)
     _put(batch, SPLAT.center_x, x0)
     _put(batch, SPLAT.center_y, y0)
     length = _sqrt(c.x * c.x + c.y * c.y + c.z * c.z)
@@ -520,21 +507,22 @@ def _project_batch(batch, singles, view, R, c, ic, px, py, ahead, step):
     # One by one, not as a structure: the two kinds' are joined in registers then.
     if discs:
         n0, n1, n2, p0, p1, p2 = a.m02, a.m12, a.m22, q.m02, q.m12, q.m22
-        depth, shape = _disc(batch, singles, view, a, c, s, ahead, length, spread, wider, step)
-        A, B, C, ex, ey, h, scale, radius_squared, is_ellipse = shape
+        A, B, C, ex, ey, h, scale, radius_squared, is_ellipse = _disc(
+            batch, singles, view, a, c, s, length, spread, wider, step
+        )
     else:
         n0, n1, n2 = _shortest_axis(s, a)
         p0, p1, p2 = _shortest_axis(s, q)
-        depth, h, is_ellipse = c.z, wider, drawn
+        h, is_ellipse = wider, drawn
         ex = ey = radius_squared = wider * 0.0
         scale = h * det
     reach = spread * EXTENT_SIGMAS
-    low, high = maximum(c.z - reach, near), maximum(c.z + reach, near)
+    low, high = maximum(c.z - reach, near), c.z + reach
     if by_center:
-        low = high = maximum(c.z, near)
+        low = high = c.z
     facing = n0 * c.x + n1 * c.y + n2 * c.z
     flip = select(facing > 0.0, -1.0, 1.0)
-    _put_single(singles, SPLAT.depth, depth)
+    _put_single(singles, SPLAT.depth, c.z)
     _put_single(singles, SPLAT.depth_low, low)
     _put_single(singles, SPLAT.depth_high, high)
     _put_single(singles, SPLAT.opacity, opacity)
@@ -624,12 +612,11 @@ def project(
         c1 = m.x * R.m10 + m.y * R.m11 + m.z * R.m12 + t1
         c2 = m.x * R.m20 + m.y * R.m21 + m.z * R.m22 + t2
         ic = reciprocal(c2)
-        ahead = view.near < c2
         px, py = (c0 * fx + c1 * skew) * ic + cx, c1 * fy * ic + cy
         visible = 255 >> (8 - min(8, last - begin))
         inside = 0
         if every:
-            inside = to_bits(ahead & (px > 0.0) & (px < width) & (py > 0.0) & (py < height))
+            inside = to_bits((px > 0.0) & (px < width) & (py > 0.0) & (py < height))
         if visible & ~inside:
             _store3(batch, BATCH.center, c0, c1, c2)
             candidates = visible & ~inside
@@ -639,7 +626,7 @@ def project(
             if visible == 0:
                 continue
         c = Vector(c0, c1, c2)
-        length = _project_batch(batch, singles, view, R, c, ic, px, py, ahead, step)
+        length = _project_batch(batch, singles, view, R, c, ic, px, py, step)
         if view.harmonic and degree > 0:
             over = reciprocal(length)
             _store3(

@@ -167,13 +167,12 @@ def workspace() -> Workspace:
 
 
 @inlined
-def _disc_backward(g, inverse, ahead, length, work):
+def _disc_backward(g, inverse, length, work):
     """Backward of a disc's plane; returns the gradient in the distance of its centre."""
     kx, ky, kxy = inverse
     a, c, s = work.axes, work.center, work.scales
     ga, gc, g_s = work.g_axes, work.g_center, work.g_scales
     h, gh = work.vectors[0], work.vectors[1]
-    depth = c[2] if ahead else length
     nc = a[0, 2] * c[0] + a[1, 2] * c[1] + a[2, 2] * c[2]
     floor = EDGE_ON * length
     tilted = abs(nc) < floor
@@ -183,13 +182,13 @@ def _disc_backward(g, inverse, ahead, length, work):
     g_depth, g_nc, g_length = g[SPLAT.depth], 0.0, 0.0
     for k in range(2):
         tc = (a[0, k] * c[0] + a[1, k] * c[1] + a[2, k] * c[2]) / nc
-        scale = depth / s[k]
+        scale = c[2] / s[k]
         for r in range(3):
             h[r] = a[r, k] - tc * a[r, 2]
-        gh[0] = g[DISC.u_x + 3 * k] * kx + g[DISC.u_y + 3 * k] * kxy
-        gh[1] = g[DISC.u_y + 3 * k] * ky
-        gh[2] = 0.0 if ahead else g[DISC.u_0 + 3 * k]
-        g_scale = gh[0] * h[0] + gh[1] * h[1] + gh[2] * h[2]
+        gh[0] = g[DISC.u_x + 2 * k] * kx + g[DISC.u_y + 2 * k] * kxy
+        gh[1] = g[DISC.u_y + 2 * k] * ky
+        gh[2] = 0.0
+        g_scale = gh[0] * h[0] + gh[1] * h[1]
         g_tc = 0.0
         for r in range(3):
             gh[r] *= scale
@@ -201,12 +200,11 @@ def _disc_backward(g, inverse, ahead, length, work):
         g_nc -= g_tc * tc / nc
         g_depth += g_scale / s[k]
         g_s[k] -= g_scale * scale / s[k]
-    scale = depth / nc
+    scale = c[2] / nc
     gh[0] = g[DISC.w_x] * kx + g[DISC.w_y] * kxy
     gh[1] = g[DISC.w_y] * ky
-    gh[2] = 0.0 if ahead else g[DISC.w_0]
     g_scale = 0.0
-    for r in range(3):
+    for r in range(2):
         g_scale += gh[r] * a[r, 2]
         ga[r, 2] += scale * gh[r]
     g_depth += g_scale / nc
@@ -217,10 +215,7 @@ def _disc_backward(g, inverse, ahead, length, work):
         for r in range(3):
             ga[r, 2] += g_nc * c[r]
             gc[r] += g_nc * a[r, 2]
-    if ahead:
-        gc[2] += g_depth
-    else:
-        g_length += g_depth
+    gc[2] += g_depth
     return g_length
 
 
@@ -374,16 +369,14 @@ def _extent_backward(g, count, by_center, near, work):
         spread += (s[2] * a[2, 2]) ** 2
     spread = math.sqrt(spread)
     if by_center:
-        if c[2] > near:
-            gc[2] += g[SPLAT.depth_low] + g[SPLAT.depth_high]
+        gc[2] += g[SPLAT.depth_low] + g[SPLAT.depth_high]
     else:
         g_spread = 0.0
         if c[2] - EXTENT_SIGMAS * spread > near:
             gc[2] += g[SPLAT.depth_low]
             g_spread -= EXTENT_SIGMAS * g[SPLAT.depth_low]
-        if c[2] + EXTENT_SIGMAS * spread > near:
-            gc[2] += g[SPLAT.depth_high]
-            g_spread += EXTENT_SIGMAS * g[SPLAT.depth_high]
+        gc[2] += g[SPLAT.depth_high]
+        g_spread += EXTENT_SIGMAS * g[SPLAT.depth_high]
         if spread > 0:
             for k in range(count):
                 g_s[k] += g_spread * s[k] * a[2, k] ** 2 / spread
@@ -519,17 +512,15 @@ def project_backward(
                 ga[r, k], gQ[r, k] = 0.0, 0.0
         g_length = 0.0
         length = math.sqrt(c[0] * c[0] + c[1] * c[1] + c[2] * c[2])
-        ahead = c[2] > near
-        if ahead:
-            gc[0] += g[SPLAT.center_x] * fx / c[2]
-            gc[1] += (g[SPLAT.center_x] * skew + g[SPLAT.center_y] * fy) / c[2]
-            gc[2] -= (
-                g[SPLAT.center_x] * (table[place, SPLAT.center_x] - cx)
-                + g[SPLAT.center_y] * (table[place, SPLAT.center_y] - cy)
-            ) / c[2]
+        gc[0] += g[SPLAT.center_x] * fx / c[2]
+        gc[1] += (g[SPLAT.center_x] * skew + g[SPLAT.center_y] * fy) / c[2]
+        gc[2] -= (
+            g[SPLAT.center_x] * (table[place, SPLAT.center_x] - cx)
+            + g[SPLAT.center_y] * (table[place, SPLAT.center_y] - cy)
+        ) / c[2]
         g_opacity = g[SPLAT.opacity]
         if discs:
-            g_length = _disc_backward(g, inverse, ahead, length, work)
+            g_length = _disc_backward(g, inverse, length, work)
         else:
             g_opacity = _ellipsoid_backward(view, g, table[place], o, i, work)
             if not by_center:

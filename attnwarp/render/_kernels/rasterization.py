@@ -28,6 +28,7 @@ from attnwarp.render._kernels.evaluation import (
     prepare_moments,
 )
 from attnwarp.render._kernels.lanes import (
+    absolute,
     any_true,
     broadcast,
     copy4,
@@ -100,7 +101,7 @@ class Slots(NamedTuple):
     depth_sum: int = 8  # sum w (z - first_depth)
     inverse_sum: int = 9  # sum w (1/z - first_inverse)
     inverse_square_sum: int = 10
-    l1: int = 11
+    ordered: int = 11
     median: int = 12
     median_step: int = 13
     last_step: int = 14
@@ -168,7 +169,7 @@ def _prefetch_pictures(pictures, tile, width, channels):
         prefetch_to_write(pictures.alpha, to)
         prefetch_to_write(pictures.depth, to)
         prefetch_to_write(pictures.median, to)
-        prefetch_to_write(pictures.l1, to)
+        prefetch_to_write(pictures.ordered, to)
         prefetch_to_write(pictures.l2, to)
         prefetch_to_write(pictures.normal, 3 * to)
         prefetch_to_write(pictures.normal, 3 * to + 3 * tile.columns - 1)
@@ -278,7 +279,8 @@ def _composite_square(space, q, left, view, channels, keep):
     depth_sum = load(buffer, SLOT.depth_sum * PIXELS + s)
     inverse_sum = load(buffer, SLOT.inverse_sum * PIXELS + s)
     square_sum = load(buffer, SLOT.inverse_square_sum * PIXELS + s)
-    l1, last_step = load(buffer, SLOT.l1 * PIXELS + s), load(buffer, SLOT.last_step * PIXELS + s)
+    ordered = load(buffer, SLOT.ordered * PIXELS + s)
+    last_step = load(buffer, SLOT.last_step * PIXELS + s)
     n0 = load(buffer, SLOT.normal * PIXELS + s)
     n1 = load(buffer, (SLOT.normal + 1) * PIXELS + s)
     n2 = load(buffer, (SLOT.normal + 2) * PIXELS + s)
@@ -322,7 +324,7 @@ def _composite_square(space, q, left, view, channels, keep):
             work, row, z, inverse_z, discs, by_center, first_depth, first_inverse
         )
         w_depth, w_inverse = w * depth, w * inverse
-        l1 = l1 + w_depth * A - w * depth_sum
+        ordered = ordered + absolute(w_depth * A - w * depth_sum)
         A, depth_sum = A + w, depth_sum + w_depth
         inverse_sum, square_sum = inverse_sum + w_inverse, square_sum + w_inverse * inverse
         n0 = n0 + w * broadcast(work, row + SPLAT.normal)
@@ -353,7 +355,7 @@ def _composite_square(space, q, left, view, channels, keep):
     store(buffer, SLOT.depth_sum * PIXELS + s, depth_sum)
     store(buffer, SLOT.inverse_sum * PIXELS + s, inverse_sum)
     store(buffer, SLOT.inverse_square_sum * PIXELS + s, square_sum)
-    store(buffer, SLOT.l1 * PIXELS + s, l1)
+    store(buffer, SLOT.ordered * PIXELS + s, ordered)
     store(buffer, SLOT.last_step * PIXELS + s, last_step)
     store(buffer, SLOT.normal * PIXELS + s, n0)
     store(buffer, (SLOT.normal + 1) * PIXELS + s, n1)
@@ -418,8 +420,8 @@ def _finish(buffer, background, ndc_scale):
         median = load(buffer, SLOT.median * PIXELS + p)
         store(buffer, SLOT.median * PIXELS + p, select(covered, median, f32(np.nan)))
         # Pairs were counted once.
-        l1 = load(buffer, SLOT.l1 * PIXELS + p)
-        store(buffer, SLOT.l1 * PIXELS + p, l1 * f32(2.0))
+        ordered = load(buffer, SLOT.ordered * PIXELS + p)
+        store(buffer, SLOT.ordered * PIXELS + p, ordered * f32(2.0))
         through = f32(1.0) - A
         for c in range(background.shape[0]):
             slot = (SLOT.color + c) * PIXELS + p
@@ -437,7 +439,7 @@ def _write_whole_tile(buffer, pictures, tile, width):
         copy4(pictures.alpha, to, buffer, SLOT.alpha * PIXELS + p)
         copy4(pictures.depth, to, buffer, SLOT.depth * PIXELS + p)
         copy4(pictures.median, to, buffer, SLOT.median * PIXELS + p)
-        copy4(pictures.l1, to, buffer, SLOT.l1 * PIXELS + p)
+        copy4(pictures.ordered, to, buffer, SLOT.ordered * PIXELS + p)
         copy4(pictures.l2, to, buffer, SLOT.l2 * PIXELS + p)
         interleave4(pictures.color, 3 * to, buffer, SLOT.color * PIXELS + p, PIXELS)
         interleave4(pictures.normal, 3 * to, buffer, SLOT.normal * PIXELS + p, PIXELS)
@@ -461,7 +463,7 @@ def _write_tile(buffer, pictures, tile):
             pictures.alpha[y, x] = buffer[u64(SLOT.alpha * PIXELS) + p]
             pictures.depth[y, x] = buffer[u64(SLOT.depth * PIXELS) + p]
             pictures.median[y, x] = buffer[u64(SLOT.median * PIXELS) + p]
-            pictures.l1[y, x] = buffer[u64(SLOT.l1 * PIXELS) + p]
+            pictures.ordered[y, x] = buffer[u64(SLOT.ordered * PIXELS) + p]
             pictures.l2[y, x] = buffer[u64(SLOT.l2 * PIXELS) + p]
             for c in range(pictures.color.shape[2]):
                 pictures.color[y, x, u64(c)] = buffer[u64((SLOT.color + c) * PIXELS) + p]

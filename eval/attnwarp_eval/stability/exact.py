@@ -131,6 +131,8 @@ class ExactSplats:
         px, py = mpmath.mpf(x), mpmath.mpf(y)
         ray_y = (py - self.K[1][2]) / self.K[1][1]
         ray = [(px - self.K[0][2] - self.K[0][1] * ray_y) / self.K[0][0], ray_y, mpmath.mpf(1)]
+        if center[2] <= self.near:
+            return center[2], mpmath.mpf(0), center[2]
         if self.kind == "2d":
             raw, z = self._disc(center, axes, scale, opacity, ray, px, py)
         else:
@@ -151,25 +153,20 @@ class ExactSplats:
         near, normal = self.near, axes[2]
         nc, nd = _dot(normal, center), _dot(normal, ray)
         floor = mpmath.mpf(constants.EDGE_ON) * mpmath.sqrt(_dot(center, center))
-        in_front = center[2] > near
         if abs(nc) < floor:
             tilted = -floor if nc < 0 else floor
-            nd += (tilted - nc) / center[2] if in_front else 0
+            nd += (tilted - nc) / center[2]
             nc = tilted
         ahead = nd / nc > 0
         z = nc / nd if ahead else mpmath.mpf(1)
-        rho = mpmath.inf
+        cx, cy = self._project(center)
+        rho = ((x - cx) ** 2 + (y - cy) ** 2) * 2
         if ahead and z >= near:
             hit = [z * r - c for r, c in zip(ray, center, strict=True)]
-            rho = sum((_dot(hit, axes[k]) / scale[k]) ** 2 for k in range(2))
-        if in_front:
-            cx, cy = self._project(center)
-            rho = min(rho, ((x - cx) ** 2 + (y - cy) ** 2) * 2)
-        if rho == mpmath.inf:
-            return mpmath.mpf(0), near
+            rho = min(rho, sum((_dot(hit, axes[k]) / scale[k]) ** 2 for k in range(2)))
         alpha = opacity * mpmath.exp(-rho / 2)
         if self.depth == "center":
-            return alpha, max(center[2], near)
+            return alpha, center[2]
         variance = sum((scale[k] * axes[k][2]) ** 2 for k in range(2))
         low, high = self._extent(center[2], variance)
         return alpha, min(max(z, low), high) if ahead else high
@@ -185,8 +182,6 @@ class ExactSplats:
         y: Number,
     ) -> tuple[Number, Number]:
         """J S J^T + 0.3 I with the clamped Jacobian of 3DGS."""
-        if center[2] <= self.near:
-            return mpmath.mpf(0), center[2]
         slopes = []
         for k in range(2):
             margin = mpmath.mpf(constants.JACOBIAN_MARGIN) * self.size[k] / 2 / self.K[k][k]

@@ -127,6 +127,16 @@ def test_before_the_first_reset_size_is_no_reason_to_go():
     assert len(model) == 3
 
 
+def test_a_fit_that_is_too_short_for_a_reset_removes_huge_splats_too():
+    start = splats(3, scale=0.05)
+    start.scales[1] = 0.3
+    model, density = model_and_density(start, reset_every=1000, iterations=16, densify_until=0.5)
+    density.refine(model, 4, torch.Generator().manual_seed(0))
+    assert len(model) == 3
+    density.refine(model, 5, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(model.gaussians().means.detach(), start.means[[0, 2]])
+
+
 def test_growth_stops_at_the_limit_and_prefers_the_largest_gradients():
     start = splats(6, scale=0.01)
     model, density = model_and_density(start, max_splats=8)

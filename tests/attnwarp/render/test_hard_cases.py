@@ -56,6 +56,30 @@ def test_case_2_edge_on_weights_agree_with_float64(facing, front_camera) -> None
     assert float((exact.alpha - fast.alpha).abs().max()) < 1e-5
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_case_4_a_disc_whose_centre_is_behind_the_camera_is_not_drawn(
+    backend, facing, front_camera
+) -> None:
+    """A ceiling whose plane is met in front, in each row above the middle."""
+    camera = front_camera(21, 30.0)
+    wall = facing([[0, 0, 4]], 0.5, 0.8)
+    both = facing(
+        [[0, 0, 4], [0, -1, -0.5]], [[0.5] * 2, [9.0] * 2], 0.8, normals=[[0, 0, -1], [0, 1, 0]]
+    )
+    ahead = both.means.clone()
+    ahead[1, 2] = 0.5
+    assert bool((render(dataclasses.replace(both, means=ahead), camera).alpha[0] > 0.7).all())
+    leaves = {
+        name: getattr(both, name).requires_grad_() for name in ("means", "scales", "opacities")
+    }
+    view, alone = render(both, camera, backend=backend), render(wall, camera, backend=backend)
+    for name in OUTPUTS[:-1]:
+        expected, actual = getattr(alone, name), getattr(view, name)
+        assert torch.equal(actual.detach().nan_to_num(-1), expected.nan_to_num(-1)), name
+    (view.color.sum() + view.depth.nansum() + view.distortion_ordered.sum()).backward()
+    assert all(not bool(leaf.grad[1].any()) for leaf in leaves.values())
+
+
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 @pytest.mark.parametrize("kind", ["2d", "3d"])
 def test_case_10_the_scale_of_the_scene_changes_nothing(

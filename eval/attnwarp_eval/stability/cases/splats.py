@@ -68,7 +68,7 @@ def _floor(sigma: float) -> Shot:
     camera = Camera.look_at([0, 0, 1], [0, 5, 1], width=48, height=40, fov_y=80)
     floor = Gaussians(
         "2d",
-        torch.zeros(1, 3, dtype=torch.float64),
+        torch.tensor([[0.0, 4, 0]], dtype=torch.float64),
         torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64),
         torch.full((1, 2), sigma, dtype=torch.float64),
         torch.full((1,), 0.9, dtype=torch.float64),
