@@ -26,7 +26,7 @@ from attnwarp.cli.options import (
     RenderThreadsOption,
     options_of,
 )
-from attnwarp.cli.shell import STOPPED, assignments, check_out, clear_errors, use_threads
+from attnwarp.cli.shell import STOPPED, assignments, check_out, clear_errors, use_threads, warn
 from attnwarp.process import asked_to_stop
 from attnwarp.reporting import Reporter, reporter
 
@@ -38,6 +38,11 @@ if TYPE_CHECKING:
 OWN_OPTIONS = {
     name: f"--{name.replace('_', '-')}" for name in ("kind", "seed", "iterations", "max_splats")
 }
+
+
+OVERFITTED = 0.5
+"""Fall of the held-out PSNR from its best, dB, that is said; the last evaluations of a sound fit
+differ by less."""
 
 
 RESULTS = ("splats.ply", "checkpoint.pt", "history.jsonl", "settings.json")
@@ -137,9 +142,26 @@ def fit(
             f"{out / 'splats.ply'}: {len(result.gaussians)} splats, {result.iteration} iterations"
             f" in {result.seconds:.0f} s{peak_memory(str(place))}{held}"
         )
+        _warn_of_overfit(result)
         if result.stopped == "asked":
             report.log("stopped; the same command goes on from here")
             raise typer.Exit(STOPPED)
+
+
+def _warn_of_overfit(result: Fit) -> None:
+    """Say whether held-out views were nearer to their pictures before."""
+    every, whole = result.settings.evaluate_every, result.stopped == "iterations"
+    # Where a fit was stopped, opacities may just have been lowered.
+    said = [(r.psnr, r.iteration) for r in result.history if whole or r.iteration % every == 0]
+    known = [(psnr, iteration) for psnr, iteration in said if psnr is not None]
+    if not known or max(known)[0] <= known[-1][0] + OVERFITTED:
+        return
+    (best, iteration), (last, _) = max(known), known[-1]
+    fewer = f", or --iterations {iteration}" if iteration else ""
+    warn(
+        f"the held-out views had {best:.2f} dB after {iteration} iterations, and have {last:.2f}:"
+        f" the fit learns its pictures by heart; take more of them{fewer}"
+    )
 
 
 def _read_start(start: Path, out: Path, kind: Kind | None) -> Gaussians:

@@ -289,6 +289,22 @@ def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
         assert json.loads((out / "settings.json").read_text())["kind"] == kind
 
 
+def test_held_out_views_that_become_worse_are_said(data, tmp_path):
+    """All pictures are white but the one that is held out: the fit leaves it behind."""
+    shutil.copytree(data, tmp_path / "data")
+    for path in (tmp_path / "data" / "images").iterdir():
+        level = 0 if path.name == "1.png" else 255
+        cv2.imwrite(str(path), np.full((32, 32, 3), level, np.uint8))
+    fit = ["fit", tmp_path / "data", "--out", tmp_path / "out", "--set", "evaluate_every=10"]
+    fit += ["--iterations", 30, "--set", "densify=false", "--set", "lr_opacity=0.2"]
+    done = in_process(*fit)
+    assert done.exit_code == 0, done.stderr
+    assert "learns its pictures by heart; take more of them" in done.stderr
+    history = (tmp_path / "out" / "history.jsonl").read_text().splitlines()
+    first, *_, last = (json.loads(line)["psnr"] for line in history)
+    assert f"had {first:.2f} dB after 0 iterations, and have {last:.2f}: " in done.stderr
+
+
 def test_views_without_pictures_are_neither_fitted_on_nor_held_out(data, tmp_path):
     shutil.copytree(data, tmp_path / "data")
     (tmp_path / "data" / "images" / "1.png").unlink()  # the second by name would be held out
