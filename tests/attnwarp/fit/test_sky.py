@@ -67,8 +67,8 @@ def points():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_fit_under_a_sky_keeps_its_depth(seed):
-    """Where gaps out of order count negative, a disc of the sky grows to 1000 extents, and the loss
-    falls below 0, with each of these seeds."""
+    """A loss in which gaps out of order count negative lets a disc of the sky grow to 1000 extents,
+    and falls below 0, with each of these seeds."""
     shots = [photograph(camera) for camera in cameras()]
     views = Views(cameras(), [color for color, _ in shots])
     settings = FitSettings(iterations=3000, max_splats=4000, sh_degree=1, seed=seed)

@@ -301,7 +301,7 @@ def test_views_that_are_alike_and_others_stay_held_out(tmp_path, recwarn):
 
 
 def test_copies_among_pictures_without_splits_are_not_held_out(tmp_path):
-    """Of ten pictures the second and the last are held out, and the last is the third once more."""
+    """The second and the last of ten pictures are held out, and the last is the third once more."""
     paths = [tmp_path / f"{k}.png" for k in range(10)]
     for k, path in enumerate(paths):
         seed = 2 if k == 9 else k
