@@ -103,13 +103,20 @@ def heeded(numbers: tuple[int, ...]) -> list[int]:
     return [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
 
 
+interrupted = False
+"""True after a stop. An import that it meets may end in an error of its own, such as numpy's."""
+
+
+def interrupt(*_: Any) -> None:
+    """Raise KeyboardInterrupt, and remember it: the handler of a signal."""
+    global interrupted
+    interrupted = True
+    raise KeyboardInterrupt
+
+
 @contextmanager
 def stops_interrupt() -> Iterator[None]:
     """A polite kill, or the terminal's end, raises KeyboardInterrupt inside, as Ctrl-C does."""
-
-    def interrupt(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
-
     handlers = {number: signal.signal(number, interrupt) for number in heeded(STOPS)}
     try:
         yield

@@ -9,13 +9,10 @@ import signal
 import sys
 from typing import Any
 
-from attnwarp.process import STOPS, heeded
+from attnwarp import process
 
 STOPPED = 130
 """Exit code after Ctrl-C, a polite kill or the terminal's end, as shells have it for Ctrl-C."""
-
-interrupted = False
-"""True after a Ctrl-C. An import that it meets may end in an error of its own, such as numpy's."""
 
 
 def enter(name: str, module: str) -> None:
@@ -32,27 +29,22 @@ def enter(name: str, module: str) -> None:
         os.write(2, f"{name}: stopped; nothing was written\n".encode())
         os._exit(STOPPED)
 
-    def interrupt(*_: Any) -> None:
-        global interrupted
-        interrupted = True
-        raise KeyboardInterrupt
-
     before = signal.getsignal(signal.SIGINT)
     heeds = before is signal.default_int_handler  # a shell's background job ignores Ctrl-C
     # Before its import's end, a command has nothing to keep.
-    early = [*heeded(STOPS), *([signal.SIGINT] if heeds else [])]
+    early = [*process.heeded(process.STOPS), *([signal.SIGINT] if heeds else [])]
     for number in early:
         signal.signal(number, leave)
     sys.argv[1:] = [expanded(argument) for argument in sys.argv[1:]]
     main = importlib.import_module(module).main
     if heeds:
-        signal.signal(signal.SIGINT, interrupt)
+        signal.signal(signal.SIGINT, process.interrupt)
     try:
         main(name)
     except KeyboardInterrupt:
         leave()
     except SystemExit as done:
-        if interrupted and isinstance(done.code, int):
+        if process.interrupted and isinstance(done.code, int):
             # Libraries whose import was cut end the interpreter with codes of their own.
             atexit._run_exitfuncs()
             os._exit(done.code)

@@ -14,7 +14,7 @@ from typing import Any
 
 import typer
 
-from attnwarp.cli import entry
+from attnwarp import process
 from attnwarp.cli.entry import STOPPED
 from attnwarp.errors import InputError, InputWarning, missing_extra
 from attnwarp.process import (
@@ -107,7 +107,7 @@ def clear_errors(
     except OSError as error:
         raise fail(file_error(error)) from None
     except ImportError as error:
-        if strict:
+        if strict or process.interrupted:
             raise
         package = error.name or str(error)
         raise fail(f"needs the package {package}: pip install {package.split('.')[0]}") from None
@@ -209,7 +209,7 @@ def run(app: typer.Typer, name: str) -> None:
         # Typer's own code for a closed pipe is 1; a regression has a type of its own.
         sys.exit(CLOSED_PIPE if done.code == 1 and type(done) is SystemExit else done.code)
     except Exception as error:
-        if entry.interrupted:
+        if process.interrupted:
             sys.exit(fail(NOTHING, STOPPED).exit_code)
         explained = missing_extra(error) if isinstance(error, ImportError) else None
         if explained is None:

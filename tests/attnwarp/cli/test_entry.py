@@ -53,6 +53,34 @@ def test_a_stop_while_a_command_is_imported_is_one_line(name, tmp_path):
     assert done.stderr == "attnwarp: stopped; nothing was written\n"
 
 
+CUT_IMPORT = """
+import os, signal, typer
+from attnwarp.cli import shell
+
+app = typer.Typer()
+
+@app.command()
+def command():
+    with shell.clear_errors(strict={strict}):
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            signal.pause()
+        except KeyboardInterrupt as stop:
+            raise ImportError("initialization failed") from stop
+
+shell.run(app, "attnwarp")
+"""
+
+
+@pytest.mark.parametrize("strict", [True, False])
+def test_a_kill_that_an_import_turns_into_its_own_error_is_one_line(strict):
+    """Errors of numpy and OpenCV are such."""
+    done = subprocess.run(
+        [sys.executable, "-c", CUT_IMPORT.format(strict=strict)], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (130, "attnwarp: stopped; nothing was written\n")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seconds", [0.1, 0.3])
 @pytest.mark.parametrize(
