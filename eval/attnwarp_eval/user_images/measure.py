@@ -526,7 +526,7 @@ class _Gathered:
                 {v: np.array(data[name][v], np.float64) for v in views if v in data[name]}
                 for name in ("clip", "dino", "before")
             ),
-            {view: with_nan(values) for view, values in data["own"].items()},
+            own={view: with_nan(values) for view, values in data["own"].items()},
         )
 
     def add(self, other: _Gathered) -> None:
