@@ -519,14 +519,17 @@ class _Gathered:
     def from_json(cls, views: Iterable[str], data: Json) -> _Gathered:
         """Some views, in this order, from the JSON of :meth:`to_json`."""
         errors, psnr, distances = (with_nan(data[k]) for k in ("errors", "psnr", "distances"))
+
+        def rows(name: str) -> dict[str, Embedding]:
+            return {v: np.array(data[name][v], np.float64) for v in views if v in data[name]}
+
         return cls(
             {v: (errors[v], psnr[v] if errors[v] else np.inf) for v in views if v in errors},
             {v: distances[v] for v in views if v in distances},
-            *(
-                {v: np.array(data[name][v], np.float64) for v in views if v in data[name]}
-                for name in ("clip", "dino", "before")
-            ),
-            own={view: with_nan(values) for view, values in data["own"].items()},
+            rows("clip"),
+            rows("dino"),
+            rows("before"),
+            {view: with_nan(values) for view, values in data["own"].items()},
         )
 
     def add(self, other: _Gathered) -> None:
