@@ -301,8 +301,8 @@ def view_of(cameras: Any, name: str | None, dataset: Dataset) -> int:
             return keys.index(name_key(name))
     if name.isdecimal() and int(name) < len(names):
         return int(name)
-    pairs = zip(dataset.cameras, dataset.image_paths, strict=True)
-    left_out = [camera.name for camera, image in pairs if image is None]
+    posed = zip(dataset.cameras, dataset.image_paths, strict=True)
+    left_out = [camera.name for camera, image in posed if image is None]
     if any(name in candidates for candidates in _spellings(left_out)):
         raise InputError(f"--source: the picture of {name!r} is missing; name another view")
     raise InputError(
