@@ -191,8 +191,16 @@ class Workdir:
         write_atomically(self.path / name, lambda stream: stream.write(data))
 
     def read_picture(self, name: str) -> npt.NDArray[np.uint8]:
-        """(H, W, 3) uint8 of a PNG that :meth:`write_picture` wrote."""
-        return read_image(self.path / name)
+        """(H, W, 3) uint8 of a PNG that :meth:`write_picture` wrote.
+
+        Raises:
+            FileFormatError: it is damaged.
+        """
+        path = self.path / name
+        try:
+            return read_image(path)
+        except FileFormatError:
+            raise FileFormatError(path, "damaged; remove it, it is made anew") from None
 
     # --- pictures that are made once
 

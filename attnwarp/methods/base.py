@@ -508,9 +508,8 @@ class _Run:
             return
         if not finished:
             self._tune_now(number, training, begin, end, state, order)
-        splats = f"rounds/{number + 1}.ply"
-        if not (finished and self.folder.has(splats)):
-            write_ply(self.folder.path / splats, self.tuning.gaussians())
+        # Each time, since nothing tells whether one that is there is whole.
+        write_ply(self.folder.path / f"rounds/{number + 1}.ply", self.tuning.gaussians())
         self.seconds.write()
 
     def _tune_now(

@@ -2,6 +2,7 @@
 """Oracles: rows counted by hooks on the network, bytes of files, a clock that counts."""
 
 import json
+import shutil
 from dataclasses import replace
 from functools import partial
 
@@ -14,7 +15,7 @@ from tiny_methods import QUICK, depth_editor, editor, rows_of, run, scene  # noq
 
 from attnwarp import Camera
 from attnwarp.errors import InputError, InputWarning
-from attnwarp.io import read_image, read_ply
+from attnwarp.io import FileFormatError, read_image, read_ply
 from attnwarp.methods import (
     METHODS,
     Budget,
@@ -102,6 +103,23 @@ def test_killed_at_a_random_moment_and_resumed_it_gives_the_same_bytes(name, who
     resumed = run(name, folder=tmp_path, checkpoint_seconds=0)
     assert files(tmp_path) == files(folder)
     assert resumed.counters == result.counters
+
+
+def test_splats_that_were_cut_are_made_whole_and_a_cut_picture_is_said_to_be(whole, run, tmp_path):
+    """Oracle: the bytes of the run that was left alone."""
+    name = "by_view"
+    folder = whole(name)[0]
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    splats, picture = tmp_path / "rounds/1.ply", next((tmp_path / "renders/after").iterdir())
+    splats.write_bytes(splats.read_bytes()[:-40])
+    run(name, folder=tmp_path)
+    assert files(tmp_path) == files(folder)
+    picture.write_bytes(picture.read_bytes()[:-40])
+    with pytest.raises(FileFormatError, match=f"{picture.name}: damaged; remove it, it is made"):
+        run(name, folder=tmp_path)
+    picture.unlink()
+    run(name, folder=tmp_path)
+    assert files(tmp_path) == files(folder)
 
 
 @pytest.mark.slow
