@@ -19,7 +19,10 @@ from attnwarp.cli.files import (
     warn_of_misfit,
 )
 from attnwarp.cli.options import (
+    MACHINE,
+    METHOD,
     MOST_PIXELS,
+    SPLATS,
     AntialiasedOption,
     DataArgument,
     Editing,
@@ -50,78 +53,128 @@ def edit(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the result; an edit in it is resumed. Named after DATA and the"
-            " instruction, in runs/edits, if left out."
+            metavar="FOLDER",
+            help="Of the result, resumed if it is there; in runs/edits if left out.",
         ),
     ] = None,
     ply: Annotated[
-        Path | None, typer.Option(help="Splats of the scene; fitted first if left out.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Splats of the scene; fitted first if left out."),
     ] = None,
     editor: EditorOption = "small-plain",
     method: Annotated[
         str,
         typer.Option(
             metavar="NAME",
-            help="attention_warping, or for comparison by_view, igs2gs, dge or gaussctrl"
-            " (see docs/method/baselines.md).",
+            help="attention_warping, or by_view, igs2gs, dge, gaussctrl; see"
+            " docs/method/baselines.md.",
+            show_default=False,
+            rich_help_panel=METHOD,
         ),
     ] = "attention_warping",
     preset: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
-            help="The method's choices: corrected, extended, paper, released, released-controlnet"
-            " (see docs/method/algorithm.md); those of other methods are in"
-            " docs/method/baselines.md. The method's first if left out.",
+            help="Its choices: corrected, extended, paper, released, released-controlnet; see"
+            " docs/method/algorithm.md.",
+            rich_help_panel=METHOD,
         ),
     ] = None,
     source_picture: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The source view, edited elsewhere.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="The source view, edited elsewhere.", rich_help_panel=METHOD
+        ),
     ] = None,
-    stages: Annotated[int | None, typer.Option(min=1, help="Of editing and tuning (3).")] = None,
+    stages: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="N", help="Of editing and tuning (3).", rich_help_panel=METHOD),
+    ] = None,
     views_per_stage: Annotated[
-        int | None, typer.Option(min=1, help="New views a stage edits.")
+        int | None,
+        typer.Option(
+            min=1, metavar="N", help="New views that a stage edits.", rich_help_panel=METHOD
+        ),
     ] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Of denoising (20).")] = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="N", help="Of denoising (20).", rich_help_panel=METHOD),
+    ] = None,
     iterations: Annotated[
-        int | None, typer.Option(min=0, help="Of tuning, in each stage (300).")
+        int | None,
+        typer.Option(
+            min=0, metavar="N", help="Of tuning, in each stage (300).", rich_help_panel=METHOD
+        ),
     ] = None,
     size: Annotated[
         int | None,
         typer.Option(
             min=16,
             max=MOST_PIXELS,
+            metavar="N",
             help="Longest side in px to edit at; the editor's own if left out.",
         ),
     ] = None,
     alone: Annotated[
-        bool, typer.Option("--each-view-alone", help="Edit view by view, for comparison.")
+        bool,
+        typer.Option(
+            "--each-view-alone", help="Carry nothing, for comparison.", rich_help_panel=METHOD
+        ),
     ] = False,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of everything random (0).")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Of everything random (0).")
+    ] = None,
     change: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Any other setting of the preset."),
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Any other setting of the preset.",
+            rich_help_panel=METHOD,
+        ),
     ] = None,
     fit_iterations: Annotated[
-        int | None, typer.Option(min=1, help="Of the fit, where no PLY is given (3000).")
+        int | None,
+        typer.Option(
+            min=1, metavar="N", help="Of the fit, without --ply (3000).", rich_help_panel=SPLATS
+        ),
+    ] = None,
+    max_splats: Annotated[
+        int | None,
+        typer.Option(
+            min=1, metavar="N", help="Most that a fit grows (30000).", rich_help_panel=SPLATS
+        ),
     ] = None,
     kind: Annotated[
         Kind | None,
-        typer.Option(help="Of the fit (2dgs), or of the PLY, whatever it says."),
-    ] = None,
-    max_splats: Annotated[
-        int | None, typer.Option(min=1, help="Do not grow the model beyond, for the fit (30000).")
+        typer.Option(
+            metavar="KIND",
+            help="Of the fit, 2dgs or 3dgs, or of the PLY, whatever it says.",
+            rich_help_panel=SPLATS,
+        ),
     ] = None,
     antialiased: AntialiasedOption = None,
     screen_filter: ScreenFilterOption = None,
     store: Annotated[
-        Store | None, typer.Option(help="Where recorded features are kept (cpu).")
+        Store | None,
+        typer.Option(
+            metavar="WHERE",
+            help="Recorded features: cpu (main memory), device or disk.",
+            rich_help_panel=MACHINE,
+        ),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0, help="Begin no edit and no iteration after so many.")
+        float | None,
+        typer.Option(
+            min=0, metavar="S", help="Begin no edit and no iteration after.", rich_help_panel=METHOD
+        ),
     ] = None,
     network_rows: Annotated[
-        int | None, typer.Option(min=0, help="Rows through the network at most.")
+        int | None,
+        typer.Option(
+            min=0, metavar="N", help="At most, through the network.", rich_help_panel=METHOD
+        ),
     ] = None,
     *,
     editing: Editing,

@@ -56,6 +56,11 @@ class Coordinates(StrEnum):
     relative = "relative"
 
 
+PANELS = (MARKING, METHOD, SPLATS, PAGE, MACHINE, READING) = (
+    "What is edited", "The method", "Splats", "The page", "The machine", "Reading DATA",
+)  # fmt: skip
+"""Panels of the help in their order, below that of the options that most calls have."""
+
 MOST_PIXELS = 4096
 """Longest side that an edit works at; more is a typing error that would take all the memory."""
 
@@ -67,49 +72,71 @@ InstructionOption = Annotated[str, typer.Option(help='What to change, such as "m
 EditorOption = Annotated[
     str,
     typer.Option(
-        metavar="NAME|FOLDER|BASE,CONTROLNET",
-        help="A bundled editor, or a folder or two in diffusers' format.",
+        metavar="NAME",
+        help="A bundled editor, or a folder in diffusers' format; two, BASE,CONTROLNET, for depth.",
     ),
 ]
 
 WhereOption = Annotated[
     str | None,
     typer.Option(
-        "--where", metavar="WORDS", help='What is edited, such as "bear"; the rest stays.'
+        "--where",
+        metavar="WORDS",
+        help='Names of it, such as "bear"; the rest stays.',
+        rich_help_panel=MARKING,
     ),
 ]
 
 BoxOption = Annotated[
     str | None,
-    typer.Option(metavar="X0,Y0,X1,Y1", help="Box around it, px of the (source) picture."),
+    typer.Option(
+        metavar="X0,Y0,X1,Y1",
+        help="Box around it, px of the (source) picture.",
+        rich_help_panel=MARKING,
+    ),
 ]
 
 AtOption = Annotated[
     str | None,
-    typer.Option(metavar="X,Y", help="Point on it, px of the (source) picture."),
+    typer.Option(
+        metavar="X,Y",
+        help="Point on it, px of the (source) picture.",
+        rich_help_panel=MARKING,
+    ),
 ]
 
 SegmenterOption = Annotated[
     str | None,
     typer.Option(
-        help="What --where asks: clip-parts if left out, or DINO_FOLDER,SAM_FOLDER (transformers)."
+        metavar="NAME",
+        help="What --where asks: clip-parts, or folders DINO,SAM.",
+        rich_help_panel=MARKING,
     ),
 ]
 
 ThreadsOption = Annotated[
     int | None,
-    typer.Option(min=1, help="CPU threads; if left out, one for a small editor, else all cores."),
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="CPU threads; one for a small editor, else all cores.",
+        rich_help_panel=MACHINE,
+    ),
 ]
 
 DeviceOption = Annotated[
-    str, typer.Option(help="cpu, cuda, or auto: a GPU where there is one.", metavar="DEVICE")
+    str,
+    typer.Option(
+        metavar="NAME", help="cpu, cuda, or auto: a GPU if there is one.", rich_help_panel=MACHINE
+    ),
 ]
 
 DtypeOption = Annotated[
     str,
     typer.Option(
-        help="Of the editor: float32, float16, bfloat16, or auto: float16 on a GPU.",
         metavar="TYPE",
+        help="Of the editor: float32, float16, bfloat16, or auto: float16 on a GPU.",
+        rich_help_panel=MACHINE,
     ),
 ]
 
@@ -117,7 +144,8 @@ LowMemoryOption = Annotated[
     bool,
     typer.Option(
         "--low-memory",
-        help="Weights wait in main memory, block by block; large pictures are decoded in tiles.",
+        help="Weights wait in main memory; pictures are decoded in tiles.",
+        rich_help_panel=MACHINE,
     ),
 ]
 
@@ -127,25 +155,36 @@ DataArgument = Annotated[
 
 
 MaxSizeOption = Annotated[
-    int | None, typer.Option(min=16, help="Shrink larger images to this many px.")
+    int | None,
+    typer.Option(
+        min=16,
+        metavar="N",
+        help="Shrink larger images to this many px.",
+        rich_help_panel=READING,
+    ),
 ]
 
 
 RenderThreadsOption = Annotated[
-    int | None, typer.Option(min=1, help="CPU threads; all cores if left out.")
+    int | None,
+    typer.Option(
+        min=1, metavar="N", help="CPU threads; all cores if left out.", rich_help_panel=MACHINE
+    ),
 ]
 
 
 SplatKindOption = Annotated[
-    Kind | None, typer.Option(help="Read the file as this kind, whatever it says of itself.")
+    Kind | None,
+    typer.Option(help="Read the file as this kind, whatever it says.", rich_help_panel=SPLATS),
 ]
 
 
 ScreenFilterOption = Annotated[
     float | None,
     typer.Option(
-        help="px^2 that the screen adds to 3D splats, whatever the file says: 0.3 of 3DGS, 0.1 of"
-        " Mip-Splatting."
+        metavar="PX2",
+        help="What the screen adds to 3D splats: 0.3 of 3DGS, 0.1 of Mip-Splatting.",
+        rich_help_panel=SPLATS,
     ),
 ]
 
@@ -154,7 +193,8 @@ AntialiasedOption = Annotated[
     bool | None,
     typer.Option(
         "--antialiased/--no-antialiased",
-        help="Whether the splats were fitted antialiased, whatever the file says.",
+        help="How the splats were fitted.",
+        rich_help_panel=SPLATS,
     ),
 ]
 
@@ -164,26 +204,48 @@ class Reading:
     """Options of reading a data set: the keywords of `attnwarp.io.read_dataset`, each an option."""
 
     format: Annotated[
-        Format | None, typer.Option(help="What DATA is, where its folder holds both formats.")
+        Format | None,
+        typer.Option(
+            metavar="NAME",
+            help="transforms or colmap, where DATA holds both.",
+            rich_help_panel=READING,
+        ),
     ] = None
-    images: Annotated[Path | None, typer.Option(help="Folder of the images of a COLMAP model.")] = (
-        None
-    )
+    images: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Images of a COLMAP model.", rich_help_panel=READING),
+    ] = None
     scale: Annotated[
-        int, typer.Option(help="2, 4 or 8: images_N in place of images; cameras are resized.")
+        int,
+        typer.Option(
+            metavar="N",
+            help="2, 4 or 8: images_N in place of images; cameras are resized.",
+            rich_help_panel=READING,
+        ),
     ] = 1
     missing_images: Annotated[
-        MissingImages, typer.Option(help="none: leave out cameras whose image is not there.")
+        MissingImages,
+        typer.Option(
+            metavar="WHAT",
+            help="error, or none: leave out cameras whose image is missing.",
+            rich_help_panel=READING,
+        ),
     ] = MissingImages.error
     resize_cameras: Annotated[
-        bool, typer.Option("--resize-cameras", help="Fit cameras to images of another size.")
+        bool,
+        typer.Option(
+            "--resize-cameras",
+            help="Fit cameras to images of another size.",
+            rich_help_panel=READING,
+        ),
     ] = False
     ignore_keys: Annotated[
         list[str] | None,
         typer.Option(
             "--ignore-key",
             metavar="KEY",
-            help="Pass over this key of a transforms.json (mask_path).",
+            help="Pass over this key of a transforms.json.",
+            rich_help_panel=READING,
         ),
     ] = None
 
@@ -202,25 +264,37 @@ class Editing:
         str | None,
         typer.Option(
             metavar="VIEW",
-            help="Name or number of the source view, which is marked; the first if left out.",
-        ),
-    ] = None
-    masks: Annotated[
-        Path | None, typer.Option(help="Folder of PNG masks, NAME.png; white is edited.")
-    ] = None
-    mask: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Mask of the source view, lifted into all; white is edited."
+            help="Name or number of the view that is marked and edited first (0).",
+            rich_help_panel=MARKING,
         ),
     ] = None
     box: BoxOption = None
     at: AtOption = None
     words: WhereOption = None
     segmenter: SegmenterOption = None
+    mask: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Mask of the source view, lifted into all; white is edited.",
+            rich_help_panel=MARKING,
+        ),
+    ] = None
+    masks: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Masks of all views, NAME.png; white is edited.",
+            rich_help_panel=MARKING,
+        ),
+    ] = None
     tune_outside: Annotated[
         bool,
-        typer.Option("--tune-outside", help="Tune splats that no mask marks, too; else they stay."),
+        typer.Option(
+            "--tune-outside",
+            help="Tune splats that no mask marks, too.",
+            rich_help_panel=MARKING,
+        ),
     ] = False
     max_size: MaxSizeOption = None
     device: DeviceOption = "auto"
@@ -231,13 +305,16 @@ class Editing:
         bool | None,
         typer.Option(
             "--control/--no-control",
-            help="Edit the page's views each alone too, for comparison; on with a bundled editor.",
+            help="Edit its views each alone too; on with a bundled editor.",
+            rich_help_panel=PAGE,
         ),
     ] = None
     turntable: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Film of the scene turning, before and after: .gif or .mp4."
+            metavar="FILE",
+            help="Film of the scene's turn, before and after: .gif, .mp4.",
+            rich_help_panel=PAGE,
         ),
     ] = None
 
@@ -293,11 +370,17 @@ def options_of(
 
         signature = inspect.signature(command, eval_str=True)
         own = [p for p in signature.parameters.values() if p.name not in names.values()]
-        options = [option for group in groups for option in fields[group]]
-        run.__signature__ = signature.replace(parameters=[*own, *options])  # type: ignore[attr-defined]
+        options = [*own, *(option for group in groups for option in fields[group])]
+        run.__signature__ = signature.replace(parameters=sorted(options, key=_place))  # type: ignore[attr-defined]
         return run
 
     return decorate
+
+
+def _place(option: inspect.Parameter) -> int:
+    """Place of an option's panel in the help."""
+    panel = option.annotation.__metadata__[0].rich_help_panel
+    return PANELS.index(panel) if panel in PANELS else -1
 
 
 def _print_version(context: typer.Context, asked: bool) -> None:

@@ -19,6 +19,7 @@ import torch
 import typer
 from imported_modules import modules_after
 from plyfile import PlyData
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from attnwarp import Camera, Gaussians, reporting
@@ -100,6 +101,18 @@ for name in names:
     heavy = {"torch", "numba", "numpy", "cv2", "scipy", "diffusers", "transformers"}
     modules = modules_after(code)
     assert "attnwarp.cli.main" in modules and not modules & heavy
+
+
+@pytest.mark.parametrize(
+    "name", ["edit", *(pytest.param(n, marks=pytest.mark.door) for n in ("fit", "render"))]
+)
+def test_help_of_80_columns_cuts_no_name_and_no_word(name):
+    """Oracle: the options of the command itself."""
+    text = CliRunner().invoke(app, [name, "--help"], env={"COLUMNS": "80"}).stdout
+    options = [o for p in get_command(app).commands[name].params for o in p.opts]
+    assert [o for o in options if o.startswith("-") and not re.search(rf"\s{o}\s", text)] == []
+    assert "…" not in text and max(map(len, text.splitlines())) <= 80
+    assert len(text.splitlines()) < 120
 
 
 def test_mistyped_words_are_answered_before_anything_heavy_is_imported(tmp_path):
