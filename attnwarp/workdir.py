@@ -114,28 +114,42 @@ class Workdir:
         """Write the manifest, or hold the one that is there against it; make the folders.
 
         Raises:
+            InputError: see :meth:`check_claimed`.
+        """
+        manifest = {"format": FORMAT, **manifest}
+        self.check_claimed(manifest, whole=True)
+        for name in self.folders:
+            (self.path / name).mkdir(parents=True, exist_ok=True)
+        if not self.has(MANIFEST):
+            self.write_json(MANIFEST, manifest)
+
+    def check_claimed(self, known: dict[str, Any], *, whole: bool = False) -> None:
+        """Hold what is known of a run, before its work, against the folder.
+
+        Args:
+            known: entries of the manifest.
+            whole: they are all that it has.
+
+        Raises:
             InputError: the folder holds a run of other settings or inputs, by name; or files where
                 results go, and no manifest that says whose they are.
         """
         self.check_unclaimed()
-        manifest = json.loads(json.dumps({"format": FORMAT, **manifest}))
-        stored = self.read_json(MANIFEST) if self.has(MANIFEST) else manifest
+        if not self.has(MANIFEST):
+            return
+        known, stored = json.loads(json.dumps(known)), self.read_json(MANIFEST)
         if stored.get("format") != FORMAT:
             raise InputError(
                 f"{self.path}: holds {self.what} made by an older version; run it again in another"
                 " folder"
             )
-        differing = list(_differences(stored, manifest))
+        differing = _differences(stored if whole else _part(stored, known), known)
         if differing:
             raise InputError(
                 f"{self.path}: holds {self.what} of other {'; '.join(differing[:3])}"
                 f"{'; ...' if len(differing) > 3 else ''}. Go on with the same ones, or name"
                 " another folder"
             )
-        for name in self.folders:
-            (self.path / name).mkdir(parents=True, exist_ok=True)
-        if not self.has(MANIFEST):
-            self.write_json(MANIFEST, manifest)
 
     def check_unclaimed(self) -> None:
         """Refuse files where results go, in a folder without a manifest: they would be written
@@ -393,6 +407,13 @@ def record_of(picture: str) -> str:
         'views/a.1.json'
     """
     return str(Path(picture).with_suffix(".json").as_posix())
+
+
+def _part(stored: Any, known: Any) -> Any:
+    """Those entries of JSON that something else has too."""
+    if not isinstance(stored, dict) or not isinstance(known, dict):
+        return stored
+    return {key: _part(stored.get(key), value) for key, value in known.items()}
 
 
 def _differences(stored: Any, now: Any, name: str = "") -> list[str]:

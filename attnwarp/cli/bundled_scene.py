@@ -16,11 +16,16 @@ VIEWS, SIZE = 24, 128
 """Pictures of a bundled scene, and their edge in px: the larger size of the bundled editors."""
 
 
-def is_scene(name: str) -> bool:
-    """Return True if the evaluation harness, where it is installed, ships a scene of that name."""
+def scenes() -> list[str]:
+    """Names of the scenes that the evaluation harness ships, where it is installed."""
     package = find_spec("attnwarp_eval")
     folders = package.submodule_search_locations if package is not None else None
-    return any((Path(folder) / "scenes" / f"{name}.yaml").is_file() for folder in folders or ())
+    return sorted(p.stem for folder in folders or () for p in Path(folder, "scenes").glob("*.yaml"))
+
+
+def view_names() -> list[str]:
+    """Names of the views that :func:`capture` renders."""
+    return [f"images/orbit_{k:03d}_of_{VIEWS}.png" for k in range(VIEWS)]
 
 
 def capture(name: str, folder: Path, report: Reporter) -> Path:

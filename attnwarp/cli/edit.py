@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from attnwarp.cli.bundled_scene import SIZE, capture, exact_masks, is_scene
+from attnwarp.cli.bundled_scene import SIZE, capture, exact_masks, scenes, view_names
 from attnwarp.cli.files import (
     check_inputs_stay,
     check_seen,
@@ -24,6 +24,7 @@ from attnwarp.cli.options import (
     MOST_PIXELS,
     SPLATS,
     AntialiasedOption,
+    AnywayOption,
     DataArgument,
     Editing,
     EditorOption,
@@ -176,6 +177,7 @@ def edit(
             min=0, metavar="N", help="At most, through the network.", rich_help_panel=METHOD
         ),
     ] = None,
+    anyway: AnywayOption = False,
     *,
     editing: Editing,
     reading: Reading,
@@ -199,7 +201,7 @@ def edit(
         }  # fmt: skip
         changes = {name: value for name, value in options.items() if value is not None}
         flags = {name: f"--{name.replace('_', '-')}" for name in options}
-        bundled = is_scene(str(data)) and not data.exists()
+        bundled = str(data) in scenes() and not data.exists()
         if bundled:
             changes.setdefault("size", SIZE)
         changes |= assignments(change or [], {**flags, "method": "--each-view-alone"})
@@ -210,10 +212,20 @@ def edit(
         )
         check_out(out)
         results = ("edited.ply", "edited-3dgs.ply")
-        check_inputs_stay((out / name for name in results), (source_picture, ply, editing.mask))
-        check_words(instruction)
+        files = [path for path in (source_picture, ply, editing.mask) if path is not None]
+        check_inputs_stay((out / name for name in results), files)
         guide_of(editor)  # refuses what is no editor
+        check_words(editor, instruction, anyway=anyway)
         from attnwarp import check, methods
+        from attnwarp.editing.segment import check_marks
+        from attnwarp.io.file import existing_file
+        from attnwarp.methods.command import (
+            FitPlan,
+            check_asked,
+            check_marked,
+            edit_dataset,
+            number_of,
+        )
         from attnwarp.methods.marks import Marks
 
         edit_options = editing.checked()
@@ -226,18 +238,23 @@ def edit(
             name = next(iter(own)).replace("_", "-")
             raise ValueError(f"--{name}: is of attention_warping, not of {method}; leave it out")
         use_threads(editing.threads)
+        for path in files:
+            existing_file(path)
+        check_asked(method, instruction, settings, budget, out, edit_options)
         if bundled:
+            if editing.source is not None:
+                number_of(view_names(), editing.source)
+            check_marks(SIZE, SIZE, box=edit_options.marks.box, at=edit_options.marks.at)
             data = capture(str(data), out / "scene", report)
             if editing.masks is None and not edit_options.marks.of_source:
                 marks = Marks(exact_masks(data, instruction, report))
                 edit_options = replace(edit_options, marks=marks)
         dataset = read_views(data, reading)
+        check_marked(edit_options, dataset)
         splats = None if ply is None else read_splats(ply, kind, antialiased, screen_filter)
         if ply is not None and splats is not None:
             check_seen(ply, splats, dataset.cameras, report)
             warn_of_misfit(ply, splats, dataset)
-        from attnwarp.methods.command import FitPlan, edit_dataset
-
         result, page = edit_dataset(
             method, dataset, splats, editor, instruction, settings, out, edit_options,
             fit_plan=FitPlan(

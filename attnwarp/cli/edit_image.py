@@ -13,6 +13,7 @@ import typer
 from attnwarp.cli.options import (
     MOST_PIXELS,
     SEGMENTER,
+    AnywayOption,
     AtOption,
     BoxOption,
     DeviceOption,
@@ -83,14 +84,15 @@ def edit_image(
     dtype: DtypeOption = "auto",
     low_memory: LowMemoryOption = False,
     threads: ThreadsOption = None,
+    anyway: AnywayOption = False,
 ) -> None:
     """Edit a picture by an instruction."""
     if mask_out is not None and words is None and box is None and at is None:
         raise ValueError("--mask-out: needs --box, --at or --where, which make the mask")
     check_segmenter(segmenter, words)
-    check_words(instruction)
     if guide_of(editor) != "picture":
         raise ValueError(f"--editor {editor}: takes depth maps, expected one that takes a picture")
+    check_words(editor, instruction, anyway=anyway)
     from attnwarp.io.file import check_other
 
     for path in (out, sheet, mask_out):
@@ -104,6 +106,7 @@ def edit_image(
     for (first, one), (second, other) in combinations(outputs, 2):
         if one is not None and other is not None and one.resolve() == other.resolve():
             raise ValueError(f"{first}, {second}: got {one} for both, expected a file for each")
+    from attnwarp.editing.segment import check_marks
     from attnwarp.methods.marks import Marks, bright_of, numbers, picture_mask, say_unmarked
 
     marks = Marks(
@@ -111,6 +114,7 @@ def edit_image(
         words=words,
     )  # fmt: skip
     image = _read(picture)
+    check_marks(image.shape[1], image.shape[0], box=marks.box, at=marks.at)
 
     import cv2
     import numpy as np
@@ -120,7 +124,7 @@ def edit_image(
     from attnwarp.devices import choose, type_of
     from attnwarp.editing.editor import edit, own_size, side_multiple
     from attnwarp.editing.segment import load_segmenter
-    from attnwarp.editing.small import check_instruction, load_editor, thread_count
+    from attnwarp.editing.small import load_editor, thread_count
     from attnwarp.methods.pictures import enlarged_change
 
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
@@ -129,7 +133,7 @@ def edit_image(
     model = load_editor(
         editor, device=device, dtype=type_of(dtype, device), low_memory=low_memory, **given
     )
-    check_instruction(editor, model, instruction)
+    model.check_text(instruction)
     torch.set_num_threads(thread_count(model, threads))
     longest = size or own_size(model)
     whole, image = image, _fit(image, longest, side_multiple(model))
@@ -143,7 +147,7 @@ def edit_image(
     elif words is not None:
         share = load_segmenter(segmenter or SEGMENTER, device=device).segment(image, words)
     elif marks.of_source:
-        full = picture_mask(marks, whole).astype(np.float32)
+        full = picture_mask(marks, whole, whole.shape[1::-1]).astype(np.float32)
         share = cv2.resize(full, (w, h), interpolation=cv2.INTER_AREA)
     if share is not None:
         share = share[..., None].astype(np.float32)

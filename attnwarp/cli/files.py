@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from attnwarp.cli.bundled_scene import is_scene
+from attnwarp.cli.bundled_scene import scenes
 from attnwarp.cli.options import Kind, Reading
-from attnwarp.errors import InputError, InputWarning
+from attnwarp.errors import InputError, InputWarning, suggest
 
 if TYPE_CHECKING:
     from attnwarp.camera import Camera
@@ -54,9 +54,12 @@ def read_views(path: Path, reading: Reading, **options: Any) -> Dataset:
             f"{path}: expected transforms.json, its folder or a COLMAP folder; for a scene:"
             f" {export}, then give DIR"
         )
-    if is_scene(str(path)) and not path.exists():
+    if not path.exists():
+        scene = f"; for a scene: {export}, then give DIR"
+        known = scenes()
         raise FileNotFoundError(
-            f"{path}: no such file or folder; for a scene: {export}, then give DIR"
+            f"{path}: no such file or folder"
+            f"{scene if str(path) in known else suggest(str(path), known)}"
         )
     typed = {**vars(reading), "ignore_keys": reading.ignore_keys or ()}
     return read_dataset(path, **(typed | options))

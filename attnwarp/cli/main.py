@@ -15,6 +15,7 @@ from attnwarp.cli.render import render
 
 app = typer.Typer(
     name="attnwarp",
+    cls=shell.Program,
     help=(
         "Gaussian splats for consistent 3D scene editing: fit them to pictures, edit, render and"
         " convert them."

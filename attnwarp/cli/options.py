@@ -69,6 +69,13 @@ SEGMENTER = "clip-parts"
 
 InstructionOption = Annotated[str, typer.Option(help='What to change, such as "make it red".')]
 
+AnywayOption = Annotated[
+    bool,
+    typer.Option(
+        "--anyway", help="Take words of which a bundled editor knows none that tells a look."
+    ),
+]
+
 EditorOption = Annotated[
     str,
     typer.Option(
@@ -264,7 +271,7 @@ class Editing:
         str | None,
         typer.Option(
             metavar="VIEW",
-            help="Name or number of the view that is marked and edited first (0).",
+            help="Name or number of the view that is marked and edited first.",
             rich_help_panel=MARKING,
         ),
     ] = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import sys
 import traceback
 import warnings
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
 from attnwarp import process
 from attnwarp.cli.entry import STOPPED
@@ -148,6 +150,27 @@ def check_out(out: Path) -> None:
         raise NotADirectoryError(
             f"{out}: --out is a file, expected a folder (made if need be); choose another name"
         )
+
+
+COMMANDS = {
+    "attnwarp": ("fit", "edit", "render", "convert", "undistort", "edit-image"),
+    "attnwarp-eval": (
+        "run", "report", "verdicts", "verify", "studies", "reproduce", "compare", "stability",
+        "metrics", "encoders", "doctor", "scenes", "userstudy", "cache",
+    ),
+}  # fmt: skip
+"""Commands that one program has and the other lacks."""
+
+
+class Program(TyperGroup):
+    """Commands of a program; one that the other program has is said to be there."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that the first argument names."""
+        for name, commands in COMMANDS.items():
+            if args[0] in commands and args[0] not in self.commands:
+                raise fail(f"{args[0]} is a command of {name}: {shlex.join([name, *args])}")
+        return super().resolve_command(ctx, args)
 
 
 def use_threads(threads: int | None) -> None:

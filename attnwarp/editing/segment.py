@@ -118,14 +118,32 @@ def load_segmenter(name: str, *, device: str = "cpu") -> Segmenter:
         >>> type(load_segmenter("clip-parts")).__name__
         'ClipSegmenter'
     """
-    if name == "clip-parts":
+    folders = segmenter_folders(name)
+    if folders is None:
         return ClipSegmenter.bundled()
-    folders = name.split(",")
-    if len(folders) != 2 or not all(folder.strip() for folder in folders):
+    return GroundedSam.from_folders(*folders, device=device)
+
+
+def segmenter_folders(name: str) -> tuple[Path, Path] | None:
+    """The folders of Grounding DINO and SAM that a segmenter's name gives; None for clip-parts.
+
+    Raises:
+        InputError: no such segmenter, or files that are missing, by name.
+    """
+    if name == "clip-parts":
+        return None
+    folders = [Path(folder.strip()) for folder in name.split(",") if folder.strip()]
+    if len(folders) != 2:
         raise InputError(
             f"segmenter {name!r}: unknown, expected clip-parts, or DINO_FOLDER,SAM_FOLDER"
         )
-    return GroundedSam.from_folders(*(Path(folder.strip()) for folder in folders), device=device)
+    _check_folders(*folders)
+    return folders[0], folders[1]
+
+
+def _check_folders(dino: Path, sam: Path) -> None:
+    _check_folder(dino, "grounding-dino", ("tokenizer.json", "vocab.txt"))
+    _check_folder(sam, "sam", ())
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +194,7 @@ class GroundedSam:
         from attnwarp.devices import device_of
 
         torch_device = str(device_of(device))
-        _check_folder(Path(dino), "grounding-dino", ("tokenizer.json", "vocab.txt"))
-        _check_folder(Path(sam), "sam", ())
+        _check_folders(Path(dino), Path(sam))
         with optional_imports():
             from transformers import (
                 AutoProcessor,
@@ -452,14 +469,9 @@ def cut_out(
     height, width = picture.shape[:2]
     if (box is None) == (at is None):
         raise InputError("cut_out: expected either a box or a point")
+    check_marks(width, height, box=box, at=at)
     marks = [*(box or ()), *(at or ())]
     limits = [width, height] * (len(marks) // 2)
-    name = "--box" if at is None else "--at"
-    if not all(0 <= v <= limit for v, limit in zip(marks, limits, strict=True)):
-        raise InputError(
-            f"{name}: got {', '.join(f'{v:g}' for v in marks)}, expected px inside the picture of"
-            f" {width} x {height}"
-        )
     small = _resized(picture, min(WORKING_SIDE, height, width))
     h, w = small.shape[:2]
     pixels = np.rint(255 * small).astype(np.uint8)
@@ -471,12 +483,44 @@ def cut_out(
         mask = _cut_box(lab, x, y, (a, *rest))
     else:
         mask = _cut_click(pixels, x, y, (min(a, w - 0.5), min(rest[0], h - 0.5)))
-    if not mask.any():
-        other = "a larger box" if at is None else "another point, or a box (--box)"
-        raise InputError(f"{name}: nothing stands out there by its colours; try {other}")
     if mask.shape != (height, width):
-        return np.asarray(cv2.resize(mask.astype(np.float32), (width, height)) > 0.5)
+        mask = np.asarray(cv2.resize(mask.astype(np.float32), (width, height)) > 0.5)
+    if not mask.any():
+        name, other = (
+            ("--box", "a larger box") if at is None else ("--at", "another point, or a box (--box)")
+        )
+        raise InputError(f"{name}: nothing stands out there by its colours; try {other}")
     return mask
+
+
+def check_marks(
+    width: int,
+    height: int,
+    *,
+    box: Sequence[float] | None = None,
+    at: Sequence[float] | None = None,
+) -> None:
+    """Refuse a box or a point beside a picture, and a box without area.
+
+    Args:
+        width, height: of the picture, px.
+        box, at: see :func:`cut_out`.
+
+    Raises:
+        InputError: it is one of these.
+    """
+    for name, marks in (("--box", box), ("--at", at)):
+        limits = [width, height] * (len(marks or ()) // 2)
+        if not all(0 <= v <= limit for v, limit in zip(marks or (), limits, strict=True)):
+            raise InputError(
+                f"{name}: got {_typed(marks)}, expected px inside the picture of {width} x {height}"
+            )
+    if box is not None and (box[2] <= box[0] or box[3] <= box[1]):
+        raise InputError(f"--box: got {_typed(box)}, expected X0,Y0,X1,Y1 with X0 < X1 and Y0 < Y1")
+
+
+def _typed(marks: Sequence[float] | None) -> str:
+    return ",".join(f"{v:g}" for v in marks or ())
 
 
 def _cut_box(
@@ -487,11 +531,6 @@ def _cut_box(
 ) -> Mask:
     x0, y0, x1, y1 = box
     within = (x0 <= x) & (x <= x1) & (y0 <= y) & (y <= y1)
-    if x1 <= x0 or y1 <= y0 or not within.any():
-        raise InputError(
-            f"--box: got {', '.join(f'{v:g}' for v in box)}, expected X0,Y0,X1,Y1 with X0 < X1 and"
-            " Y0 < Y1, at least a pixel apart"
-        )
     middle, half = ((x0 + x1) / 2, (y0 + y1) / 2), ((x1 - x0) / 2, (y1 - y0) / 2)
     away = np.hypot((x - middle[0]) / half[0], (y - middle[1]) / half[1])
     if within.all():  # grabCut needs colours of both
@@ -499,6 +538,8 @@ def _cut_box(
     labels = np.where(within, _label("PR_BGD"), _label("BGD"))
     labels[within & (away < WITHIN)] = _label("PR_FGD")
     labels[within & (away < CORE)] = _label("FGD")
+    if within.all() or not (within & (away < WITHIN)).any():
+        return np.zeros_like(within)
     return _grab_cut(pixels, labels.astype(np.uint8)) & within
 
 
@@ -528,6 +569,8 @@ def _cut_click(
     def alike(a: Mask, b: Mask) -> float:
         return float((a & b).sum() / max(1, (a | b).sum()))
 
+    if len(cuts) < 3:  # a picture of a few pixels
+        return np.zeros(away.shape, bool)
     steps = [alike(a, b) for a, b in pairwise(cuts)]
     steadiness = [min(a, b) * big for (a, b), big in zip(pairwise(steps), grown[1:], strict=False)]
     return cuts[1 + int(np.argmax(steadiness))] & (max(steadiness) > 0)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import unicodedata
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,52 +90,74 @@ def thread_count(editor: Any, asked: int | None = None) -> int:
     return 1 if small else core_count()
 
 
-def check_words(text: str) -> None:
-    """Refuse an instruction without words, before any editor is loaded.
+LOOKS = {
+    *("red", "scarlet", "crimson", "orange", "yellow", "green", "blue", "purple", "violet"),
+    *("pink", "brown", "black", "white", "grey", "gray", "shiny", "gold", "golden", "silver"),
+    *("bronze", "copper", "chrome", "steel", "wood", "wooden", "stone", "marble", "striped"),
+    *("checked", "chequered", "checkered", "pattern", "color", "material", "grass", "garden"),
+    *("lawn", "park", "meadow", "sand", "beach", "desert", "snow", "snowy", "winter", "floor"),
+    *("boards", "tile", "tiles", "tiled", "road", "asphalt", "earth", "bare", "soil", "clearing"),
+    *("forest", "ground", "somewhere", "day", "daylight", "sun", "sunny", "sunset"),
+    *("evening", "dusk", "warm", "night", "moon", "moonlit", "moonlight", "cloudy", "overcast"),
+    *("time", "light", "sky", "colour", "statue", "something", "else", "another", "other"),
+    *("different", "new"),
+}
+"""Words by which instructions of the training ask for a colour, a material, a pattern, a ground or
+a time of day, one or any. Others name things, or join.
+"""
 
-    Raises:
-        InputError: no words.
-    """
-    if not text.strip():
-        raise InputError("instruction: is empty, expected words such as 'make it red'")
 
-
-def check_instruction(name: str, editor: InstructPix2Pix | DepthControlNet, text: str) -> None:
-    """Refuse an instruction that an editor cannot take, and warn of words that it was not trained
-    on.
+def check_words(name: str, text: str, *, anyway: bool = False) -> None:
+    """Refuse an instruction of which an editor would do nothing, before the editor is loaded; warn
+    of words that a bundled editor was not trained on.
 
     Args:
         name: of the editor, as :func:`load_editor` takes it.
-        editor: the loaded one.
         text: the instruction.
+        anyway: take one without a word of :data:`LOOKS`. An editor that is guided by depth does,
+            since its text describes the edited scene.
 
     Raises:
-        InputError: no words.
-        ValueError: more words than the text encoder takes.
+        InputError: no words; of a bundled editor that is guided by pictures, no word of
+            :data:`LOOKS`.
     """
-    check_words(text)
-    editor.check_text(text)
-    unknown = unknown_words(editor, text) if name in bundled() else []
+    if not text.strip():
+        raise InputError("instruction: is empty, expected words such as 'make it red'")
+    if name not in bundled():
+        return
+    card = f"{WEIGHTS / name / 'card.md'} says what it can do"
+    words = {word.lower() for word in _words(text)}
+    if not (anyway or words & LOOKS or guide_of(name) == "depth"):
+        raise InputError(
+            f"instruction: {text!r} names no color, material, pattern, ground or time of day that"
+            f" the editor {name!r} knows, so it would do nothing of it; {card}, --anyway tries"
+        )
+    unknown = unknown_words(name, text)
     if unknown:
         warnings.warn(
             f"instruction: the editor {name!r} was not trained on {', '.join(map(repr, unknown))},"
-            f" so the result may have nothing to do with it; {WEIGHTS / name / 'card.md'} says what"
-            " it can do",
+            f" so the result may have nothing to do with it; {card}",
             InputWarning,
             stacklevel=2,
         )
 
 
-def unknown_words(editor: Any, text: str) -> list[str]:
+def unknown_words(name: str, text: str) -> list[str]:
     """Words that a bundled editor was not trained on: its tokenizer has a token for each word of
     the training texts, and takes others apart.
 
     Example:
-        >>> unknown_words(load_editor("small-plain"), "make the bear furious and red")
+        >>> unknown_words("small-plain", "make the bear furious and red")
         ['furious']
     """
-    words = dict.fromkeys(re.findall(r"[^\W\d_]+", text))
-    return [word for word in words if len(editor.tokenizer.tokenize(word)) > 1]
+    file = WEIGHTS / name / "tokenizer" / "tokenizer.json"
+    tokens = json.loads(file.read_text(encoding="utf-8"))["model"]["vocab"]
+    return [word for word in _words(text) if f"Ġ{word.lower()}" not in tokens]
+
+
+def _words(text: str) -> list[str]:
+    """The words of a text, each once."""
+    return [*dict.fromkeys(re.findall(r"[^\W\d_]+", unicodedata.normalize("NFKC", text)))]
 
 
 def guide_of(name_or_folder: str) -> Guide:

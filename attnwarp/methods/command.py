@@ -12,10 +12,12 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from attnwarp.devices import choose, peak_memory, type_of
+from attnwarp.camera import Camera
+from attnwarp.devices import choose, device_of, peak_memory, type_of
 from attnwarp.editing.editor import own_size
 from attnwarp.editing.memory import weight_bytes
-from attnwarp.editing.small import bundled, check_instruction, load_editor, thread_count
+from attnwarp.editing.segment import check_marks, segmenter_folders
+from attnwarp.editing.small import bundled, load_editor, thread_count
 from attnwarp.errors import InputError, suggest
 from attnwarp.fit import (
     FitSettings,
@@ -33,6 +35,7 @@ from attnwarp.methods import METHODS, MethodSettings, Result
 from attnwarp.methods.base import VIEWER_PLY, workdir_of
 from attnwarp.methods.features import Features
 from attnwarp.methods.marks import (
+    HOW,
     Marks,
     lifted_segments,
     read_mask,
@@ -49,6 +52,7 @@ from attnwarp.methods.tuning import perceptual_net
 from attnwarp.methods.view_edits import check_editor
 from attnwarp.process import asked_to_stop
 from attnwarp.reporting import Reporter
+from attnwarp.workdir import FORMAT, Budget
 
 FIT_FOLDER = "fit"
 
@@ -140,11 +144,13 @@ def edit_dataset(
         InputError: no such view, mask, editor or segmenter; marks where nothing is found; files of
             something else where results go; a film of another format.
     """
-    check_film(options.turntable)
-    workdir_of(out).check_unclaimed()  # again in the edit, but here before a fit
+    index = view_of(dataset, options.source)
     device = choose(options.device, report)
+    editor = _editor(editor_name, device, options, report)
+    editor.check_text(instruction)
+    if settings.size is None:
+        settings = settings.changed(size=own_size(editor))
     views = load_views(dataset, max_size=options.max_size)
-    index = view_of(views.cameras, options.source, dataset)
     images = images_of(views)
     warping = isinstance(settings, AttentionWarpingSettings)
     if warping:
@@ -153,10 +159,6 @@ def edit_dataset(
     segments = marked(
         options.marks, editor_name, dataset, views, images, index, out, device, report
     )
-    editor = _editor(editor_name, device, options, report)
-    check_instruction(editor_name, editor, instruction)
-    if settings.size is None:
-        settings = settings.changed(size=own_size(editor))
     if splats is None:
         assert fit_plan is not None
         # Settings that the editor or the tuning cannot use are refused before it.
@@ -243,7 +245,6 @@ def marked(
 ) -> Callable[[Gaussians], list[Segment] | None]:
     """Segments of all views as a function of the splats; what is marked is read at once."""
     pictures = [path for path in dataset.image_paths if path is not None]
-    full = [c for c, path in zip(dataset.cameras, dataset.image_paths, strict=True) if path]
     if marks.masks is not None:
         given = _masks(marks.masks, views.cameras, pictures, report)
         return lambda splats: given
@@ -251,10 +252,21 @@ def marked(
         if editor_name in bundled():
             say_unmarked(editor_name, report)
         return lambda splats: None
-    camera, width = views.cameras[index], full[index].width
-    mask = source_mask(marks, camera, images[index], pictures[index], width, out, device, report)
-    at = None if marks.at is None else [camera.width / width * v for v in marks.at]
-    return lambda splats: lifted_segments(mask, splats, views.cameras, index, report, at)
+    camera, full = views.cameras[index], _with_picture(dataset)[index]
+    size = full.width, full.height
+    mask = source_mask(marks, camera, images[index], pictures[index], size, out, device, report)
+    at = None if marks.at is None else [camera.width / size[0] * v for v in marks.at]
+
+    def segments(splats: Gaussians) -> list[Segment]:
+        lifted = lifted_segments(mask, splats, views.cameras, index, report, at)
+        if not any((segment > 0.5).any() for segment in lifted):
+            raise InputError(
+                f"{marks.option}: lifted through the splats, what it marks covers no pixel of any"
+                f" view; mark more, by {HOW}, or all views by --masks"
+            )
+        return lifted
+
+    return segments
 
 
 def _fitted(
@@ -285,13 +297,85 @@ def _fitted(
     return result.gaussians
 
 
-def view_of(cameras: Any, name: str | None, dataset: Dataset) -> int:
-    """The number of a view by its name, its file's name with or without suffix, or its number."""
-    if name is None:  # the first that splats were fitted to
-        pairs = zip(dataset.splits, dataset.image_paths, strict=True)
-        splits = [split for split, image in pairs if image is not None]
+def check_asked(
+    method: str,
+    instruction: str,
+    settings: MethodSettings,
+    budget: Budget,
+    out: Path,
+    options: EditOptions,
+) -> None:
+    """Refuse what needs no capture to be refused, before one is rendered or read.
+
+    Args:
+        method, instruction, settings, out, options: see :func:`edit_dataset`.
+        budget: of the method.
+
+    Raises:
+        InputError: no such device, precision or segmenter; a film of another format; an edit of
+            other settings in the folder, or files of something else where results go.
+    """
+    check_film(options.turntable)
+    type_of(options.dtype, "cpu" if options.device == "auto" else str(device_of(options.device)))
+    if options.marks.words is not None:
+        segmenter_folders(options.marks.segmenter)
+    known = settings.to_dict()
+    if settings.size is None:  # the editor's own, which it tells once it is loaded
+        del known["size"]
+    workdir_of(out).check_claimed(
+        {
+            "format": FORMAT,
+            "method": method,
+            "instruction": instruction,
+            "settings": known,
+            "budget": budget.to_dict(),
+        }
+    )
+
+
+def check_marked(options: EditOptions, dataset: Dataset) -> None:
+    """Refuse a source view that is not there, and marks beside its picture.
+
+    Raises:
+        InputError: it is one of these.
+    """
+    index, marks = view_of(dataset, options.source), options.marks
+    camera = _with_picture(dataset)[index]
+    check_marks(camera.width, camera.height, box=marks.box, at=marks.at)
+
+
+def _with_picture(dataset: Dataset) -> list[Camera]:
+    pairs = zip(dataset.cameras, dataset.image_paths, strict=True)
+    return [camera for camera, image in pairs if image is not None]
+
+
+def view_of(dataset: Dataset, name: str | None) -> int:
+    """The number of a view among those with a picture; see :func:`number_of`. The first that splats
+    were fitted to, for no name."""
+    if name is None:
+        posed = zip(dataset.splits, dataset.image_paths, strict=True)
+        splits = [split for split, image in posed if image is not None]
         return splits.index("train") if "train" in splits else 0
-    names = [camera.name for camera in cameras]
+    pairs = zip(dataset.cameras, dataset.image_paths, strict=True)
+    left_out = [camera.name for camera, image in pairs if image is None]
+    return number_of([camera.name for camera in _with_picture(dataset)], name, left_out)
+
+
+def number_of(names: Sequence[str], name: str, left_out: Sequence[str] = ()) -> int:
+    """The number of a view by its name, its file's name with or without suffix, or its number.
+
+    Args:
+        names: of the views.
+        name: as typed.
+        left_out: names of views whose picture is missing.
+
+    Raises:
+        InputError: no such view.
+
+    Example:
+        >>> number_of(["left/a.png", "left/b.png"], "b"), number_of(["a", "b", "c"], "2")
+        (1, 2)
+    """
     for candidates in _spellings(names):
         if candidates.count(name) == 1:
             return candidates.index(name)
@@ -301,8 +385,6 @@ def view_of(cameras: Any, name: str | None, dataset: Dataset) -> int:
             return keys.index(name_key(name))
     if name.isdecimal() and int(name) < len(names):
         return int(name)
-    posed = zip(dataset.cameras, dataset.image_paths, strict=True)
-    left_out = [camera.name for camera, image in posed if image is None]
     if any(name in candidates for candidates in _spellings(left_out)):
         raise InputError(f"--source: the picture of {name!r} is missing; name another view")
     raise InputError(
@@ -311,9 +393,9 @@ def view_of(cameras: Any, name: str | None, dataset: Dataset) -> int:
     )
 
 
-def _spellings(names: list[str]) -> list[list[str]]:
+def _spellings(names: Sequence[str]) -> list[list[str]]:
     """The names, their files' names with suffix, and without."""
-    return [names, [Path(name).name for name in names], [Path(name).stem for name in names]]
+    return [[*names], [Path(name).name for name in names], [Path(name).stem for name in names]]
 
 
 def _masks(

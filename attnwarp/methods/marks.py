@@ -15,7 +15,7 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.digest import digest
-from attnwarp.editing.segment import Mask, cut_out, load_segmenter, segments_of
+from attnwarp.editing.segment import Mask, check_marks, cut_out, load_segmenter, segments_of
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import read_upright
@@ -65,20 +65,29 @@ class Marks:
     segmenter: str = "clip-parts"
 
     def __post_init__(self) -> None:
-        options = {
-            "--masks": self.masks, "--mask": self.mask, "--box": self.box, "--at": self.at,
-            "--where": self.words,
-        }  # fmt: skip
-        given = [name for name, value in options.items() if value is not None]
+        given = self._given
         if len(given) > 1:
             raise InputError(f"{given[1]}: got {given[0]} too, expected one of the two")
         if self.words is not None and not self.words.strip():
             raise InputError(f"--where: got {self.words!r}, expected words such as 'bear'")
 
     @property
+    def _given(self) -> list[str]:
+        options = {
+            "--masks": self.masks, "--mask": self.mask, "--box": self.box, "--at": self.at,
+            "--where": self.words,
+        }  # fmt: skip
+        return [name for name, value in options.items() if value is not None]
+
+    @property
+    def option(self) -> str:
+        """Option that was given; empty for none."""
+        return "".join(self._given)
+
+    @property
     def of_source(self) -> bool:
         """True if the source view alone is marked, so that its mask is lifted."""
-        return any(value is not None for value in (self.mask, self.box, self.at, self.words))
+        return self.option not in ("", "--masks")
 
 
 def numbers(text: str | None, names: str, option: str) -> tuple[float, ...] | None:
@@ -116,17 +125,27 @@ def say_unmarked(editor: str, report: Reporter) -> None:
     )
 
 
-def picture_mask(marks: Marks, image: npt.NDArray[Any], scale: float = 1.0) -> Mask:
+def picture_mask(marks: Marks, image: npt.NDArray[Any], size: tuple[int, int]) -> Mask:
     """(H, W) bool of a picture by box or point.
 
     Args:
         marks: with ``box`` or ``at``.
         image: (H, W, 3) sRGB.
-        scale: px of the image for one of the marks'.
+        size: width and height of the file, px, that the marks are of.
+
+    Raises:
+        InputError: they lie beside it, a box without area, or nothing found.
     """
-    box = None if marks.box is None else tuple(scale * v for v in marks.box)
-    at = None if marks.at is None else tuple(scale * v for v in marks.at)
-    return cut_out(to_float(image), box=box, at=at)
+    check_marks(*size, box=marks.box, at=marks.at)
+    # Shrunk sides are rounded: a mark on the border must not leave the picture.
+    scales = [(side / full, side) for side, full in zip(image.shape[1::-1], size, strict=True)]
+
+    def shrunk(numbers: tuple[float, ...] | None) -> list[float] | None:
+        if numbers is None:
+            return None
+        return [min(v * s, side) for v, (s, side) in zip(numbers, scales * 2, strict=False)]
+
+    return cut_out(to_float(image), box=shrunk(marks.box), at=shrunk(marks.at))
 
 
 def source_mask(
@@ -134,7 +153,7 @@ def source_mask(
     camera: Camera,
     image: npt.NDArray[Any],
     picture: Path,
-    full_width: int,
+    size: tuple[int, int],
     out: Path,
     device: str,
     report: Reporter,
@@ -146,7 +165,7 @@ def source_mask(
         camera: of the source view.
         image: (H, W, 3) of it.
         picture: its file.
-        full_width: px of the file that coordinates are of.
+        size: width and height of the file, px, that coordinates are of.
         out: folder of the edit, which keeps masks by words.
         device: of a segmenter.
         report: hears what was found.
@@ -155,15 +174,14 @@ def source_mask(
         InputError: nothing is marked, or nothing was found.
     """
     if marks.mask is not None:
-        mask, how = read_mask(marks.mask, camera, beside=picture, option="--mask"), "--mask"
+        mask = read_mask(marks.mask, camera, beside=picture, option="--mask")
         if not mask.any():
             raise InputError(f"--mask: {marks.mask} is black; white is edited")
     elif marks.words is not None:
-        mask, how = mask_by_words(marks, camera, image, out, device), "--where"
+        mask = mask_by_words(marks, camera, image, out, device)
     else:
-        how = "--box" if marks.at is None else "--at"
-        mask = picture_mask(marks, image, camera.width / full_width)
-    report.log(f"{how} marks {mask.mean():.1%} of the source view {camera.name}")
+        mask = picture_mask(marks, image, size)
+    report.log(f"{marks.option} marks {mask.mean():.1%} of the source view {camera.name}")
     return mask
 
 

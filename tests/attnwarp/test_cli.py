@@ -22,12 +22,15 @@ from plyfile import PlyData
 from typer.main import get_command
 from typer.testing import CliRunner
 
+import attnwarp_eval.cli.main
 from attnwarp import Camera, Gaussians, reporting
+from attnwarp.cli.bundled_scene import VIEWS, view_names
 from attnwarp.cli.main import app
-from attnwarp.cli.shell import clear_errors
+from attnwarp.cli.shell import COMMANDS, clear_errors
 from attnwarp.io import Dataset, read_dataset, read_ply, write_ply, write_transforms
 from attnwarp.render import render
 from attnwarp.render.threads import set_thread_count
+from attnwarp_eval.splats.export import orbit_name
 
 ATTNWARP = [sys.executable, "-m", "attnwarp"]
 
@@ -92,6 +95,7 @@ def test_help_of_every_command_imports_nothing_heavy():
     code = """
 from typer.main import get_command
 from typer.testing import CliRunner
+from attnwarp.cli.bundled_scene import VIEWS, view_names
 from attnwarp.cli.main import app
 names = sorted(get_command(app).commands)
 assert {"fit", "render", "edit", "edit-image", "convert"} <= set(names)
@@ -128,6 +132,7 @@ def test_mistyped_words_are_answered_before_anything_heavy_is_imported(tmp_path)
     }
     code = f"""
 from typer.testing import CliRunner
+from attnwarp.cli.bundled_scene import VIEWS, view_names
 from attnwarp.cli.main import app
 for message, calls in {wrong!r}.items():
     for call in calls:
@@ -473,6 +478,58 @@ def test_a_bundled_scene_is_edited_by_its_name_inside_an_exact_mask(tmp_path, mo
             outside.append(change[~near].max())
             inside.extend(change[mask > 0].ravel())
     assert max(outside) <= 1 < np.mean(inside)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (("--at", "300,3"), "--at: got 300,3, expected px inside the picture of 128 x 128"),
+        *(
+            pytest.param(more, message, marks=pytest.mark.door)
+            for more, message in (
+                (
+                    ("--source", "24"),
+                    "--source: got '24', expected a view's name or a number below",
+                ),
+                (("--ply", "no.ply"), "no.ply: no such file"),
+                (("--mask", "no.png"), "no.png: no such file"),
+                (("--where", "bear", "--segmenter", "a,b"), "a: no such folder"),
+                (("--dtype", "f8"), "dtype 'f8': unknown"),
+                (("--device", "tpu"), "device 'tpu': unknown"),
+                (("--turntable", "a.avi"), "--turntable: got a.avi, expected a name ending in"),
+                (("--set", "nonsense=1"), "nonsense"),
+            )
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_refused_before_a_bundled_scene_is_rendered(more, message, tmp_path):
+    done = in_process(
+        "edit", "bear", "--instruction", "make it red", "--out", tmp_path / "out", *more
+    )
+    assert done.exit_code == 2 and message in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_views_of_a_bundled_scene_have_the_names_that_an_export_gives_them():
+    assert view_names() == [f"images/{orbit_name(k, VIEWS)}.png" for k in range(VIEWS)]
+
+
+@pytest.mark.door
+def test_a_misspelt_scene_and_a_command_of_the_other_program_are_named(data, tmp_path):
+    done = in_process("edit", "baer", "--instruction", "make it red", "--out", tmp_path / "out")
+    assert "baer: no such file or folder; did you mean 'bear'?" in done.stderr
+    (tmp_path / "photos").mkdir()
+    done = in_process("fit", tmp_path / "photos", "--out", tmp_path / "out")
+    assert "photographs get poses first, as in docs/start/own-photographs.md" in done.stderr
+    programs = {"attnwarp": app, "attnwarp-eval": attnwarp_eval.cli.main.app}
+    names = {name: {*get_command(program).commands} for name, program in programs.items()}
+    for name, other in (tuple(names), tuple(reversed(names))):
+        assert {*COMMANDS[name]} == names[name] - names[other]
+        command = COMMANDS[name][0]
+        done = CliRunner().invoke(programs[other], [command, "a b"])
+        assert (
+            done.exit_code == 2 and f"is a command of {name}: {name} {command} 'a b'" in done.stderr
+        )
 
 
 def test_render_needs_no_points(data, tmp_path):

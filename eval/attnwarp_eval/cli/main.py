@@ -21,6 +21,7 @@ from attnwarp_eval.cli import (
 
 app = typer.Typer(
     name="attnwarp-eval",
+    cls=shell.Program,
     help=(
         "Check warps, masks and depth of Gaussian scenes against exact truth, and report what"
         " accuracy costs in time."

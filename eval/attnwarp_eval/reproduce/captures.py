@@ -79,7 +79,7 @@ def _read(
 ) -> Ready:
     dataset = read_dataset(data, images=images, scale=scale)
     views = load_views(dataset, max_size=max_size, damaged="error")
-    index = view_of(views.cameras, source, dataset)
+    index = view_of(dataset, source)
     content = digest([views.digest, [camera.name for camera in views.cameras], index])
     return Ready(dataset, views, images_of(views), index, content)
 

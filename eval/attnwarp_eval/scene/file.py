@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -105,6 +106,11 @@ def scene_file(name_or_path: str | os.PathLike[str]) -> Path:
     for folder in scene_folders():
         if (folder / f"{text}.yaml").is_file():
             return folder / f"{text}.yaml"
+    if re.fullmatch(r"drawn-\d+", text):
+        raise SceneError(
+            f"{text!r} is of a population, which says what is drawn: in a study's file"
+            " scenes: {drawn: 48, generator: 1, seed: 7}; attnwarp-eval scenes draw writes files"
+        )
     available = list_scenes()
     raise SceneError(
         f"no scene named {text!r}{suggest(text, available)}; known scenes:"

@@ -243,9 +243,9 @@ def test_what_a_person_marks_is_cut_out_alone(marks):
 @pytest.mark.parametrize(
     "marks, message",
     [
-        ({"at": (90, 4)}, "--at: got 90, 4, expected px inside the picture of 80 x 60"),
-        ({"box": (1, 2, 99, 40)}, "--box: got 1, 2, 99, 40, expected px inside"),
-        ({"box": (30, 9, 10, 40)}, "--box: got 30, 9, 10, 40, expected X0,Y0,X1,Y1 with X0 < X1"),
+        ({"at": (90, 4)}, "--at: got 90,4, expected px inside the picture of 80 x 60"),
+        ({"box": (1, 2, 99, 40)}, "--box: got 1,2,99,40, expected px inside"),
+        ({"box": (30, 9, 10, 40)}, "--box: got 30,9,10,40, expected X0,Y0,X1,Y1 with X0 < X1"),
         ({}, "expected either a box or a point"),
         ({"at": (3, 4), "box": (1, 2, 9, 9)}, "expected either a box or a point"),
     ],
@@ -253,6 +253,20 @@ def test_what_a_person_marks_is_cut_out_alone(marks):
 def test_marks_that_say_nothing_are_refused(marks, message):
     with pytest.raises(InputError, match=re.escape(message)):
         cut_out(two_squares(), **marks)
+
+
+@pytest.mark.parametrize(
+    ("shape", "marks"),
+    [
+        ((900, 1200), {"box": (600, 400, 603, 403)}),  # less than a pixel of what is cut
+        pytest.param((2, 2), {"box": (0, 0, 2, 2)}, marks=pytest.mark.door),
+        pytest.param((2, 2), {"at": (1, 1)}, marks=pytest.mark.door),
+        pytest.param((1, 1), {"at": (1, 1)}, marks=pytest.mark.door),
+    ],
+)
+def test_a_mark_of_too_few_pixels_is_one_line_of_its_own(shape, marks):
+    with pytest.raises(InputError, match="nothing stands out there by its colours; try"):
+        cut_out(np.full((*shape, 3), 0.4, np.float32), **marks)
 
 
 def test_a_box_around_the_whole_picture_still_cuts():

@@ -1,6 +1,7 @@
 """The bundled editors as they ship: sizes, cards, and diffusers' own pipeline on the same folder."""
 
 import shutil
+import unicodedata
 import warnings
 
 import numpy as np
@@ -18,12 +19,15 @@ from attnwarp.editing.small import (
     TEXT_GUIDANCE,
     WEIGHTS,
     bundled,
-    check_instruction,
     check_sums,
+    check_words,
     guide_of,
     load_editor,
+    unknown_words,
 )
 from attnwarp.errors import InputError, InputWarning
+from attnwarp_eval.drawn.worlds import OBJECTS
+from training.worlds.editing_pairs import ambiguous_instruction, instruction
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")
 
@@ -84,16 +88,51 @@ def test_a_bundled_editor_with_a_flipped_bit_is_refused_by_the_files_name(name, 
 
 def test_words_that_no_training_text_has_are_named_and_no_others():
     """Oracle: the words that the card and the shipped scenes' edits use, and invented ones."""
-    editor = load_editor("small-plain")
     with pytest.warns(InputWarning, match="not trained on 'zorgoblatt', 'Sphinx', so"):
-        check_instruction(
-            "small-plain", editor, "make the bear zorgoblatt and turn it into the Sphinx"
-        )
+        check_words("small-plain", "make the red bear zorgoblatt and turn it into the Sphinx")
     with warnings.catch_warnings():
         warnings.simplefilter("error", InputWarning)
         for text in ("Make the ground snow!", "turn the man into bronze, at night", "striped"):
-            check_instruction("small-plain", editor, text)
-        check_instruction("a/folder", editor, "zorgoblatt")
+            check_words("small-plain", text)
+        check_words("a/folder", "zorgoblatt")
+
+
+def test_words_are_unknown_where_the_tokenizer_takes_them_apart():
+    """Oracle: transformers' tokenizer."""
+    tokenizer = load_editor("small-plain").tokenizer
+    known = [
+        token[1:] for token in tokenizer.get_vocab() if token[0] == "Ġ" and token[1:].isalpha()
+    ]
+    words = [*known, *["furious", "Snowman", "XYLOPHONE", "hüte", "the", "ﬁre"]]
+    apart = [word for word in words if len(tokenizer.tokenize(word)) > 1]
+    assert unknown_words("small-plain", " ".join(words)) == [
+        unicodedata.normalize("NFKC", word) for word in apart
+    ]
+    assert len(apart) < len(words) / 2
+
+
+def test_an_instruction_that_names_no_look_is_refused_and_none_of_the_training_is():
+    """Oracle: the sentences that the editor was trained on."""
+    random = np.random.default_rng(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputWarning)
+        for kind, finishes in (
+            ("color", (0, 1)), ("material", range(2, 8)), ("pattern", (8, 9)), ("ground", (0,)),
+            ("time", (0,)),
+        ):  # fmt: skip
+            for _ in range(100):
+                thing, finish = random.integers(len(OBJECTS)), random.choice(finishes)
+                colors = (-1, -1) if kind == "material" else random.integers(11, size=2)
+                look = np.array([finish, *colors, random.integers(7), random.integers(4)])
+                check_words("small-plain", instruction(kind, thing, look, random))
+                if kind != "pattern":
+                    check_words("small-plain", ambiguous_instruction(kind, thing, random))
+    for text in ("Add a hat", "remove the bear", "make it fly", "mach den Bären grün"):
+        with pytest.raises(InputError, match="names no color, material, pattern, ground or time"):
+            check_words("small-plain", text)
+        with pytest.warns(InputWarning):
+            check_words("small-plain", text, anyway=True)
+    check_words("small-depth", "a bear")  # describes the edited scene
 
 
 @pytest.mark.parametrize(

@@ -72,6 +72,9 @@ def place(tmp_path_factory):
         for camera in views:
             grey = np.full((32, 32, 3), value, np.uint8)
             (folder / name / camera.name).write_bytes(encode_png(grey))
+    pixel = np.zeros((32, 32, 3), np.uint8)
+    pixel[16, 16] = 255
+    (folder / "pixel.png").write_bytes(encode_png(pixel))
     (folder / "wide.png").write_bytes(encode_png(np.zeros((32, 48, 3), np.uint8)))
     return folder
 
@@ -378,6 +381,8 @@ def test_transparent_pixels_of_a_mask_or_a_picture_by_hand_are_black(tmp_path):
         (("--masks", ".", "--where", "bear"), "--where: got --masks too, expected one of the two"),
         (("--masks", "data/images"), "v0.png is coloured, expected a grey picture"),
         (("--at", "3,4", "--box", "1,2,3,4"), "--at: got --box too, expected one of the two"),
+        (("--at", "33,4"), "--at: got 33,4, expected px inside the picture of 32 x 32"),
+        (("--box", "5,3,5,9"), "--box: got 5,3,5,9, expected X0,Y0,X1,Y1 with X0 < X1"),
         (("--at", "3"), "--at: got '3', expected X,Y in px, such as 64,68"),
         (("--where", " "), "--where: got ' ', expected words such as 'bear'"),
         (("--where", "bear", "--segmenter", "dino"), "segmenter 'dino': unknown, expected"),
@@ -428,6 +433,29 @@ def test_settings_that_an_edit_cannot_have_are_refused_before_the_fit(
     assert result.exit_code == 2
     assert message in result.output
     assert not any(tmp_path.iterdir())
+
+
+def test_a_mark_of_which_nothing_is_left_is_named_by_its_option(place, tmp_path):
+    result = run(place, tmp_path, "--ply", place / "splats.ply", "--mask", place / "pixel.png")
+    assert result.exit_code == 2
+    assert "--mask: lifted through the splats, what it marks covers no pixel" in result.output
+
+
+def test_an_edit_of_other_settings_or_words_is_refused_before_a_picture_is_read(place, tmp_path):
+    shutil.copytree(place, tmp_path / "copy")
+    ply = ("--ply", place / "splats.ply")
+    first = run(tmp_path / "copy", tmp_path / "out", *ply)
+    assert first.exit_code == 0, first.output
+    for picture in (tmp_path / "copy/data/images").iterdir():
+        picture.write_bytes(b"")
+    for more, message in (
+        ({"instruction": "a cat"}, 'holds an edit of other instruction ("a bear", now "a cat")'),
+        ({}, "holds an edit of other settings.seed (0, now 3). Go on with the same ones, or name"),
+    ):
+        again = run(
+            tmp_path / "copy", tmp_path / "out", *ply, *(() if more else ("--seed", 3)), **more
+        )
+        assert again.exit_code == 2 and message in again.output
 
 
 @pytest.mark.door
