@@ -251,9 +251,9 @@ def test_an_infinite_psnr_is_null_in_the_history(data, tmp_path):
     shutil.copytree(data, tmp_path / "data")
     there = read_dataset(tmp_path / "data")
     away = Camera.look_at([0, 0, 50], [0, 0, 99], width=32, height=32, fov_y=40, up=(1, 0, 0))
-    first = replace(away, name=there.cameras[0].name)
-    cv2.imwrite(str(there.image_paths[0]), np.zeros((32, 32, 3), np.uint8))
-    cameras = [first, *there.cameras[1:]]
+    held_out = replace(away, name=there.cameras[1].name)
+    cv2.imwrite(str(there.image_paths[1]), np.zeros((32, 32, 3), np.uint8))
+    cameras = [there.cameras[0], held_out, *there.cameras[2:]]
     write_transforms(
         tmp_path / "data", Dataset(cameras, there.image_paths, there.points, there.colors)
     )
