@@ -45,7 +45,11 @@ def test_a_stop_while_a_command_is_imported_is_one_line(name, tmp_path):
     (tmp_path / "imported.py").write_text(
         f"import os, signal, time\nos.kill(os.getpid(), signal.{name})\ntime.sleep(9)"
     )
-    program = "from attnwarp.cli.entry import enter; enter('attnwarp', 'imported')"
+    # What started the tests may have it ignored, as nohup does.
+    program = (
+        f"import signal; signal.signal(signal.{name}, signal.default_int_handler)\n"
+        "from attnwarp.cli.entry import enter; enter('attnwarp', 'imported')"
+    )
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, cwd=tmp_path, check=False
     )

@@ -35,7 +35,7 @@ def run(place, *words):
         "--ply", place / "splats.ply", "--editor", place / "editor", "--instruction", "a bear",
         "--out", place / "out", "--threads", 1, "--size", 32,
     ]  # fmt: skip
-    arguments = ["edit", place / "data", "--method", *words, *given]
+    arguments = ["edit", place / "data", *given, "--method", *words]
     return CliRunner().invoke(app, [str(word) for word in arguments])
 
 
@@ -72,6 +72,8 @@ def test_the_command_gives_what_the_library_gives_and_says_where(place):
 def test_mistakes_end_in_one_line_and_exit_code_2(place, words, message):
     if "holds" in message:
         assert run(place, "by_view", "--steps", 1, "--iterations", 1).exit_code == 0
+    else:
+        words = (*words, "--out", place / "another")
     result = run(place, *words)
     assert result.exit_code == 2
     (line,) = [line for line in result.stderr.splitlines() if line.startswith("attnwarp: ")]

@@ -181,9 +181,9 @@ def test_the_report_says_which_effects_the_studys_scenes_call_for(tmp_path):
         return [section for place, section in made if place == Place.APPENDIX]
 
     (section,) = sections(fog=Extra(transport_of(load_scene("fog"))).to_json())
-    ((scene, usual, beyond, missing, planned, full, why),) = section.tables[0].rows
-    assert scene == "fog" and "shadows" in usual and "medium (" in beyond and missing == "–"
-    assert planned == full == "volpath" and "medium" in why
+    ((scene, needed, missing, planned, full),) = section.tables[0].rows
+    assert scene == "fog" and "shadows" in needed and "medium" in needed and missing == "–"
+    assert planned == full == "volpath"
     assert "Mitsuba's `scalar_rgb`" in section.text[-1]
     assert plan_words(plan(load_scene("lens")).to_dict()) == "path, thin lens"
 
