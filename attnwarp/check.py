@@ -50,7 +50,7 @@ def same_aspect(size: tuple[int, int], full: tuple[int, int], name: str, remedy:
     Args:
         size: (h, w) that came.
         full: (H, W) of the picture.
-        name: of the argument.
+        name: name of the argument.
         remedy: the end of the message.
 
     Example:
@@ -111,9 +111,9 @@ def instance(value: Any, kind: type, name: str, expected: str) -> None:
     """Raise TypeError unless ``value`` is an instance of ``kind``.
 
     Args:
-        value: of the argument.
-        kind: what it has to be.
-        name: of the argument.
+        value: value of the argument.
+        kind: expected kind.
+        name: name of the argument.
         expected: the kind for the reader, as it is imported.
 
     Example:

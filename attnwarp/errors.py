@@ -19,7 +19,7 @@ class Extra:
 
     Attributes:
         modules: that it brings and the plain package lacks.
-        lack: what its lack costs.
+        lack: cost of its lack.
     """
 
     modules: tuple[str, ...]

@@ -92,7 +92,7 @@ def ssim(image: check.Array, target: check.Array) -> Tensor:
     windows that are partly outside. Differentiable in both.
 
     Args:
-        image, target: of one shape, at least 11 x 11 pixels, float32 or float64.
+        image, target: image and target of one shape, at least 11 x 11 pixels, float32 or float64.
 
     Raises:
         ValueError: different shapes, another type, or a picture smaller than the window, for which
@@ -156,7 +156,7 @@ def check_sizes(cameras: Sequence[Camera], smallest: int, loss: str, setting: st
     """Raise ValueError that names the first view that is too small for a loss.
 
     Args:
-        cameras: of the views.
+        cameras: cameras of the views.
         smallest: side in px that the loss takes.
         loss: for the message.
         setting: the loss's weight.
@@ -291,7 +291,7 @@ def normal_consistency(view: Render) -> Tensor:
     al. 2024 (2DGS).
 
     Args:
-        view: what was rendered.
+        view: rendered view.
 
     Example:
         >>> import torch
@@ -322,7 +322,7 @@ def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.
     """Mean over pixels of the spread of the splats that share a ray.
 
     Args:
-        view: what was rendered.
+        view: rendered view.
         form: "l1", sum_ij w_i w_j |z_i - z_j|, each pair twice (the 2DGS paper). "ordered", 2 sum_i
             w_i |sum_{j<i} w_j (z_i - z_j)|, j composited before i: cheaper, and less where splats
             intersect. "l2_ndc", sum_{j<i} w_i w_j (m_i - m_j)^2, each pair once, with depths mapped

@@ -60,7 +60,7 @@ def kernel_folders(name: str) -> Iterator[Path]:
     between it and the temporary folder: there is none.
 
     Args:
-        name: of the compiler, such as "numba".
+        name: name of the compiler, such as "numba".
     """
     folders = [cache_dir() / name]
     with suppress(FileNotFoundError):  # no temporary folder either

@@ -41,7 +41,7 @@ class Reporter:
         Args:
             done: steps.
             total: steps in all; 0 while their number is unknown.
-            text: what is at work, or has just ended.
+            text: name of the step at work, or of the one that has just ended.
             left: seconds, where the work knows more of them than its pace tells; NaN while it
                 does not know them.
         """
@@ -57,7 +57,7 @@ class Part(Reporter):
     """Reports one of many works: what it says is shown with the count of all of them.
 
     Args:
-        report: of all works.
+        report: report of all works.
         done: works that ended before.
         total: works in all.
 
@@ -209,8 +209,8 @@ def reporter(
     """Report on stderr, or on another console: a bar on a terminal, a line now and then elsewhere.
 
     Args:
-        console: of rich.
-        title: of the work.
+        console: console of rich.
+        title: title of the work.
         every: each step that is done gets a line where there is no terminal.
 
     Example:

@@ -49,9 +49,9 @@ class Budget(Settings):
     """Limits of a run. No batch of edits and no iteration of tuning begins beyond them.
 
     Args:
-        seconds: of editing and tuning, over all sittings; None for no limit. A run that was cut
-            short by seconds depends on the machine. A method that tunes after all of its edits may
-            end before it has tuned.
+        seconds: seconds of editing and tuning, over all sittings; None for no limit. A run that was
+            cut short by seconds depends on the machine. A method that tunes after all of its edits
+            may end before it has tuned.
         network_rows: rows through the UNet; None for no limit. A batch of edits that would go
             beyond does not begin, and the round's tuning is the last.
 
@@ -93,7 +93,7 @@ class Workdir:
         results: files where results go, besides those in ``folders``.
 
     Attributes:
-        path, what: see there.
+        path, what: file, and the words for it in messages.
         seconds: by part.
     """
 
@@ -303,7 +303,7 @@ class Workdir:
         cannot run code.
 
         Args:
-            name: of the file.
+            name: name of the file.
             remedy: the end of a message.
 
         Raises:
@@ -357,7 +357,7 @@ class Seconds:
     """Seconds by part of a run's work, in a file of its folder; former sittings' are read from it.
 
     Args:
-        folder: of the run.
+        folder: path of the run.
     """
 
     def __init__(self, folder: Workdir) -> None:

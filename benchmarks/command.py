@@ -12,7 +12,7 @@ def parser(name: str, description: str) -> argparse.ArgumentParser:
     """A benchmark's parser, with the option ``--out``.
 
     Args:
-        name: of the benchmark's module.
+        name: name of the benchmark's module.
         description: one sentence for ``--help``.
     """
     made = argparse.ArgumentParser(prog=f"python -m benchmarks.{name}", description=description)
@@ -24,8 +24,8 @@ def add_turns(parser: argparse.ArgumentParser, quick: str, rounds: int) -> None:
     """Add ``--quick`` and ``--rounds`` of a benchmark that measures its cases in turn.
 
     Args:
-        parser: of the benchmark.
-        quick: what ``--quick`` measures.
+        parser: parser of the benchmark.
+        quick: measurements of ``--quick``.
         rounds: times each case is measured by default.
     """
     parser.add_argument("--quick", action="store_true", help=quick)

@@ -56,7 +56,7 @@ class Plan:
     """A share of the time.
 
     Args:
-        name: of the row.
+        name: name of the row.
         fit: iterations and splats.
         tuning: iterations a stage.
     """
@@ -172,11 +172,11 @@ def against_one_by_one(
     Both edit the same views in the same batches from the same noise, without tuning.
 
     Args:
-        editor_name: of the editor.
+        editor_name: name of the editor.
         pixels: side of the views.
-        count: of splats.
+        count: number of splats.
         views: the source and the views nearest to it.
-        steps: of denoising.
+        steps: number of steps of denoising.
         rounds: each runs propagation twice and one by one once, in an order drawn anew.
 
     Returns:

@@ -63,8 +63,8 @@ class Case:
 
     Attributes:
         editor: its name.
-        size: of the view in px.
-        runs: what was measured.
+        size: size of the view in px.
+        runs: measured runs.
     """
 
     editor: str
@@ -77,8 +77,8 @@ def measure(editor: Any, size: int, *, steps: int = STEPS, rounds: int = 5) -> R
 
     Args:
         editor: that takes pictures.
-        size: of the view in px.
-        steps: of denoising.
+        size: size of the view in px.
+        steps: number of steps of denoising.
         rounds: that are kept; one more comes first.
     """
     view = np.random.default_rng(0).random((size, size, 3), dtype=np.float32)

@@ -50,9 +50,9 @@ class Need:
     """Work of a row of the tables.
 
     Attributes:
-        name: of the row.
+        name: name of the row.
         cells: edits times seeds, without those of rows before it.
-        rows, edits, iterations: of a cell.
+        rows, edits, iterations: rows, edits and iterations of a cell.
     """
 
     name: str
@@ -67,8 +67,8 @@ class Cost:
     """Measured cost of a method's edits.
 
     Attributes:
-        name: of the row.
-        editor: of the manifest.
+        name: name of the row.
+        editor: editor of the manifest.
         edits: views that were edited.
         rows: through the UNet.
         widest: rows of the largest pass.
@@ -174,10 +174,10 @@ def measure(name: str, row: Row, editor: Any, sizes: Sizes, **changes: Any) -> C
     """Edit two views by a method, in one step, and tune for one iteration.
 
     Args:
-        name: of the cost.
-        row: of the manifest.
+        name: name of the cost.
+        row: row of the manifest.
         editor: with networks of ``sizes``.
-        sizes: of the views and the networks.
+        sizes: sizes of the views and the networks.
         changes: further ones of the method's settings.
     """
     short = {**SHORT.get(row.method, {}), **changes}

@@ -14,6 +14,9 @@ FRAGMENT = re.compile(
 )
 """First words of a docstring that begins with neither a noun nor an imperative verb."""
 
+ENTRY = re.compile(r"(?m)^ +[a-z_0-9]+(?:, [a-z_0-9]+)*: (of|what|whose|see there)[ .,:;]")
+"""Entry of ``Args:`` or ``Attributes:`` that does not begin with a noun, and its first words."""
+
 
 def docstrings(tree: ast.AST) -> Iterator[ast.Constant]:
     """Docstrings of a module, its classes and functions, and the strings below assignments."""
@@ -25,10 +28,14 @@ def docstrings(tree: ast.AST) -> Iterator[ast.Constant]:
 
 
 def fragments(text: str) -> Iterator[tuple[int, str]]:
-    """Line and first words of each docstring that begins as a fragment."""
+    """Line and first words of each docstring, or entry of one, that begins as a fragment."""
     for constant in docstrings(ast.parse(text)):
-        if isinstance(constant.value, str) and (found := FRAGMENT.match(constant.value)):
+        if not isinstance(constant.value, str):
+            continue
+        if found := FRAGMENT.match(constant.value):
             yield constant.lineno, found[1]
+        for found in ENTRY.finditer(constant.value):
+            yield constant.lineno + constant.value.count("\n", 0, found.start()), found[1]
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ def enter(name: str, module: str) -> None:
     """Import a command and run its ``main``.
 
     Args:
-        name: of the command, with which its messages begin.
+        name: name of the command, with which its messages begin.
         module: where its ``main`` is.
     """
 

@@ -95,9 +95,9 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera], report:
     """Refuse splats that no camera sees, before an edit spends minutes on them.
 
     Args:
-        path: of the splats, for the message.
-        splats: of the scene.
-        cameras: of the data set; the first that sees splats ends the search.
+        path: path of the splats, for the message.
+        splats: splats of the scene.
+        cameras: cameras of the data set; the first that sees splats ends the search.
         report: receives a line where kernels are compiled first.
 
     Raises:
@@ -127,8 +127,8 @@ def warn_of_misfit(path: Path, splats: Gaussians, dataset: Dataset) -> None:
     colour a view explains nothing of it.
 
     Args:
-        path: of the splats, for the message.
-        splats: of the scene.
+        path: path of the splats, for the message.
+        splats: splats of the scene.
         dataset: its views.
     """
     import numpy as np

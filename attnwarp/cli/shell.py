@@ -76,7 +76,7 @@ def clear_errors(
     """Turn errors about a person's input into one clear line and exit code 2.
 
     Args:
-        stopped: what is said after Ctrl-C, a polite kill or the terminal's end.
+        stopped: message after Ctrl-C, a polite kill or the terminal's end.
         out: folder of the results that it speaks of, if it does; nothing was written while it is
             not there.
         strict: errors but InputError are faults of the program, and leave as they are; Python's

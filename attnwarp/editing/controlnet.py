@@ -77,12 +77,13 @@ class DepthControlNet(Latent):
     """An :class:`~attnwarp.editing.editor.Editor` over diffusers' own models.
 
     Args:
-        unet, vae, text_encoder, tokenizer: of diffusers and transformers.
+        unet, vae, text_encoder, tokenizer: networks and tokenizer of diffusers and
+            transformers.
         scheduler: a DDIMScheduler.
-        controlnet: of diffusers, for depth.
+        controlnet: controlnet of diffusers, for depth.
         guidance: s of e = e_un + s (e_txt - e_un); 1 turns it off, and the batch is a half.
-        control_scale: what the ControlNet's residuals are multiplied by.
-        negative_prompt: of the unconditional branch.
+        control_scale: factor of the ControlNet's residuals.
+        negative_prompt: negative prompt of the unconditional branch.
     """
 
     guide: Guide = "depth"
@@ -163,7 +164,7 @@ class ControlTask:
     """Embedded prompt and control pictures of some views.
 
     Attributes:
-        editor: whose networks run.
+        editor: editor with the networks.
         text: (branches x B, L, D).
         control: (branches x B, 3, H, W).
         shape: (B, C, h, w) of the latents.

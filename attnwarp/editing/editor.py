@@ -97,7 +97,7 @@ class Edit:
     Attributes:
         images: (H, W, 3) float32 sRGB in [0, 1], one a view.
         latents: (B, C, h, w) scaled latents.
-        timesteps: of the editor's schedule that were run.
+        timesteps: timesteps of the editor's schedule that were run.
     """
 
     images: list[Image]
@@ -110,7 +110,7 @@ def shared_noise(shape: tuple[int, int, int, int], seed: int) -> Tensor:
 
     Args:
         shape: (B, C, h, w).
-        seed: of torch's generator.
+        seed: seed of torch's generator.
 
     Example:
         >>> first, second = shared_noise((2, 4, 8, 8), seed=0)
@@ -127,8 +127,8 @@ def drawn(shape: Sequence[int], seed: int) -> Tensor:
     process's default type is: float64 would draw other numbers.
 
     Args:
-        shape: of the result.
-        seed: of torch's generator.
+        shape: shape of the result.
+        seed: seed of torch's generator.
     """
     generator = torch.Generator().manual_seed(seed)
     return torch.randn(tuple(shape), generator=generator, dtype=torch.float32)
@@ -155,15 +155,15 @@ def edit(
 
     Args:
         editor: the model.
-        guides: of the views, all of one size: what ``editor.task`` takes.
+        guides: guides of the views, all of one size: what ``editor.task`` takes.
         prompt: instruction or description.
-        steps: of DDIM.
-        seed: of the noise, which the views share.
+        steps: number of steps of DDIM.
+        seed: seed of the noise, which the views share.
         start: Stable Diffusion's timestep T to start from, as publications give it. The views' own
             latents are noised to T's share of signal, then ``steps`` steps follow
             (:func:`attnwarp.editing.schedule.steps_as_published`). Left out, the edit starts from
             pure noise.
-        grid: of the steps below ``start``; noise is added at ``start`` in either.
+        grid: grid of the steps below ``start``; noise is added at ``start`` in either.
         pictures: (H, W, 3) that ``start`` begins from; ``guides`` if left out.
         noise: (B, C, h, w) in place of the seed's.
         latents: (B, C, h, w) to begin from as they are, such as those of an inversion; neither
@@ -247,8 +247,8 @@ def tensor_of(images: Sequence[npt.NDArray[Any]], name: str, multiple: int) -> T
 
     Args:
         images: at least one, all of one size.
-        name: of the argument, for errors.
-        multiple: what the sides have to be multiples of.
+        name: name of the argument, for errors.
+        multiple: number that divides both sides.
 
     Raises:
         ValueError: no picture, another shape, several sizes, sides of other multiples, values that
@@ -309,11 +309,11 @@ def check_networks(
     """Refuse networks that do not fit each other, by their configurations.
 
     Args:
-        network: of a UNet or a ControlNet.
-        text_encoder: of the same model.
+        network: network of a UNet or a ControlNet.
+        text_encoder: text encoder of the same model.
         channels: that the network has to take.
-        name: of the network, for the message.
-        hint: what takes so many channels, for the message.
+        name: name of the network, for the message.
+        hint: network that takes so many channels, for the message.
 
     Raises:
         ValueError: another number of channels, texts of another size, or a model that takes more

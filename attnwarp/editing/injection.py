@@ -101,14 +101,14 @@ def inject(
         recording: features of the source view.
         branches: the guidance branches in the order of the batch; those that were recorded get
             features. One whose share of the guidance is 0 may be missing.
-        warps: of the pictures of a batch, one each: :class:`attnwarp.warp.WarpedView` or None for
-            the identity.
+        warps: warps of the pictures of a batch, one each: :class:`attnwarp.warp.WarpedView` or None
+            for the identity.
         weight: a by (step number, number of steps); :func:`decay` if left out.
         mask: (H, W) bool of the target where features may be injected, at any size with the
             target's proportions; everywhere if left out.
         layers: to inject, all recorded ones if left out.
-        blend: of tokens along a warp; the formula above if left out. Half precision comes to it as
-            float32.
+        blend: blend of tokens along a warp; the formula above if left out. Half precision comes to
+            it as float32.
 
     Raises:
         ValueError: a timestep, layer, branch or size that does not match the recording, or a run

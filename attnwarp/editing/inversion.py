@@ -36,11 +36,11 @@ def ddim_invert(
     with a task that has none.
 
     Args:
-        schedule: of the model; its network predicts noise or v. One that predicts the picture
-            gives no noise of a clean picture, and needs ``begin``.
+        schedule: schedule of the model; its network predicts noise or v. One that predicts the
+            picture gives no noise of a clean picture, and needs ``begin``.
         predict: the network's output.
         latents: (B, C, h, w) scaled latents of the picture.
-        timesteps: of the edit, falling.
+        timesteps: timesteps of the edit, falling.
         begin: timestep that the latents were noised to; the timesteps are then those above. Left
             out, the latents are clean.
 
@@ -86,11 +86,11 @@ def invert_view(
 
     Args:
         editor: a model that draws the whole picture, such as a depth ControlNet.
-        guide: what ``editor.task`` takes of the view.
+        guide: guide of the view, as ``editor.task`` takes it.
         picture: (H, W, 3) of the view, in [0, 1].
-        prompt: what the picture shows; "" names nothing.
-        steps: of the edit.
-        seed: of the noise of :func:`inversion_steps`, the same for all views.
+        prompt: description of the picture; "" names nothing.
+        steps: number of steps of the edit.
+        seed: seed of the noise of :func:`inversion_steps`, the same for all views.
 
     Example:
         >>> import numpy as np
@@ -156,7 +156,7 @@ def edit_friendly_invert(
     Every x_t gets a noise of its own, so the noise maps are larger and carry the picture's layout.
 
     Args:
-        schedule: of the model; any prediction.
+        schedule: schedule of the model; any prediction.
         predict: the network's output.
         latents: (B, C, h, w) scaled latents of the picture.
         timesteps: falling. To skip the noisiest, leave them out: the paper takes
@@ -164,7 +164,7 @@ def edit_friendly_invert(
             the picture, and 15 in the replay with one for its edit.
         noises: (steps, B, C, h, w) white noise of the steps, in the order of ``timesteps``; drawn
             from ``seed`` if left out.
-        seed: of the drawn noises.
+        seed: seed of the drawn noises.
 
     Raises:
         ValueError: noises of another shape.
@@ -206,10 +206,10 @@ def noise_maps(
 
     Args:
         editor: the model.
-        task: of its edit.
+        task: task of its edit.
         picture: (H, W, 3) in [0, 1].
         timesteps: falling.
-        seed: of :func:`attnwarp.editing.editor.shared_noise`.
+        seed: seed of :func:`attnwarp.editing.editor.shared_noise`.
     """
     latents = editor.encode([picture])
     noises = drawn((len(timesteps), *latents.shape), seed + 1)
@@ -229,9 +229,9 @@ def replay(
     With the task of the inversion they are those of its picture; with another prompt, of its edit.
 
     Args:
-        schedule: of the model, that of the inversion.
+        schedule: schedule of the model, that of the inversion.
         predict: the network's output.
-        noise: of :func:`edit_friendly_invert`.
+        noise: noise of :func:`edit_friendly_invert`.
         on_step: called with the step, the number of steps and the latents after each step.
     """
     x = noise.start

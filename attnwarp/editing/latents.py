@@ -60,7 +60,7 @@ class HaarLatents(ModelMixin, ConfigMixin):
         block_out_channels: diffusers' pipelines read the factor between picture and latents off its
             length: 2 ** (3 - 1) = 4.
         latent_channels: 48.
-        scaling_factor: what latents are multiplied by after encoding; the gains stand in its place.
+        scaling_factor: factor of latents after encoding; the gains stand in its place.
 
     Example:
         >>> import torch

@@ -34,10 +34,10 @@ class Layer:
     """An attention layer of a UNet.
 
     Attributes:
-        name: of the module, such as ``up_blocks.3.attentions.2.transformer_blocks.0.attn2``.
+        name: name of the module, such as ``up_blocks.3.attentions.2.transformer_blocks.0.attn2``.
         kind: "self" or "cross".
         level: how often the latents are halved before it; its size is that fraction of theirs.
-        channels: of its output.
+        channels: channel counts of its output.
 
     Example:
         >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 1, 64)
@@ -99,8 +99,8 @@ def choose_layers(
 
     Args:
         unet: a diffusers UNet.
-        fractions: of the latents' side: 1, 0.5, 0.25, ...
-        kinds: of attention.
+        fractions: fractions of the latents' side: 1, 0.5, 0.25, ...
+        kinds: kinds of attention.
         blocks: "down", "mid" or "up".
 
     Raises:
@@ -159,7 +159,7 @@ def hooked(unet: torch.nn.Module, layers: Sequence[Layer], hook: Hook) -> Iterat
 
     Args:
         unet: a diffusers UNet.
-        layers: of it, by :func:`all_layers` or :func:`choose_layers`.
+        layers: layers of it, by :func:`all_layers` or :func:`choose_layers`.
         hook: its (batch, H W, C) result replaces the features; None leaves them. Gradients flow
             through.
 

@@ -43,7 +43,7 @@ def save_memory(editor: Any, device: str) -> None:
     Attention in slices is none of it: torch's own attention takes less memory than slices do.
 
     Args:
-        editor: whose networks lie in main memory.
+        editor: editor with networks that lie in main memory.
         device: that computes, "cpu" or "cuda".
 
     Raises:

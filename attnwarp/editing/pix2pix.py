@@ -47,7 +47,8 @@ class InstructPix2Pix(Latent):
     """An :class:`~attnwarp.editing.editor.Editor` over diffusers' own models.
 
     Args:
-        unet, vae, text_encoder, tokenizer: of diffusers and transformers.
+        unet, vae, text_encoder, tokenizer: networks and tokenizer of diffusers and
+            transformers.
         scheduler: a DDIMScheduler.
         text_guidance: s_T of e = e_un + s_T (e_txt - e_img) + s_I (e_img - e_un).
         image_guidance: s_I. Guidance is off, and the batch a third, where s_T is 1 and s_I is 1.
@@ -154,11 +155,11 @@ class Pix2PixTask:
     """Embedded instruction and encoded pictures of some views.
 
     Attributes:
-        editor: whose networks run.
+        editor: editor with the networks.
         text: (branches x B, L, D).
         before: (branches x B, C, h, w).
         views: B.
-        shares: of the branches in the output, in the order of the UNet's batch.
+        shares: shares of the branches in the output, in the order of the UNet's batch.
         region: (B, h, w) of what is edited, for :class:`attnwarp.editing.small_unet.EditUNet`.
     """
 

@@ -28,9 +28,9 @@ class RecordingPlan:
         branches: the guidance branches in the order of the batch, such as
             :data:`PIX2PIX_BRANCHES`; ("text",) without guidance.
         keep: those of them to record.
-        steps: of denoising.
+        steps: number of steps of denoising.
         views: pictures in a batch.
-        dtype: of what is stored. Half precision halves the memory and rounds.
+        dtype: dtype of what is stored. Half precision halves the memory and rounds.
         store: "device" leaves features where they are made, "cpu" moves them to main memory, a
             Path of a folder writes them there. Each recording has a folder of its own in it.
         chosen: numbers of the steps to record, from 0; all of them if left out. The others are
@@ -146,9 +146,9 @@ class Recording:
     """Features of one run, by step, layer and branch.
 
     Attributes:
-        plan: what was recorded.
-        timesteps: of the steps so far, in their order, those without features included. A scheduler
-            that evaluates a timestep twice (PNDM, Heun) has it twice.
+        plan: plan of the recording.
+        timesteps: timesteps of the steps so far, in their order, those without features included. A
+            scheduler that evaluates a timestep twice (PNDM, Heun) has it twice.
     """
 
     plan: RecordingPlan
@@ -215,7 +215,8 @@ class Recording:
         """The number of a timestep among those of the recorded run, from 0.
 
         Args:
-            begin: of those with that timestep, the first from this number on, or else the first.
+            begin: begin of those with that timestep, the first from this number on, or else the
+                first.
 
         Raises:
             ValueError: the run had no such timestep.
@@ -270,7 +271,7 @@ def record(unet: torch.nn.Module, plan: RecordingPlan) -> Iterator[Recording]:
 
     Args:
         unet: a diffusers UNet; any pipeline or loop may call it.
-        plan: what to record; ``print(plan)`` tells the memory that it takes.
+        plan: features to record; ``print(plan)`` tells the memory that it takes.
 
     Raises:
         ValueError: latents of another size, a batch of another number of rows, or more steps, than

@@ -34,7 +34,7 @@ class Schedule:
     Args:
         alphas: (N,) float32 alpha-bar of the training steps: x_t = sqrt(alpha-bar) x_0 +
             sqrt(1 - alpha-bar) noise.
-        prediction: what the network gives, in diffusers' words.
+        prediction: prediction type of the network, in diffusers' words.
         final_alpha: alpha-bar after the last step.
     """
 
@@ -83,8 +83,8 @@ class Schedule:
         """One deterministic DDIM step (Song et al. 2021, eq. 12 with eta 0).
 
         Args:
-            output: of the network at ``x``.
-            timestep: of ``x``.
+            output: output of the network at ``x``.
+            timestep: timestep of ``x``.
             following: the step that follows, None after the last.
             change: takes the predicted x_0 and returns what stands in its place; the noise is then
                 what that x_0 leaves of ``x``.
@@ -185,7 +185,7 @@ def steps_as_published(
     as often as published.
 
     Args:
-        schedule: of the editor.
+        schedule: schedule of the editor.
         start: Stable Diffusion's first timestep, in [0, 999].
         steps: how many.
         grid: see :data:`Grid`.

@@ -61,7 +61,7 @@ class NoDetectionError(InputError):
     """A picture in which a segmenter detects nothing that the words name.
 
     Args:
-        words: what was asked for.
+        words: words that were searched for.
         view: name of the view, if it has one.
     """
 
@@ -80,8 +80,8 @@ def segments_of(
 
     Args:
         segmenter: see :class:`Segmenter`.
-        words: of what is edited.
-        names: of the views, for errors.
+        words: words of what is edited.
+        names: names of the views, for errors.
 
     Raises:
         NoDetectionError: by the function; the message names the words and the view.
@@ -155,9 +155,9 @@ class GroundedSam:
         detector_processor: its processor.
         sam: transformers' ``SamModel``.
         sam_processor: its processor.
-        box_threshold: of a box's best score, in [0, 1].
-        text_threshold: of the scores that name a box, in [0, 1]. A box that no word of the text
-            names, only a mark between words, is dropped.
+        box_threshold: least value of a box's best score, in [0, 1].
+        text_threshold: least value of the scores that name a box, in [0, 1]. A box that no word
+            of the text names, only a mark between words, is dropped.
     """
 
     detector: Any
@@ -316,8 +316,8 @@ class ClipSegmenter:
     exact masks is in reports/editor/segments.md. Look at its masks before you use them.
 
     Args:
-        encoder: of places and words; see :func:`attnwarp.encoders.load_encoder`.
-        sides: of the sizes at which the picture is rated, the short side in px.
+        encoder: encoder of places and words; see :func:`attnwarp.encoders.load_encoder`.
+        sides: sides of the sizes at which the picture is rated, the short side in px.
         likely: least probability of what is first taken for the thing.
         background: a pixel less probable than this can never become part of the mask.
         sure: a pixel at least as probable as this stays in it.
@@ -503,7 +503,7 @@ def check_marks(
     """Refuse a box or a point beside a picture, and a box without area.
 
     Args:
-        width, height: of the picture, px.
+        width, height: width and height of the picture, px.
         box, at: see :func:`cut_out`.
 
     Raises:

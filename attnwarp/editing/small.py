@@ -112,7 +112,7 @@ def check_words(name: str, text: str, *, anyway: bool = False) -> None:
     of words that a bundled editor was not trained on.
 
     Args:
-        name: of the editor, as :func:`load_editor` takes it.
+        name: name of the editor, as :func:`load_editor` takes it.
         text: the instruction.
         anyway: take one without a word of :data:`LOOKS`. An editor that is guided by depth does,
             since its text describes the edited scene.
@@ -164,7 +164,7 @@ def guide_of(name_or_folder: str) -> Guide:
     """Tell the guide of an editor without loading it: a ControlNet means depth maps.
 
     Args:
-        name_or_folder: of the editor, as :func:`load_editor` takes it.
+        name_or_folder: name or folder of the editor, as :func:`load_editor` takes it.
 
     Raises:
         InputError: no such editor or folder.
@@ -180,7 +180,7 @@ def folders_of(name_or_folder: str) -> tuple[Path, Path | None]:
     """An editor's folder, and its ControlNet's; None for an editor that is guided by pictures.
 
     Args:
-        name_or_folder: of the editor, as :func:`load_editor` takes it.
+        name_or_folder: name or folder of the editor, as :func:`load_editor` takes it.
 
     Raises:
         InputError: no such editor or folder.

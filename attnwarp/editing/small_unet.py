@@ -70,9 +70,9 @@ class EditUNet(UNet2DConditionModel):
 
         Args:
             sample: (B, 2C, h, w).
-            timestep: of the noisy latents.
+            timestep: timestep of the noisy latents.
             encoder_hidden_states: (B, L, D) tokens of the text.
-            args, more: of the base class.
+            args, more: arguments of the base class.
             return_dict: False gives a tuple.
         """
         noisy, before = sample.split(self.config.out_channels, dim=1)

@@ -27,8 +27,8 @@ class EncoderInfo:
         kind: "clip" (images and texts in one space), "dino" (images alone) or "perceptual" (a
             distance of images).
         source: "bundled", or the folder or file that the weights were read from.
-        weights_sha256: of the weights' file, or of several files' bytes in the order of their
-            names.
+        weights_sha256: SHA-256 of the weights' file, or of several files' bytes in the order
+            of their names.
         preprocessing: the steps before the network, in words.
         size: side in px of the network's square input; None: pictures keep their size.
         dim: length of an embedding; None for a distance.

@@ -37,7 +37,7 @@ def load(name: str, folder: Path = WEIGHTS) -> BundledClip | BundledDino | Bundl
     """A bundled encoder by name: "clip-small", "clip-parts", "dino-small" or "perceptual-small".
 
     Args:
-        name: of the encoder.
+        name: name of the encoder.
         folder: holds ``name``.safetensors, and for clip-small and clip-parts a tokenizer; the
             package's own if left out.
 

@@ -43,9 +43,9 @@ class Backbone:
 
     Attributes:
         name: in LPIPS.
-        file: of its weights in torchvision.
+        file: file of its weights in torchvision.
         taps: index of the last layer of each stage in torchvision's ``features``.
-        channels: of each stage.
+        channels: channel counts of each stage.
         smallest: shortest side in px of a picture that reaches the last stage.
     """
 
@@ -143,7 +143,7 @@ class Lpips:
         network: its ``features``, see :func:`features`.
         weights: the linear layers, one (channels,) tensor a stage.
         about: identity, stored with results.
-        device: of the computation.
+        device: device of the computation.
 
     Attributes:
         smallest: shortest side in px of a picture that it takes.

@@ -90,7 +90,7 @@ class Patches(nn.Module):
 
     Args:
         widths: channels of the stages, each of which has half of the size of the one before.
-        dim: of the vectors.
+        dim: number of dimensions of the vectors.
         hidden: channels in between.
     """
 
@@ -151,9 +151,9 @@ class TextTower(nn.Module):
 
     Args:
         vocabulary: number of tokens; token 0 is padding.
-        width, depth, heads: of the transformer.
+        width, depth, heads: width, depth and heads of the transformer.
         length: longest text in tokens; longer ones are cut, keeping their end token.
-        dim: of the embedding.
+        dim: number of dimensions of the embedding.
     """
 
     def __init__(
@@ -180,8 +180,8 @@ class ClipSmall(nn.Module):
     """Pictures and texts in one space (Radford et al. 2021), small.
 
     Args:
-        vocabulary: of the tokenizer.
-        dim: of the shared space.
+        vocabulary: vocabulary of the tokenizer.
+        dim: number of dimensions of the shared space.
     """
 
     size = 112
@@ -208,8 +208,8 @@ class ClipParts(ClipSmall):
     """:class:`ClipSmall` with a vector for each place of 8 x 8 px in the space of texts.
 
     Args:
-        vocabulary: of the tokenizer.
-        dim: of the shared space.
+        vocabulary: vocabulary of the tokenizer.
+        dim: number of dimensions of the shared space.
     """
 
     def __init__(self, vocabulary: int, dim: int = 192) -> None:

@@ -55,11 +55,11 @@ class Record:
         seconds, cpu_seconds: spent on iterations alone: no evaluation, no writing, over all
             sittings.
         splats: their number.
-        loss: of the last iterations, smoothed; None before the first.
+        loss: loss of the last iterations, smoothed; None before the first.
         psnr: mean over the held-out views, dB; None without any. Infinite where all are equal to
             their pictures.
-        psnr_pooled: of their mean squared error.
-        measures: what the caller's own measure gave.
+        psnr_pooled: PSNR of their mean squared error.
+        measures: figures of the caller's measure.
 
     Example:
         >>> from attnwarp.fit import Record
@@ -89,7 +89,7 @@ class Fit:
         iteration: iterations done.
         seconds, cpu_seconds: spent on them.
         stopped: why it ended: "iterations" (all done), "time", "patience", or "asked".
-        extent: of the scene, by which the settings' shares are measured.
+        extent: extent of the scene, by which the settings' shares are measured.
 
     Example:
         >>> import numpy as np
@@ -138,9 +138,9 @@ def fit(
     report says that the schedule of those done was another.
 
     Args:
-        start: what to begin with: :func:`attnwarp.fit.from_points`, or splats that were fitted
-            before; of the settings' kind. Harmonics that it uses are used from the first iteration.
-            The fit runs where they lie: ``start.to(device="cuda")`` takes it to a GPU.
+        start: first splats: :func:`attnwarp.fit.from_points`, or splats that were fitted before; of
+            the settings' kind. Harmonics that it uses are used from the first iteration. The fit
+            runs where they lie: ``start.to(device="cuda")`` takes it to a GPU.
         views: the pictures to fit on.
         settings: the default ones for ``start.kind`` if left out.
         held_out: pictures to evaluate on, never fitted on.
@@ -150,9 +150,9 @@ def fit(
             is none of them. The learning rates follow ``settings.iterations`` all the same.
         checkpoint_seconds: see above; more where a checkpoint takes long, of which the writing
             then takes 5 % of the time.
-        third_scale: of 2D splats in ``splats.ply``, for viewers of 3D ones; see
+        third_scale: normal scale of 2D splats in ``splats.ply``, for viewers of 3D ones; see
             :func:`attnwarp.io.write_ply`.
-        backend: of :func:`attnwarp.render.render`.
+        backend: name of :func:`attnwarp.render.render`.
         measure: called at every evaluation with the splats; its figures go into the history. A view
             of the truth, such as the error of depth.
         report: receives how the fit stands after every iteration.

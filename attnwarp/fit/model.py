@@ -44,7 +44,7 @@ class Model:
         first, second: Adam's moments by name.
         steps: steps done.
         rates: learning rates by name.
-        extent: of the scene, in its units.
+        extent: extent of the scene, in its units.
         scales_range: smallest and largest logarithm that a scale may take.
     """
 

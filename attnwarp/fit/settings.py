@@ -23,14 +23,15 @@ class FitSettings(Settings):
     Args:
         kind: "2d" (2DGS) or "3d" (3DGS).
         iterations: optimisation steps, one view each.
-        seed: of the order of views, the random background and the splitting of splats.
-        sh_degree: of the colour's spherical harmonics, 0 to 3.
+        seed: seed of the order of views, the random background and the splitting of splats.
+        sh_degree: degree of the colour's spherical harmonics, 0 to 3.
         sh_every: iterations after which one more degree is used, from the degree of the first
             splats (0 for points).
         lr_means, lr_means_final: learning rates of the centres at the beginning and the end,
             exponential in between, times the scene's extent.
-        lr_dc, lr_rest, lr_opacity, lr_scales, lr_quats: of the constant and the other harmonics,
-            the opacity's logit, the scales' logarithm, and the quaternions.
+        lr_dc, lr_rest, lr_opacity, lr_scales, lr_quats: learning rates
+            of the constant and the other harmonics, the opacity's logit, the scales'
+            logarithm, and the quaternions.
         ssim: share of 1 - SSIM in the picture's loss; the rest is L1.
         normal: weight of normal consistency. None: 0.05 for "2d" (published), 0 for "3d".
         distortion: weight of depth distortion. None: 0.01 for "2d", 0 for "3d".
@@ -55,7 +56,7 @@ class FitSettings(Settings):
             reset on or the middle of ``densify_until``, whichever is earlier.
         reset_every: iterations after which all opacities are lowered to ``reset_opacity``, as long
             as splats are added.
-        reset_opacity: see there.
+        reset_opacity: opacity after a reset, in (0, 1).
         antialiased: "3d" only: fit for the opacity-compensated rasteriser.
         near: nothing nearer to a camera is drawn, as a share of the extent.
         evaluate_every: iterations between two evaluations on the held-out views, which also the

@@ -96,7 +96,7 @@ def from_points(
         colors: (P, 3) uint8 sRGB.
         kind: "2d" or "3d".
         sh_degree: room for harmonics up to this degree; all but the constant are 0.
-        seed: of the random turns.
+        seed: seed of the random turns.
         cameras: that see the points. They size a lone point, which has no gaps around it: a
             hundredth of the scene's extent (:func:`extent_of`), or of one unit without cameras.
 
@@ -205,8 +205,8 @@ def first_splats(
     """First splats at a data set's points, or at random ones where it has none.
 
     Args:
-        dataset: whose points and colours are taken.
-        cameras: of the views that are fitted on.
+        dataset: data set with points and colours.
+        cameras: cameras of the views that are fitted on.
         settings: kind, degree and seed of the splats.
         report: receives a line where random points are taken, and of points that lie too far
         away (:func:`within_reach`).
@@ -258,8 +258,8 @@ def random_points(
 
     Args:
         cameras: at least one.
-        count: of points, at least 1.
-        seed: of positions and colours.
+        count: number of points, at least 1.
+        seed: seed of positions and colours.
 
     Returns:
         points: (count, 3) world coordinates.

@@ -300,7 +300,7 @@ def twins(
 
     Args:
         fitted, held_out: cameras of either part.
-        fitted_keys, held_out_keys: what tells the picture of each.
+        fitted_keys, held_out_keys: keys that tell the pictures apart.
     """
     of_key = {key: j for j, keys in enumerate(fitted_keys) for key in keys}
     both = [*fitted, *held_out]

@@ -27,7 +27,7 @@ def compile_kernels(
     takes. Further calls in a process do nothing.
 
     Args:
-        kind: of the splats, "2d" or "3d".
+        kind: kind of the splats, "2d" or "3d".
         report: receives one line if it takes seconds.
         device: where the splats lie: numba compiles for a CPU, Warp for a GPU.
 

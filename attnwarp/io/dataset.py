@@ -130,7 +130,7 @@ def nearest_rotation(path: Path, name: str, R: Array) -> Array:
 
     Args:
         path: the file that ``R`` comes from, for the error.
-        name: of the field there.
+        name: name of the field there.
         R: (3, 3).
     """
     with np.errstate(over="ignore", invalid="ignore"):
@@ -171,10 +171,10 @@ def with_images(
     """Check that each camera's image exists and has the camera's size.
 
     Args:
-        source: of the cameras, for messages.
+        source: source of the cameras, for messages.
         cameras, paths: one path for each camera.
         missing_images, resize_cameras: see :func:`attnwarp.io.read_dataset`.
-        finder: of the folder that the images' names are relative to.
+        finder: text of the folder that the images' names are relative to.
         elsewhere: how a person names the images' folder, where that can be.
 
     Returns:

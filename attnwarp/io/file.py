@@ -58,7 +58,7 @@ def check_other(out: Path, source: Path, what: str) -> None:
 
     Args:
         out: where a result goes.
-        source: what it is made from.
+        source: name of the input that it is made from.
         what: the source is, for the message.
 
     Raises:
@@ -132,7 +132,7 @@ def write_atomically(
     killed process is removed by the next one that writes to the folder.
 
     Args:
-        path: of the file; its folder must exist.
+        path: path of the file; its folder must exist.
         write: called with the open temporary file.
         durable: whether the content survives a power cut too, which costs milliseconds. A file
             that carries a checksum and can be made again does without.

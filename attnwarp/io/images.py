@@ -48,7 +48,7 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     The size is that of the stored pixels: EXIF orientation is ignored.
 
     Args:
-        path: of any format that Pillow or OpenCV reads.
+        path: picture of any format that Pillow or OpenCV reads.
 
     Raises:
         FileNotFoundError: no such file.
@@ -247,7 +247,7 @@ def _with_pillow(path: Path, use: Callable[[Any], Any], data: bytes | None = Non
     None for a format that Pillow does not know, such as TIFF of 16 bits and three channels.
 
     Args:
-        path: of the picture.
+        path: path of the picture.
         use: called with it.
         data: in place of the file's, if given.
     """

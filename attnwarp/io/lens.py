@@ -210,7 +210,7 @@ def undistorted_camera(camera: Camera, lens: Lens) -> Camera:
     """The largest pinhole camera of the same focal length and axis that sees no blank pixel.
 
     Args:
-        camera: of the distorted picture, its lens apart.
+        camera: camera of the distorted picture, its lens apart.
         lens: its distortion.
 
     Returns:
@@ -269,8 +269,8 @@ def undistorted_image(
     Args:
         image: (H, W, C) uint8 or uint16, taken by ``camera`` through ``lens``; a fourth channel is
             straight alpha.
-        camera, lens: of the picture.
-        target: what to resample to.
+        camera, lens: camera and lens of the picture.
+        target: camera to resample to.
 
     Returns:
         (target.height, target.width, C) of the same dtype; 0 where the picture does not reach.

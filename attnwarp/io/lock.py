@@ -20,7 +20,7 @@ def locked(path: Path, *, wait: bool) -> Iterator[None]:
     """Hold a lock file, which is made.
 
     Args:
-        path: of the file, in a folder that exists.
+        path: path of the file, in a folder that exists.
         wait: until whoever holds it lets go.
 
     Raises:
@@ -43,7 +43,8 @@ def alone_in(folder: str | os.PathLike[str]) -> Iterator[None]:
     has no such locks.
 
     Args:
-        folder: of the results. If nothing was written to it and it was made here, it is removed.
+        folder: path of the results. If nothing was written to it and it was made here, it is
+            removed.
 
     Raises:
         InputError: another run holds it.

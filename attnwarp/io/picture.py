@@ -20,8 +20,8 @@ def encode_picture(
     Args:
         image: (H, W, 3) sRGB in [0, 1], clipped there, or uint8, taken as it is.
         suffix: ".png" or ".jpg".
-        quality: of a JPEG, 1 to 100.
-        chroma: of a JPEG: colours at full ("444") or half ("420") resolution.
+        quality: quality of a JPEG, 1 to 100.
+        chroma: chroma of a JPEG: colours at full ("444") or half ("420") resolution.
 
     Raises:
         ValueError: another shape or suffix.

@@ -211,7 +211,7 @@ def write_ply(
 
     Args:
         path: the file; an older one is replaced.
-        gaussians: what to write.
+        gaussians: splats to write.
         third_scale: for the 2D kind, write a third scale of this size (scene units) for viewers
             that know only 3D splats; :data:`THIRD_SCALE` is the usual one. Left out, two scales are
             written, as 2DGS trainers do.

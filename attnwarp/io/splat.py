@@ -41,8 +41,8 @@ def write_splat(
 
     Args:
         path: the file; an older one is replaced, atomically.
-        gaussians: what to write.
-        third_scale: third scale of 2D splats, in scene units.
+        gaussians: splats to write.
+        third_scale: normal scale of 2D splats, in scene units.
         coordinates: "world", or "relative" for positions without ``gaussians.origin``.
 
     Raises:

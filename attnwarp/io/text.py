@@ -20,8 +20,8 @@ def read_text(path: Path, errors: str = "strict") -> str:
     """The text of a file, in UTF-8 or with a byte order mark, its lines ended by ``\\n``.
 
     Args:
-        path: of the file.
-        errors: what becomes of bytes that are no UTF-8, as for :meth:`bytes.decode`.
+        path: path of the file.
+        errors: treatment of bytes that are no UTF-8, as for :meth:`bytes.decode`.
 
     Raises:
         OSError: it cannot be read.
@@ -75,8 +75,8 @@ def overstated(lines: list[bytes], size: int) -> tuple[str, str] | None:
     number that it announces; None where there is none. Readers take memory for announced rows.
 
     Args:
-        lines: of the header.
-        size: of the file, in bytes.
+        lines: lines of the header.
+        size: size of the file, in bytes.
 
     Example:
         >>> overstated([b"ply", b"element vertex 8", b"element face 200000000"], 300)

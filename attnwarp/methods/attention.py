@@ -70,7 +70,7 @@ def joint(tokens: Tensor, branches: int) -> Tensor:
 
     Args:
         tokens: (branches V, L, C), branch by branch.
-        branches: of guidance.
+        branches: branches of guidance.
 
     Example:
         >>> import torch
@@ -92,7 +92,7 @@ def aligned(references: int, self_share: float, branches: int) -> Rule:
     Args:
         references: R.
         self_share: s in [0, 1].
-        branches: of guidance.
+        branches: branches of guidance.
     """
 
     def rule(name: str, tokens: Tensor, attend: Attend) -> Tensor:

@@ -56,8 +56,8 @@ def attention_warping(
             noise is replayed (edit-friendly inversion).
         warps: the warp from the source to a target, by their numbers, such as one from exact depth;
             used in place of those from the splats' depth.
-        store: of the recorded features: on the editor's "device", in main memory ("cpu"), or in
-            the folder ("disk") until the edit is done.
+        store: store of the recorded features: on the editor's "device", in main memory ("cpu"), or
+            in the folder ("disk") until the edit is done.
 
     Raises:
         ValueError, InputError, RuntimeError: see :func:`by_view`.

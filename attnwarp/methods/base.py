@@ -74,17 +74,17 @@ class Options(TypedDict, total=False):
     """Options that every method takes by name.
 
     Args:
-        folder: of all results, created if need be; one that another run writes to is refused. A
-            killed run resumes from it. All files but ``times.json`` then get the bytes of an
+        folder: path of all results, created if need be; one that another run writes to is refused.
+            A killed run resumes from it. All files but ``times.json`` then get the bytes of an
             uninterrupted run, on one machine, with the same number of threads and without a budget
             in seconds.
         budget: limits of the run, :class:`Budget`; None for a whole run.
-        segments: what is edited: (H, W) masks of the views, bool or soft in [0, 1], or a function
-            of a view's number and picture. The original stays outside.
+        segments: masks of the edited parts: (H, W) masks of the views, bool or soft in [0, 1], or a
+            function of a view's number and picture. The original stays outside.
         tune_outside: tune all splats alike (False). Else each takes the share of a step that it
             belongs to what the segments mark, so that the rest stays.
         checkpoint_seconds: between two checkpoints of tuning (30); more where one takes long.
-        backend: of :func:`attnwarp.render.render` ("auto").
+        backend: name of :func:`attnwarp.render.render` ("auto").
         report: receives how the run stands, :class:`attnwarp.reporting.Reporter`.
         load: loads the perceptual distance, :func:`attnwarp.encoders.load_encoder`. One that keeps
             what it loaded serves several runs.
@@ -112,7 +112,7 @@ class Round:
     Attributes:
         views: numbers of the views that it edits, in the order of editing.
         training: numbers of the views that it tunes on.
-        iterations: of tuning.
+        iterations: iterations of tuning.
         rows: through the UNet that its edits take.
 
     Example:
@@ -172,7 +172,7 @@ class ViewEdit:
 
     Attributes:
         picture: (h, w, 3) in [0, 1].
-        about: what the edit was, for its record.
+        about: description of the edit, for its record.
         pictures: (H, W, 3) uint8 for people, by the folder that they go to.
     """
 
@@ -192,7 +192,7 @@ class Loop(Protocol):
         """Edit views together.
 
         Args:
-            number: of the round, from 0.
+            number: number of the round, from 0.
             views: their numbers.
             edit: does it; not called where the folder has the edits.
             rows: through the UNet that it takes.
@@ -205,7 +205,7 @@ class Loop(Protocol):
         """Tune the splats on edited views.
 
         Args:
-            number: of the round, from 0.
+            number: number of the round, from 0.
             views: numbers of views; those without an edit are left out.
             iterations: one view each.
             order: see :meth:`attnwarp.methods.tuning.Tuning.advance`.
@@ -246,7 +246,7 @@ class Plan:
     """A loop that does nothing but note what a method would do.
 
     Attributes:
-        rounds: of the method.
+        rounds: number of rounds of the method.
         calls: each edit and tuning with its round, views, and rows or iterations.
     """
 
@@ -291,9 +291,9 @@ def run(
     """Run a method; the other arguments as of :func:`attnwarp.methods.by_view`.
 
     Args:
-        name: of the method.
+        name: name of the method.
         make: the method, of the work and its settings.
-        kind: of the settings.
+        kind: kind of the settings.
     """
     for option in options:
         check.one_of(option, list(Options.__annotations__), "option")

@@ -33,7 +33,7 @@ def by_view(
         cameras: V views, at least one.
         images: V pictures (H, W, 3), sRGB, uint8, uint16 or floating in [0, 1]: the views before
             the edit. None takes renders of ``gaussians``.
-        editor: of either kind, see :mod:`attnwarp.editing`.
+        editor: editor of either kind, see :mod:`attnwarp.editing`.
         instruction: an instruction or a prompt, as the editor takes it.
         settings: :class:`ByViewSettings`, its defaults if left out.
         options: see :class:`Options`.

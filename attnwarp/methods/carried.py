@@ -24,7 +24,7 @@ class Estimates:
         settings: weight, its end, and whether latents or pictures are warped.
 
     Attributes:
-        sources: of each source, (C, h, w) at each step.
+        sources: sources of each source, (C, h, w) at each step.
     """
 
     def __init__(self, editor: Any, settings: AttentionWarpingSettings) -> None:
@@ -39,7 +39,7 @@ class Estimates:
         None where nothing is.
 
         Args:
-            sights: of the views.
+            sights: sights of the views.
             sources: how many are taken.
             keep: gets the result of a lone view at each step.
         """
@@ -112,9 +112,9 @@ def _carry(
 
     Args:
         own: (C, h, w) the target's.
-        maps: of the sources.
+        maps: maps of the sources.
         warps: from the sources.
-        weight: of the sources', in [0, 1].
+        weight: weight of the sources', in [0, 1].
     """
     tokens = own.flatten(1).T[None].contiguous()
     for warp, map_ in zip(warps, maps, strict=False):
@@ -132,7 +132,7 @@ class Noise:
         settings: which, and the seed.
 
     Attributes:
-        orders: of each source, (h, w) order of its noise where noise sticks to the surface.
+        orders: orders of each source, (h, w) order of its noise where noise sticks to the surface.
     """
 
     def __init__(self, settings: AttentionWarpingSettings) -> None:

@@ -66,7 +66,7 @@ class FitPlan:
     and what half and twice as much time buys.
 
     Args:
-        iterations: of the fit.
+        iterations: iterations of the fit.
         kind: "2d" or "3d".
         max_splats: no more than these.
     """
@@ -81,15 +81,15 @@ class EditOptions:
     """Options of an edit by any method.
 
     Args:
-        marks: what is edited.
+        marks: marks of the edited parts.
         tune_outside: tune splats that are not marked, too.
         source: name or number of the source view, which marks are of; the first if None, of the
             split "train" where there is one.
         max_size: larger pictures are averaged down to it.
-        device: of the editor and the splats, "auto", "cpu" or "cuda".
-        dtype: of the editor; see :func:`attnwarp.devices.type_of`.
+        device: device of the editor and the splats, "auto", "cpu" or "cuda".
+        dtype: dtype of the editor; see :func:`attnwarp.devices.type_of`.
         low_memory: see :func:`attnwarp.editing.memory.save_memory`.
-        threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
+        threads: threads of the editor; see :func:`attnwarp.editing.small.thread_count`.
         control: also edit the page's views each alone; None does so with a bundled editor.
         turntable: file of the scene's turn, GIF or MP4.
     """
@@ -129,10 +129,10 @@ def edit_dataset(
         splats: the scene before the edit; None fits them first.
         editor_name: see :func:`attnwarp.editing.small.load_editor`.
         instruction: in words.
-        settings: of the method. Without a size, the editor's own is taken.
+        settings: settings of the method. Without a size, the editor's own is taken.
         out: folder of all results, with a PLY for other viewers too.
-        options: of the edit.
-        fit_plan: of the fit, where splats are None.
+        options: options of the edit.
+        fit_plan: plan of the fit, where splats are None.
         source_picture: file of the source view edited elsewhere, for attention warping.
         report: receives how the work stands.
         own: further options of the method, such as "budget".
@@ -309,7 +309,7 @@ def check_asked(
 
     Args:
         method, instruction, settings, out, options: see :func:`edit_dataset`.
-        budget: of the method.
+        budget: budget of the method.
 
     Raises:
         InputError: no such device, precision or segmenter; a film of another format; an edit of
@@ -365,7 +365,7 @@ def number_of(names: Sequence[str], name: str, left_out: Sequence[str] = ()) -> 
     """The number of a view by its name, its file's name with or without suffix, or its number.
 
     Args:
-        names: of the views.
+        names: names of the views.
         name: as typed.
         left_out: names of views whose picture is missing.
 

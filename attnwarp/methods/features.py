@@ -22,7 +22,7 @@ class Features:
 
     Args:
         editor: the model.
-        settings: see there.
+        settings: settings of the recording.
         store: "device", "cpu", or a folder.
 
     Attributes:

@@ -29,7 +29,7 @@ class Geometry:
 
     Args:
         work: the scene.
-        settings: of its edit.
+        settings: settings of its edit.
         warps: from outside, such as along exact depth; None for those along the splats' depth.
     """
 
@@ -148,8 +148,8 @@ def choose_chain(
     Args:
         views: their number.
         source: number of the first source.
-        count: of sources, the first included; fewer if there are fewer views.
-        coverage: see there.
+        count: number of sources, the first included; fewer if there are fewer views.
+        coverage: share of a cell that its mask must cover.
         seen: (H, W) bool of two views, a source and a target: pixels of the target that the source
             sees, and those that show surface.
 

@@ -95,7 +95,7 @@ def numbers(text: str | None, names: str, option: str) -> tuple[float, ...] | No
 
     Args:
         text: as it was typed, or None.
-        names: of the numbers, "X,Y".
+        names: names of the numbers, "X,Y".
         option: for the error.
 
     Raises:
@@ -161,13 +161,13 @@ def source_mask(
     """(H, W) bool of the source view, as it is marked.
 
     Args:
-        marks: of the source.
-        camera: of the source view.
+        marks: marks of the source.
+        camera: camera of the source view.
         image: (H, W, 3) of it.
         picture: its file.
         size: width and height of the file, px, that coordinates are of.
         out: folder of the edit, which keeps masks by words.
-        device: of a segmenter.
+        device: device of a segmenter.
         report: hears what was found.
 
     Raises:
@@ -193,10 +193,10 @@ def mask_by_words(
 
     Args:
         marks: with ``words``.
-        camera: of the view.
+        camera: camera of the view.
         image: (H, W, 3) of it.
         out: folder of the edit.
-        device: of a segmenter.
+        device: device of a segmenter.
 
     Raises:
         NoDetectionError: the view shows nothing that the words name.
@@ -255,8 +255,8 @@ def read_mask(
     """(H, W) bool of a picture: what is white and opaque.
 
     Args:
-        path: of the mask.
-        camera: of its view.
+        path: path of the mask.
+        camera: camera of its view.
         beside: the view's picture; see :func:`attnwarp.io.read_upright`.
         option: that named it, for errors.
 

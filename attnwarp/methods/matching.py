@@ -79,8 +79,8 @@ class KeyViews:
     """Tokens of the key views at one step, by layer, and how other views take them.
 
     Args:
-        branches: of guidance, in the order of the batch.
-        layers: of self-attention: (h, w) by name.
+        branches: branches of guidance, in the order of the batch.
+        layers: layers of self-attention: (h, w) by name.
         epipolar: distance in cells beyond which a match is excluded; None excludes none.
     """
 
@@ -183,7 +183,7 @@ def key_views(
 
     Args:
         unet: a diffusers UNet.
-        branches: of guidance, in the order of the batch.
+        branches: branches of guidance, in the order of the batch.
         latent_size: (h, w).
         epipolar: see :class:`KeyViews`.
     """

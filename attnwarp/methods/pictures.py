@@ -48,8 +48,8 @@ def check_view_aspect(size: Size, camera: Camera, name: str) -> None:
     Args:
         size: (h, w) of the picture: the view's aspect ratio, or what an editor makes of it by
             rounding its sides to multiples.
-        camera: of the view.
-        name: of the argument.
+        camera: camera of the view.
+        name: name of the argument.
 
     Raises:
         ValueError: another aspect ratio.
@@ -135,7 +135,7 @@ def full_size(
         original: (H, W, 3) in [0, 1].
         edited: (h, w, 3) in [0, 1], of :func:`composite`.
         segment: (H, W) bool or in [0, 1]; None where all is edited.
-        how, blur: of :func:`composite`.
+        how, blur: arguments of :func:`composite`.
     """
     picture = enlarged_change(original, edited)
     if segment is None or how == "none" or edited.shape == original.shape:

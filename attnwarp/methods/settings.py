@@ -35,24 +35,25 @@ class MethodSettings(Settings):
     (:func:`attnwarp.editing.schedule.steps_as_published`).
 
     Args:
-        seed: of everything random.
+        seed: seed of everything random.
         size: longest side in px at which the editor works; None for the cameras' own. Sides are
             rounded to what the editor takes.
-        steps: of denoising.
+        steps: number of steps of denoising.
         noise: "fresh" for each edit, as published, or "shared" by all edits of a run. Shared noise
             comes with one timestep to start from for all views of a round.
         text_guidance: s_T of InstructPix2Pix, or the guidance of a ControlNet; None for the
             editor's own.
         image_guidance: s_I of InstructPix2Pix; None for the editor's own.
-        iterations: of tuning, one view each: in all, or in each stage of attention warping.
+        iterations: iterations of tuning, one view each: in all, or in each stage of attention
+            warping.
         l1, ssim, perceptual, normal, distortion: weights of the losses; that of ssim counts
             1 - SSIM, that of distortion the form "ordered" of
             :func:`attnwarp.losses.depth_distortion`.
         perceptual_encoder: :func:`attnwarp.encoders.load_encoder`'s name of the perceptual loss.
         color_rate: factor of the published learning rates of the colours.
         background: behind the splats while tuning.
-        composite: what stands outside the segments, where they are given: the edit ("none"),
-            "black", or the "original" picture.
+        composite: picture outside the segments, where they are given: the edit ("none"), "black",
+            or the "original" picture.
         composite_blur: sigma in px that the segments are blurred with before compositing.
 
     Raises:
@@ -120,7 +121,7 @@ class AttentionWarpingSettings(MethodSettings):
     Args:
         method: "warp" carries the source's features into each view; "each view alone" edits each
             view by itself, with all else equal: the control.
-        stages: of editing and tuning.
+        stages: stages of editing and tuning.
         views_per_stage: new views that a stage edits. None: an equal share of the views, at most
             40. A stage for which no view is left is dropped.
         fill_last_stage: whether a last stage that is short of views takes some that were edited
@@ -128,22 +129,24 @@ class AttentionWarpingSettings(MethodSettings):
         noise: "shared" by source and targets, pixel by pixel; "fresh" for each view; or "surface":
             a point of the surface has the same noise in every view
             (:mod:`attnwarp.methods.noise`).
-        latents: what a view's edit starts from: "random" ones, or the DDIM "inversion" of its
+        latents: start of a view's edit: "random" ones, or the DDIM "inversion" of its
             ``start_picture``, without guidance, of an editor that is guided by depth. Each view
             then has a start of its own, so ``noise`` stays "shared" and ``start`` None. "by_stage":
             random in the first stage, inversion in those after it.
-        source_prompt: of the inversion: what the scene shows; None for the instruction.
+        source_prompt: prompt of the inversion: what the scene shows; None for the
+            instruction.
         start: (lowest, highest) timestep of Stable Diffusion, of which one is drawn for all views,
             to start from in place of pure noise. On the editor's own schedule it becomes the step
             that leaves as much of the picture
             (:func:`attnwarp.editing.schedule.steps_as_published`).
-        grid: of the steps below ``start``, :data:`attnwarp.editing.schedule.Grid`.
-        start_picture: what is noised to ``start`` or inverted: the "original", the current "render"
-            (IGS2GS), or "by_stage": the original in the first stage, the render after it.
-        suffix: of the instruction.
-        negative_prompt: of a ControlNet's unconditional branch; None for the editor's own.
+        grid: grid of the steps below ``start``, :data:`attnwarp.editing.schedule.Grid`.
+        start_picture: picture that is noised to ``start`` or inverted: the "original", the current
+            "render" (IGS2GS), or "by_stage": the original in the first stage, the render after it.
+        suffix: suffix of the instruction.
+        negative_prompt: negative prompt of a ControlNet's unconditional branch; None for the
+            editor's own.
         text_guidance: s_T of the first stage; None for the editor's own.
-        guidance_drop: what each further stage takes off ``text_guidance``, which may fall to 0 and
+        guidance_drop: decrease of ``text_guidance`` in each further stage, which may fall to 0 and
             not below.
         source_text_guidance: s_T of the source; None for the first stage's.
         batch: target views that go through the network together. Another batch gives other bits.
@@ -163,19 +166,19 @@ class AttentionWarpingSettings(MethodSettings):
             inside, or as a "picture", which is decoded, warped pixel by pixel and encoded again.
             In each step of a view the editor then decodes the view and each source, and encodes
             twice.
-        estimate_margin: what of the source on either side of a depth edge is not warped as its
-            estimate, since pixels there mix near and far; a share of its shorter side, rounded to
-            whole pixels.
+        estimate_margin: margin of the source on either side of a depth edge that is not warped as
+            its estimate, since pixels there mix near and far; a share of its shorter side, rounded
+            to whole pixels.
         depth_from: the model before the edit ("frozen") or as tuned so far ("current").
         a0: weight of the injected features at the first step.
         decay: "linear", a_t = a0 (T - t) / T, or "constant".
-        kinds: of attention, :func:`attnwarp.editing.layers.choose_layers`.
+        kinds: kinds of attention, :func:`attnwarp.editing.layers.choose_layers`.
         feature_steps: (from, until) shares of the steps whose features are recorded and injected.
             The others leave every view its own: [0, 0.5] halves the memory.
         branches: guidance branches that get features. None: text and image of InstructPix2Pix,
             both of a ControlNet.
-        feature_type: of the recorded features. float16 halves their memory and rounds; bfloat16
-            rounds eight times as coarsely and has float32's range.
+        feature_type: type of the recorded features. float16 halves their memory and rounds;
+            bfloat16 rounds eight times as coarsely and has float32's range.
         training: views that a stage tunes on. "all": the source and everything edited so far.
             "stage": the stage's views. "modulo": view ``step % n`` of the stage's n views, but the
             source at every tenth step; of 40 views 4 are then never visited (the released code).
@@ -353,7 +356,7 @@ class IGS2GSSettings(MethodSettings):
     Args:
         every: iterations of tuning after which all views are edited again.
         start: (lowest, highest) timestep, of which each edit draws one to start from.
-        grid: of the steps below it, :data:`attnwarp.editing.schedule.Grid`.
+        grid: grid of the steps below it, :data:`attnwarp.editing.schedule.Grid`.
 
     Example:
         >>> from attnwarp.methods import IGS2GSSettings
@@ -381,7 +384,7 @@ class DGESettings(MethodSettings):
         views: that a round edits; all where there are fewer.
         batch: neighbouring views that share a key view.
         starts: timestep that a round starts from; the last also serves all further rounds.
-        grid: of the steps below it, :data:`attnwarp.editing.schedule.Grid`.
+        grid: grid of the steps below it, :data:`attnwarp.editing.schedule.Grid`.
         plain_below: timestep below which every view has its own attention.
         epipolar: distance in px of the layer from the epipolar line beyond which matches are
             excluded; None excludes none.
@@ -425,10 +428,10 @@ class GaussCtrlSettings(MethodSettings):
         self_share: weight of a view's own keys in the UNet's self-attention; the rest is shared
             equally by the reference views.
         control_share: the same in the ControlNet; None leaves its attention alone.
-        latents: what an edit starts from: the DDIM "inversion" of the render, or "random" ones.
-        source_prompt: of the inversion; None for the instruction.
-        suffix: of the instruction.
-        negative_prompt: of the unconditional branch; None for the editor's own.
+        latents: start of an edit: the DDIM "inversion" of the render, or "random" ones.
+        source_prompt: prompt of the inversion; None for the instruction.
+        suffix: suffix of the instruction.
+        negative_prompt: negative prompt of the unconditional branch; None for the editor's own.
         batch: views that go through the network together, besides the reference views.
 
     Example:
@@ -564,7 +567,7 @@ def preset(method: str, name: str | None = None, /, **changes: Any) -> Any:
 
     Args:
         method: a key of :data:`attnwarp.methods.METHODS`.
-        name: of a preset of that method; its default if left out.
+        name: name of a preset of that method; its default if left out.
         changes: fields of the method's settings; ``warp.NAME`` is a field of its warp.
 
     Raises:

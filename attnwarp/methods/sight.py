@@ -121,11 +121,11 @@ class Sight:
     Args:
         views: the warp from each source, in the order of the sources.
         soft: weigh features by confidence instead of the mask alone.
-        scales: of each source: its edit's pixels per pixel of its photograph, over the same of the
-            target. Features have the edits' resolution, which photographs of several sizes need not
-            differ in. None where all are 1.
-        margins: of each source: px of its depth map on either side of a depth edge whose picture is
-            not taken. None where all are 0.
+        scales: scales of each source: its edit's pixels per pixel of its photograph, over the same
+            of the target. Features have the edits' resolution, which photographs of several sizes
+            need not differ in. None where all are 1.
+        margins: margins of each source: px of its depth map on either side of a depth edge whose
+            picture is not taken. None where all are 0.
         zeros: features of what projects outside a source are zeros, not its border's.
 
     Example:
@@ -210,8 +210,8 @@ class Sight:
         that size, -1 where none does; of equals the first.
 
         Args:
-            size: of the grid.
-            picture: of sources' pictures, which :attr:`margins` keep away from depth edges.
+            size: size of the grid.
+            picture: picture of sources' pictures, which :attr:`margins` keep away from depth edges.
         """
         key = size, picture and self.margins is not None
         if key not in self._choices:
@@ -238,9 +238,9 @@ class SourceWarp:
     :class:`attnwarp.editing.injection.LayerWarp`.
 
     Args:
-        sight: of the target.
-        number: of the source.
-        picture: of its picture, not its features.
+        sight: sight of the target.
+        number: number of the source.
+        picture: picture of its picture, not its features.
     """
 
     sight: Sight
@@ -273,7 +273,7 @@ class ZerosOutside:
     multiplied by the weight of the taps inside.
 
     Args:
-        warp: of the layer.
+        warp: warp of the layer.
     """
 
     warp: FeatureWarp

@@ -61,7 +61,7 @@ def perceptual_net(
 
     Args:
         settings: name it.
-        device: of its network.
+        device: device of its network.
         load: called as :func:`attnwarp.encoders.load_encoder` is.
 
     Raises:
@@ -77,8 +77,8 @@ class TrainingView:
     """A view to tune on.
 
     Attributes:
-        number: of the view.
-        camera: of the size of the picture.
+        number: number of the view.
+        camera: camera of the size of the picture.
         picture: (H, W, 3) in [0, 1].
     """
 
@@ -105,7 +105,7 @@ class DrawnViews(Sequence[TrainingView]):
 
     Args:
         makers: one a view.
-        held_bytes: of pictures that are kept.
+        held_bytes: bytes of pictures that are kept.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class DistanceToViews:
 
     Args:
         perceptual: the distance.
-        kept_bytes: of the pictures' features.
+        kept_bytes: bytes of the pictures' features.
     """
 
     def __init__(self, perceptual: PerceptualLoss, kept_bytes: int = FEATURE_BYTES) -> None:
@@ -169,17 +169,17 @@ class Tuning:
 
     Args:
         start: the splats before the edit.
-        cameras: of all views; they decide the extent.
+        cameras: cameras of all views; they decide the extent.
         settings: losses, rates, background, seed.
         iterations: in all, over which the centres' learning rate falls.
-        backend: of the renderer.
+        backend: name of the renderer.
         membership: (N,) in [0, 1], factor of each splat's steps; None for 1. A splat of 0 keeps its
             bytes.
-        load: of the perceptual distance, see :func:`perceptual_net`.
+        load: load of the perceptual distance, see :func:`perceptual_net`.
 
     Attributes:
         iteration: iterations done, over all rounds.
-        loss: of the last iteration.
+        loss: loss of the last iteration.
         visits: how often each view was tuned on, by its number.
         weights: by the loss that has them, the SHA-256 of its network's.
 
@@ -253,7 +253,7 @@ class Tuning:
         Args:
             begin, end: iterations of the round.
             views: to tune on.
-            order: of the views; None takes each once before any comes again, at random.
+            order: order of the views; None takes each once before any comes again, at random.
             spent: true once no further iteration may begin.
             step: called after each iteration.
         """
@@ -344,7 +344,7 @@ class Tuning:
 
         Args:
             picture: the render.
-            view: what it shall become.
+            view: picture that it shall become.
         """
         s = self.settings
         image = picture.color.float()

@@ -51,7 +51,7 @@ class RecordedSource:
         picture: (h, w, 3) in [0, 1].
         recording: its features; None where every view is edited alone.
         estimates: (C, h, w) clean latents that were predicted at each step.
-        sight: of the sources before; None for the first.
+        sight: sight of the sources before; None for the first.
     """
 
     picture: Image
@@ -110,7 +110,7 @@ class ViewEdits:
 
     Args:
         work: the scene and the editor.
-        settings: see there.
+        settings: settings of the method.
         source: number of the source view.
         by_hand: its edit made elsewhere, or None.
         warps: from outside, or None.
@@ -119,8 +119,8 @@ class ViewEdits:
 
     Attributes:
         sources: numbers of the source views, in the order of editing.
-        features, geometry: what is recorded, and along what it is warped.
-        about, inputs: what the run's manifest says of them.
+        features, geometry: recorded features, and the geometry that they are warped along.
+        about, inputs: entries of the run's manifest.
 
     Raises:
         ValueError: an argument or a setting that does not fit the editor or the views.
@@ -286,8 +286,8 @@ class ViewEdits:
         """Edit views from their start.
 
         Args:
-            start: of the views.
-            sights: of each, for noise and estimates that are carried along.
+            start: start of the views.
+            sights: sights of each, for noise and estimates that are carried along.
             step: called after each step.
 
         Returns:

@@ -37,9 +37,9 @@ class Work:
         scene: cameras, pictures and segments.
         editor: see :mod:`attnwarp.editing`.
         instruction: in words.
-        settings: see there.
-        backend: of the renderer.
-        folder: of the run.
+        settings: settings of the method.
+        backend: name of the renderer.
+        folder: path of the run.
         report: receives how the run stands.
 
     Attributes:
@@ -140,7 +140,7 @@ class Work:
 
         Args:
             lowest: timestep of Stable Diffusion; where it fits, all above it do.
-            field: of the settings, for the error.
+            field: field of the settings, for the error.
         """
         steps = self.settings.steps
         try:

@@ -53,7 +53,7 @@ class Render:
             "reference" has "splats", "pairs" and "contributing"; "gpu" has the first four, which
             it need not wait for.
         camera: the camera, with the pose that was used.
-        depth_mode, backend: what was asked for, and what rendered it.
+        depth_mode, backend: depth mode as requested, and the backend that rendered.
 
     Example:
         A disc that faces the camera: its normals point back at it, and beside it nothing is drawn.

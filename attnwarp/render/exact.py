@@ -40,7 +40,7 @@ def outputs_of(
     """Outputs of a backend.
 
     Args:
-        inputs: what was drawn.
+        inputs: drawn inputs.
         tensors: the pictures, a placeholder for the exact distortion, and the weights.
         counters: amounts of work.
         of_drawn: makes the exact distortion of what the first pass kept.

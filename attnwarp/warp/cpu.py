@@ -44,7 +44,8 @@ def correspond_and_mask(
 
     Args:
         source, target: the cameras.
-        parts: of both surfaces, by :func:`attnwarp.warp.rules.parts_of`; pictures were checked.
+        parts: parts of both surfaces, by :func:`attnwarp.warp.rules.parts_of`; pictures were
+            checked.
         rules: those of the settings.
         settings: the choices.
 

@@ -103,7 +103,7 @@ def lift_masks(
 
     Args:
         gaussians: N splats of kind "2d" or "3d".
-        cameras: of the masked views.
+        cameras: cameras of the masked views.
         masks: (h, w) of each view, bool or floating in [0, 1], of the camera's aspect ratio at any
             size. What none of them marks is outside, so a mask marks all of the thing that its view
             shows.

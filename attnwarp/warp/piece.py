@@ -36,7 +36,7 @@ def piece_around(
 
     Args:
         gaussians: splats of either kind.
-        camera: of the picture.
+        camera: camera of the picture.
         at: x, y in px of it.
         near: near-plane depth, in scene units; a hundredth of the splats' median distance if left
             out.

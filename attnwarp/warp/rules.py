@@ -32,7 +32,7 @@ def in_front(correspondence: Correspondence) -> Tensor:
     """The point lies in front of the source camera (z > 0).
 
     Args:
-        correspondence: of the target's pixels, by :func:`attnwarp.warp.correspond`.
+        correspondence: correspondence of the target's pixels, by :func:`attnwarp.warp.correspond`.
 
     Example:
         >>> import numpy as np
@@ -59,7 +59,7 @@ def opaque(
     """Both images show surface rather than background.
 
     Args:
-        correspondence: of the target's pixels, by :func:`attnwarp.warp.correspond`.
+        correspondence: correspondence of the target's pixels, by :func:`attnwarp.warp.correspond`.
         minimum: smallest alpha that counts.
         target_alpha: (H, W) in [0, 1]; left out, every pixel passes.
         source_alpha: (h, w) in [0, 1], read bilinearly at the source position; left out, every
@@ -97,7 +97,7 @@ def depth_agrees(
     interpolated in 1 / z and taps that straddle an edge rejected.
 
     Args:
-        correspondence: of the target's pixels, by :func:`attnwarp.warp.correspond`.
+        correspondence: correspondence of the target's pixels, by :func:`attnwarp.warp.correspond`.
         source_depth: (h, w) depth along the source's optical axis, NaN where undefined.
         relative: tolerance as a fraction of z, :data:`EXACT_DEPTH_TOLERANCE` for exact depth.
         slope: pixels of the source's depth slope to allow.
@@ -153,7 +153,7 @@ def photometric(
     difference <= ``limit``.
 
     Args:
-        correspondence: of the target's pixels, by :func:`attnwarp.warp.correspond`.
+        correspondence: correspondence of the target's pixels, by :func:`attnwarp.warp.correspond`.
         source_image: (h, w, C), before any edit, sRGB in [0, 1].
         target_image: (H, W, C), likewise.
         limit: the largest difference that passes.
@@ -184,7 +184,7 @@ def facing(correspondence: Correspondence, target_normal: Array) -> Tensor:
     side of the tangent plane.
 
     Args:
-        correspondence: of the target's pixels, by :func:`attnwarp.warp.correspond`.
+        correspondence: correspondence of the target's pixels, by :func:`attnwarp.warp.correspond`.
         target_normal: (H, W, 3) world normals of either sign and any length; zero and NaN are
             undefined.
 
@@ -281,7 +281,7 @@ def gaussian_filter(
     """Mask of the Gaussians that remain when the target's depth is rendered.
 
     Args:
-        gaussians: of the scene.
+        gaussians: gaussians of the scene.
         source, target: the cameras.
         rule: "none" keeps all. "facing" keeps those of which both cameras see the same side,
             "source_incidence" those the source also sees within ``angle`` of the normal.
@@ -434,7 +434,7 @@ class Rule:
     stands in ``attnwarp/warp/_kernels/pair.py``, that is computed in place of the definition.
 
     Args:
-        name: of its mask in :attr:`~attnwarp.warp.view.WarpedView.rules`.
+        name: name of its mask in :attr:`~attnwarp.warp.view.WarpedView.rules`.
         definition: function of the correspondence and, by keyword, of all that is read, to an (H,
             W) bool mask, or to None where the rule has nothing to say.
         setting: field of the settings that turns it on by True, a number, or the rule's name; None
@@ -445,7 +445,7 @@ class Rule:
         limits: field of the settings for each further keyword.
         margin: function of the same arguments to the (H, W) distance from the other verdict,
             positive where the rule passes and NaN where that is undefined; None without one.
-        unit: of the margin.
+        unit: unit of the margin.
 
     Example:
         >>> import numpy as np

@@ -139,7 +139,7 @@ def taps_at(
 
     Args:
         size: (h, w) of that image.
-        dtype: of the weights, which are worked out in float64.
+        dtype: dtype of the weights, which are worked out in float64.
         device: where the taps shall lie.
     """
     h, w = size
@@ -152,7 +152,7 @@ def sample_maps(maps: Tensor, taps: Taps) -> Tensor:
 
     Args:
         maps: (..., h*w) floating.
-        taps: of N positions, with weights of :func:`work_type`, on the maps' device.
+        taps: taps of N positions, with weights of :func:`work_type`, on the maps' device.
     """
     total = torch.zeros((), dtype=taps.weight.dtype, device=maps.device)
     # Converted before it is read: the gradient sums what reads a pixel in this type too, and is

@@ -57,8 +57,8 @@ class WarpSettings(Settings):
             peak along the ray for a 3D one) or "center" (the z of the splat's centre, as in
             gsplat).
         depth_statistic: "expected" or "median" depth along the ray.
-        undefined_depth: what stands where the render has no depth: "none", or the view's largest
-            depth ("farthest").
+        undefined_depth: value where the render has no depth: "none", or the view's largest depth
+            ("farthest").
         depth_interpolation: how depth reaches the centres of a feature grid, see
             :func:`attnwarp.warp.resize_depth`.
         depth_spread: taps that differ by more than this fraction are not blended; None blends

@@ -41,7 +41,7 @@ class WarpedView:
 
     Args:
         settings: the choices it was made with.
-        correspondence: of the H x W target image.
+        correspondence: correspondence of the H x W target image.
         mask: (H, W) bool, all rules together.
         rules: each rule's own (H, W) mask, by name, in the order they were applied. ``defined`` is
             always among them.
@@ -165,11 +165,11 @@ def warp_surfaces(
 
     Args:
         source, target: the cameras.
-        target_surface: what the target sees; its normals are needed by the normal tests, its image
-            by the photometric. The rule ``opaque`` takes a view without alpha, target or source,
-            for opaque everywhere.
-        source_surface: what the source sees; needed by depth agreement (depth) and the photometric
-            test (image).
+        target_surface: surface that the target sees; its normals are needed by the normal tests,
+            its image by the photometric. The rule ``opaque`` takes a view without alpha, target or
+            source, for opaque everywhere.
+        source_surface: surface that the source sees; needed by depth agreement (depth) and the
+            photometric test (image).
         settings: which rules, and how. ``gaussian_filter``, ``depth`` and ``depth_statistic``
             concern the rendering of the surfaces and play no part here.
         target_segment: (H, W) bool, the part of the target that is edited; for settings with
@@ -278,8 +278,8 @@ def warp_view(
         source_surface: the source's render if it is at hand, :func:`render_surface`; one source
             serves many targets.
         near: as in :func:`render_surface`.
-        backend: of the renderer, as in :func:`attnwarp.render.render`.
-        warp_backend, warn_empty: of the warp, as in :func:`warp_surfaces`.
+        backend: name of the renderer, as in :func:`attnwarp.render.render`.
+        warp_backend, warn_empty: arguments of the warp, as in :func:`warp_surfaces`.
 
     Raises:
         ValueError, TypeError: as in :func:`warp_surfaces`.
@@ -343,12 +343,12 @@ def render_surface(
 
     Args:
         gaussians: to render.
-        camera: whose view is rendered; (H, W) is its size.
+        camera: camera of the rendered view; (H, W) is its size.
         settings: their ``depth``, ``depth_statistic`` and ``undefined_depth`` choose the depth. 3D
             splats have "peak" depth in place of "intersection".
         near: nothing nearer than this depth is seen, in scene units; a hundredth of the splats'
             median distance if left out.
-        backend: of :func:`attnwarp.render.render`.
+        backend: name of :func:`attnwarp.render.render`.
 
     Returns:
         A surface of (H, W) tensors without gradients, on the CPU.

@@ -13,7 +13,8 @@ def to_srgb(linear: npt.ArrayLike) -> npt.NDArray[Any]:
     """Linear values to sRGB-encoded ones in [0, 1], by IEC 61966-2-1.
 
     Args:
-        linear: of any shape; values outside [0, 1] are clipped. A float dtype stays the same.
+        linear: linear of any shape; values outside [0, 1] are clipped. A float dtype stays the
+            same.
 
     Example:
         >>> [round(float(value), 4) for value in to_srgb([0.0, 0.2140411, 1.0, 2.0])]

@@ -143,7 +143,7 @@ def in_turn(
     Args:
         contestants: at least one; called with the number of the round, from 1.
         rounds: how many are kept.
-        seed: of the order.
+        seed: seed of the order.
         before: called, untimed, with the index of the contestant that comes next.
 
     >>> turns = in_turn([lambda turn: "a", lambda turn: "b"], rounds=3)
@@ -220,7 +220,7 @@ def count_plugin(module: str, file: Path) -> None:
 
     Args:
         module: its name.
-        file: of the module; of a package all files count.
+        file: file of the module; of a package all files count.
     """
     whole = file.name == "__init__.py"
     _plugins[module] = _hash_of(file.parent, file.parent.rglob("*.py") if whole else [file])

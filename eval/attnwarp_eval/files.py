@@ -40,7 +40,7 @@ def write_picture(path: Path, image: npt.ArrayLike, **jpeg: Any) -> Path:
     """Write a picture atomically, as PNG or JPEG by its name's suffix; return ``path``.
 
     Args:
-        path: of the file; missing folders are made.
+        path: path of the file; missing folders are made.
         image: see :func:`attnwarp.io.picture.encode_picture`.
         jpeg: its ``quality`` and ``chroma``.
     """

@@ -56,7 +56,7 @@ class TwoView:
 
     Attributes:
         source, target: the cameras.
-        hits: what the target's pixels show.
+        hits: hits of the target's pixels.
         xy: (H, W, 2) float64 source pixel coordinates of the same surface point; NaN where there is
             no surface or it is not in front of the source camera.
         z_source: (H, W) float64 depth of the point in the source camera, of either sign; NaN where

@@ -35,10 +35,10 @@ class World:
 
     Args:
         scene: as it was loaded.
-        size: of the images, in pixels; the study's.
+        size: size of the images, in pixels; the study's.
 
     Attributes:
-        content_hash: of the scene's file, which a cell's spec names.
+        content_hash: hash of the scene's file, which a cell's spec names.
         source: the source camera.
         targets: the target cameras by name.
         signed_yaw: degrees from the source in [-180, 180), by the target's name.
@@ -171,8 +171,8 @@ def splats(scene: str, size: int, seed: int, **settings: Any) -> Gaussians:
     """Gaussians on a scene's surfaces; the last few are cached here, all of them on disk.
 
     Args:
-        scene, size: of the :func:`world`.
-        seed: of their places and their noise.
+        scene, size: arguments of the :func:`world`.
+        seed: seed of their places and their noise.
         settings: kind, count, position_noise and normal_noise of
             :func:`attnwarp_eval.splats.surface.surface_splats`.
     """

@@ -21,7 +21,7 @@ class Entry:
         stage: name of the checkpoint.
         epoch: how many epochs have ended.
         steps: how many steps they had in all; None where the recipe does not count them.
-        seconds: of all of them, and of what came before the first.
+        seconds: seconds of all of them, and of what came before the first.
         losses: their means in this epoch, by name.
     """
 

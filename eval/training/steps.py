@@ -39,8 +39,8 @@ class Task:
     """One kind of step.
 
     Attributes:
-        share: of the steps.
-        count: of rows in a minibatch.
+        share: share of the steps.
+        count: number of rows in a minibatch.
         draw: (rows, generator) -> inputs, each with one row a pair.
         loss: inputs -> the loss, and what to print of it.
     """
@@ -85,7 +85,7 @@ def train_steps(
         net: on the device.
         plan: how many steps, at which rate, from which seed.
         checkpoint: written as it goes.
-        recipe: what the result depends on, see :class:`training.common.Run`.
+        recipe: inputs that decide the result, see :class:`training.common.Run`.
         spent: seconds that went before the first step.
     """
     recipe = {**recipe, "device": device.type}  # optimizers of a CPU and of a GPU hold other states

@@ -6,7 +6,7 @@ def ball_scene(title, radius, colors, cameras, edits, *, objects=()):
 
     Args:
         title: in words.
-        radius: of the ball, which lies on the ground at the origin.
+        radius: radius of the ball, which lies on the ground at the origin.
         colors: two, of its squares.
         cameras: entries besides the field of view and the size, 32 x 32 px; ``targets`` as yaws.
         edits: as a scene's file has them.

@@ -29,10 +29,10 @@ def record(views, *, spec=None, environment=ENVIRONMENT, cost=None, **extra):
 
     Args:
         views: (name, yaw, figures) each.
-        spec: of the cell.
+        spec: spec of the cell.
         environment: where it was computed.
         cost: entries of the cost that matter.
-        extra: what only the probe's records hold.
+        extra: entries that only the probe's records hold.
     """
     return {
         "id": "",

@@ -65,9 +65,9 @@ def show_edit(
     """Write the page of a finished edit, ``index.html``, from its folder's files.
 
     Args:
-        folder: of the edit, by any method.
+        folder: path of the edit, by any method.
         before: the splats before the edit.
-        cameras: of the views.
+        cameras: cameras of the views.
         images: (H, W, 3) photograph of each view, sRGB, uint8, uint16 or floating in [0, 1].
         editor: edits the page's views each alone, as the control; None for no control.
         turntable: file of the orbit as a film, GIF or MP4; None for none.

@@ -39,7 +39,7 @@ def edited_alone(
     """Edit views each alone, with noise of its own and all else equal, into a run's folder.
 
     Args:
-        folder: of the run that this is the control of.
+        folder: path of the run that this is the control of.
         gaussians, scene, editor: before the edit, and what edits.
         views: their numbers; those that the folder has are kept.
         report: receives each view.
@@ -71,7 +71,7 @@ def disagreement(
 
     Args:
         gaussians: the scene before the edit.
-        cameras: of the views, at the size of their pictures.
+        cameras: cameras of the views, at the size of their pictures.
         pictures: (H, W, 3) uint8 of each view, by what they show.
         segments: (H, W) bool of each view: pixels of others do not count.
 

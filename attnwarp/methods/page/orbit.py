@@ -78,7 +78,7 @@ def orbit(cameras: Sequence[Camera], points: Array, *, first: int = 0) -> list[C
     from one side.
 
     Args:
-        cameras: of the capture; height and distance follow those nearby.
+        cameras: cameras of the capture; height and distance follow those nearby.
         points: (N, 3) of the scene.
         first: number of the camera that a full turn begins beside.
 

@@ -124,7 +124,7 @@ def disagreement_backward(begin, end, lens, rotation, share, maps, d_alpha, d_no
 
     Args:
         share: float32.
-        d_alpha, d_normal: of the maps' shapes.
+        d_alpha, d_normal: gradients of the maps' shapes.
         to_neighbors: (4, H, W) float32, each pixel's gradients in its neighbours' depths.
     """
     height, width = maps.depth.shape

@@ -177,7 +177,7 @@ def evaluate(work, row, linear, x, y, screen_x, screen_y, discs, by_center):
     for.
 
     Args:
-        row: of ``work``, where the splat's row begins; see :func:`lay_out`.
+        row: row of ``work``, where the splat's row begins; see :func:`lay_out`.
         linear: where its linear terms begin; see :func:`move_to_quarter`.
         x, y: Lanes, pixels from the middle of the quarter.
         screen_x, screen_y: the same times the root of 2.

@@ -452,7 +452,7 @@ def rules_of_pair(begin, end, pair, rows, limits, target, source, positions, pas
         rows: the row of ``passes`` for each of :data:`RULES`, -1 for a rule that is off.
         limits: a tuple of floats for each.
         target, source: a :class:`View` each.
-        positions: of the target's size.
+        positions: positions of the target's size.
         passes: (R, H, W) bool, a row for each rule: defined, in_bounds, then those of ``rows``.
         mask: (H, W) bool, all rules together.
     """

@@ -36,11 +36,11 @@ class Check:
     """One thing about the machine.
 
     Attributes:
-        name: of the thing.
+        name: name of the thing.
         state: "lack": everything runs without it, at a cost; "broken": something needed fails.
-        text: what there is.
-        cost: what the lack costs, or what fails.
-        remedy: what to do about it.
+        text: finding.
+        cost: cost of the lack, or the part that fails.
+        remedy: remedy.
     """
 
     name: str

@@ -54,7 +54,7 @@ def resumable(state: Callable[[], str]) -> Iterator[None]:
     """Turn Ctrl-C, a polite kill or the terminal's end into one clear line and exit code 130.
 
     Args:
-        state: what is finished and stays, such as "3 cells are kept"; asked after the interrupt.
+        state: finished work that stays, such as "3 cells are kept"; asked after the interrupt.
     """
     try:
         with stops_interrupt():

@@ -81,7 +81,7 @@ def read_baseline(path: Path) -> Snapshot:
     """Read a baseline's file.
 
     Args:
-        path: of the JSON lines that ``compare --update`` wrote.
+        path: path of the JSON lines that ``compare --update`` wrote.
 
     Raises:
         BaselineError: it is not a baseline, or was changed since it was written.

@@ -47,8 +47,8 @@ class Fault:
         kind: ``missing``: the baseline has it and the run lacks it; ``unmeasured``: scenes,
             variants, probes or seeds of which the run has nothing; ``redefined``: the cell
             computes something else; ``counter``: its work is another.
-        name: of the cell, metric or view.
-        detail: what was expected and what came.
+        name: name of the cell, metric or view.
+        detail: expected value and the value that came.
     """
 
     kind: FaultKind
@@ -61,12 +61,13 @@ class Row:
     """The verdict on one metric of one variant over all scenes and views.
 
     Attributes:
-        probe, variant, metric: what it is of.
+        probe, variant, metric: probe, variant and metric.
         verdict: "equal" only where the margin shows it.
         baseline, run: means over scenes of the means over the views that both sides define.
         difference: run - baseline, paired on scene and view; of absolute values where a figure is
             best at 0.
-        adjusted_p: of the difference, for all tests of the comparison; NaN where none was made.
+        adjusted_p: p-value of the difference, for all tests of the comparison; NaN where none was
+            made.
         worst: the view that got worse most (``scene/view/seed``), with its two values.
         undefined: views whose value was defined in the baseline only, in whatever seed.
         beyond_margin: views of the same seed that got worse by more than the metric's margin; one
@@ -95,10 +96,11 @@ class Comparison:
         exact: whether both sides have the same seeds, so that views are compared one by one.
         scenes: how many the figure with most of them was compared on; hard cases are none.
         rows: one a (probe, variant, metric) that both sides have.
-        faults: what fails without a figure.
-        added: what only the run has; it passes until ``--update`` takes it into the baseline.
+        faults: failures without a figure.
+        added: figures that only the run has; they pass until ``--update`` takes it into the
+            baseline.
         unread: probes that both sides have cells of, with figures none of which was compared.
-        left_out: what one side alone has and a comparison of what both have passed over.
+        left_out: figures of one side alone, which a comparison of common figures left out.
     """
 
     study: str
@@ -147,8 +149,8 @@ def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparis
     """Compare a run with a baseline over the union of their cells, metrics and views.
 
     Args:
-        baseline: what is trusted.
-        run: what is judged.
+        baseline: trusted figures.
+        run: judged figures.
         common: whether to compare what both have alone, seeds included. The rest is then no fault,
             and stands in ``left_out``.
 

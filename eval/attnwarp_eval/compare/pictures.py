@@ -24,11 +24,11 @@ class Change:
     """A view whose figures changed, and its pictures on both sides.
 
     Attributes:
-        scene, probe, variant, view: of the figures.
-        metric: whose value moved by the most margins.
+        scene, probe, variant, view: scene, probe, variant and view of the figures.
+        metric: metric with the value that moved by the most margins.
         before, now: its values.
         margins: by how many; infinite where only one side is defined.
-        pictures: what is shown -> the files of the baseline and of the run.
+        pictures: content -> the files of the baseline and of the run.
     """
 
     scene: str
@@ -76,7 +76,7 @@ def write_pictures(baseline: Path, pictures: Pictures) -> None:
     Those are removed when all of the new ones are there.
 
     Args:
-        pictures: of the run that it was written from.
+        pictures: pictures of the run that it was written from.
     """
     folder = folder_of(baseline)
     new, former = folder.with_suffix(".pictures-new"), folder.with_suffix(".pictures-former")

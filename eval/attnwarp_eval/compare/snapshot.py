@@ -26,7 +26,7 @@ class Figure:
     """One gated metric of one cell.
 
     Attributes:
-        version: of the metric.
+        version: version of the metric.
         values: by view, to nine significant digits; NaN where undefined.
     """
 
@@ -39,10 +39,10 @@ class Measured:
     """One measured cell.
 
     Attributes:
-        scene, probe, seed: of the cell.
+        scene, probe, seed: scene, probe and seed of the cell.
         variants: every name that the study gives to its content.
         definition: hash of all that decides its figures but the seed.
-        counters: of work.
+        counters: counts of work.
         figures: gated metrics by key.
 
     A cell whose figures depend on the machine has neither counters nor figures.

@@ -42,8 +42,9 @@ def drawing(
     random ids.
 
     Args:
-        path: of the SVG.
-        height, width: of the whole figure, in inches; 5.4 a column if ``width`` is left out.
+        path: path of the SVG.
+        height, width: height and width of the whole figure, in inches; 5.4 a column if ``width`` is
+            left out.
 
     Example:
         >>> from pathlib import Path

@@ -74,7 +74,7 @@ def spread(value: Interval, scenes: int | None = None) -> str:
 
     Args:
         value: the interval.
-        scenes: of the study; where fewer were measured, the text says how many.
+        scenes: scenes of the study; where fewer were measured, the text says how many.
 
     Example:
         >>> from attnwarp_eval.statistics.intervals import interval

@@ -227,7 +227,7 @@ def templates(package: str, *, autoescape: bool) -> Environment:
     """The templates that lie beside a package's modules; a name without a value is an error.
 
     Args:
-        package: whose folder has them.
+        package: package that has them in its folder.
         autoescape: whether values are text of HTML rather than of Markdown.
 
     Example:
@@ -284,7 +284,7 @@ def write_files(report: Report, folder: Path, name: str) -> list[Path]:
 
     Args:
         report: its pictures and figures lie below ``folder``.
-        name: of the files, without a suffix.
+        name: name of the files, without a suffix.
 
     Example:
         >>> from pathlib import Path

@@ -118,7 +118,7 @@ def measured(scene: Scene, groups: Mapping[str, str], *, size: int = 96) -> dict
     Args:
         scene: with a target ``yaw060``.
         groups: by an object's name, what it belongs to: "thing 0" and so on, "fence", "around".
-        size: of the views that are cast, px.
+        size: size of the views that are cast, px.
     """
     small = scene.with_size(size, size)
     geometry = Geometry(small)

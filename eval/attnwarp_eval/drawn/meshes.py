@@ -52,7 +52,7 @@ def draw_meshes(
     Args:
         number, seed, axes: as for :func:`~attnwarp_eval.drawn.scenes.draw`; there are two or three
             things, whatever the axis says.
-        files: of :func:`mesh_files`.
+        files: files of :func:`mesh_files`.
         up: upright axis of all files; that of their format if left out.
 
     Raises:

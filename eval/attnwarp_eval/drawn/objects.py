@@ -455,7 +455,7 @@ def body(word: str, instance: int, *, plain: bool = False, resolution: int = 64)
         word: a key of :data:`RECIPES`.
         instance: the same number gives the same shape.
         plain: without the details' own colours, as a statue is.
-        resolution: of the lattice that the body is meshed on.
+        resolution: resolution of the lattice that the body is meshed on.
     """
     rng = np.random.default_rng([instance, *word.encode()])
     parts = RECIPES[word](Dice(rng))

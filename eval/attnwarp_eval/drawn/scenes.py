@@ -81,8 +81,8 @@ def draw(number: int, seed: int, axes: Mapping[str, float] | None = None) -> Dra
     """Draw the scene of a number and a seed.
 
     Args:
-        number: of the scene, from 0.
-        seed: of the population.
+        number: number of the scene, from 0.
+        seed: seed of the population.
         axes: places on axes that are fixed; the others are drawn.
 
     Example:

@@ -32,7 +32,7 @@ class Finding:
         simulated: whether pictures show it.
         source: "detected", "pinned", "said" (the scene's own cap on bounces leaves it out) or
             "absent".
-        evidence: what in the file, in Mitsuba's graph and in the loaded scene says so.
+        evidence: signs in the file, in Mitsuba's graph and in the loaded scene.
 
     Example:
         >>> finding = Finding(True, True, "detected", ("lights[0] is a sun",))

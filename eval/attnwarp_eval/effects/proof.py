@@ -83,7 +83,8 @@ class Level:
         name: "pixel", "block" or "picture".
         tests: how many values were compared.
         least: the smallest p.
-        threshold: what p must stay above, after Sidak over the values and over the three levels.
+        threshold: bound that p must stay above, after Sidak over the values and over the three
+            levels.
         worst: the largest difference in standard errors, as a share of the picture's mean.
         detectable: the difference, as a share of the picture's mean, that a value of median noise
             would have been detected with a power of 80 %.
@@ -234,11 +235,11 @@ def prove(
     """Hold ``ours`` (the scene's own plan if left out) against a rendering with everything on.
 
     Args:
-        size: of the square picture of the source view.
+        size: size of the square picture of the source view.
         seeds: pictures a side for the last rung, at least 10.
-        seconds: what rendering may take. Samples a pixel are chosen from a few trial pictures so
-            that the equivalence test can succeed, if that fits; if it does not, the verdict is
-            "can't tell".
+        seconds: seconds that rendering may take. Samples a pixel are chosen from a few trial
+            pictures so that the equivalence test can succeed, if that fits; if it does not, the
+            verdict is "can't tell".
         seed: the first of those used.
         structure: without it the first rung is left out, so that the statistics stand alone (to
             test them).
@@ -330,7 +331,7 @@ def climb(
 
     Args:
         pictures: renders stacks of a side; see :data:`Pictures`.
-        seeds: of each side in Welch's test.
+        seeds: seeds of each side in Welch's test.
         seconds: that Welch's pictures may take; fewer samples a pixel are the consequence.
         seed: the first; the rungs take the next ones.
         alpha: chance that two equal sides are refused.

@@ -31,7 +31,8 @@ class Cap:
         bias: mean light of the plan's pictures over that of everything on without a cap, less 1.
         bias_interval: its 95 %, by Welch's test on the logarithms of the rounds' means; both None
             for a black picture.
-        seconds, variance: of everything on within the cap, as :class:`Cost` has them.
+        seconds, variance: seconds and variance of everything on within the cap, as :class:`Cost`
+            has them.
         faster: how many times longer it takes for the same samples.
         at_equal_error: how many times longer for the same noise, which is the same error, since its
             pictures have the plan's mean; infinite where the plan has no noise.
@@ -62,7 +63,7 @@ class Cost:
     equal error there, and ``cap`` says what is.
 
     Attributes:
-        size, spp: of the measurement.
+        size, spp: size in px and samples a pixel of the measurement.
         seconds: (plan, everything on) medians.
         faster: how many times longer everything on takes for the same samples: the median over
             rounds, in each of which both were rendered one after the other.
@@ -122,8 +123,8 @@ def measure(
     plan says.
 
     Args:
-        size, spp: of the picture; if left out as large as needed for tracing, not starting, to take
-            most of the time.
+        size, spp: size in px and samples a pixel of the picture; if left out as large as needed for
+            tracing, not starting, to take most of the time.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene

@@ -50,7 +50,7 @@ class Settings:
     Attributes:
         prove: climb the ladder of :mod:`attnwarp_eval.effects.proof`.
         budget: seconds that a proof may render.
-        rounds: of the timing against everything on; 0 for none.
+        rounds: number of rounds of the timing against everything on; 0 for none.
         pictures: whether plan, everything on and their difference are drawn.
     """
 

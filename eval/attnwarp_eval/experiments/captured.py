@@ -71,10 +71,10 @@ class Words:
 
     Attributes:
         instruction: for editors that are told what to change.
-        target: what the edited scene shows, for editors guided by depth and for CLIP; None: depth
-            editors get the instruction, and CLIP's figures are left out.
-        source: what the scene showed before, for CLIP's direction and for methods that invert with
-            it; None leaves both out.
+        target: description of the edited scene, for editors guided by depth and for CLIP; None:
+            depth editors get the instruction, and CLIP's figures are left out.
+        source: description of the scene before, for CLIP's direction and for methods that invert
+            with it; None leaves both out.
     """
 
     instruction: str
@@ -167,7 +167,7 @@ def compare(
         views: pictures and cameras, the source first.
         splats: the scene before the edit.
         out: folder of ``captured.json``, ``.md`` and ``.html``, and of a folder for each variant.
-        editors: what edits single views.
+        editors: editors of single views.
 
     Raises:
         InputError: no variant that can run without truth, or one whose folder holds another run;

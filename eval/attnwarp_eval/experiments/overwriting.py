@@ -22,7 +22,7 @@ def check_nothing_is_lost(
     would be others, so none of them is overwritten.
 
     Args:
-        path: of the table's JSON, in the run's folder; there may be none yet.
+        path: path of the table's JSON, in the run's folder; there may be none yet.
         table: the key of the list of rows; None where the list is all there is.
         fields: the keys of a row that name it.
         available: the rows that the call makes.

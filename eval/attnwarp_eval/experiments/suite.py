@@ -67,7 +67,8 @@ def measure(
         names: scenes' names or paths.
         views: the source and the targets that come first in the file, fewer where a scene has
             fewer.
-        geometry_size, size: of the square images of depth and ids, and of the pictures.
+        geometry_size, size: sizes of the square images of depth and ids, and of
+            the pictures.
 
     Raises:
         InputError: a scene that cannot be used, or two scenes of one name.

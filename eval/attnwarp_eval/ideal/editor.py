@@ -80,9 +80,9 @@ class IdealUNet(torch.nn.Module):
     """The network: its layers have the names of a diffusers UNet's.
 
     Args:
-        views: of one size, with the same number of answers.
+        views: views of one size, with the same number of answers.
         alphas: (N,) alpha-bar of the steps.
-        cross: what cross-attention gives, "paint" or "word".
+        cross: output of cross-attention, "paint" or "word".
     """
 
     before: Tensor
@@ -141,7 +141,7 @@ class IdealUNet(torch.nn.Module):
 
         Args:
             sample: (B, C, h, w) at the step.
-            timestep: of the schedule.
+            timestep: timestep of the schedule.
             views: number of each row's view.
 
         Returns:
@@ -168,7 +168,7 @@ class IdealUNet(torch.nn.Module):
 
         Args:
             x: (B, n, C) noisy tokens.
-            timestep: of the schedule.
+            timestep: timestep of the schedule.
             views: number of each row's view.
         """
         a = self.alphas[timestep].to(x)
@@ -250,8 +250,8 @@ class IdealEditor:
 
     Args:
         views: by name.
-        share: of the schedule's signal, see :func:`schedule`.
-        cross: what cross-attention gives.
+        share: share of the schedule's signal, see :func:`schedule`.
+        cross: output of cross-attention.
     """
 
     guide: Guide = "picture"
@@ -310,7 +310,7 @@ class IdealTask:
     """An edit of some views.
 
     Attributes:
-        editor: whose network runs.
+        editor: editor with the network.
         views: their numbers.
     """
 

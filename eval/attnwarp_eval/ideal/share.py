@@ -46,7 +46,7 @@ class Alone:
 
     Attributes:
         settled: mean over views and parts of the share of steps before the final answer holds.
-        frequencies: of each answer.
+        frequencies: frequency of each answer.
         agreement: share of (view, part) with the first view's answer, among parts of both.
     """
 
@@ -109,9 +109,9 @@ def edit_alone(grams: Grams, start: Tensor, share: float, steps: int) -> Tensor:
     """(T, N, R, K) posterior weights at each step of views that are edited alone.
 
     Args:
-        grams: of the parts.
+        grams: Gram matrices of the parts.
         start: (N, R, K) <noise, D_k> of each part and draw.
-        share: of signal.
+        share: share of signal.
         steps: T.
     """
     alphas, G, y = schedule(share).alphas.double(), grams.matrices, start.double()
@@ -158,10 +158,10 @@ def alone(grams: Grams, share: float, steps: int, seed: int = 1) -> Alone:
     """Edit views alone, each with fresh noise.
 
     Args:
-        grams: of the parts; the first view is what others agree with.
-        share: of signal.
-        steps: of denoising.
-        seed: of the noise.
+        grams: Gram matrices of the parts; the first view is what others agree with.
+        share: share of signal.
+        steps: number of steps of denoising.
+        seed: seed of the noise.
     """
     weights = edit_alone(grams, _starts(grams, seed), share, steps)
     answers = weights[-1].argmax(dim=-1).numpy()
@@ -184,10 +184,10 @@ def solve_share(grams: Grams, settled: float, steps: int) -> float:
     """Share of signal at which answers settle after a share of the steps.
 
     Args:
-        grams: of the parts.
+        grams: Gram matrices of the parts.
         settled: in (0, 1): mean over views and parts of the share of steps before the final answer
             holds.
-        steps: of denoising.
+        steps: number of steps of denoising.
 
     Raises:
         ValueError: answers cannot settle then; the message has the range.

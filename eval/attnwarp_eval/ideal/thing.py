@@ -26,7 +26,7 @@ def labels_of(
     """(H, W) part of each pixel by the view's name, -1 outside the thing.
 
     Args:
-        cameras: of the views, whose surface points are pooled.
+        cameras: cameras of the views, whose surface points are pooled.
         objects: names of what the thing is made of.
 
     Raises:

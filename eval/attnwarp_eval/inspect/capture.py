@@ -114,7 +114,7 @@ class Edit:
         instruction: in words.
         source: name of the source view.
         views: names of the edited target views.
-        settings: of its warp.
+        settings: settings of its warp.
         steps: "before", the stages, and "edited" once it is done.
     """
 
@@ -172,7 +172,7 @@ def read_edit(path: Path, names: Sequence[str]) -> Edit:
     """The edit in a folder.
 
     Args:
-        names: of the data set's views, without suffix.
+        names: names of the data set's views, without suffix.
 
     Raises:
         InputError: the manifest is damaged, or the edit is of another data set.

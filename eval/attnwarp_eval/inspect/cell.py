@@ -21,7 +21,7 @@ class Tap:
     """A source cell that is read.
 
     Attributes:
-        column, row: of the cell in the source's grid.
+        column, row: column and row of the cell in the source's grid.
         weight: its share of the warped feature, in [0, 1].
         point: (3,) surface point that the source sees at the cell's centre; NaN where none.
 
@@ -41,19 +41,19 @@ class CellReport:
     """Report on a cell of the target's feature grid.
 
     Attributes:
-        column, row: of the cell.
+        column, row: column and row of the cell.
         size: (h, w) of the target's grid.
         depth: at the cell's centre, along the target's axis; NaN where taps straddle an edge.
         point: (3,) surface point in the world; NaN without a depth.
         xy: (2,) position in the source's grid, in cells.
         z: depth of the point in the source camera.
         inside: the position lies inside the source's image.
-        share: of the image-size mask inside the cell; above one half counts.
+        share: share of the image-size mask inside the cell; above one half counts.
         accepted: the cell gets features of the source.
         taps: the source cells that are read, with their weights.
-        label: of the truth on this grid, "" without truth.
+        label: label of the truth on this grid, "" without truth.
         true_xy: (2,) exact position in cells; NaN without truth.
-        token: what becomes of its label, in words; "" where no run has labels.
+        token: fate of its label, in words; "" where no run has labels.
 
     Example:
         >>> from attnwarp.warp import PRESETS

@@ -21,7 +21,7 @@ def inspect_command(
     Args:
         scene, variant, view: as the run names them.
         seed: one of the run's; its first if None.
-        color: what the surface is coloured by; the command's own choice if None.
+        color: quantity that colours the surface; the command's own choice if None.
         pixel: COLUMN,ROW of a target pixel to explain.
 
     Example:

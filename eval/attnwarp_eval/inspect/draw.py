@@ -74,7 +74,7 @@ def outside(
     """Position, focal point and upward axis of a view of the scene and of two cameras.
 
     Args:
-        subject: whose centre is in view.
+        subject: subject with the centre of the view.
         cameras: source and target; their frusta are wholly in view, above the sliders.
         aspect: width by height of the view, which is :data:`VIEW_ANGLE` degrees high.
     """

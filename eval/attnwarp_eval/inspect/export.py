@@ -54,7 +54,7 @@ def write_export(path: Path, subject: Subject, state: State, picked: Any = None)
     Args:
         path: ends in .html (a page that needs no network), .glb (coloured surface, frusta with
             their pictures, splats, rays) or .vtp (the surface with every number of its pixels).
-        subject, state: what is shown.
+        subject, state: subject, and the state that is shown.
         picked: the report of a picked pixel or cell, or None.
 
     Raises:
@@ -275,8 +275,8 @@ def page(parts: Sequence[Part], subject: Subject, pair: Pair, title: str, legend
     """An HTML page with the parts and a viewer in it, which works without a network.
 
     Args:
-        subject, pair: whose cameras are in view.
-        title: of the page, and of what it shows.
+        subject, pair: subject and pair with the cameras in view.
+        title: title of the page, and of what it shows.
         legend: (text, "#rrggbb") of what the colours mean.
     """
     with optional_imports():

@@ -35,7 +35,7 @@ class Parts:
     """Parts of a scene's thing, as the probe ``labels`` of a study tells them apart.
 
     Attributes:
-        world: of the scene.
+        world: world of the scene.
         views: names of the views whose surface points are pooled, the source among them.
         objects: names of what the thing is made of.
         count: number of parts.

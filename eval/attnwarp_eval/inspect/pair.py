@@ -402,7 +402,7 @@ class Pair:
         Args:
             coloring: one of :attr:`colorings`.
             layer: (h, w) of a feature grid, whose mask "mask" and whose tokens "labels" then show.
-            step: of the edit, whose scene "picture" then shows.
+            step: step of the edit, whose scene "picture" then shows.
         """
         if coloring not in self.colorings:
             raise ValueError(
@@ -496,7 +496,7 @@ class Pair:
 
         Args:
             layer: (h, w) of a feature grid: what is warped then has its cells.
-            step: of the edit.
+            step: step of the edit.
         """
         source, target = self.images
         parts = {"source": source, "target": target}

@@ -21,10 +21,10 @@ class Verdict:
 
     Attributes:
         rule: its name.
-        passed: what the rule says.
+        passed: verdict of the rule.
         margin: how far the pixel is from the other verdict, positive where it passes; NaN where
             the quantity is undefined.
-        unit: of the margin.
+        unit: unit of the margin.
 
     Example:
         >>> Verdict("in_front", passed=False, margin=-0.2, unit="scene units").passed
@@ -65,13 +65,13 @@ class PixelReport:
     """Report on a target pixel.
 
     Attributes:
-        column, row: of the pixel.
+        column, row: column and row of the pixel.
         point: (3,) surface point in the world; NaN without a surface.
         depths: z along the target's axis, by definition.
         xy: (2,) source pixel coordinates of the warp.
         z: depth of the warp's point in the source camera.
         source_depth: depth that the source itself has at ``xy``; NaN where it has none.
-        tolerance: of the depth agreement there.
+        tolerance: tolerance of the depth agreement there.
         verdicts: every rule that was applied, in order.
         accepted: all rules together.
         seen_instead: (3,) what the source really sees toward the point, where something else

@@ -27,7 +27,7 @@ class RunEdit:
     """Pictures of one edited view that a run has.
 
     Attributes:
-        folder: of the run.
+        folder: path of the run.
         source, target: names of the views.
         files: by what they show.
         steps: "before" and "edited".
@@ -71,7 +71,7 @@ class Measured:
 
     Attributes:
         edited: whether an editing method was measured, else a fit alone.
-        settings: of the method's warp; None where it has none.
+        settings: settings of the method's warp; None where it has none.
         exact_mask: whether the method injects features where the source truly sees the surface.
         fit: file of the splats that were fitted to true pictures; None where none were.
         edits: by "edit/view", those of which the run has pictures.
@@ -112,7 +112,7 @@ def measured(
 
     Args:
         cells: the expected ones, as ``study.json`` lists them.
-        scene, seed: of the cells to read.
+        scene, seed: scene and seed of the cells to read.
         content: hash of the scene as it is now.
 
     Raises:

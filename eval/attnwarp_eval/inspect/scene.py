@@ -250,8 +250,8 @@ class Part:
     """Something in the 3D view.
 
     Attributes:
-        name: of the part; a part of the same name is replaced.
-        key: what it depends on; a part with the key of the one on show is not drawn again.
+        name: name of the part; a part of the same name is replaced.
+        key: inputs that it depends on; a part with the key of the one on show is not drawn again.
         mesh: makes it.
         color: "#rrggbb", or None for the mesh's own ``colors``.
         picture: makes the (H, W, 3) sRGB texture, where it has one.
@@ -277,7 +277,7 @@ class State:
         variant, target: names.
         coloring: one of the pair's colorings.
         layer: (h, w) of a feature grid; None for the image's pixels.
-        step: of the edit, "" without one.
+        step: step of the edit, "" without one.
         splats: as discs.
         surface: the whole true surface, translucent.
     """

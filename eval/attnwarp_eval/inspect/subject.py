@@ -49,17 +49,18 @@ class Subject:
 
     Attributes:
         scene: name or path.
-        size: of the images, in pixels.
+        size: size of the images, in pixels.
         spp: samples a pixel of the true pictures.
-        seed: of the splats.
+        seed: seed of the splats.
         variants: by name, each with its splats; None stands for the truth's own depth, or for the
             user's own splats.
         targets: names of the views.
         capture: the user's own scene, which has no truth.
-        edit: of the user's own scene.
-        measured: what a run has of its variants, where they edit the scene or fit splats to it.
-        elsewhere: what to open for an edited view that a run has no pictures of; empty for
-            anything but a run of edits.
+        edit: edit of the user's own scene.
+        measured: measured figures of a run's variants, where they edit the scene or fit splats to
+            it.
+        elsewhere: file to open for an edited view that a run has no pictures of; empty for anything
+            but a run of edits.
         thing: parts that a run carries labels of; None where it carries none.
 
     Example:
@@ -196,7 +197,7 @@ def of_run(
 
     Args:
         scene: one of the run's; the first, if left out.
-        size: of the images; the run's own, if left out.
+        size: size of the images; the run's own, if left out.
         seed: one of the run's; the first, if left out.
 
     Raises:

@@ -58,12 +58,12 @@ class Window:
     """A warp in 3D.
 
     Args:
-        state: what is shown at first.
+        state: state that is shown at first.
         off_screen: draw without a display.
-        size: of the window, in pixels.
+        size: size of the window, in pixels.
 
     Attributes:
-        state: what is shown.
+        state: state that is shown.
         picked: the report of the picked pixel or cell, or None.
         changed: called after each change of what is shown.
 

@@ -198,7 +198,7 @@ def sift_features(image_srgb: Any, name: str = "image_srgb") -> Keypoints:
 
     Args:
         image_srgb: (H, W, 3) sRGB in [0, 1].
-        name: of the picture, for messages.
+        name: name of the picture, for messages.
 
     Raises:
         ValueError: a picture that is not sRGB in [0, 1].

@@ -267,8 +267,8 @@ class EditPsnr:
     Attributes:
         views: the views that were measured, by name and in order. Methods that edit different views
             are not comparable by this figure: fewer edited views are easier to follow.
-        mse: of each view; NaN where it is undefined.
-        psnr: of each view in dB; +inf where the pictures are equal, NaN where it is undefined.
+        mse: mse of each view; NaN where it is undefined.
+        psnr: psnr of each view in dB; +inf where the pictures are equal, NaN where it is undefined.
 
     Example:
         >>> import math

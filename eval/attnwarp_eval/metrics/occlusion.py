@@ -171,7 +171,7 @@ class YawBin:
         low, high: degrees.
         views: how many views fell in.
         counts: their counts, summed.
-        scores: of the sums, NaN where undefined.
+        scores: scores of the sums, NaN where undefined.
 
     Example:
         >>> from attnwarp_eval import metrics

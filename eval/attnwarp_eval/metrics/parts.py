@@ -47,7 +47,7 @@ class PartTruth:
         """The truth of a view whose tokens have parts.
 
         Args:
-            before, after: see there.
+            before, after: pictures before and after.
             pixels: (H, W) part of each pixel, -1 outside the thing.
             tokens: (h, w) part of each token.
         """

@@ -35,8 +35,8 @@ def refit_psnr(
     dB; the PSNR is that of the mean squared error over all pictures of a set.
 
     Args:
-        splats: of the scene; their colours are not read.
-        cameras: of the V views.
+        splats: splats of the scene; their colours are not read.
+        cameras: cameras of the V views.
         sets: V pictures each, (H, W, 3) sRGB in [0, 1] of their cameras' sizes. All sets are
             fitted at once, in little more time than one.
 

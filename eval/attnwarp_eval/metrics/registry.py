@@ -30,8 +30,8 @@ class Metric:
         column: head of a column in the table of the probe that measures it, and of its row in ``attnwarp-eval
             metrics``; one without stands in tables that name it.
         pictures: folders of ``attnwarp-eval metrics`` that it is computed from, of "renders", "edited", "originals".
-        function: what computes it from a view's pictures, (H, W, 3) sRGB in [0, 1] in the order of ``pictures``, such
-            as "attnwarp_eval.metrics.image:psnr".
+        function: function that computes it from a view's pictures, (H, W, 3) sRGB in [0, 1] in the
+            order of ``pictures``, such as "attnwarp_eval.metrics.image:psnr".
     """
 
     name: str

@@ -58,7 +58,7 @@ def write_report_of_parts(folder: Path, *, timings: bool = True) -> list[Path]:
     """Write the report of a folder of raw results, without the views' pictures.
 
     Args:
-        folder: of ``results*.jsonl.xz``, parts of one study.
+        folder: path of ``results*.jsonl.xz``, parts of one study.
         timings: see :func:`write_report`.
 
     Returns:

@@ -35,7 +35,7 @@ class Row:
 
     Attributes:
         variant, metric: names.
-        specification: of the metric.
+        specification: specification of the metric.
         difference: the variant's against the baseline's.
         p: adjusted over the table, or over the claims where one makes this comparison.
         claim: the one that does.

@@ -180,7 +180,7 @@ def in_words(value: float, metric: Metric, key: str) -> str:
     """A figure with its unit, as a person says it.
 
     Args:
-        value: of the figure; NaN where undefined.
+        value: value of the figure; NaN where undefined.
         metric: its specification.
         key: its name in a record, whose last part may be the size of a feature grid.
 

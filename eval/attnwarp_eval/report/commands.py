@@ -26,7 +26,7 @@ def add_commands(results: Results, sections: Sequence[Section]) -> None:
     """Give pictures of a variant in a target view their command; the others have none.
 
     Args:
-        sections: whose galleries also get one command a scene, for plain text.
+        sections: sections with galleries that also get one command a scene, for plain text.
     """
     commands = {path: (scene, command) for path, scene, command in _commands(results)}
     for gallery in (section.gallery for section in sections):

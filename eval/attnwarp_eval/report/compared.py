@@ -170,7 +170,7 @@ def detectable_text(value: Contrast) -> str:
     """The smallest difference that one test at 5 % would tell in 80 % of studies.
 
     Args:
-        value: whose spread between scenes counts.
+        value: value with the spread between scenes.
     """
     least = value.student.detectable
     if value.scenes < FEWEST_SCENES or not math.isfinite(least):

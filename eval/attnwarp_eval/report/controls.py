@@ -46,7 +46,7 @@ def seen(results: Results, name: str, metric: str, baseline: str, label: str) ->
     Args:
         results, name, baseline: as for :func:`controls_of`.
         metric: a figure for which one direction is better.
-        label: of the control.
+        label: label of the control.
     """
     direction = probe(name).metric(metric).direction
     judged = between(results, name, baseline, label, metric).verdict(direction)  # type: ignore[arg-type]

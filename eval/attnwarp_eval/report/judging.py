@@ -38,9 +38,9 @@ class JudgedClaim:
 
     Attributes:
         claim: for one editor, where it has several.
-        measured: of the run.
+        measured: measured of the run.
         agreement: views with the expected sign, and all of them.
-        here: what is seen on the run's scenes.
+        here: result on the run's scenes.
         below_floor: scenes in which both sides disagree less than true views do.
         judges: whether the run is of the study that judges the claim, on a sample.
         p: adjusted p-value; that of its own test before :func:`decided`.
@@ -162,7 +162,7 @@ def decided(claims: Iterable[JudgedClaim]) -> list[JudgedClaim]:
     (Benjamini-Hochberg).
 
     Args:
-        claims: of one run, or of the runs of all studies that judge.
+        claims: claims of one run, or of the runs of all studies that judge.
     """
     every = list(claims)
     adjusted = benjamini_hochberg([c.p if c.judges else float("nan") for c in every])

@@ -55,7 +55,7 @@ def needed(value: Contrast, difference: float) -> int:
     """Scenes with which a test at 5 % tells a true difference in 80 % of studies, at least six.
 
     Args:
-        value: whose spread between scenes counts.
+        value: value with the spread between scenes.
         difference: on the contrast's scale.
     """
     return max(FEWEST, scenes_needed(difference, value.deviation))
@@ -102,7 +102,7 @@ class Cost:
     """Cost of cells that are still to do.
 
     Attributes:
-        hours: of one worker.
+        hours: hours of one worker.
         gigabytes: that they add to the run's folder.
         unknown: cells of kinds of which none was measured; they are in neither.
     """

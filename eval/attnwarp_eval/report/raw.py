@@ -39,7 +39,7 @@ def write_raw(store: Store, path: Path) -> Path:
     """Write the raw results of a run, without its pictures and without paths of this machine.
 
     Args:
-        path: of the file; in a folder, the file is called :data:`NAME`.
+        path: path of the file; in a folder, the file is called :data:`NAME`.
 
     Returns:
         Path of the file.

@@ -60,7 +60,7 @@ def verdicts(folder: Path) -> list[Judged]:
     """Every claim with its verdict, p-values adjusted over all studies together.
 
     Args:
-        folder: of reports, with raw results beside each.
+        folder: path of reports, with raw results beside each.
 
     Raises:
         InputError: raw results that cannot be read, or are of no one study.
@@ -203,7 +203,7 @@ def filled(text: str, judged: list[Judged], beside: Path) -> str:
     no claim among them has raw results.
 
     Args:
-        judged: of :func:`verdicts`.
+        judged: judged of :func:`verdicts`.
 
     Example:
         >>> filled("<!-- headlines -->\\nas before\\n<!-- /headlines -->\\n", [], Path())

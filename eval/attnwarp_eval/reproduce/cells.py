@@ -57,8 +57,8 @@ class Made:
     Attributes:
         figures: by their title, with the encoders' published preprocessing.
         authors: the same with that of the paper's authors.
-        counts: of views, edited views, network rows, iterations and splats.
-        seconds: of the method, by part.
+        counts: counts of views, edited views, network rows, iterations and splats.
+        seconds: seconds of the method, by part.
         gpu: GiB of a GPU at most; NaN without one.
         files: path in the run's folder, and SHA-256.
     """

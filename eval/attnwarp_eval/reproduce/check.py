@@ -72,7 +72,7 @@ def check(loaded: Loaded, run: Path, device: str = "cpu") -> Checked:
     """Check captures, splats, masks, weights, and whether methods and editors fit.
 
     Args:
-        device: of the networks while they are probed.
+        device: device of the networks while they are probed.
     """
     done = Checked()
     for name in loaded.manifest.captures:

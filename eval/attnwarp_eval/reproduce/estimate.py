@@ -45,8 +45,9 @@ class Unit:
         whole: seconds of a cell beside edits and tuning: renders, files, figures.
         edit: seconds of an edit with all its steps.
         iteration: seconds of one of tuning.
-        rows, edits, iterations, rounds: of a whole run on this capture; rows through the UNet.
-        views: of the capture.
+        rows, edits, iterations, rounds: rows, edits, iterations and rounds of a whole run on this
+            capture; rows through the UNet.
+        views: views of the capture.
         files, state, picture: bytes of a cell's other files, of a round's end, of an edit.
         original, asked: bytes of a view's picture, and of one in the page that asks people.
         memory: GiB of the process, with the features of all steps.

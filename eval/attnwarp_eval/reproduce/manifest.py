@@ -304,7 +304,7 @@ def write_probes(path: Path, probes: Mapping[str, float]) -> None:
     """Write probe values into a manifest, before the ``folder`` of what they are of.
 
     Args:
-        path: of the manifest; all else in it stays, comments too.
+        path: path of the manifest; all else in it stays, comments too.
         probes: by key, such as ``editors.pix2pix``.
 
     Raises:

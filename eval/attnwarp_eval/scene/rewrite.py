@@ -17,8 +17,8 @@ def with_bounces(text: str, numbers: Mapping[Which, int | Literal["unlimited"]])
     An edit gets a number where it has another than the scene, or has one already.
 
     Args:
-        text: of a file that :func:`~attnwarp_eval.scene.file.load_scene` reads.
-        numbers: of the scene and of everything that its edits make of it.
+        text: text of a file that :func:`~attnwarp_eval.scene.file.load_scene` reads.
+        numbers: numbers of the scene and of everything that its edits make of it.
 
     Example:
         >>> print(with_bounces("name: room\\nappearance: {spp: 8}  # few", {(None, None): 3}))

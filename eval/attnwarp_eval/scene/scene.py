@@ -66,7 +66,7 @@ class Scene:
     """A checked scene.
 
     Attributes:
-        spec: what the file says.
+        spec: contents of the file.
         path: the file, or None for one made in code; mesh files are relative to its folder.
 
     Example:

@@ -115,8 +115,8 @@ def orbit_name(index: int, count: int) -> str:
     """Name of a camera of :func:`orbit`.
 
     Args:
-        index: of the camera, from 0.
-        count: of all cameras, which decides the number of digits.
+        index: index of the camera, from 0.
+        count: number of all cameras, which decides the number of digits.
 
     Example:
         >>> orbit_name(0, 64) == orbit_name(1, 64)
@@ -157,7 +157,7 @@ def first_points(
         count: number of points, at least 10.
         noise: standard deviation of the displacement along each axis, in local spacings of the
             points.
-        seed: of the sampling and the noise.
+        seed: seed of the sampling and the noise.
         geometry: ``Geometry(scene)``, if there is one already.
 
     Raises:

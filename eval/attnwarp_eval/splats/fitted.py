@@ -43,7 +43,7 @@ def fit_scene(
 
     Args:
         scene: with the image size that the fit is to have.
-        folder: of the fit's files; a fit that was stopped there is resumed.
+        folder: path of the fit's files; a fit that was stopped there is resumed.
         views, spp, points, noise, seed: see :func:`attnwarp_eval.splats.export.export`.
         geometry: ``Geometry(scene)``, if there is one already.
         report: as in :func:`attnwarp.fit.fit`.

@@ -89,7 +89,8 @@ def surface_splats(
         position_noise: standard deviation of a displacement in every direction, in local spacings.
             The colour stays that of the undisturbed point.
         normal_noise: standard deviation of a tilt about each of the two tangents, in degrees.
-        seed: of the sampling and the noise; the noise of one seed does not change the sampling.
+        seed: seed of the sampling and the noise; the noise of one seed does not change the
+            sampling.
         size: standard deviation of a splat in its plane, in local spacings. Larger splats close
             holes and reach further beyond outlines (reports/splats/surface.md).
         thickness: the third standard deviation of "3d" splats, in local spacings.
@@ -97,8 +98,8 @@ def surface_splats(
             equally dense; further out the density falls with the square of the distance. A third of
             the cameras' orbit if left out.
         geometry: ``Geometry(scene)``, if there is one already.
-        samples: of :func:`colored_samples` with this count, seed and focus, if there are some
-            already: splats of every kind and noise share them.
+        samples: samples of :func:`colored_samples` with this count, seed and focus, if there are
+            some already: splats of every kind and noise share them.
 
     Returns:
         Gaussians in float32 relative to the float64 scene centre, SH degree 0.

@@ -82,7 +82,7 @@ class Bound:
     """Largest error that is allowed.
 
     Attributes:
-        unit: of the error.
+        unit: unit of the error.
         tolerance: in that unit; a function of the level where it depends on it.
         reason: for the tolerance.
 
@@ -113,10 +113,10 @@ class Case:
         number: in the report of reports/stability; several cases may share one.
         name: for commands and records.
         title: one line for people.
-        input: what is built.
-        oracle: what the result is held against; no code under test.
-        hardness: what is swept, with its unit.
-        levels: of hardness, the easiest first.
+        input: input that is built.
+        oracle: reference for the result; no code under test.
+        hardness: swept quantity, with its unit.
+        levels: levels of hardness, the easiest first.
         required: the last level whose values must hold; what comes after it is there to break.
         quick: the levels of a short sweep.
         bounds: by direction.
@@ -207,7 +207,7 @@ class Case:
             level: one of ``levels``.
             way: one of ``ways``.
             error: in the bound's unit; NaN where the result is not finite, and where refused.
-            refusal: what was said where the input was refused, else empty.
+            refusal: message where the input was refused, else empty.
         """
         return Outcome(
             level,
@@ -224,7 +224,7 @@ class Outcome:
     """Outcome of one way at one level.
 
     Attributes:
-        level: of hardness.
+        level: level of hardness.
         required: whether it must hold.
         error: in the bound's unit; infinite where the result is not finite, NaN where refused.
         tolerance: in the same unit.

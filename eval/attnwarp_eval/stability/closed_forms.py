@@ -26,10 +26,10 @@ def orbit(
     Args:
         yaw: degrees.
         size: height of the image in px, and its width unless ``width`` is given.
-        distance: of the circle's radius, in scene units.
+        distance: distance of the circle's radius, in scene units.
         fov: vertical, degrees.
         height: above the circle's plane, in scene units.
-        width: of the image in px.
+        width: width of the image in px.
     """
     angle = np.radians(yaw)
     position = (distance * np.cos(angle), distance * np.sin(angle), height)

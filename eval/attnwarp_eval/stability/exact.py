@@ -52,7 +52,7 @@ class ExactSplats:
         gaussians: few splats; their stored values are taken as exact.
         camera: the same.
         near: nothing nearer is drawn.
-        antialiased: of 3D splats.
+        antialiased: screen filter of 3D splats.
         depth: the mode, as in :func:`attnwarp.render.render`.
     """
 

@@ -35,10 +35,10 @@ class Shot:
 
     Attributes:
         gaussians: in float64; a way converts them.
-        camera: of the picture.
+        camera: camera of the picture.
         pixels: (row, column) of each.
-        options: of :func:`attnwarp.render.render` beside the backend: ``near``, ``antialiased``
-            and ``depth``.
+        options: options of :func:`attnwarp.render.render` beside the backend: ``near``,
+            ``antialiased`` and ``depth``.
         unmoved: the same shot where it is not hard, for the oracle; itself if None.
     """
 
@@ -113,7 +113,7 @@ def against_exact(
     """The measure of a case whose oracle is :class:`ExactSplats`.
 
     Args:
-        build: of a level.
+        build: build of a level.
         outputs: ``alpha``, ``depth`` or both. Alpha counts absolutely, depth relatively.
     """
 

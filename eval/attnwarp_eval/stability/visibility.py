@@ -51,7 +51,7 @@ def exact_labels(
         source, target: cameras of pictures of one size (H, W).
         source_depth, target_depth: (H, W) as stored, NaN where nothing is seen.
         target_normal: (H, W, 3) in world axes.
-        relative, slope, spread: of :class:`attnwarp.warp.WarpSettings`.
+        relative, slope, spread: tolerances of :class:`attnwarp.warp.WarpSettings`.
     """
     height, width = target_depth.shape
     z, d = target_depth.astype(np.longdouble), source_depth.astype(np.longdouble)

@@ -25,7 +25,7 @@ class Contrast:
     """Difference of two arms, scene by scene, on one scale.
 
     Attributes:
-        scale: of the differences; those of ``ratio`` and ``odds`` are logarithms.
+        scale: scale of the differences; those of ``ratio`` and ``odds`` are logarithms.
         views: pairs of views in it.
         undefined: views that one side alone has, or where it is undefined.
         by_scene: mean over a scene's views; scenes without a pair are left out.

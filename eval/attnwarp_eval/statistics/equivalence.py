@@ -152,7 +152,7 @@ class Equivalence:
     """Two one-sided tests of two means.
 
     Attributes:
-        difference, error: of the means, as shares of the mean.
+        difference, error: difference of the means, and its standard error, as shares of the mean.
         margin: the share that counts as equal.
 
     Example:

@@ -356,8 +356,8 @@ def front(cost: Sequence[float], error: Sequence[float]) -> list[int]:
     """Indices of the Pareto front, cheapest first: a point stays when its error strictly improves.
 
     Args:
-        cost: of each point, such as seconds.
-        error: of each point; less is better. Points that are not finite are left out.
+        cost: cost of each point, such as seconds.
+        error: error of each point; less is better. Points that are not finite are left out.
 
     Example:
         >>> front([1.0, 2.0, 3.0], [0.5, 0.6, 0.1])  # the second costs more and errs more

@@ -79,7 +79,7 @@ class Share:
 
     Attributes:
         value: in [0, 1].
-        low, high: of the interval; NaN with fewer than two people.
+        low, high: bounds of the interval; NaN with fewer than two people.
     """
 
     value: float
@@ -125,7 +125,7 @@ def preferences(choices: Choices, methods: Sequence[str], *, seed: int = 0) -> P
     of as many people.
 
     Args:
-        choices: of each person; one without any counts for nothing.
+        choices: choices of each person; one without any counts for nothing.
         methods: all names.
 
     Raises:
@@ -245,7 +245,8 @@ class Agreement:
     """Agreement of people's choices.
 
     Attributes:
-        share: of pairs of people who chose the same, mean over pairs of choices; NaN without any.
+        share: share of pairs of people who chose the same, mean over pairs of choices; NaN without
+            any.
         kappa: the share above chance, 2 share - 1: free-marginal kappa (Randolph 2005), since
             either side of a choice is right by chance half of the time.
         comparisons: that at least two people judged.

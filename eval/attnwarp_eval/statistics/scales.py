@@ -29,7 +29,7 @@ def compared(
 
     Args:
         a, b: the figures.
-        scale: of their metric.
+        scale: scale of their metric.
         floor: smallest error that means anything, above 0, for ``ratio``.
         counts: things that each share is of, for ``odds``.
 

@@ -580,7 +580,7 @@ class _Queue:
         """The next cell for a worker; None when nothing is left.
 
         Args:
-            scene: of the cell that the worker computed last; None if it is its first.
+            scene: scene of the cell that the worker computed last; None if it is its first.
             busy: probes of the cells at work. A first cell is of another probe if there is one:
                 kernels that one worker compiles are on disk when the other needs them.
         """

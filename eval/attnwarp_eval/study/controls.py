@@ -49,7 +49,7 @@ class MovedView(WarpedView):
 
     Args:
         control: "mirrored" or "displaced".
-        share: of the source's width, for "displaced".
+        share: share of the source's width, for "displaced".
     """
 
     control: Control = "mirrored"

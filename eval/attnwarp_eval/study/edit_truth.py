@@ -126,7 +126,7 @@ def edit_truth(
     """The truth of an edit; cached, since all variants of a scene share it.
 
     Args:
-        scene, size: of :func:`attnwarp_eval.world.world`.
+        scene, size: arguments of :func:`attnwarp_eval.world.world`.
         edit: as for :func:`answers_of`.
         views: names, the source among them.
         planned: the answers for which the cell was planned; whatever the file says if None.

@@ -58,7 +58,7 @@ class Donor:
     """Another scene, whose source's features a control injects.
 
     Attributes:
-        editor: of its source, with the same layers as the job's.
+        editor: editor of its source, with the same layers as the job's.
         picture: (H, W, 3) sRGB in [0, 1], its source before the edit.
     """
 
@@ -72,17 +72,18 @@ class Job:
 
     Attributes:
         gaussians: the scene before the edit.
-        cameras: of the views, the source first; all of one size (H, W).
+        cameras: cameras of the views, the source first; all of one size (H, W).
         images: (H, W, 3) sRGB in [0, 1], the views before the edit.
-        editor: of single views.
+        editor: editor of single views.
         instruction: in words; a description of the result for an editor that is guided by depth.
-        settings: what the method's ``settings`` returned.
+        settings: return value of the method's ``settings``.
         folder: for the method's files; removed afterwards.
         warps: the warp from the source to a target by their numbers, in place of the method's own.
         truth: the true edited views by answer, in the order of ``cameras``. Only methods that
             bound others may look at it.
         budget: limits of the method; None for none. Only methods with ``takes_budget`` get one.
-        donor: of the features that targets get in place of the source's; None for the source's.
+        donor: donor of the features that targets get in place of the source's; None for the
+            source's.
         segments: (H, W) bool of each view, outside which nothing may change; None for everywhere.
     """
 
@@ -109,7 +110,7 @@ class EditedScene:
         edited: (h, w, 3) uint8 sRGB by the view's number, the source among them; views that the
             method did not edit are left out.
         seconds: by part. ``edit``, ``source``, ``warp`` and ``tune`` are the method's own work.
-        counters: of work, such as ``network_rows``.
+        counters: counts of work, such as ``network_rows``.
         cut: the limit of the budget that ended the method; None for a whole run.
     """
 

@@ -102,8 +102,8 @@ def tasks(scene: Scene, names: Sequence[str] = ()) -> list[Task]:
 
     Args:
         scene: with its edits.
-        names: of the edits; all of the scene's if empty. Names that the scene lacks are passed
-            over.
+        names: names of the edits; all of the scene's if empty. Names that the scene lacks are
+            passed over.
     """
     results = []
     for place, edit in enumerate(scene.edits):

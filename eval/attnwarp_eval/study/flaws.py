@@ -26,13 +26,13 @@ class Edited:
     """A true edit as the target of a pair shows it, and what flaws are made of.
 
     Attributes:
-        pair: of source and target.
+        pair: pair of source and target.
         source: (h, w, 3) sRGB in [0, 1], the true source after the edit.
         before, after, other: (H, W, 3) the target before the edit, after it, and with another right
             answer.
         mask: (H, W) bool, the edited object in the target.
         elsewhere: (H, W, 3) a view of another scene; None where there is none.
-        seed: of what flaws draw.
+        seed: seed of what flaws draw.
     """
 
     pair: TwoView
@@ -87,7 +87,7 @@ class Flaw:
     Attributes:
         name: the first part of a condition's key.
         title: for people, short.
-        unit: of its sizes.
+        unit: unit of its sizes.
         sizes: rising.
         reference: the size that tables of all flaws show.
         make: (H, W, 3) sRGB of the flawed target at a size; None where it cannot be made.

@@ -51,7 +51,7 @@ def of_warp(
     """JPEG files of a warp: the two true views, the warped source, mask and endpoint error.
 
     Args:
-        truth: of the pair, at image size (H, W).
+        truth: truth of the pair, at image size (H, W).
         view: the warp to show, (H, W).
     """
     source, target = world.image(world.source.name, spp), world.image(name, spp)
@@ -76,7 +76,7 @@ def of_fit(surface: Surface, hits: Hits, image: npt.NDArray[np.uint8]) -> dict[s
     """JPEG files of a view held out from a fit.
 
     Args:
-        surface: what the splats show, with its image.
+        surface: rendered surface of the splats, with its image.
         hits: truth of the view.
         image: (H, W, 3) sRGB, its true picture.
     """

@@ -18,7 +18,7 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
     ``drawn``, is one for each of its scenes.
 
     Args:
-        data: of a study; ``scenes`` is a mapping, or ``population`` says what the files are.
+        data: data of a study; ``scenes`` is a mapping, or ``population`` says what the files are.
 
     Raises:
         InputError: there is no such population.

@@ -45,10 +45,10 @@ class InTurn:
     """Seconds of contestants that ran in turn in one process.
 
     Attributes:
-        names: of the contestants; the first is the baseline.
+        names: names of the contestants; the first is the baseline.
         seconds: stage -> contestant -> round; the baseline's second run comes last.
         rounds, threads: how they were taken.
-        of: what each contestant did, in words.
+        of: task of each contestant, in words.
     """
 
     names: tuple[str, ...]
@@ -63,10 +63,11 @@ class Work:
     """One cell at work: what a probe computes with, and where its figures go.
 
     Attributes:
-        cell: what is computed.
+        cell: cell to compute.
         root: the run's folder.
-        scene_world: of the scene at the study's size; None for a probe that needs no scenes.
-        meter: of seconds and counters.
+        scene_world: world of the scene at the study's size; None for a probe that needs no
+            scenes.
+        meter: meter of seconds and counters.
         views, pictures: results so far.
     """
 
@@ -189,7 +190,7 @@ class Probe(ABC, Generic[E]):
         """The cells of a study: here, one for each scene, variant and seed.
 
         Args:
-            names: of the variants that the study names for it.
+            names: names of the variants that the study names for it.
             scenes: by the names that the study gives them.
 
         Raises:

@@ -64,17 +64,17 @@ class ProbeReport:
     :func:`register_report` decorates it. It measures nothing.
 
     Attributes:
-        name: of the probe.
-        columns: of the table of variants, title -> metric; ``{layer}`` stands for a feature grid.
-            Every metric of the probe under its own name where there are none. Metrics with a
+        name: name of the probe.
+        columns: columns of the table of variants, title -> metric; ``{layer}`` stands for a feature
+            grid. Every metric of the probe under its own name where there are none. Metrics with a
             ``column`` in the registry stand behind them.
         tabulates_all: whether its own section has every variant, in a study's tables or not.
         contrasts: metrics in which a variant is tested against a baseline.
-        stage: of :class:`~attnwarp_eval.study.probe.InTurn`, the one whose seconds its figures
-            cost.
+        stage: stage of :class:`~attnwarp_eval.study.probe.InTurn`, the one whose seconds its
+            figures cost.
         cost, cost_of, cost_text: stage of a cell's seconds that its figures cost where nothing was
             taken in turn, what they are seconds of, and what is in them.
-        measures: what it measures, for the first sentence of a report; its name if empty.
+        measures: measured quantity, for the first sentence of a report; its name if empty.
         picture_label: title of its pictures; the variant's name if empty.
     """
 
@@ -127,7 +127,7 @@ class ProbeReport:
         """Folded tables below a table of variants.
 
         Args:
-            names: of the variants, the baseline first.
+            names: names of the variants, the baseline first.
         """
         return []
 
@@ -202,9 +202,9 @@ def side_by_side(
     """Pictures of variants in the views of one scene; None where the run has none.
 
     Args:
-        probe, variants: whose pictures; variants are the rows.
-        content: what they show.
-        scene: whose; the first one that has some where this has none.
+        probe, variants: probe and variants of the pictures; variants are the rows.
+        content: content of the pictures.
+        scene: scene of the pictures; the first one that has some where this has none.
         first: label of a row before them -> what it shows, the same for all variants.
     """
     found: dict[str, dict[str, dict[tuple[str, str], str]]] = {}

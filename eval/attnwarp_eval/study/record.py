@@ -65,9 +65,9 @@ class PictureFile:
 
     Attributes:
         view: its name.
-        content: what it shows, such as ``mask``.
+        content: content, such as ``mask``.
         path: relative to the run's folder.
-        sha256: of the file.
+        sha256: sha256 of the file.
     """
 
     view: str
@@ -96,10 +96,10 @@ class Cost:
 
     Attributes:
         seconds: by stage; None where there was nothing to time.
-        counters: of work, such as pixels or pairs.
-        peak_memory_mb: of the process while it computed the cell, MiB, with what it held before;
-            of the process so far where the system cannot count anew (not Linux).
-        threads: of the renderer.
+        counters: counts of work, such as pixels or pairs.
+        peak_memory_mb: peak memory of the process while it computed the cell, MiB, with what it
+            held before; of the process so far where the system cannot count anew (not Linux).
+        threads: threads of the renderer.
     """
 
     seconds: Mapping[str, float | None]
@@ -131,9 +131,9 @@ class Environment:
     """Environment in which a cell was computed.
 
     Attributes:
-        versions: of Python and packages.
+        versions: versions of Python and packages.
         machine: ``system``, ``arch`` and ``cores``.
-        revision: of the source; None for an installed copy.
+        revision: revision of the source; None for an installed copy.
         dirty: whether the source had local changes.
         source: SHA-256 of the source.
     """
@@ -176,11 +176,11 @@ class Record(Generic[E]):
     """The result of one cell.
 
     Attributes:
-        id, spec: of the cell; see :class:`attnwarp_eval.study.cell.Cell`.
+        id, spec: id and spec of the cell; see :class:`attnwarp_eval.study.cell.Cell`.
         views: figures by view.
         pictures: files of the run's folder.
-        cost, environment: what it took, and where.
-        extra: what only this probe's records hold.
+        cost, environment: cost, and the machine.
+        extra: entries that only this probe's records hold.
     """
 
     id: str

@@ -31,7 +31,7 @@ class Code:
 
     Attributes:
         source: SHA-256 of the source files of both packages and of the plugins.
-        versions: of Python (major and minor) and of the packages that results depend on.
+        versions: versions of Python (major and minor) and of the packages that results depend on.
         worker: its name in the cluster; empty outside one.
         unseen: paths that a cell needs and the worker cannot read.
     """

@@ -20,7 +20,7 @@ class Outcome:
     """An expected cell of a run.
 
     Attributes:
-        id, title, scene, probe, seed: of the cell.
+        id, title, scene, probe, seed: id, title, scene, probe and seed of the cell.
         variants: every name that the study gives to its content.
         record: None where the cell is not done.
     """
@@ -165,7 +165,7 @@ class Results:
         once a cell, at its first view, done or not.
 
         Args:
-            probe, variant: whose records.
+            probe, variant: probe and variant of the records.
             yaw: closed range of degrees that a view's yaw from the source must lie in; any if None.
         """
         table: dict[str, dict[str, float]] = {}

@@ -37,7 +37,7 @@ class Plan:
     """A resolved study and what of it is still to do.
 
     Attributes:
-        study, scenes, cells: what a complete run has.
+        study, scenes, cells: study, scenes and cells of a complete run.
         todo: cells without a record.
         other_code: how many records were computed by other code than this.
         notices: by scene, what a person should know of it; scenes without any are left out.
@@ -327,7 +327,7 @@ def compute_cells(
     """Compute cells, in this process or on workers, and return what failed.
 
     Args:
-        cells: of registered probes.
+        cells: cells of registered probes.
         store: the run's folder, which gets every record and failure.
         jobs: worker processes, at most one a cell; 1 stays in this process.
         scheduler: see :func:`execute`.

@@ -151,9 +151,9 @@ class AnswerPictures(Part):
     Args:
         caption: above them.
         probe: that draws them; the main probe if left out.
-        scene: whose they are; the first one that has some where this has none.
+        scene: scene of the pictures; the first one that has some where this has none.
         first: label of a row before those of the variants -> what it shows, the same for all.
-        content: what the variants' rows show.
+        content: content of the variants' rows.
         variants: the rows.
     """
 
@@ -299,8 +299,8 @@ class Study(Part):
         """Raise ValueError unless every name is a variant's, and ``probe`` measures it.
 
         Args:
-            key: of the YAML, for the message.
-            probe: whose table needs them; any if empty.
+            key: key of the YAML, for the message.
+            probe: probe with the table that needs them; any if empty.
         """
         for name in names:
             if name not in self.variants:
@@ -332,7 +332,7 @@ class Study(Part):
         """Those of the views that the study wants pictures of, in its own order.
 
         Args:
-            variant: of the cell; None where it has none, as in the calibration.
+            variant: variant of the cell; None where it has none, as in the calibration.
         """
         if variant is not None and variant not in self.pictures.variants:
             return ()

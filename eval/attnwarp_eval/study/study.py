@@ -453,8 +453,8 @@ def explain_errors(error: ValidationError, model: type[BaseModel] | None = None)
     """Pydantic's errors in one readable text: each key, what came, and what was expected.
 
     Args:
-        error: of a study, or
-        model: of this part.
+        error: error of a study, or
+        model: model of this part.
     """
     model = model or _models(tuple(probes()))[0]
     problems = error.errors(include_url=False)

@@ -37,7 +37,7 @@ def results(
     """The results of tasks, in their order. After an interruption only missing ones are computed.
 
     Args:
-        store: of the folder, which is locked meanwhile.
+        store: store of the folder, which is locked meanwhile.
         tasks: taken one by one, so that what one of them holds can be freed.
         report: receives each task, and what is at work in it.
 

@@ -18,7 +18,7 @@ class Timed:
 
     Attributes:
         turns: one for each cell that timed the stage.
-        stage: of :class:`InTurn`.
+        stage: stage of :class:`InTurn`.
     """
 
     turns: Sequence[InTurn]

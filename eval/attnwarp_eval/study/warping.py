@@ -17,7 +17,7 @@ def warp_truth(world: World, truth: TwoView, settings: WarpSettings, **images: A
     """Warp by the truth's own depth.
 
     Args:
-        truth: of the pair, (H, W).
+        truth: truth of the pair, (H, W).
         images: ``source_image`` and ``target_image``, (H, W, 3) sRGB in [0, 1], for photometric
             rules.
     """

@@ -25,7 +25,7 @@ def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = Non
 
     Args:
         root: the run's folder; the cell's pictures go below it.
-        threads: of the renderer; every core this process may use, if left out.
+        threads: threads of the renderer; every core this process may use, if left out.
 
     Raises:
         InputError: the scene's file has changed since the cell was planned.

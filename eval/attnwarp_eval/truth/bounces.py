@@ -88,10 +88,10 @@ class Answer:
 
     Attributes:
         bounces: the number; "unlimited" where none up to :data:`MOST` is shown to suffice.
-        held: what that number leaves out, in the view where its bound is the largest; None where
-            nothing was measured.
-        fewer: what one bounce fewer leaves out, in the view that refused it; None where there is
-            none.
+        held: light that this number leaves out, in the view where its bound is the largest; None
+            where nothing was measured.
+        fewer: light that one bounce fewer leaves out, in the view that refused it; None where there
+            is none.
         made_by: Mitsuba's version and variant; None where nothing was measured.
 
     Example:

@@ -178,7 +178,7 @@ def edge_band(geometry: Geometry, camera: Camera, width: float = EDGE_BAND) -> M
     included.
 
     Args:
-        camera: whose view; (H, W) is its size.
+        camera: camera of the view; (H, W) is its size.
         width: px.
 
     Example:

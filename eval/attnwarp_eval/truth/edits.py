@@ -28,7 +28,7 @@ def edit_mask(
     light.
 
     Args:
-        hits: of the view, from :meth:`~attnwarp_eval.truth.Geometry.trace`.
+        hits: hits of the view, from :meth:`~attnwarp_eval.truth.Geometry.trace`.
     """
     edit = scene.edit(name)
     if (pick(edit, answer) or edit).lights is not None:

@@ -33,7 +33,7 @@ class SolidField:
             bilinear sampling at the worst place (half way between two taps) errs by 1 - cos(pi/16)
             = 2 % of a channel's amplitude, and 8 % on the 32 grid.
         terms: sinusoids a channel.
-        seed: of the frequencies (uniform in the ball) and phases.
+        seed: seed of the frequencies (uniform in the ball) and phases.
     """
 
     center: Sequence[float] | Array

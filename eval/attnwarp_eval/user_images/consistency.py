@@ -102,7 +102,7 @@ class _View:
 
     Attributes:
         edited, original: (H, W, 3) at full size; the original None where there is none.
-        camera: of that size.
+        camera: camera of that size.
     """
 
     edited: Picture

@@ -59,8 +59,8 @@ class Inputs:
         edited: folder of the edited pictures that the scene was fitted on, named as the renders.
         originals: folder of pictures of the scene before the edit, named as the renders.
         source_edit: the one edited picture that the others follow.
-        prompt: what the edited scene should show.
-        source_prompt: what the scene showed before.
+        prompt: description of the edited scene.
+        source_prompt: description of the scene before.
         masks: folder of masks, named as the renders: white counts for Edit PSNR and the perceptual
             distance, black and transparent do not.
         poses, ply: cameras with pictures, and splats of the scene before the edit, for
@@ -116,7 +116,7 @@ class Measured:
     """The figures of a user's pictures, and why others are missing.
 
     Attributes:
-        inputs: what it was measured on.
+        inputs: measured inputs.
         rows: the figures.
         missing: title of a figure that was not computed -> why.
         encoders: kind -> which one.

@@ -61,9 +61,9 @@ class Person:
     """The answers of one person.
 
     Attributes:
-        name: what the page drew for the person.
-        path: of the file.
-        study, title: of the page.
+        name: name that the page drew for the person.
+        path: path of the file.
+        study, title: study and title of the page.
         planned: how many choices the person was to make.
         choices: those made, attention checks left out.
         checks: attention checks.

@@ -53,10 +53,10 @@ def draw(
     Every second plan is the one before with its sides exchanged, in another order.
 
     Args:
-        methods: of each item.
-        choices: of a plan; all comparisons where there are fewer.
+        methods: methods of each item.
+        choices: choices of a plan; all comparisons where there are fewer.
         checks: attention checks of a plan, beside the choices.
-        seed: of everything drawn.
+        seed: seed of everything drawn.
 
     Raises:
         ValueError: no item has two methods.

@@ -40,7 +40,7 @@ class Item:
     """One scene under one instruction and seed.
 
     Attributes:
-        scene, edit, seed: of the cells.
+        scene, edit, seed: scene, edit and seed of the cells.
         instruction: in words.
         content: hash of the scene, all that decides its views, and the instruction.
         before: by view, the file of the view before the edit.

@@ -31,9 +31,9 @@ class Design:
     Attributes:
         questions: names of :data:`QUESTIONS`.
         plans: different draws; each person gets one.
-        choices: of a person.
+        choices: choices of a person.
         checks: attention checks of a person, beside the choices.
-        seed: of everything drawn.
+        seed: seed of everything drawn.
     """
 
     questions: Sequence[str] = tuple(QUESTIONS)
@@ -47,7 +47,7 @@ def build_page(items: Sequence[Item], design: Design, title: str) -> str:
     """The page as HTML, with every picture inside it.
 
     Args:
-        items: of :func:`attnwarp_eval.userstudy.material.read_items`.
+        items: items of :func:`attnwarp_eval.userstudy.material.read_items`.
 
     Raises:
         InputError: a picture's file is missing.

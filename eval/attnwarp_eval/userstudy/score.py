@@ -29,7 +29,7 @@ class Score:
     """Preferences of people.
 
     Attributes:
-        title: of the page.
+        title: title of the page.
         preferences: by question, and of all together.
         agreement: the same.
         people: everybody.

@@ -53,7 +53,8 @@ class Kept:
     """Results of a long measurement in a file, by name: one that was stopped goes on where it was.
 
     Args:
-        path: of the JSON; it names whatever the results depend on, such as the weights' checksum.
+        path: path of the JSON; it names whatever the results depend on, such as the weights'
+            checksum.
         say: shows the name of each result as it is computed; those that are read back are not told.
     """
 

@@ -56,7 +56,7 @@ class Case:
     """A picture with its true answers.
 
     Attributes:
-        world, view: of the test split.
+        world, view: world and view of the test split.
         before: (S, S, 3).
         answers: the colours that it may get, the picture before first.
         thing: (S, S) bool.
@@ -77,7 +77,7 @@ def cases_of(worlds: Worlds, size: int, number: int = 0) -> list[Case]:
     """Both whole views of every world whose thing is large enough.
 
     Args:
-        number: of the round, which draws the colour that each world has before.
+        number: number of the round, which draws the colour that each world has before.
     """
     pairs = Pictures(worlds, size)
     further = [number] if number else []
@@ -165,7 +165,7 @@ def swap_figures(
     Rounds of other pictures and noises go on until every question has as many answers as were asked for.
 
     Args:
-        worlds: of the test split.
+        worlds: worlds of the test split.
         pairs: answers asked of every question; after :data:`MOST_ROUNDS` rounds it is as many as were had.
         kept: results of batches, so that a stopped measurement goes on.
     """
@@ -194,8 +194,8 @@ def _swapped(swap: Swap, batch: Sequence[Case], seed: int, number: int) -> Marks
 
     Args:
         batch: the pictures, those of a world one after the other.
-        seed: of the first picture's noise.
-        number: of the round: it chooses the noises, and whose features another picture gets.
+        seed: seed of the first picture's noise.
+        number: number of the round: it chooses the noises, and whose features another picture gets.
     """
     marks: Marks = {key: [] for key in QUESTIONS}
     first = batch[0].before

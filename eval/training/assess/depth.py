@@ -51,7 +51,7 @@ def assess_depth(editor: Any, prompts: Prompts) -> list[tuple[Figure, Figure]]:
 
     Args:
         editor: a :class:`attnwarp.editing.controlnet.DepthControlNet`.
-        prompts: of test worlds.
+        prompts: prompts of test worlds.
 
     Returns:
         For each question the figure with the right prompt and depth map, and the control's: the same
@@ -133,7 +133,7 @@ def assess_depth_editor(
 
     Args:
         data: folder of the pictures.
-        worlds: of the test split; all if left out.
+        worlds: worlds of the test split; all if left out.
     """
     from attnwarp.editing.small import DEPTH_GUIDANCE, load_editor
 

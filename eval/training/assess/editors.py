@@ -53,8 +53,9 @@ def assess(
     whose mean colour in the mask is nearest to the result's has to be the one that was asked for.
 
     Args:
-        worlds: of the test split.
-        noises: of an open instruction, for each of a quarter of the worlds; 0 leaves that figure out.
+        worlds: worlds of the test split.
+        noises: number of noises of an open instruction, for each of a quarter of the worlds; 0 leaves that
+            figure out.
     """
     pairs = Pictures(worlds, size)
     results = []
@@ -146,7 +147,7 @@ def editor_card(
     """A bundled editor's card in Markdown.
 
     Args:
-        figures, control: of it and of an editor that changes nothing.
+        figures, control: figures of it and of an editor that changes nothing.
     """
     learned, missing = "", "parts of things (a jacket, a pot), "
     if facts["parts"]:
@@ -188,7 +189,7 @@ def assess_editor(
     """The card of an exported editor.
 
     Args:
-        worlds: of each test split; all if left out.
+        worlds: worlds of each test split; all if left out.
     """
     from attnwarp.editing.small import IMAGE_GUIDANCE, TEXT_GUIDANCE, load_editor
 

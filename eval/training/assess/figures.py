@@ -295,8 +295,8 @@ def nearest(
 
     Args:
         features: (N, D); compared by their cosine.
-        look: of the query; the 64 are seen in look 0.
-        seed: of the galleries.
+        look: look of the query; the 64 are seen in look 0.
+        seed: seed of the galleries.
 
     Returns:
         Whether the nearest is the thing itself, and the thing's world, for every world.

@@ -28,8 +28,8 @@ class Pictures:
 
     Args:
         worlds: at :data:`training.worlds.editing_pairs.SIZE`.
-        size: of the pictures in px, 64 or 128. At 64, half of the pictures are a quarter of the full one about
-            the thing, so that things come large and small.
+        size: size of the pictures in px, 64 or 128. At 64, half of the pictures are a quarter of the full one
+            about the thing, so that things come large and small.
     """
 
     def __init__(self, worlds: Worlds, size: int) -> None:

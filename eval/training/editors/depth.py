@@ -76,13 +76,13 @@ class DepthStage:
     """A part of the training, which can be stopped and gone on with.
 
     Attributes:
-        size: of the pictures in px.
-        steps: of ``batch`` pictures each.
+        size: size of the pictures in px.
+        steps: number of steps of ``batch`` pictures each.
         peak: learning rate, which falls over the last 30 %.
         worlds: how many of the training worlds are used.
         start: the editor's stage whose text encoder and UNet this one starts from.
         batch: pictures a step.
-        seed: of everything random.
+        seed: seed of everything random.
     """
 
     size: int
@@ -215,7 +215,7 @@ class PromptPool(PicturePool):
         Args:
             noise: (B, 48, h, w) of the latents.
             generator: on the pool's device.
-            size: of the pictures in px.
+            size: size of the pictures in px.
         """
         count = len(noise)
         tokens, true = self.tokens, self.true
@@ -284,7 +284,7 @@ def train_depth_stage(
         data: folder of the pictures, rendered where they are missing.
         out: folder of checkpoints, with the one that the stage starts from.
         stage: in place of the one of that name.
-        device: of torch; on a GPU matrices are multiplied in bfloat16.
+        device: device of torch; on a GPU matrices are multiplied in bfloat16.
         pool: on that device, if it is there already.
     """
     stage = DEPTH_STAGES[name] if stage is None else stage

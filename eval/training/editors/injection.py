@@ -174,7 +174,7 @@ def inputs(
     Args:
         alphas: alpha-bar of the steps.
         empty: tokens of no text.
-        count: of pairs.
+        count: number of pairs.
         generator: on the pool's device.
         inject: False is the control: nothing goes over, B's target is its own answer.
         noisy_from: more of the steps are drawn from here on.
@@ -218,7 +218,7 @@ def injected_loss(
 
     Args:
         net: being trained.
-        x: of :func:`inputs`.
+        x: inputs of :func:`inputs`.
         inject: False is the control: the same runs, nothing goes over.
     """
     moves = Moves(x["noisy A"].shape[-1], x["index"], x["mask"], x["share"])

@@ -93,7 +93,7 @@ class Batch:
         tokens: (B, 24).
         t: (B,) steps.
         weight: (B, 1, h, w) of the cells.
-        rows: what each pair shows.
+        rows: content of each pair.
     """
 
     before: Tensor
@@ -224,8 +224,8 @@ class PairPool(PicturePool):
 
         Args:
             generator: on the pool's device.
-            size: of the pictures in px. At 64, half of the pictures are a quarter of the full one about the thing,
-                so that things come large and small.
+            size: size of the pictures in px. At 64, half of the pictures are a quarter of the full one about
+                the thing, so that things come large and small.
             kinds: how often each kind comes, by name.
             unclear: share of the pairs of kinds with open instructions that get one.
         """
@@ -279,7 +279,7 @@ class PairPool(PicturePool):
 
         Args:
             generator: on the pool's device.
-            size: of the pictures in px, 64 or 128.
+            size: size of the pictures in px, 64 or 128.
             t: (B,) time steps.
             kinds, unclear: see :meth:`rows`.
             composed: share of the open pairs at settled steps whose result has one answer in a region and another

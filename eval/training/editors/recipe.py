@@ -72,8 +72,8 @@ class Stage:
     """A part of the training, which can be stopped, gone on with, and started from another's result.
 
     Attributes:
-        size: of the pictures in px; latents have a quarter of it.
-        steps: of them.
+        size: size of the pictures in px; latents have a quarter of it.
+        steps: number of steps of them.
         peak: learning rate, which falls over the last 30 %.
         worlds: how many of the training worlds of one thing each are used.
         parts: how many of those of things with parts (:mod:`attnwarp_eval.drawn.assemblies`).
@@ -81,10 +81,10 @@ class Stage:
         inject: "none", "features" (recorded features of another run are mixed in, the target composed to match) or
             "control" (the same pairs and steps without the injection).
         batch: pictures of ``size`` in a step; an injected pair is two of them, and there are a quarter as many large ones.
-        seed: of everything random.
+        seed: seed of everything random.
         unclear: share of pairs whose instruction leaves the answer to the noise.
         draws: whether the noise's mean adds to the text (:class:`attnwarp.editing.small_unet.EditUNet`).
-        shift: of the noise schedule, see :func:`training.editors.net.scheduler`.
+        shift: shift of the noise schedule, see :func:`training.editors.net.scheduler`.
         noisy_from: :data:`training.editors.net.NOISY_SHARE` of the steps are drawn from here on.
         composed: share of the open pairs at settled steps whose result has one answer in a region and another
             outside it. Without them the network takes a thing to have one colour, and its late steps undo
@@ -126,8 +126,8 @@ def make_tokenizer(count: int = 80_000, worlds: int = 200) -> Tokenizer:
     """Byte pairs learned from instructions: any text can be written with it, words of the worlds in a token or two.
 
     Args:
-        count: of instructions, about things and parts in turn.
-        worlds: whose looks they name.
+        count: number of instructions, about things and parts in turn.
+        worlds: worlds with the looks that they name.
     """
     rng = np.random.default_rng(20)
     split = PAIR_SPLITS["edit-train"]
@@ -205,7 +205,7 @@ def train_stage(
         name: a key of :data:`STAGES`.
         data: folder of the pictures, rendered where they are missing.
         stage: in place of the one of that name.
-        device: of torch; on a GPU matrices are multiplied in bfloat16.
+        device: device of torch; on a GPU matrices are multiplied in bfloat16.
         pool: on that device, if it is there already.
     """
     stage = STAGES[name] if stage is None else stage

@@ -24,7 +24,7 @@ def learn_byte_pairs(
     Args:
         corpus: sentences.
         vocabulary: how many tokens there are; 0 pads and 1 ends a sentence.
-        most_tokens: of a sentence; the rest is cut.
+        most_tokens: largest number of tokens of a sentence; the rest is cut.
         length: to which every sentence is padded; that of a batch's longest if left out.
     """
     tokenizer = Tokenizer(models.BPE())

@@ -86,10 +86,11 @@ def card(
     """A card in Markdown.
 
     Args:
-        figures: of the trained network (:class:`training.assess.figures.Figure` as dictionaries).
+        figures: figures of the trained network (:class:`training.assess.figures.Figure` as
+            dictionaries).
         control: the same of a network with random weights.
-        facts: what the text's blanks say.
-        files: of weights, whose hashes are given.
+        facts: contents of the text's blanks.
+        files: files of weights, whose hashes are given.
     """
     lines = [f"# {name}", "", ABOUT[name].format(**facts), "", DATA.format(**facts), ""]
     lines += [

@@ -81,7 +81,7 @@ def balanced(scores: Tensor, rounds: int = 3) -> Tensor:
 
     Args:
         scores: (N, P) of the teacher.
-        rounds: of normalising columns, then rows.
+        rounds: number of rounds of normalising columns, then rows.
 
     Returns:
         (N, P), rows that sum to 1.

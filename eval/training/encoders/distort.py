@@ -146,8 +146,8 @@ def distorted(image: Image, kind: str, strength: float, seed: int) -> Image:
         image: (H, W, 3) in [0, 1], with :data:`MARGIN` pixels around what is returned.
         kind: a key of :data:`KINDS`.
         strength: 0 to the kind's greatest.
-        seed: of directions, signs and noise; the same one for both of a pair of one kind, so that
-            strength alone differs.
+        seed: seed of directions, signs and noise; the same one for both of a pair of one kind, so
+            that strength alone differs.
     """
     apply, _ = KINDS[kind]
     out = apply(image, strength, np.random.default_rng(seed))

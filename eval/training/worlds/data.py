@@ -187,7 +187,7 @@ def render_missing(
     """Render the files that are not there, each from its number; all of them are returned in order.
 
     Args:
-        title: what the progress bar says.
+        title: text of the progress bar.
         files: their numbers.
         render: writes a file; it runs in processes of their own.
         workers: how many of these.

@@ -44,7 +44,8 @@ class Scripted:
     """Stands where an editor's runs stand: paints the thing in colours that its seed picks.
 
     Args:
-        obeys: what injected features do: "carry" them where they go, "ignore" them, or paint their colour "anywhere".
+        obeys: effect of injected features: "carry" them where they go, "ignore" them, or paint their colour
+            "anywhere".
     """
 
     def __init__(self, obeys):

@@ -86,7 +86,7 @@ def depth(
     float64.
 
     Args:
-        size: of the square image that is traced.
+        size: size of the square image that is traced.
         rays: pixels held against every triangle in float64.
     """
     from attnwarp_eval._open3d import open3d

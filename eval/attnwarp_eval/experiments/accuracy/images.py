@@ -28,7 +28,7 @@ def pictures(
     variant.
 
     Args:
-        size: of the square picture.
+        size: size of the square picture.
         samples: a pixel.
         rounds: pictures of each contestant.
         reference: how many pictures of how many samples the converged one is the mean of. Its own

@@ -21,7 +21,7 @@ class Contestant:
         name: for a person.
         error: in the panel's unit, with a 95 % interval where rounds differ (bootstrap over
             rounds), else three times itself.
-        seconds: of each round.
+        seconds: seconds of each round.
         more: further figures by name.
     """
 
@@ -38,7 +38,7 @@ class Panel:
     Attributes:
         question: "pictures", "depth" or "visibility".
         scene: its name.
-        unit: of the error.
+        unit: unit of the error.
         contestants: the baseline first; none where the scene leaves nothing to measure.
         again: seconds of the baseline's second run of each round.
         squares: squared error of each round, by contestant ("pictures" only).

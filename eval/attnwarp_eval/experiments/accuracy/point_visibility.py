@@ -41,9 +41,10 @@ def visibility(
     of all triangles in float64, is right.
 
     Args:
-        size: of the target, whose every pixel is a point.
+        size: size of the target, whose every pixel is a point.
         points: how many of them are held against every triangle.
-        rounds: of the timing, which covers all points and the making of the depth map.
+        rounds: number of rounds of the timing, which covers all points and the making of the depth
+            map.
         maps: sizes of the depth maps.
 
     Returns:

@@ -51,7 +51,7 @@ class MeshFile:
         crossed: polygons left out because they cross themselves.
         flat: triangles left out because they have no area.
         unused: vertices that no polygon names.
-        ignored: what else the file holds and nobody uses, in words.
+        ignored: unused contents of the file, in words.
         cut_off: why polygons may be missing at the file's end, or None.
         inside_out: whether the faces of a closed surface look inward.
     """

@@ -29,7 +29,7 @@ class Surface:
         corners: (C,) indices into ``vertices``, polygon after polygon.
         sizes: (P,) corners of each polygon; they sum to C.
         tint: (V, 3) linear RGB, or None.
-        ignored: what the file holds and nobody uses, with its number, such as "3 lines".
+        ignored: unused contents of the file, with its number, such as "3 lines".
         cut_off: why the file may lack its end although its syntax is right, or None.
         first: number of the first vertex in the file's own counting, for messages.
     """

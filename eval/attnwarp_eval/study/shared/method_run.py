@@ -66,10 +66,11 @@ def run_method(
     """Edit a scene by the method of a cell; its seconds go to the work's meter.
 
     Args:
-        work: of the cell, whose spec has ``method``, ``settings``, ``editor`` and ``edit``.
-        names: of the views, the source first.
+        work: work of the cell, whose spec has ``method``, ``settings``, ``editor`` and ``edit``.
+        names: names of the views, the source first.
         editor: in place of the one that the spec names.
-        donor: of the control's features; the other scene's source with the same editor if left out.
+        donor: donor of the control's features; the other scene's source with the same editor if
+            left out.
         segments: (H, W) bool of each view, outside which nothing changes.
     """
     spec, world = work.spec, work.world

@@ -56,8 +56,8 @@ def cells_of_edit(
     Args:
         probe: its name is the study's key under which ``edit`` stands.
         edit: one with at least two answers.
-        own: what else decides the probe's numbers.
-        sources: of the cells, beside the other scene's file.
+        own: further inputs that decide the probe's numbers.
+        sources: sources of the cells, beside the other scene's file.
 
     Raises:
         StudyError: a scene has no such edit.

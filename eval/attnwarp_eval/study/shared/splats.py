@@ -36,7 +36,7 @@ def check_splats(study: Study, probe: str, what: str) -> None:
 
     Args:
         study: with or without the probe.
-        what: of a render it measures.
+        what: measured part of a render.
     """
     for name in study.probes.get(probe, []):
         if study.variants[name].geometry != "splats":

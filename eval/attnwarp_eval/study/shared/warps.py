@@ -38,7 +38,7 @@ def warped_views(work: Work, grids: Sequence[int]) -> Iterator[tuple[str, TwoVie
     """Each target of a cell with its truth and its warp, which counts as the cell's work.
 
     Args:
-        work: of the cell, whose spec has ``settings`` and the source of depth.
+        work: work of the cell, whose spec has ``settings`` and the source of depth.
         grids: sides of the feature grids that are warped too.
     """
     spec, world, meter = work.spec, work.world, work.meter

@@ -43,8 +43,8 @@ def render_plan(
     """A picture by a plan: (H, W, 3) float32, linear RGB, every value finite. It is not cached.
 
     Args:
-        camera: whose view; (H, W) is its size.
-        plan: of :func:`attnwarp_eval.truth.plan.plan`; it has the samples a pixel.
+        camera: camera of the view; (H, W) is its size.
+        plan: plan of :func:`attnwarp_eval.truth.plan.plan`; it has the samples a pixel.
         seed: the same seed and variant give the same bits, except for light paths ("ptracer").
             Threads add those to pixels in any order, which changes the last bits of float32.
         made_by: Mitsuba's variant; :func:`~attnwarp_eval.truth.llvm.variant` if left out.

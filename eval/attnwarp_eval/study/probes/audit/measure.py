@@ -251,7 +251,7 @@ class _Pair:
         refit: Edit PSNR of each of several pairs.
         before: source and target before the edit.
         partners: the true target of each true source after the edit, the right edit's first.
-        texts: what the source and the edit show, in words.
+        texts: descriptions of the source and of the edit.
 
     Attributes:
         contestants: metric -> what computes it of source and target after the edit.

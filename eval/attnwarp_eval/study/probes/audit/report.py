@@ -42,8 +42,8 @@ class Row:
     """A metric as tables show it.
 
     Attributes:
-        key, title: of the metric.
-        needs: what a person needs beside the edited pictures.
+        key, title: key and title of the metric.
+        needs: inputs beside the edited pictures.
         truth: whether that is the truth.
     """
 

@@ -49,9 +49,9 @@ class Transport:
     Attributes:
         needed: effects that are simulated -> the words of the scene's file that call for them.
         not_simulated: effects that are not -> the same.
-        plan: of the rendering, as JSON.
+        plan: plan of the rendering, as JSON.
         everything_on: the integrator that would simulate everything.
-        variant: of Mitsuba, which draws the pictures' noise.
+        variant: variant of Mitsuba, which draws the pictures' noise.
     """
 
     needed: Mapping[str, str]

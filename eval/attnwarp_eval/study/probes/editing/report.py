@@ -341,8 +341,8 @@ def _part(
     """The ratio of a variant's sum over the shared views to its control's, or why there is none.
 
     Args:
-        names: of the variant and its control.
-        shared: what both have in the views that they share, by scene.
+        names: names of the variant and its control.
+        shared: values of both in the views that they share, by scene.
     """
     if scene in shared[0]:
         own, control = (sum(table[scene].values()) for table in shared)

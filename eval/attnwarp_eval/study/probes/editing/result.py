@@ -39,16 +39,16 @@ class EditResult:
     """Entries of a cell's record beside the figures of its views.
 
     Attributes:
-        name, instruction: of the edit.
-        source: what the source's edit shows.
-        alone: what all edited views together show, the source's included.
+        name, instruction: name and instruction of the edit.
+        source: content of the source's edit.
+        alone: content of all edited views together, the source's included.
         answers: by "edit" and "render": by view, the nearest answer; None where nothing of the
             object shows.
         overall: by "edit" and "render", the answer nearest to all views together.
         edit_psnr: dB, edited views against renders, pooled, where a surface shows.
         edited: number of edited views.
         injected: mean share of the targets' pixels that got features; 0 without a warp.
-        budget: of the method; None for none.
+        budget: budget of the method; None for none.
     """
 
     name: str
@@ -94,7 +94,7 @@ class Measurement:
     """The figures of one edited scene.
 
     Args:
-        names: of the views, the source first.
+        names: names of the views, the source first.
         before: the splats before the edit.
     """
 

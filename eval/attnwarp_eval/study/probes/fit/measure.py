@@ -28,7 +28,7 @@ class Point:
         iteration: iterations done.
         seconds, cpu_seconds: spent on them, without evaluations and files.
         splats: their number.
-        loss: of the last iterations, smoothed.
+        loss: loss of the last iterations, smoothed.
         psnr, psnr_pooled: mean over the views held out, and of their mean squared error; dB.
         measures: further figures over the views held out.
     """

@@ -48,12 +48,12 @@ class IdealResult:
     """Entries of a cell's record beside the figures of its views.
 
     Attributes:
-        share: of signal, solved from the editor's ``settled``.
-        settled, frequencies, agreement: of views edited alone,
+        share: share of signal, solved from the editor's ``settled``.
+        settled, frequencies, agreement: settled, frequencies and agreement of views edited alone,
             :class:`attnwarp_eval.ideal.share.Alone`.
         fault: reason why the editor is not ideal; None where it is.
         part_share: mean share of a view's pixels that a part takes, of those that show it.
-        answers: of each part in the source's edit, -1 where it does not show.
+        answers: answers of each part in the source's edit, -1 where it does not show.
         edited: number of edited views.
     """
 

@@ -124,7 +124,7 @@ def _figures(
     """Figures of the part labels that a warp carries.
 
     Args:
-        truth: of the pair, (H, W).
+        truth: truth of the pair, (H, W).
         labels: (H, W) part of each pixel of the source and of the target.
         grid: side of the token grid, a divisor of the image's.
     """

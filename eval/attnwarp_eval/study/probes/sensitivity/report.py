@@ -36,10 +36,10 @@ class Row:
     """A metric as the figure shows it.
 
     Attributes:
-        key: what ranks. A PSNR ranks by its MSE, which is finite where pictures are equal.
+        key: metric that ranks. A PSNR ranks by its MSE, which is finite where pictures are equal.
         title: for people.
         meant: flaws that it is there to see; its discriminating power is the mean over them.
-        cost: whose seconds are its own.
+        cost: metric with its seconds.
     """
 
     key: str

@@ -47,7 +47,7 @@ class Swept:
     """One way of one case, as it was measured.
 
     Attributes:
-        case, way: what was swept.
+        case, way: case, and the swept input.
         outcomes: the easiest level first.
     """
 

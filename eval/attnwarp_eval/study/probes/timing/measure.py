@@ -49,7 +49,7 @@ class Rounds:
 
     Attributes:
         seconds: stage -> contestant -> round; the first contestant's second run comes last.
-        work: of each contestant, counters of one edit; empty for warps.
+        work: work of each contestant, counters of one edit; empty for warps.
     """
 
     seconds: Mapping[str, list[list[float]]]
