@@ -77,7 +77,7 @@ def bits(tensor):
 def both(layer, call):
     """Results of the kernels and of the definition, each with taps of its own."""
     kernels, definition = (
-        dataclasses.replace(layer, backend=backend, _taps={}) for backend in ("auto", "reference")
+        dataclasses.replace(layer, backend=backend) for backend in ("auto", "reference")
     )
     return call(kernels), call(definition)
 
@@ -297,7 +297,7 @@ def test_a_layer_makes_its_taps_once(layer, monkeypatch):
     made = []
     original = cpu.taps_at
     monkeypatch.setattr(cpu, "taps_at", lambda *a: made.append(a) or original(*a))
-    fresh = dataclasses.replace(layer, _taps={}, _masks={})
+    fresh = dataclasses.replace(layer)
     for dtype in (torch.float32, torch.float16, torch.float32):
         rows = tokens_of(random_maps(layer, dtype=dtype))
         fresh.warp_tokens(rows)
