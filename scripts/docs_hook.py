@@ -16,7 +16,11 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = {"attnwarp": ROOT / "attnwarp", "attnwarp_eval": ROOT / "eval" / "attnwarp_eval"}
+PACKAGES = {
+    "attnwarp": ROOT / "attnwarp",
+    "attnwarp_eval": ROOT / "eval" / "attnwarp_eval",
+    "attnwarp_lab": ROOT / "eval" / "attnwarp_lab",
+}
 LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 
 

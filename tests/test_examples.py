@@ -13,7 +13,11 @@ import small_capture
 import torch
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = {"attnwarp": ROOT / "attnwarp", "attnwarp_eval": ROOT / "eval" / "attnwarp_eval"}
+PACKAGES = {
+    "attnwarp": ROOT / "attnwarp",
+    "attnwarp_eval": ROOT / "eval" / "attnwarp_eval",
+    "attnwarp_lab": ROOT / "eval" / "attnwarp_lab",
+}
 
 
 DOORS = [

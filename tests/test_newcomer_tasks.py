@@ -168,7 +168,7 @@ for share in (0.0, 0.5, 1.0):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_a_newcomers_task_touches_two_files_at_most_and_takes_effect(name, tmp_path):
-    for package in ("attnwarp", "eval/attnwarp_eval"):
+    for package in ("attnwarp", "eval/attnwarp_eval", "eval/attnwarp_lab"):
         # With the compiled kernels beside the modules, which numba knows by their times.
         shutil.copytree(ROOT / package, tmp_path / package)
     diff = DIFFS / f"{name}.diff"

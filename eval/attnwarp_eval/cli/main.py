@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from importlib.metadata import entry_points
+from typing import Any
+
 import typer
 
 from attnwarp.cli import shell
@@ -16,7 +19,6 @@ from attnwarp_eval.cli import (
     run,
     scenes,
     stability,
-    userstudy,
 )
 
 app = typer.Typer(
@@ -34,25 +36,50 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+COMMANDS: dict[str, Any] = {
+    "run": run.run,
+    "report": run.report,
+    "verdicts": run.verdicts,
+    "verify": run.verify,
+    "studies": run.studies,
+    "reproduce": reproduce.reproduce,
+    "compare": compare.compare,
+    "stability": stability.stability,
+    "metrics": metrics.metrics,
+    "encoders": metrics.encoders,
+    "inspect": inspect.inspect,
+    "doctor": doctor.doctor,
+    "scenes": scenes.app,
+    "userstudy": None,
+    "cache": cache.app,
+}
+"""Commands in the order of ``--help``; None keeps the place of one of the laboratory."""
+
+GROUP = "attnwarp_eval.commands"
+"""Group of entry points: each names a dictionary of commands by name, typer's apps or functions."""
+
+
+def plugin_commands() -> dict[str, Any]:
+    """Commands of installed packages. One that cannot be imported is named on stderr."""
+    found: dict[str, Any] = {}
+    for entry in entry_points(group=GROUP):
+        try:
+            found |= entry.load()
+        except Exception as error:
+            typer.echo(
+                f"attnwarp-eval: warning: commands of the entry point {entry.value!r} cannot be"
+                f" imported: {type(error).__name__}: {error}",
+                err=True,
+            )
+    return found
+
+
 app.callback()(program_options)
-for command in (
-    run.run,
-    run.report,
-    run.verdicts,
-    run.verify,
-    run.studies,
-    reproduce.reproduce,
-    compare.compare,
-    stability.stability,
-    metrics.metrics,
-    metrics.encoders,
-    inspect.inspect,
-    doctor.doctor,
-):
-    app.command()(command)
-app.add_typer(scenes.app, name="scenes")
-app.add_typer(userstudy.app, name="userstudy")
-app.add_typer(cache.app, name="cache")
+for command_name, command in (COMMANDS | plugin_commands()).items():
+    if isinstance(command, typer.Typer):
+        app.add_typer(command, name=command_name)
+    elif command is not None:
+        app.command(command_name)(command)
 
 
 def main(name: str = "attnwarp-eval") -> None:

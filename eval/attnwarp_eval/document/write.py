@@ -231,8 +231,8 @@ def templates(package: str, *, autoescape: bool) -> Environment:
         autoescape: whether values are text of HTML rather than of Markdown.
 
     Example:
-        >>> templates("attnwarp_eval.userstudy", autoescape=True).list_templates("j2")
-        ['page.html.j2']
+        >>> templates("attnwarp_eval.document", autoescape=True).list_templates("j2")
+        ['report.html.j2', 'report.md.j2']
     """
     return Environment(
         loader=PackageLoader(package, "."),

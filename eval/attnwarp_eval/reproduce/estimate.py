@@ -18,7 +18,7 @@ from attnwarp_eval.reproduce.captures import ready
 from attnwarp_eval.reproduce.cells import Job, Made, Planned
 from attnwarp_eval.reproduce.report import asked_about
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.userstudy.material import MOST_VIEWS, read_picture
+from attnwarp_lab.userstudy.material import MOST_VIEWS, read_picture
 
 STEPS = (1, 3)
 """Steps of denoising of the two pilots of a method: their difference is what a step takes."""

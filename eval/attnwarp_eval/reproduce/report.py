@@ -359,8 +359,8 @@ def asked_about(
 
 def _ask_people(results: Results) -> Path | None:
     """Write the page that compares the rows of the first table; None where there is no pair."""
-    from attnwarp_eval.userstudy.material import CAPTURED, read_items
-    from attnwarp_eval.userstudy.page import Design, build_page
+    from attnwarp_lab.userstudy.material import CAPTURED, read_items
+    from attnwarp_lab.userstudy.page import Design, build_page
 
     folders = []
     groups = asked_about(results.planned, (cell for cell, _ in results.edits()))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
 from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import entry_points
@@ -13,7 +14,7 @@ from attnwarp.errors import InputError
 from attnwarp_eval.cost import count_plugin
 
 GROUP = "attnwarp_eval"
-"""Group of entry points: each names a module of an installed package."""
+"""Group of entry points: each names a module of an installed package. The laboratory's is one."""
 
 VARIABLE = "ATTNWARP_PLUGINS"
 """Environment variable: modules to import as well, separated by commas. Workers of the same machine
@@ -30,12 +31,14 @@ def load_plugins() -> None:
     """
     for module, named_by in _named():
         try:
-            file = importlib.import_module(module).__file__
+            imported = importlib.import_module(module)
         except (Exception, SystemExit) as error:
             raise InputError(
                 f"{named_by}: the plugin {module!r} cannot be imported:"
                 f" {type(error).__name__}: {' '.join(str(error).split())}"
             ) from error
+        package = sys.modules[module.partition(".")[0]]
+        file = package.__file__ or imported.__file__  # none of a namespace
         if file is not None and file.endswith(".py"):
             count_plugin(module, Path(file))
 

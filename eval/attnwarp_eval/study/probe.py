@@ -290,22 +290,23 @@ def unregister(name: str) -> None:
     _registered.pop(name, None)
 
 
+def import_probes(package: str) -> None:
+    """Import the modules of a package of probes, of a folder its ``measure.py``."""
+    folder = importlib.import_module(package).__path__
+    for module in sorted(pkgutil.iter_modules(folder), key=lambda module: module.name):
+        importlib.import_module(f"{package}.{module.name}{'.measure' if module.ispkg else ''}")
+
+
 @cache
 def _discover() -> None:
-    folder = importlib.import_module(PROBES).__path__
-    for module in sorted(pkgutil.iter_modules(folder), key=lambda module: module.name):
-        importlib.import_module(f"{PROBES}.{module.name}{'.measure' if module.ispkg else ''}")
+    import_probes(PROBES)
     load_plugins()
 
 
 def probes() -> list[Probe[Any]]:
-    """Every probe: those that ship by their names, then those registered elsewhere."""
+    """Every probe, by name."""
     _discover()
-    own = {name: p for name, p in _registered.items() if type(p).__module__.startswith(PROBES)}
-    return [
-        *(own[name] for name in sorted(own)),
-        *(p for p in _registered.values() if p.name not in own),
-    ]
+    return [_registered[name] for name in sorted(_registered)]
 
 
 def probe(name: str) -> Probe[Any]:

@@ -4,11 +4,13 @@ import errno
 import os
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
 from attnwarp.cli.shell import file_error
+from attnwarp_eval.cli import main
 
 PRINTS = [sys.executable, "-m", "attnwarp_eval", "cache", "info"]
 
@@ -92,3 +94,11 @@ def test_an_error_of_a_connection_does_not_blame_the_disk():
     assert file_error(missing) == str(missing)
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/study.json")
     assert file_error(full).startswith("run/study.json: No space left on device; check the path")
+
+
+@pytest.mark.door
+def test_commands_of_a_package_that_is_broken_leave_the_others(monkeypatch, capsys):
+    broken = EntryPoint("mine", "no_such_package:COMMANDS", main.GROUP)
+    monkeypatch.setattr(main, "entry_points", lambda group: [broken])
+    assert main.plugin_commands() == {}
+    assert "'no_such_package:COMMANDS' cannot be imported" in capsys.readouterr().err

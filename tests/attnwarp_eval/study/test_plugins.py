@@ -46,22 +46,25 @@ def plugins_of_this_test(monkeypatch):
     cost.environment.cache_clear()
 
 
-@pytest.mark.parametrize("package", [False, True])
-def test_cells_of_a_plugin_that_changed_are_of_other_code(tmp_path, monkeypatch, package):
+@pytest.mark.parametrize(
+    ("package", "plugin"), [(False, "my_other"), (True, "my_other"), (True, "my_other.door")]
+)
+def test_cells_of_a_plugin_that_changed_are_of_other_code(tmp_path, monkeypatch, package, plugin):
     cost.source_hash.cache_clear()
     alone = cost.source_hash()
     file = tmp_path / ("my_other/inner.py" if package else "my_other.py")
     file.parent.mkdir(exist_ok=True)
     if package:
         (tmp_path / "my_other/__init__.py").write_text("from my_other import inner\n")
+        (tmp_path / "my_other/door.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setenv("ATTNWARP_PLUGINS", "my_other")
+    monkeypatch.setenv("ATTNWARP_PLUGINS", plugin)
     hashes = []
     for text in ("answer = 1\n", "answer = 2\n", "answer = 1\n"):
         file.write_text(text)
         plugins.load_plugins.__wrapped__()
         hashes.append(cost.environment()["source"])
-        for name in ("my_other", "my_other.inner"):
+        for name in ("my_other", "my_other.inner", "my_other.door"):
             sys.modules.pop(name, None)
     assert hashes[0] == hashes[2] and len({alone, *hashes}) == 3
 
@@ -111,7 +114,7 @@ def test_a_run_with_a_plugin_that_is_not_here_names_it(tmp_path):
     store = Store(tmp_path / "run")
     content = {"name": "own", "scenes": ["spheres"], "variants": {"a": {}}}
     stored = expected(plan(parse_study(content | {"probes": {"depth": ["a"]}}), store))
-    assert "plugins" not in stored
+    assert stored["plugins"] == ["attnwarp_lab.probes"]  # the laboratory, which comes along
     store.write_study(stored | {"plugins": ["my_plugin"]})
     assert verify(store).missing  # what needs no plugin is read without it
     stored["study"]["probes"] = {"chord": ["a"]}

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
-from attnwarp_eval.userstudy.draw import SCRAMBLED, draw
+from attnwarp_lab.userstudy.draw import SCRAMBLED, draw
 
 STRENGTH = {"alone": 0.0, "warped": 1.5, "third": 0.5}
 QUESTIONS = ["instruction", "quality"]

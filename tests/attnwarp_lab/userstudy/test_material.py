@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from attnwarp.errors import InputError
-from attnwarp_eval.userstudy.material import Item, read_items
+from attnwarp_lab.userstudy.material import Item, read_items
 
 
 def test_a_turntable_turns_one_way_also_where_yaws_are_negative():

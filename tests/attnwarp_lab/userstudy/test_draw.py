@@ -5,7 +5,7 @@ from collections import Counter
 
 import pytest
 
-from attnwarp_eval.userstudy.draw import SCRAMBLED, draw
+from attnwarp_lab.userstudy.draw import SCRAMBLED, draw
 
 METHODS = [["a", "b", "c", "d"], ["a", "b", "c", "d"], ["a", "c", "d"]]
 QUESTIONS = ["instruction", "quality"]

@@ -17,7 +17,7 @@ from attnwarp_eval.cli.main import app
 from attnwarp_eval.document.write import LARGEST
 from attnwarp_eval.study import Store, load_study
 from attnwarp_eval.study.run import expected, plan
-from attnwarp_eval.userstudy.draw import SCRAMBLED
+from attnwarp_lab.userstudy.draw import SCRAMBLED
 
 
 class Reader(HTMLParser):
@@ -99,7 +99,7 @@ def test_methods_and_questions_can_be_chosen(run, tmp_path):
 def test_a_page_of_many_pictures_stays_within_its_size(run, tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     monkeypatch.setattr(
-        "attnwarp_eval.userstudy.page.of_views", lambda item, files: [noise(rng) for _ in files]
+        "attnwarp_lab.userstudy.page.of_views", lambda item, files: [noise(rng) for _ in files]
     )
     assert build(run.root, "--out", tmp_path / "a").exit_code == 0
     _, study = read(tmp_path / "a")
@@ -114,7 +114,7 @@ def noise(rng):
 
 
 def test_scrambling_moves_the_parts_and_keeps_them():
-    from attnwarp_eval.userstudy.material import TILES, scrambled
+    from attnwarp_lab.userstudy.material import TILES, scrambled
 
     rng = np.random.default_rng(0)
     colors = rng.integers(0, 255, (TILES, TILES, 3), np.uint8)

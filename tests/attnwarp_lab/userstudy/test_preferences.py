@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import optimize, special, stats
 
-from attnwarp_eval.statistics.preferences import agreement, chances, preferences, strengths
+from attnwarp_lab.userstudy.preferences import agreement, chances, preferences, strengths
 
 
 def test_strengths_have_the_highest_likelihood():

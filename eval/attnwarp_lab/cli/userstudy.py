@@ -44,8 +44,8 @@ def build(
     """
     from attnwarp.errors import InputError, suggest
     from attnwarp_eval.files import write_atomic
-    from attnwarp_eval.userstudy.material import read_items
-    from attnwarp_eval.userstudy.page import QUESTIONS, Design, build_page
+    from attnwarp_lab.userstudy.material import read_items
+    from attnwarp_lab.userstudy.page import QUESTIONS, Design, build_page
 
     with clear_errors():
         asked = list(QUESTIONS) if questions is None else names(questions) or []
@@ -82,8 +82,8 @@ def score(
     from attnwarp.cli.shell import check_out
     from attnwarp_eval.document import write
     from attnwarp_eval.files import write_atomic
-    from attnwarp_eval.userstudy.answers import read_answers
-    from attnwarp_eval.userstudy.score import report, score
+    from attnwarp_lab.userstudy.answers import read_answers
+    from attnwarp_lab.userstudy.score import report, score
 
     with clear_errors():
         if out is not None:

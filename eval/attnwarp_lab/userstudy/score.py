@@ -11,14 +11,14 @@ from typing import Any
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.document.model import Report, Section, Table
 from attnwarp_eval.document.numbers import number
-from attnwarp_eval.statistics.preferences import (
+from attnwarp_lab.userstudy.answers import Person
+from attnwarp_lab.userstudy.preferences import (
     Agreement,
     Preferences,
     Share,
     agreement,
     preferences,
 )
-from attnwarp_eval.userstudy.answers import Person
 
 OVERALL = "overall"
 """Name of all questions together."""
@@ -89,7 +89,7 @@ def score(people: Sequence[Person]) -> Score:
     """Preferences by question and overall, of the people who failed no attention check.
 
     Args:
-        people: from :func:`attnwarp_eval.userstudy.answers.read_answers`.
+        people: from :func:`attnwarp_lab.userstudy.answers.read_answers`.
 
     Raises:
         ValueError: nobody is left, or nobody chose anything.
@@ -169,7 +169,7 @@ def selection(value: Preferences) -> dict[str, tuple[int, int]]:
     """Times that each method was chosen, and times that it was shown.
 
     Example:
-        >>> from attnwarp_eval.statistics.preferences import preferences
+        >>> from attnwarp_lab.userstudy.preferences import preferences
         >>> selection(preferences({"one": [("a", "b"), ("a", "c"), ("b", "a")]}, ["a", "b", "c"]))
         {'a': (2, 3), 'b': (1, 2), 'c': (0, 1)}
     """

@@ -10,8 +10,8 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from attnwarp.errors import InputError
-from attnwarp_eval.userstudy.draw import SCRAMBLED
-from attnwarp_eval.userstudy.page import FORMAT
+from attnwarp_lab.userstudy.draw import SCRAMBLED
+from attnwarp_lab.userstudy.page import FORMAT
 
 
 class Answer(BaseModel):

@@ -10,8 +10,8 @@ from typing import Any
 
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.document.write import reduced, reduction, templates
-from attnwarp_eval.userstudy.draw import SCRAMBLED, Choice, draw
-from attnwarp_eval.userstudy.material import Item, of_views, scrambled
+from attnwarp_lab.userstudy.draw import SCRAMBLED, Choice, draw
+from attnwarp_lab.userstudy.material import Item, of_views, scrambled
 
 QUESTIONS = {
     "instruction": "Which one follows the instruction better?",
@@ -47,7 +47,7 @@ def build_page(items: Sequence[Item], design: Design, title: str) -> str:
     """The page as HTML, with every picture inside it.
 
     Args:
-        items: items of :func:`attnwarp_eval.userstudy.material.read_items`.
+        items: items of :func:`attnwarp_lab.userstudy.material.read_items`.
 
     Raises:
         InputError: a picture's file is missing.
@@ -95,7 +95,7 @@ def build_page(items: Sequence[Item], design: Design, title: str) -> str:
         + base64.b64encode(reduced(data, scale) if scale < 1 else data).decode()
         for name, data in files.items()
     }
-    environment = templates("attnwarp_eval.userstudy", autoescape=True)
+    environment = templates("attnwarp_lab.userstudy", autoescape=True)
     return environment.get_template("page.html.j2").render(study=study) + "\n"
 
 
