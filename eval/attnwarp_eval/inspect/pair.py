@@ -30,12 +30,12 @@ from attnwarp.warp import (
 )
 from attnwarp.warp.view import near_plane
 from attnwarp_eval.inspect.capture import Capture, Edit, rendered
-from attnwarp_eval.inspect.labels import KINDS, OTHER, Carried, Parts
 from attnwarp_eval.inspect.run import RunEdit
 from attnwarp_eval.study import pictures
 from attnwarp_eval.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
 
 if TYPE_CHECKING:
+    from attnwarp_eval.study.probe import Carried, TokenLabels
     from attnwarp_eval.world import World
 
 Array = npt.NDArray[np.float64]
@@ -106,7 +106,7 @@ class Pair:
         views: a scene with truth, or a user's own.
         model: the splats that give depth; None takes the truth's own depth.
         exact_mask: whether the mask is the truth's, as an oracle's.
-        thing: the scene's thing, in as many parts as a run's probe ``labels`` has, by number.
+        labels: labels of tokens that a probe of a run follows.
     """
 
     views: World | Capture
@@ -116,7 +116,7 @@ class Pair:
     spp: int = 8
     edit: Edit | RunEdit | None = None
     exact_mask: bool = False
-    thing: Parts | None = None
+    labels: TokenLabels | None = None
 
     @property
     def world(self) -> World | None:
@@ -364,7 +364,7 @@ class Pair:
             sides = (target.height, target.width, source.height, source.width)
             if all(side % factor == 0 for side in sides) and min(sides) >= 2 * factor:
                 sizes.append((target.height // factor, target.width // factor))
-        own = () if self.thing is None else self.thing.grids
+        own = () if self.labels is None else self.labels.grids
         return tuple(sorted({*sizes, *((g, g) for g in own if g != target.height)}, reverse=True))
 
     def layer(self, size: Size) -> FeatureWarp:
@@ -378,10 +378,10 @@ class Pair:
         return blocks(self.layer(layer).mask.numpy(), self.size)
 
     def carried(self, layer: Size | None = None) -> Carried | None:
-        """Labels of a thing's parts on a feature grid, or by pixels; None where no run has any."""
-        if self.thing is None or self.truth is None:
+        """Labels carried on a feature grid, or by pixels; None where no run has any."""
+        if self.labels is None or self.truth is None:
             return None
-        return self.thing.carried(self.layer(layer or self.size), self.target, self.truth)
+        return self.labels.carried(self.layer(layer or self.size), self.target, self.truth)
 
     # --- colours
 
@@ -393,7 +393,7 @@ class Pair:
             for name in COLORINGS
             if (self.truth is not None or name not in NEEDS_TRUTH)
             and (self.edit is not None or name != EDIT_DISAGREEMENT)
-            and (self.thing is not None or name != PART_LABELS)
+            and (self.labels is not None or name != PART_LABELS)
         )
 
     def colors(self, coloring: str, layer: Size | None = None, step: str | None = None) -> Image:
@@ -424,10 +424,9 @@ class Pair:
             return disagreement_map(self.disagreement)
         if coloring == PART_LABELS:
             carried = self.carried(layer)
-            assert carried is not None
-            return tinted(
-                [c for _, c in (*KINDS.values(), OTHER)], blocks(carried.kind, self.size), target
-            )
+            assert carried is not None and self.labels is not None
+            colors = [color for _, color in self.labels.legend]
+            return tinted(colors, blocks(carried.kind, self.size), target)
         assert truth is not None
         if coloring == "endpoint error":
             return pictures.endpoint_map(self.view.correspondence.xy.numpy(), truth)
@@ -449,7 +448,7 @@ class Pair:
             ]
             return [("accepted", ACCEPTED), *rules]
         if coloring == PART_LABELS:
-            return [*KINDS.values(), OTHER]
+            return [] if self.labels is None else [*self.labels.legend]
         if coloring == "covered by":
             views = zip(self._covering_views(), CATEGORIES, strict=False)
             return [*views, ("no view", REJECTED)]

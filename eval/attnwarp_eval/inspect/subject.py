@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -25,13 +25,13 @@ from attnwarp_eval.inspect.capture import (
     one_of,
     read_edit,
 )
-from attnwarp_eval.inspect.labels import Parts
 from attnwarp_eval.inspect.pair import Pair
 from attnwarp_eval.inspect.run import Measured, measured
-from attnwarp_eval.study.schema import Splats, Study, Variant
+from attnwarp_eval.study.schema import Splats, Variant
 from attnwarp_eval.study.store import Store
 
 if TYPE_CHECKING:
+    from attnwarp_eval.study.probe import TokenLabels
     from attnwarp_eval.world import World
 
 SIZE = 512
@@ -61,7 +61,7 @@ class Subject:
             it.
         elsewhere: file to open for an edited view that a run has no pictures of; empty for anything
             but a run of edits.
-        thing: parts that a run carries labels of; None where it carries none.
+        labels: labels of tokens that a probe of a run follows; None where none does.
 
     Example:
         >>> subject = of_scene("spheres", 16)
@@ -79,7 +79,7 @@ class Subject:
     edit: Edit | None = field(default=None, repr=False)
     measured: Mapping[str, Measured] = field(default_factory=dict, repr=False)
     elsewhere: str = ""
-    thing: Parts | None = field(default=None, repr=False)
+    labels: TokenLabels | None = field(default=None, repr=False)
     _pairs: dict[tuple[str, str], Pair] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -123,7 +123,7 @@ class Subject:
             self.spp,
             own.edits.get(target),
             own.exact_mask,
-            self.thing,
+            self.labels,
         )
 
     @property
@@ -214,6 +214,7 @@ def of_run(
         >>> of_run(store.root).scene
         'spheres'
     """
+    from attnwarp_eval.study.probe import probe
     from attnwarp_eval.study.run import stored_study
     from attnwarp_eval.world import world
 
@@ -246,7 +247,8 @@ def of_run(
     elsewhere = ""
     if any(own.edited for own in records.values()):
         elsewhere = _elsewhere(folder, pictured, edited)
-    scene, seen = files[name], study.views or views.targets
+    scene, seen = files[name], tuple(study.views or views.targets)
+    followed = (probe(each).token_labels(study, views, seen) for each in study.probes)
     return Subject(
         scene,
         size,
@@ -256,22 +258,7 @@ def of_run(
         (*edited, *seen),
         measured=records,
         elsewhere=elsewhere,
-        thing=_parts(study, views, seen) if "labels" in study.probes else None,
-    )
-
-
-def _parts(study: Study, views: World, targets: Iterable[str]) -> Parts:
-    """Parts that the probe ``labels`` of a study carries, in the first of its numbers."""
-    from attnwarp_eval.study.probes.labels.measure import StudyPart, grids_of
-    from attnwarp_eval.study.shared.things import thing_of
-
-    size = views.source.width
-    return Parts(
-        views,
-        (views.source.name, *targets),
-        tuple(thing_of(study, views.scene)),
-        study.part(StudyPart).labels.parts[0],
-        tuple(grid for grid in grids_of(study, size) if size % grid == 0),
+        labels=next(filter(None, followed), None),
     )
 
 

@@ -53,7 +53,6 @@ from attnwarp_eval.metrics.known_geometry import (
     feature_consistency,
     perceptual_consistency,
 )
-from attnwarp_eval.metrics.labels import carried_labels, label_tokens, label_transport
 from attnwarp_eval.metrics.masks import mask_overlap
 from attnwarp_eval.metrics.multiview import (
     above_floor,
@@ -82,7 +81,6 @@ __all__ = [
     "answers_by_view",
     "at_size",
     "by_yaw",
-    "carried_labels",
     "clip_similarity",
     "confusion",
     "cross_view",
@@ -101,8 +99,6 @@ __all__ = [
     "flow_consistency",
     "image_error",
     "image_similarity",
-    "label_tokens",
-    "label_transport",
     "mask_error",
     "mask_overlap",
     "match_features",

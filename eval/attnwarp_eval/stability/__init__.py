@@ -7,13 +7,16 @@ call the same cases.
 
 from __future__ import annotations
 
+import importlib
 from functools import cache
 
 from attnwarp.errors import InputError, suggest
+from attnwarp_eval.plugins import load_plugins
 from attnwarp_eval.stability.case import DECADES, Bound, Case, Outcome, Verdict, Way, level_name
 
 __all__ = [
     "DECADES",
+    "ROOMS",
     "Bound",
     "Case",
     "Outcome",
@@ -25,6 +28,13 @@ __all__ = [
 ]
 
 
+ROOMS = [
+    f"attnwarp_eval.stability.cases.{room}"
+    for room in ("splats", "warps", "lifting", "truth", "metrics", "editing", "gradients")
+]
+"""Modules with ``CASES``, by room of the library. A plugin appends its own."""
+
+
 @cache
 def hard_cases() -> dict[str, Case]:
     """Every case by its name, in the order of their numbers.
@@ -34,10 +44,10 @@ def hard_cases() -> dict[str, Case]:
         >>> hard_cases()["zero_baseline"].number
         6
     """
-    from attnwarp_eval.stability.cases import EVERY
-
-    table = {item.name: item for item in sorted(EVERY, key=lambda item: item.number)}
-    if len(table) != len(EVERY):
+    load_plugins()
+    cases: list[Case] = [case for room in ROOMS for case in importlib.import_module(room).CASES]
+    table = {item.name: item for item in sorted(cases, key=lambda item: item.number)}
+    if len(table) != len(cases):
         raise ValueError("two hard cases have the same name")
     return table
 

@@ -126,7 +126,6 @@ class Case:
         must_refuse: whether a way must refuse a level.
         required_backward: the last level whose gradients must hold, ``required`` if left out.
         limit: why it ends where it does; empty where it holds at every level.
-        group: which figure shows it; the package of cases sets it.
         version: raise it when the errors change meaning.
 
     Example:
@@ -164,7 +163,6 @@ class Case:
     must_refuse: Callable[[float, Way], bool] = field(default=lambda level, way: False, repr=False)
     required_backward: float | None = None
     limit: str = ""
-    group: str = ""
     version: int = 1
 
     def __post_init__(self) -> None:
@@ -268,9 +266,9 @@ class Outcome:
 
 
 @cache
-def _rows() -> dict[str, dict[str, Any]]:
-    """The rows of cases.yaml by the case's name."""
-    text = (resources.files("attnwarp_eval.stability") / "cases.yaml").read_text("utf-8")
+def _rows(package: str) -> dict[str, dict[str, Any]]:
+    """The rows of a package's cases.yaml by the case's name."""
+    text = (resources.files(package) / "cases.yaml").read_text("utf-8")
     return {
         name: {key: tuple(v) if isinstance(v, list) else v for key, v in row.items()}
         for name, row in read_yaml(text)[1].items()
@@ -284,12 +282,14 @@ def hard(
     *,
     bounds: Mapping[Direction, Bound],
     must_refuse: Callable[[float, Way], bool] = lambda level, way: False,
+    package: str = "attnwarp_eval.stability",
 ) -> Case:
     """The case whose texts and levels stand in a row of cases.yaml.
 
     Args:
         name: row of the table.
         measure, ways, bounds, must_refuse: as in :class:`Case`.
+        package: package whose cases.yaml has the row.
 
     Example:
         >>> from attnwarp_eval.stability.case import exact, hard, ways
@@ -299,7 +299,7 @@ def hard(
     """
     return Case(
         name=name, measure=measure, ways=ways, bounds=bounds, must_refuse=must_refuse,
-        **_rows()[name],
+        **_rows(package)[name],
     )  # fmt: skip
 
 

@@ -20,17 +20,22 @@ from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.warp import FeatureWarp
 from attnwarp_eval.cost import Meter
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import METRICS, Metric, Registry
+from attnwarp_eval.plugins import load_plugins
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.plugins import load_plugins
 from attnwarp_eval.study.record import Extra, Json, NoExtra, PictureFile, Record, View
 from attnwarp_eval.study.results import Outcome
 from attnwarp_eval.study.schema import Part, Study, Variant
+from attnwarp_eval.two_view import TwoView
 from attnwarp_eval.world import World
 
 E = TypeVar("E", bound=Extra)
@@ -56,6 +61,32 @@ class InTurn:
     rounds: int
     threads: int
     of: str
+
+
+class Carried(Protocol):
+    """Labels that the tokens of a grid take along a warp."""
+
+    @property
+    def kind(self) -> npt.NDArray[np.int64]:
+        """(h, w) index into :attr:`TokenLabels.legend`, -1 for its last entry."""
+
+    def text(self, row: int, column: int) -> str:
+        """Words for what happens at a token."""
+
+
+class TokenLabels(Protocol):
+    """Labels of tokens that a probe follows along warps, as ``inspect`` shows them."""
+
+    @property
+    def grids(self) -> Sequence[int]:
+        """Sides of the token grids."""
+
+    @property
+    def legend(self) -> Sequence[tuple[str, str]]:
+        """Text and colour of each kind of token; the last is of all others."""
+
+    def carried(self, layer: FeatureWarp, target: str, truth: TwoView) -> Carried:
+        """Labels that the tokens of a target take along the warp of their grid."""
 
 
 @dataclass
@@ -234,6 +265,12 @@ class Probe(ABC, Generic[E]):
         A probe of methods leaves a method's own settings out, but for those that ``wanted`` names.
         """
         return self.meaning(study, variant) == self.meaning(study, wanted)
+
+    def token_labels(
+        self, study: Study, world: World, targets: Sequence[str]
+    ) -> TokenLabels | None:
+        """Labels of tokens that ``inspect`` shows of a run; None where it follows none."""
+        return None
 
     # From a cell to its record
 

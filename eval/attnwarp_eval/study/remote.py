@@ -15,10 +15,10 @@ from attnwarp.errors import InputError
 from attnwarp.io.file import inside
 from attnwarp_eval.cost import environment, source_hash
 from attnwarp_eval.files import write_atomic
+from attnwarp_eval.plugins import load_plugins
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import MeshSpec
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.plugins import load_plugins
 from attnwarp_eval.study.probe import Probe
 from attnwarp_eval.study.record import Failure, Json
 from attnwarp_eval.study.store import Store

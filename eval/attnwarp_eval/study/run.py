@@ -15,13 +15,13 @@ from attnwarp.errors import InputError
 from attnwarp.process import core_count
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.cost import environment
+from attnwarp_eval.plugins import VARIABLE, load_plugins, plugin_modules
 from attnwarp_eval.scene.base import silence_notices
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.notices import notices
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
-from attnwarp_eval.study.plugins import VARIABLE, load_plugins, plugin_modules
 from attnwarp_eval.study.probe import probe, probes
 from attnwarp_eval.study.record import Environment, Failure
 from attnwarp_eval.study.reporting import CellReporter

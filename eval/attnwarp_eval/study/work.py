@@ -11,9 +11,9 @@ import torch
 from attnwarp.process import core_count
 from attnwarp.render.threads import set_thread_count, thread_count
 from attnwarp_eval.cost import Meter, environment, peak_memory_mb, reset_peak_memory
+from attnwarp_eval.plugins import load_plugins
 from attnwarp_eval.scene.base import silence_notices
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.plugins import load_plugins
 from attnwarp_eval.study.probe import Probe, Work
 from attnwarp_eval.study.record import Cost, Environment, Failure, Record
 from attnwarp_eval.study.store import Store

@@ -15,7 +15,6 @@ from attnwarp.editing.layers import Layer
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.schedule import Prediction, Schedule
 from attnwarp.warp import FeatureWarp, Surface, WarpedView, warp_surfaces
-from attnwarp_eval.ideal.editor import Answers, IdealUNet
 from attnwarp_eval.stability.bilinear import Extended, extended, sampling_matrix
 from attnwarp_eval.stability.case import Bound, Way, exact, hard, ways
 from attnwarp_eval.stability.cases.warps import (
@@ -281,43 +280,6 @@ def _step_terms(prediction: str, x: float, out: float, then: float, now: float) 
         return [float(term) for term in terms]
 
 
-def _ideal(tokens: int, alpha: float, way: Way) -> float:
-    """Error of the ideal editor's picture, at an alpha-bar, of a part of so many tokens of 64."""
-    random, answers = np.random.default_rng(int(tokens)), 3
-    before = random.random((32, 32, 3)).astype(np.float32)
-    after = random.random((answers, 32, 32, 3)).astype(np.float32)
-    parts = np.full(64, -1)
-    parts[random.permutation(64)[:tokens]] = 0
-    view = Answers(before, after, parts.reshape(8, 8))
-    a = torch.tensor([alpha], dtype=torch.float64).float()
-    net = IdealUNet([view], a).to(way.dtype)
-    z, change = net.before[0].double(), net.change[0].double()
-    generator = torch.Generator().manual_seed(1)
-    noise = torch.randn(z.shape, generator=generator, dtype=torch.float64)
-    x = (a.double().sqrt() * (z + change[1]) + (1 - a.double()).sqrt() * noise).to(way.dtype)
-    result = net(x.T.reshape(1, -1, 8, 8), 0, views=[0])[0].flatten(1).T.double()
-
-    now, inside = mpmath.mpf(float(a)), parts >= 0
-    with mpmath.workdps(40):
-        root = mpmath.sqrt(now)
-        logs = []
-        for k in range(answers):
-            # |x - sqrt(a) z_k|^2 but for what all answers share, from exact sums of products.
-            d, rest = change[k][inside].flatten(), x[inside].double().flatten()
-            fit = mpmath.fdot(d.tolist(), rest.tolist())
-            own = mpmath.fdot(d.tolist(), z[inside].flatten().tolist())
-            energy = mpmath.fdot(d.tolist(), d.tolist())
-            logs.append((root * fit - now * own - now / 2 * energy) / (1 - now))
-        weights = [mpmath.exp(value - max(logs)) for value in logs]
-        shares = torch.tensor([float(w / sum(weights)) for w in weights], dtype=torch.float64)
-    expected = z + torch.where(
-        torch.from_numpy(inside)[:, None], torch.einsum("k,knc->nc", shares, change), 0.0
-    )
-    return float((result - expected).abs().max())
-
-
-IDEAL = Bound("of 1", 1e-3, "a quarter of a step of an 8-bit picture is 1e-3")
-
 CASES = [
     hard(
         "half_attention",
@@ -351,17 +313,5 @@ CASES = [
         bounds={
             "forward": Bound("steps of the type", 4, "eight roundings of its terms, each by half")
         },
-    ),
-    hard(
-        "ideal_alpha_bar",
-        lambda alpha, way: _ideal(16, alpha, way),
-        ways("ideal"),
-        bounds={"forward": IDEAL},
-    ),
-    hard(
-        "part_of_one_token",
-        lambda tokens, way: _ideal(int(tokens), 0.01, way),
-        ways("ideal"),
-        bounds={"forward": IDEAL},
     ),
 ]

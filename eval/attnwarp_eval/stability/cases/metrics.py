@@ -35,7 +35,7 @@ def _vectors() -> tuple[np.ndarray, np.ndarray]:
     return rng.uniform(-1, 1, 64), rng.uniform(-1, 1, 64)
 
 
-def _against(expected: float, result: float) -> float:
+def against(expected: float, result: float) -> float:
     """Their difference; infinite where only one of them is undefined, or infinite."""
     if math.isnan(expected) or math.isnan(result):
         return 0.0 if math.isnan(expected) and math.isnan(result) else math.inf
@@ -47,7 +47,7 @@ def _against(expected: float, result: float) -> float:
 def _magnitude(magnitude: float, way: Way) -> float:
     """Error of the cosine of long embeddings."""
     a, b = ((v * magnitude).astype(way.numpy) for v in _vectors())
-    return _against(_cosine(a, b), float(metrics.image_similarity(a, b[None]).values[0]))
+    return against(_cosine(a, b), float(metrics.image_similarity(a, b[None]).values[0]))
 
 
 def _short(length: float, way: Way) -> float:
@@ -56,7 +56,7 @@ def _short(length: float, way: Way) -> float:
     short = (a / np.linalg.norm(a) * length).astype(way.numpy)
     result = float(metrics.image_similarity(short, b[None].astype(way.numpy)).values[0])
     defined = np.linalg.norm(short.astype(np.float64)) >= TINY_NORM
-    return _against(_cosine(short, b.astype(way.numpy)) if defined else math.nan, result)
+    return against(_cosine(short, b.astype(way.numpy)) if defined else math.nan, result)
 
 
 def _displacement(length: float, way: Way) -> float:
@@ -76,7 +76,7 @@ def _displacement(length: float, way: Way) -> float:
     text[0, 0] = text[1, 1] = 1.0
     result = metrics.directional_similarity(before[None], after[None], text[0], text[1])
     defined = np.linalg.norm(change) >= TINY_DISPLACEMENT
-    return _against(
+    return against(
         _cosine(change, text[1] - text[0]) if defined else math.nan, float(result.values[0])
     )
 
@@ -85,7 +85,7 @@ def _psnr(difference: float, way: Way) -> float:
     """Error of the PSNR of pictures that differ by a constant."""
     image = np.full((8, 8, 3), 0.25, way.numpy)
     target = (image + np.array(difference, way.numpy)).astype(way.numpy)
-    return _against(_decibels(image[0, 0, 0], target[0, 0, 0]), metrics.psnr(image, target))
+    return against(_decibels(image[0, 0, 0], target[0, 0, 0]), metrics.psnr(image, target))
 
 
 def _decibels(a: float, b: float) -> float:
@@ -108,7 +108,7 @@ def _masked(outside: Callable[[np.ndarray], None]) -> Callable[[float, Way], flo
         outside(spoiled)
         target[~mask] = spoiled
         expected = _decibels(0.25, 0.375) if pixels else math.nan
-        return _against(expected, metrics.psnr(image, target, mask))
+        return against(expected, metrics.psnr(image, target, mask))
 
     return measure
 
@@ -121,26 +121,6 @@ def _nothing(values: np.ndarray) -> None:
     values[:] = np.nan
 
 
-def _visible_tokens(visible: float, way: Way) -> float:
-    """Error of the shares of right, wrong and missing labels among a few visible tokens of 64."""
-    tokens, seen = np.zeros((8, 8), np.int16), np.zeros((8, 8), bool)
-    seen.ravel()[np.random.default_rng(0).permutation(64)[: int(visible)]] = True
-    carried = (np.arange(64) % 3 - 2).astype(np.int16).reshape(8, 8)  # none, outside, right
-    result = metrics.label_transport(carried, tokens, tokens, seen, ~seen)
-    taken = [int(label) for label, shown in zip(carried.flat, seen.flat, strict=True) if shown]
-    hidden = [int(label) for label, shown in zip(carried.flat, seen.flat, strict=True) if not shown]
-    counted = {
-        "right": (taken.count(0), taken),
-        "wrong": (taken.count(-1), taken),
-        "none": (taken.count(-2), taken),
-        "painted_hidden": (hidden.count(0), hidden),
-    }
-    return max(
-        _against(float(Fraction(n, len(of))) if of else math.nan, result[f"labels.{name}"])
-        for name, (n, of) in counted.items()
-    )
-
-
 def _ends(distance: float, way: Way) -> float:
     """Error of the difference of logits of two shares of 1,000, at a distance from 0 and from 1."""
     count, low, high = 1000, distance, 1 - distance
@@ -150,7 +130,7 @@ def _ends(distance: float, way: Way) -> float:
             for k in (mpmath.mpf(share) * count for share in (low, high))
         ]
         exact = float(logits[1] - logits[0])
-    return _against(exact, compared(low, high, "odds", counts=(count, count)))
+    return against(exact, compared(low, high, "odds", counts=(count, count)))
 
 
 def _baseline(distance: float, way: Way) -> float:
@@ -173,7 +153,7 @@ def _baseline(distance: float, way: Way) -> float:
     source, target = (xy.astype(way.numpy) for xy in pixels)
     found = metrics.epipolar_distance(source, target, F)
     expected = _symmetric_distances(cameras, [source, target])
-    return max(map(_against, expected, map(float, found)))
+    return max(map(against, expected, map(float, found)))
 
 
 def _symmetric_distances(cameras: list[Camera], pixels: list[np.ndarray]) -> list[float]:
@@ -217,9 +197,9 @@ def _matches(count: float, way: Way) -> float:
     middle = (ordered[(len(ordered) - 1) // 2] + ordered[half]) / 2 if len(ordered) >= 10 else None
     below = 1 + (middle is not None and middle < 2)
     return max(
-        _against(math.nan if middle is None else middle, float(result.medians[0])),
-        _against(below / 2, result.share(2)),
-        _against(float(middle is None), result.figures()["consistency.tsed_few_matches"]),
+        against(math.nan if middle is None else middle, float(result.medians[0])),
+        against(below / 2, result.share(2)),
+        against(float(middle is None), result.figures()["consistency.tsed_few_matches"]),
     )
 
 
@@ -235,7 +215,7 @@ def _contrast(contrast: float, way: Way) -> float:
     lines = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]])  # matches lie in rows of pixels
     result = metrics.tsed([metrics.epipolar_distance(source, target, lines)])
     if len(source) < 10:
-        return _against(math.nan, float(result.medians[0]))
+        return against(math.nan, float(result.medians[0]))
     shift = np.median(source - target, axis=0)
     return max(abs(float(shift[0]) - 16), abs(float(shift[1])), float(result.medians[0]))
 
@@ -253,12 +233,6 @@ CASES = [
     hard("empty_mask", _masked(_equal), FLOATS, bounds={"forward": DECIBELS}),
     hard("nan_outside_a_mask", _masked(_nothing), FLOATS, bounds={"forward": DECIBELS}),
     hard("masked_psnr", _masked(_equal), FLOATS, bounds={"forward": DECIBELS}),
-    hard(
-        "visible_tokens",
-        _visible_tokens,
-        (Way("metrics"),),
-        bounds={"forward": Bound("of 1", 1e-12, "a fraction of whole numbers")},
-    ),
     hard(
         "shares_at_the_ends",
         _ends,

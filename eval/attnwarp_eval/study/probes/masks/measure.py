@@ -29,7 +29,7 @@ from attnwarp_eval.study.shared.splats import (
     splats_of,
     surface_spec,
 )
-from attnwarp_eval.study.shared.things import thing_of
+from attnwarp_eval.study.shared.things import ThingsPart, thing_of
 from attnwarp_eval.truth import appearance
 from attnwarp_eval.world import World, turned
 
@@ -58,12 +58,17 @@ class Masks(Probe[NoExtra]):
     """Overlap of lifted masks with the exact ones of the targets."""
 
     name = "masks"
+    study_part = ThingsPart
     variant_part = VariantPart
     metrics = metrics_of("masks.")
 
     def check(self, study: Study) -> None:
         """A variant without splats has nothing to lift through."""
         check_splats(study, self.name, "mask to lift")
+
+    def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
+        """A thing of a scene that is not there would be measured nowhere."""
+        study.check_scenes(study.part(ThingsPart).things, "things", scenes)
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

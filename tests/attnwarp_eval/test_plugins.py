@@ -11,13 +11,13 @@ import pytest
 import yaml
 
 from attnwarp.errors import InputError
-from attnwarp_eval import cost
+from attnwarp_eval import cost, plugins
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.study import Store, editing_methods, parse_study, plugins
+from attnwarp_eval.study import Store, editing_methods, parse_study
 from attnwarp_eval.study.probe import probe, unregister
 from attnwarp_eval.study.run import expected, plan, stored_study, verify
 
-HELPERS = Path(__file__).parents[2] / "helpers"
+HELPERS = Path(__file__).parents[1] / "helpers"
 PLUGIN = """\
 from chord_probe import Chord
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, Method

@@ -7,12 +7,11 @@ import pytest
 import torch
 
 from attnwarp.warp import preset
-from attnwarp_eval import metrics
-from attnwarp_eval.ideal.parts import token_parts
-from attnwarp_eval.ideal.thing import labels_of
-from attnwarp_eval.metrics.labels import NONE, carried_labels
 from attnwarp_eval.study.warping import warp_truth
 from attnwarp_eval.world import world
+from attnwarp_lab.ideal.labels import NONE, carried_labels, label_transport
+from attnwarp_lab.ideal.parts import token_parts
+from attnwarp_lab.ideal.thing import labels_of
 
 PARTS = 9
 
@@ -41,7 +40,7 @@ def test_labels_are_those_of_a_loop_over_pixels(labels, grid, rules):
     layer = warp_truth(of, pair, rules).at((grid, grid))
     source, target = (token_parts(labels[name], (grid, grid)) for name in ("source", "yaw045"))
     carried = carried_labels(layer, source)
-    figures = metrics.label_transport(carried, target, labels["yaw045"], pair.visible, pair.unseen)
+    figures = label_transport(carried, target, labels["yaw045"], pair.visible, pair.unseen)
 
     xy, mask, cell = layer.correspondence.xy.numpy(), layer.mask.numpy(), 64 // grid
     counts = dict.fromkeys(
@@ -97,16 +96,14 @@ def test_labels_are_those_of_a_loop_over_pixels(labels, grid, rules):
 def test_without_tokens_of_a_kind_a_share_is_undefined():
     outside = np.full((2, 2), -1, np.int16)
     nothing = np.zeros((4, 4), bool)
-    figures = metrics.label_transport(
-        outside, outside, np.full((4, 4), -1, np.int16), nothing, nothing
-    )
+    figures = label_transport(outside, outside, np.full((4, 4), -1, np.int16), nothing, nothing)
     assert math.isnan(figures["labels.right"]) and math.isnan(figures["labels.painted_hidden"])
     assert figures["labels.painted_outside"] == 0.0 and figures["labels.outside"] == 4
 
 
 def test_a_grid_that_does_not_divide_the_picture_is_refused():
     with pytest.raises(ValueError, match="tokens: got 3 x 3 for 4 x 4 px"):
-        metrics.label_transport(
+        label_transport(
             np.zeros((3, 3), np.int16), np.zeros((3, 3), np.int16), np.zeros((4, 4), np.int16),
             np.zeros((4, 4), bool), np.zeros((4, 4), bool),
         )  # fmt: skip

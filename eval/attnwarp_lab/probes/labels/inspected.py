@@ -1,22 +1,21 @@
-"""A thing in parts: where the labels of its parts arrive along a warp, token by token."""
+"""Labels of a thing's parts as inspect shows them: what arrives along a warp, token by token."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp_eval import metrics
-from attnwarp_eval.ideal.parts import token_parts
-from attnwarp_eval.ideal.thing import labels_of
+from attnwarp.warp import FeatureWarp
 from attnwarp_eval.two_view import TwoView
-
-if TYPE_CHECKING:
-    from attnwarp_eval.world import World
+from attnwarp_eval.world import World
+from attnwarp_lab.ideal.labels import carried_labels, label_tokens
+from attnwarp_lab.ideal.parts import token_parts
+from attnwarp_lab.ideal.thing import labels_of
 
 KINDS = {
     "right": ("right", "#2ca25f"),
@@ -47,6 +46,7 @@ class Parts:
     objects: tuple[str, ...]
     count: int
     grids: tuple[int, ...]
+    legend: ClassVar[tuple[tuple[str, str], ...]] = (*KINDS.values(), OTHER)
 
     @cached_property
     def labels(self) -> Mapping[str, npt.NDArray[np.int16]]:
@@ -54,16 +54,17 @@ class Parts:
         cameras = [self.world.camera(name) for name in self.views]
         return labels_of(self.world.scene, self.world.geometry, cameras, self.objects, self.count)
 
-    def carried(self, layer: Any, target: str, truth: TwoView) -> Carried:
+    def carried(self, layer: FeatureWarp, target: str, truth: TwoView) -> Carried:
         """Labels that the tokens of a target take along a warp.
 
         Args:
             layer: the warp of the tokens' grid, (h, w).
         """
-        size = tuple(layer.mask.shape)
-        source, own = (token_parts(self.labels[n], size) for n in (self.world.source.name, target))
-        taken = metrics.carried_labels(layer, source)
-        kinds = metrics.label_tokens(taken, own, self.labels[target], truth.visible, truth.unseen)
+        h, w = layer.mask.shape
+        views = self.world.source.name, target
+        source, own = (token_parts(self.labels[name], (h, w)) for name in views)
+        taken = carried_labels(layer, source)
+        kinds = label_tokens(taken, own, self.labels[target], truth.visible, truth.unseen)
         return Carried(own, taken, np.select([kinds[k] for k in KINDS], range(len(KINDS)), -1))
 
 
@@ -74,7 +75,7 @@ class Carried:
     Attributes:
         own: (h, w) true part, -1 outside the thing.
         taken: (h, w) the part that arrives, -1 for what is no part, -2 for none.
-        kind: (h, w) index into :data:`KINDS`, -1 for :data:`OTHER`.
+        kind: (h, w) index into :attr:`Parts.legend`, -1 for :data:`OTHER`.
     """
 
     own: npt.NDArray[np.int16]
@@ -92,4 +93,4 @@ class Carried:
         own, taken, kind = (int(grid[row, column]) for grid in (self.own, self.taken, self.kind))
         what = "no part" if own < 0 else f"part {own}"
         takes = {-2: "nothing", -1: "what is no part"}.get(taken, f"part {taken}")
-        return f"label: {what} takes {takes}: {[*(t for t, _ in KINDS.values()), OTHER[0]][kind]}"
+        return f"label: {what} takes {takes}: {Parts.legend[kind][0]}"

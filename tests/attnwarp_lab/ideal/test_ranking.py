@@ -8,15 +8,15 @@ from torch_threads import on_one_thread
 from attnwarp.methods import attention_warping
 from attnwarp.methods import preset as method_preset
 from attnwarp.warp import preset, warp_view
-from attnwarp_eval import metrics
-from attnwarp_eval.ideal.parts import token_parts
-from attnwarp_eval.ideal.share import solve_share
-from attnwarp_eval.ideal.thing import Thing, in_front
-from attnwarp_eval.metrics.parts import part_answers, part_figures
 from attnwarp_eval.study.controls import MovedView
 from attnwarp_eval.study.warping import warp_truth
 from attnwarp_eval.two_view import HIDDEN
 from attnwarp_eval.world import splats, world
+from attnwarp_lab.ideal.figures import part_answers, part_figures
+from attnwarp_lab.ideal.labels import carried_labels, label_transport
+from attnwarp_lab.ideal.parts import token_parts
+from attnwarp_lab.ideal.share import solve_share
+from attnwarp_lab.ideal.thing import Thing, in_front
 
 SIZE, GRID, PARTS = 128, 32, 12
 VIEWS = ["source", "yaw010", "yaw030", "yaw045", "yaw060"]
@@ -74,8 +74,8 @@ def test_labels_rank_warps_as_the_ideal_editor_does(scene, objects):
         labels, shown = [], []
         for k, name in enumerate(VIEWS[1:], 1):
             pair = of.pair(name, SIZE)
-            carried = metrics.carried_labels(made[k].at((GRID, GRID)), tokens["source"])
-            figures = metrics.label_transport(
+            carried = carried_labels(made[k].at((GRID, GRID)), tokens["source"])
+            figures = label_transport(
                 carried, tokens[name], thing.labels[name], pair.visible, pair.unseen
             )
             labels.append(figures["labels.right"])

@@ -7,9 +7,6 @@ import pytest
 import yaml
 
 from attnwarp.warp import preset
-from attnwarp_eval import metrics
-from attnwarp_eval.ideal.parts import token_parts
-from attnwarp_eval.ideal.thing import labels_of
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
@@ -18,6 +15,9 @@ from attnwarp_eval.study.run import execute, plan
 from attnwarp_eval.study.warping import warp_truth
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.world import world
+from attnwarp_lab.ideal.labels import carried_labels, label_transport
+from attnwarp_lab.ideal.parts import token_parts
+from attnwarp_lab.ideal.thing import labels_of
 
 THING = ["melon", "planet"]
 EXACT = {"depth_relative": 0.0001, "depth_spread": 0.02}
@@ -60,10 +60,8 @@ def test_a_cell_has_the_labels_of_its_warp_by_grid_and_parts(tmp_path):
         labels = labels_of(of.scene, of.geometry, cameras, THING, parts)
         for grid in (8, 16):
             source, target = (token_parts(labels[n], (grid, grid)) for n in ("source", "yaw030"))
-            carried = metrics.carried_labels(warped.at((grid, grid)), source)
-            own = metrics.label_transport(
-                carried, target, labels["yaw030"], pair.visible, pair.unseen
-            )
+            carried = carried_labels(warped.at((grid, grid)), source)
+            own = label_transport(carried, target, labels["yaw030"], pair.visible, pair.unseen)
             for key, value in own.items():
                 got = view.metrics[f"{key}.{grid}.{parts}"]
                 assert got == value or (math.isnan(got) and math.isnan(value))

@@ -14,12 +14,6 @@ import attnwarp.warp
 from attnwarp.editing.editor import edit
 from attnwarp.methods import attention_warping, preset
 from attnwarp.render import render
-from attnwarp_eval.ideal.editor import Answers, IdealEditor, schedule, tokens_of
-from attnwarp_eval.ideal.paint import painted
-from attnwarp_eval.ideal.parts import part_labels, token_parts
-from attnwarp_eval.ideal.share import Alone, Grams, alone, edit_alone, settling_steps, solve_share
-from attnwarp_eval.ideal.thing import Thing
-from attnwarp_eval.metrics.parts import part_answers, part_figures
 from attnwarp_eval.scene.edits import apply
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
@@ -27,6 +21,12 @@ from attnwarp_eval.study.controls import MovedView
 from attnwarp_eval.study.warping import warp_truth
 from attnwarp_eval.two_view import HIDDEN
 from attnwarp_eval.world import splats, world
+from attnwarp_lab.ideal.editor import Answers, IdealEditor, schedule, tokens_of
+from attnwarp_lab.ideal.figures import part_answers, part_figures
+from attnwarp_lab.ideal.paint import painted
+from attnwarp_lab.ideal.parts import part_labels, token_parts
+from attnwarp_lab.ideal.share import Alone, Grams, alone, edit_alone, settling_steps, solve_share
+from attnwarp_lab.ideal.thing import Thing
 
 SPHERES = ["melon", "marble", "beach_ball", "planet", "stone", "bubble"]
 VIEWS = ["source", "yaw010", "yaw030"]

@@ -24,7 +24,7 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from attnwarp.editing.schedule import PUBLISHED_STEPS, following, steps_from
-from attnwarp_eval.ideal.editor import Answers, IdealUNet, schedule
+from attnwarp_lab.ideal.editor import Answers, IdealUNet, schedule
 
 DRAWS = 200
 """Edits of each view alone."""

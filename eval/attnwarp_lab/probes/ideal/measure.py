@@ -15,10 +15,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from attnwarp_eval.ideal.paint import EDIT
-from attnwarp_eval.ideal.share import alone, solve_share
-from attnwarp_eval.ideal.thing import Thing, in_front
-from attnwarp_eval.metrics.parts import part_answers, part_figures
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import EditTruth
@@ -33,9 +29,13 @@ from attnwarp_eval.study.shared.edits import (
 )
 from attnwarp_eval.study.shared.method_run import other_world, own_seconds, run_method
 from attnwarp_eval.study.shared.splats import splats_of
-from attnwarp_eval.study.shared.things import ThingsPart, thing_of
+from attnwarp_eval.study.shared.things import thing_of
 from attnwarp_eval.two_view import HIDDEN
 from attnwarp_eval.world import World
+from attnwarp_lab.ideal.figures import part_answers, part_figures
+from attnwarp_lab.ideal.paint import EDIT
+from attnwarp_lab.ideal.share import alone, solve_share
+from attnwarp_lab.ideal.thing import Thing, in_front
 
 Image = npt.NDArray[np.float32]
 
@@ -50,7 +50,7 @@ class IdealResult:
     Attributes:
         share: share of signal, solved from the editor's ``settled``.
         settled, frequencies, agreement: settled, frequencies and agreement of views edited alone,
-            :class:`attnwarp_eval.ideal.share.Alone`.
+            :class:`attnwarp_lab.ideal.share.Alone`.
         fault: reason why the editor is not ideal; None where it is.
         part_share: mean share of a view's pixels that a part takes, of those that show it.
         answers: answers of each part in the source's edit, -1 where it does not show.
@@ -83,7 +83,6 @@ class IdealProbe(MethodProbe[IdealResult]):
 
     name = "ideal"
     whole = True
-    study_part = ThingsPart
     metrics = metrics_of("parts.")
 
     def check(self, study: Study) -> None:
@@ -101,10 +100,6 @@ class IdealProbe(MethodProbe[IdealResult]):
                     f"probes.{self.name}: method {own.method!r} of {name!r} changes attention"
                     " itself, which the ideal editor has none of; leave it out"
                 )
-
-    def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
-        """A thing of a scene that is not there would be measured nowhere."""
-        study.check_scenes(study.part(ThingsPart).things, "things", scenes)
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]

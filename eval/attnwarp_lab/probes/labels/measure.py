@@ -9,19 +9,21 @@ from typing import Annotated
 from pydantic import Field
 
 from attnwarp.warp import WarpedView
-from attnwarp_eval import metrics
-from attnwarp_eval.ideal.editor import FACTOR
-from attnwarp_eval.ideal.parts import token_parts
-from attnwarp_eval.ideal.thing import labels_of
-from attnwarp_eval.metrics.labels import Labels as LabelMap
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Part, Study, Variant, Whole
-from attnwarp_eval.study.shared.things import ThingsPart, thing_of
+from attnwarp_eval.study.shared.things import thing_of
 from attnwarp_eval.study.shared.warps import WarpProbe, warped_views
 from attnwarp_eval.two_view import TwoView
+from attnwarp_eval.world import World
+from attnwarp_lab.ideal.editor import FACTOR
+from attnwarp_lab.ideal.labels import Labels as LabelMap
+from attnwarp_lab.ideal.labels import carried_labels, label_transport
+from attnwarp_lab.ideal.parts import token_parts
+from attnwarp_lab.ideal.thing import labels_of
+from attnwarp_lab.probes.labels.inspected import Parts
 
 GRIDS = (8, 16, 32, 64)
 """Sides of the token grids that are measured where a study names none."""
@@ -42,7 +44,7 @@ class Labels(Part):
 
 
 class StudyPart(Part):
-    """Keys of a study that only this probe reads; the thing is that of the probe ``ideal``."""
+    """Keys of a study that only this probe reads."""
 
     labels: Labels = Labels()
 
@@ -73,10 +75,6 @@ class LabelTransport(WarpProbe):
                     f"labels.grids: got {grid}, expected divisors of the image size, {study.size}"
                 )
 
-    def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
-        """A thing of a scene that is not there would be measured nowhere."""
-        study.check_scenes(study.part(ThingsPart).things, "things", scenes)
-
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
@@ -92,6 +90,17 @@ class LabelTransport(WarpProbe):
             "grids": grids_of(study, study.size),
             "parts": study.part(StudyPart).labels.parts,
         }
+
+    def token_labels(self, study: Study, world: World, targets: Sequence[str]) -> Parts:
+        """Labels of the first of the numbers of parts."""
+        size = world.source.width
+        return Parts(
+            world,
+            (world.source.name, *targets),
+            tuple(thing_of(study, world.scene)),
+            study.part(StudyPart).labels.parts[0],
+            tuple(grid for grid in grids_of(study, size) if size % grid == 0),
+        )
 
     def compute(self, work: Work) -> NoExtra:
         """Warp, carry and count, view by view."""
@@ -130,6 +139,6 @@ def _figures(
     """
     source, target = (token_parts(of, (grid, grid)) for of in labels)
     with work.meter.stage("carry"):
-        carried = metrics.carried_labels(view.at((grid, grid)), source)
+        carried = carried_labels(view.at((grid, grid)), source)
     with work.meter.stage("checks"):
-        return metrics.label_transport(carried, target, labels[1], truth.visible, truth.unseen)
+        return label_transport(carried, target, labels[1], truth.visible, truth.unseen)

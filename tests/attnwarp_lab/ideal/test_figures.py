@@ -5,7 +5,7 @@ import math
 import numpy as np
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from attnwarp_eval.metrics.parts import PartTruth, part_answers, part_figures
+from attnwarp_lab.ideal.figures import PartTruth, part_answers, part_figures
 
 RANDOM = np.random.default_rng(0)
 

@@ -10,14 +10,14 @@ import numpy as np
 
 from attnwarp.camera import Camera
 from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.ideal.editor import FACTOR, Answers, Cross, IdealEditor
-from attnwarp_eval.ideal.paint import answer_colors, painted
-from attnwarp_eval.ideal.parts import Labels, part_labels, token_parts
-from attnwarp_eval.ideal.share import Grams
-from attnwarp_eval.metrics.parts import PartTruth
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.truth import Geometry, appearance
 from attnwarp_eval.two_view import TwoView
+from attnwarp_lab.ideal.editor import FACTOR, Answers, Cross, IdealEditor
+from attnwarp_lab.ideal.figures import PartTruth
+from attnwarp_lab.ideal.paint import answer_colors, painted
+from attnwarp_lab.ideal.parts import Labels, part_labels, token_parts
+from attnwarp_lab.ideal.share import Grams
 
 
 def labels_of(

@@ -73,7 +73,7 @@ def part_answers(
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp_eval.metrics.parts import PartTruth, part_answers
+        >>> from attnwarp_lab.ideal.figures import PartTruth, part_answers
         >>> after = np.stack([np.full((4, 4, 3), v, np.float32) for v in (0.2, 0.8)])
         >>> truth = PartTruth(after[0], after, np.zeros((4, 4), np.int16), np.zeros((4, 4), bool))
         >>> part_answers(np.full((4, 4, 3), 0.7, np.float32), truth, parts=2).tolist()

@@ -51,7 +51,7 @@ def carried_labels(layer: Layer, source: Labels) -> Labels:
         >>> import numpy as np, torch
         >>> from attnwarp import Camera
         >>> from attnwarp.warp import FeatureWarp, correspond
-        >>> from attnwarp_eval.metrics.labels import carried_labels
+        >>> from attnwarp_lab.ideal.labels import carried_labels
         >>> camera = Camera(np.array([[2.0, 0, 1], [0, 2, 1], [0, 0, 1]]), np.eye(4), 2, 2)
         >>> same = correspond(camera, camera, np.ones((2, 2)))
         >>> layer = FeatureWarp(same, torch.tensor([[True, True], [True, False]]))
@@ -95,9 +95,9 @@ def label_tokens(
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp_eval import metrics
+        >>> from attnwarp_lab.ideal.labels import label_transport
         >>> parts, everywhere = np.array([[0, 1]]), np.ones((1, 2), dtype=bool)
-        >>> kinds = metrics.label_tokens(np.array([[0, 0]]), parts, parts, everywhere, ~everywhere)
+        >>> kinds = label_tokens(np.array([[0, 0]]), parts, parts, everywhere, ~everywhere)
         >>> kinds["right"].tolist(), kinds["wrong"].tolist()
         ([[True, False]], [[False, True]])
     """
@@ -152,11 +152,11 @@ def label_transport(
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp_eval import metrics
+        >>> from attnwarp_lab.ideal.labels import label_transport
         >>> true = np.array([[0, 1, -1]], np.int16)
         >>> seen = np.array([[True, False, False]])
         >>> carried = np.array([[0, 0, -2]], np.int16)
-        >>> figures = metrics.label_transport(carried, true, true, seen, ~seen)
+        >>> figures = label_transport(carried, true, true, seen, ~seen)
         >>> figures["labels.right"], figures["labels.painted_hidden"]
         (1.0, 1.0)
     """

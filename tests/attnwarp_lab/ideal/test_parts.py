@@ -5,9 +5,9 @@ of the views.
 import numpy as np
 import pytest
 
-from attnwarp_eval.ideal.parts import part_labels
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.truth import Geometry
+from attnwarp_lab.ideal.parts import part_labels
 
 TOWER = ("card_20mm", "card_50mm", "card_100mm", "tile_20mm", "tile_50mm", "tile_100mm")
 

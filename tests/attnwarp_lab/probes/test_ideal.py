@@ -13,18 +13,18 @@ from typer.testing import CliRunner
 
 from attnwarp.methods import attention_warping, preset
 from attnwarp_eval.cli.main import app
-from attnwarp_eval.ideal.share import Alone, alone, solve_share
-from attnwarp_eval.ideal.thing import Thing, in_front
-from attnwarp_eval.metrics.parts import part_answers, part_figures
 from attnwarp_eval.report.build import build
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import StudyError, cells_of, load_study
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
-from attnwarp_eval.study.probes.ideal import measure
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.two_view import HIDDEN
 from attnwarp_eval.world import splats, world
+from attnwarp_lab.ideal.figures import part_answers, part_figures
+from attnwarp_lab.ideal.share import Alone, alone, solve_share
+from attnwarp_lab.ideal.thing import Thing, in_front
+from attnwarp_lab.probes.ideal import measure
 
 THING = ["melon", "planet", "beach_ball"]
 STUDY = {
