@@ -48,6 +48,14 @@ def plugin_modules() -> list[str]:
     return sorted({module for module, _ in _named()})
 
 
+def plugin_folders(name: str) -> list[Path]:
+    """Folders of that name in the packages of plugins, which need not be there."""
+    load_plugins()
+    packages = sorted({module.partition(".")[0] for module in plugin_modules()})
+    paths = (path for each in packages for path in getattr(sys.modules[each], "__path__", ()))
+    return [Path(path) / name for path in paths]
+
+
 def _named() -> Iterator[tuple[str, str]]:
     """Module names, each with what names it."""
     for entry in entry_points(group=GROUP):

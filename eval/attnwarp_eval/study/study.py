@@ -13,6 +13,7 @@ from pydantic import BaseModel, Field, ValidationError, create_model, model_vali
 from attnwarp.errors import InputError
 from attnwarp.io.text import read_text
 from attnwarp_eval.metrics.registry import Metric
+from attnwarp_eval.plugins import plugin_folders
 from attnwarp_eval.scene import explain
 from attnwarp_eval.scene.file import is_scene_file, scene_name
 from attnwarp_eval.scene.scene import Scene
@@ -260,9 +261,10 @@ def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:
 
 
 def shipped_studies() -> dict[str, Path]:
-    """Studies that come with the package, by name."""
-    folder = Path(str(resources.files("attnwarp_eval.study") / "shipped"))
-    return {p.stem: p for p in sorted(folder.glob("*.yaml"))}
+    """Studies that come with the package or in the folder ``studies`` of a plugin's, by name."""
+    own = Path(str(resources.files("attnwarp_eval.study") / "shipped"))
+    files = [p for folder in (own, *plugin_folders("studies")) for p in folder.glob("*.yaml")]
+    return {p.stem: p for p in sorted(files, key=lambda p: p.stem)}
 
 
 def load_study(name_or_path: str, **overrides: Any) -> Study:
