@@ -219,6 +219,7 @@ def edit(
         from attnwarp import check, methods
         from attnwarp.editing.segment import check_marks
         from attnwarp.io.file import existing_file
+        from attnwarp.methods.change import say_change, say_little
         from attnwarp.methods.command import (
             FitPlan,
             check_asked,
@@ -264,6 +265,9 @@ def edit(
             ),
             budget=budget, report=report, **own,
         )  # fmt: skip
+        typer.echo(say_change(result.change, edit_options.marks.option != ""))
+        if little := say_little(result.change):
+            warnings.warn(little, InputWarning, stacklevel=1)
         views = len(result.edited)
         carried = ""
         if getattr(settings, "method", None) == "warp" and views > 1:

@@ -9,7 +9,7 @@ views/NAME.png        the last edit of each view
 renders/before/ after/  the scene from every view
 sheet.png             both and the edits, side by side
 cut.json              the budget's limit that ended the run, and its place; absent if none did
-edited.ply  result.json  times.json  the edited splats; counters and Edit PSNR; seconds by part
+edited.ply  result.json  times.json  the edited splats; change, counters, Edit PSNR; seconds by part
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from attnwarp.fit import compile_kernels
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
 from attnwarp.io.names import file_stems
+from attnwarp.methods.change import Change, change_of
 from attnwarp.methods.pictures import (
     Bytes,
     Image,
@@ -144,6 +145,8 @@ class Result:
         seconds: by part, over all sittings.
         cut: "seconds" or "network_rows" where that limit of the budget ended the run; None for a
             whole run.
+        change: dE00 inside the mask: of the "scene", from renders before to renders after, and of
+            the "source view", or of the "edited views" by a method without a source.
 
     Example:
         >>> import numpy as np, torch
@@ -164,6 +167,7 @@ class Result:
     counters: dict[str, float]
     seconds: dict[str, float]
     cut: str | None = None
+    change: Change = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -566,6 +570,7 @@ class _Run:
                         self.folder.write_picture(path, to_bytes(picture))
             self.folder.write_picture("sheet.png", self._sheet())
             psnr = self._edit_psnr(final)
+            change = change_of(self.work, self.names, self.method.about.get("source"), edited)
         records = {
             view: self.folder.record(self._picture(number, view))
             for view, number in self.latest.items()
@@ -581,12 +586,11 @@ class _Run:
         }
         tuned = {self.names[view]: n for view, n in sorted(self.tuning.visits.items())}
         limit = None if cut is None else cut["limit"]
-        self.folder.write_json(
-            "result.json", {"edit_psnr": psnr, "counters": counters, "tuned": tuned, "cut": limit}
-        )
+        about = {"edit_psnr": psnr, "counters": counters, "tuned": tuned, "cut": limit}
+        self.folder.write_json("result.json", {"change": change, **about})
         self.seconds.write()
         return Result(
-            self.name, final, edited, self.rounds, psnr, counters, self.seconds.parts, limit
+            self.name, final, edited, self.rounds, psnr, counters, self.seconds.parts, limit, change
         )
 
     def _edit_psnr(self, final: Gaussians) -> dict[str, Any]:

@@ -37,6 +37,7 @@ from attnwarp.methods.features import Features
 from attnwarp.methods.marks import (
     HOW,
     Marks,
+    check_middle,
     lifted_segments,
     read_mask,
     read_over_black,
@@ -264,6 +265,7 @@ def marked(
                 f"{marks.option}: lifted through the splats, what it marks covers no pixel of any"
                 f" view; mark more, by {HOW}, or all views by --masks"
             )
+        check_middle(marks, mask, camera.width / size[0], lifted[index])
         return lifted
 
     return segments

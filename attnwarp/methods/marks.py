@@ -15,7 +15,7 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.digest import digest
-from attnwarp.editing.segment import Mask, check_marks, cut_out, load_segmenter, segments_of
+from attnwarp.editing.segment import CORE, Mask, check_marks, cut_out, load_segmenter, segments_of
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import read_upright
@@ -34,6 +34,12 @@ HOW = "--at X,Y, --box X0,Y0,X1,Y1, --mask FILE or --where WORDS"
 
 POOR = 0.8
 """Overlap of a mask and of itself, lifted, below which the splats do not follow it."""
+
+KEPT = 0.1
+"""Share of the middle of what is marked that its lifted mask must keep."""
+
+CLICKED = 2.0
+"""Radius of the middle of a click, px."""
 
 
 @dataclass(frozen=True)
@@ -247,6 +253,39 @@ def lifted_segments(
     # The soft edge lies inside, so that nothing changes where less than half of a pixel is marked.
     soft = (np.clip(4 * lifted.render(camera) - 2, 0, 1) for camera in cameras)
     return [np.rint(255 * share).astype(np.float32) / np.float32(255) for share in soft]
+
+
+def check_middle(marks: Marks, mask: Mask, scale: float, lifted: Segment) -> None:
+    """Refuse a lifted mask that leaves out the middle of what the source's marks are of.
+
+    Args:
+        marks: marks of the source.
+        mask: (H, W) of the source view, as it is marked.
+        scale: px of the view for each px of its file, which the marks are in.
+        lifted: (H, W) in [0, 1] of the source view.
+
+    Raises:
+        InputError: it leaves the middle out: of a box, of a click, or of the mask's widest part.
+    """
+    import cv2
+
+    h, w = mask.shape
+    x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
+    if marks.box is not None:
+        x0, y0, x1, y1 = (scale * v for v in marks.box)
+        limit, away = CORE, np.hypot((2 * x - x0 - x1) / (x1 - x0), (2 * y - y0 - y1) / (y1 - y0))
+    elif marks.at is not None:
+        limit, away = CLICKED, np.hypot(x - scale * marks.at[0], y - scale * marks.at[1])
+    else:
+        inward = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        limit, away = 0.5, 1 - inward / inward.max()
+    share = (lifted[away <= max(limit, away.min())] > 0.5).mean()
+    if share < KEPT:
+        raise InputError(
+            f"{marks.option}: lifted through the splats, what it marks leaves {1 - share:.0%} of"
+            " its own middle out, so other things would be edited; mark the thing in another way,"
+            f" by {HOW}, or in another --source"
+        )
 
 
 def read_mask(

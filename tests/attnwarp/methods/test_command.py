@@ -12,16 +12,18 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import PIL.ImageOps
 import pytest
 import torch
+from skimage.color import deltaE_ciede2000, rgb2lab
 from tiny_editors import pix2pix
 from tiny_scenes import cameras, pictures, splats
 from tiny_segmenters import save_dino, save_sam
 from typer.testing import CliRunner
 
-from attnwarp import Camera
+from attnwarp import Camera, Gaussians
 from attnwarp.cli.main import app
 from attnwarp.editing.segment import GroundedSam, cut_out
 from attnwarp.errors import InputError
@@ -240,12 +242,12 @@ def test_a_box_marks_what_opencv_cuts_out(place, tmp_path, option, value):
 def test_a_click_is_held_to_the_surface_around_it(place, tmp_path):
     """Oracle: the cut of the source's picture on the piece around the point, given as a file."""
     source = read_image(place / "data" / "images" / "v0.png").astype(np.float32) / 255
-    mask = cut_out(source, at=(16, 16))
-    mask &= piece_around(read_ply(place / "splats.ply"), cameras()[0], (16, 16))
+    mask = cut_out(source, at=(8, 20))
+    mask &= piece_around(read_ply(place / "splats.ply"), cameras()[0], (8, 20))
     picture = 255 * np.repeat(mask[..., None], 3, axis=2).astype(np.uint8)
     (tmp_path / "mask.png").write_bytes(encode_png(picture))
     ply = ("--ply", place / "splats.ply")
-    done = run(place, tmp_path / "a", *ply, "--at", "16,16")
+    done = run(place, tmp_path / "a", *ply, "--at", "8,20")
     assert done.exit_code == 0 and "held to the surface around the point" in done.output
     assert run(place, tmp_path / "b", *ply, "--mask", tmp_path / "mask.png").exit_code == 0
     for k in range(len(cameras())):
@@ -439,6 +441,58 @@ def test_a_mark_of_which_nothing_is_left_is_named_by_its_option(place, tmp_path)
     result = run(place, tmp_path, "--ply", place / "splats.ply", "--mask", place / "pixel.png")
     assert result.exit_code == 2
     assert "--mask: lifted through the splats, what it marks covers no pixel" in result.output
+
+
+def test_a_box_whose_lifted_mask_leaves_its_middle_out_is_refused(place, tmp_path):
+    """Splats that have a ball's rim and not its middle, where the wall shows through."""
+    angle = torch.linspace(0, 2 * torch.pi, 60)
+    rim = torch.stack([0.6 * angle.cos(), 0.6 * angle.sin(), 0 * angle], dim=1)
+    colors = torch.tensor([[0.8, 0.1, 0.1]] + [[0.1, 0.8, 0.2]] * 60)
+    model = Gaussians(
+        "2d", torch.cat([torch.tensor([[0.0, 0, -0.1]]), rim]),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(61, 1),
+        torch.tensor([0.9, *[0.05] * 60])[:, None].repeat(1, 2), torch.full((61,), 0.99),
+        Gaussians.sh_from_rgb(colors),
+    )  # fmt: skip
+    write_ply(tmp_path / "target.ply", model)
+    shutil.copytree(place / "data", tmp_path / "data")
+    shutil.copytree(place / "editor", tmp_path / "editor")
+    photograph = 255 * render(model, cameras()[2]).color.clamp(0, 1).numpy()
+    cv2.circle(photograph, (16, 16), 9, (25, 204, 51), -1)
+    path = tmp_path / "data" / "images" / "v2.png"
+    path.write_bytes(encode_png(np.rint(photograph).astype(np.uint8)))
+    result = run(
+        tmp_path, tmp_path / "out", "--ply", tmp_path / "target.ply", "--box", "5,5,27,27",
+        "--source", "v2.png",
+    )  # fmt: skip
+    assert result.exit_code == 2, result.output
+    assert re.search(r"--box: lifted through the splats, .* leaves \d+% of its own", result.output)
+    assert not (tmp_path / "out" / "rounds").exists()
+
+
+def test_an_edit_begins_with_how_much_it_changed_inside_the_mask(place, tmp_path):
+    """Oracle: scikit-image on the files of the folder."""
+    half = np.zeros((32, 32), dtype=bool)
+    half[:, :16] = True
+    picture = 255 * np.repeat(half[..., None], 3, axis=2).astype(np.uint8)
+    (tmp_path / "mask.png").write_bytes(encode_png(picture))
+    out, ply = tmp_path / "out", ("--ply", place / "splats.ply")
+    result = run(place, out, *ply, "--mask", tmp_path / "mask.png", "--iterations", 0)
+    assert result.exit_code == 0, result.output
+    inside = read_image(out / "segments" / "v0.png")[..., 0] > 127
+    source = read_image(place / "data" / "images" / "v0.png")
+    edited = read_image(out / "views" / "v0.png")
+    expected = deltaE_ciede2000(rgb2lab(source), rgb2lab(edited))[inside].mean()
+    change = json.loads((out / "result.json").read_text())["change"]
+    assert change["scene"] == 0  # not tuned
+    assert change["source view"] == pytest.approx(expected, abs=0.01)
+    line = f"inside the mask the scene changed by 0.0 dE00, the source view by {expected:.1f}"
+    assert result.stdout.splitlines()[0] == line
+    page = (out / "index.html").read_text()
+    first = re.search(r"</h1>\s*<p>(.*?)</p>", page)[1]
+    assert line[1:] in first
+    for said in (result.stderr, page):
+        assert "the splats hardly took the edit" in " ".join(said.split())
 
 
 def test_an_edit_of_other_settings_or_words_is_refused_before_a_picture_is_read(place, tmp_path):

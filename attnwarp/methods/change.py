@@ -1,0 +1,126 @@
+"""Change that an edit made, and advice where that is hardly anything."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from attnwarp.colors import ciede2000, to_lab
+from attnwarp.methods.pictures import Bytes, Mask, resized, to_bytes
+from attnwarp.methods.work import Work
+
+LITTLE = 3.0
+"""dE00 inside the mask below which an edit is hardly seen. Two pictures side by side differ visibly
+from about 1; rounding, tuning and a source that stays as it was make up to 2."""
+
+MOST_PIXELS = 20_000
+"""Pixels of a view that are compared, evenly spread; more change no digit that is shown."""
+
+Change = Mapping[str, float | None]
+"""Mean CIEDE2000 of "scene" and of "source view", or of "edited views" where a method has no
+source; None where there is no pixel."""
+
+
+def change_of(
+    work: Work, names: Sequence[str], source: str | None, edited: Mapping[int, Bytes]
+) -> Change:
+    """Change inside the mask of an edit whose renders are written.
+
+    Args:
+        work: the scene before the edit, and the folder of its renders.
+        names: file names of the views.
+        source: name of the source view, which the scene's change leaves out; None for no source.
+        edited: edited views by their numbers.
+
+    Returns:
+        The change of renders from before the edit to after, and of the source's picture.
+    """
+    segments = work.scene.segments
+    masks = None if segments is None else [segment > 0.5 for segment in segments]
+
+    def rendered(views: Iterable[int]) -> float | None:
+        read = work.folder.read_picture
+        return mean_change(
+            (read(f"renders/before/{names[view]}.png"), read(f"renders/after/{names[view]}.png"),
+             masks and masks[view])
+            for view in views
+        )  # fmt: skip
+
+    def edit(view: int) -> tuple[Bytes, Bytes, Mask | None]:
+        size = work.sizes[view]
+        mask = (
+            masks and resized(np.float32(masks[view])[..., None].repeat(3, 2), size)[..., 0] > 0.5
+        )
+        return to_bytes(work.picture(view)), edited[view], mask
+
+    views = range(len(names))
+    scene = rendered(view for view in views if names[view] != source)
+    edits = [view for view in edited if source in (None, names[view])]
+    return {
+        "scene": rendered(views) if scene is None else scene,
+        "source view" if source else "edited views": mean_change(map(edit, edits)),
+    }
+
+
+def mean_change(pictures: Iterable[tuple[Bytes, Bytes, Mask | None]]) -> float | None:
+    """Mean CIEDE2000 of pictures before and after, over all pixels of all views.
+
+    Args:
+        pictures: (h, w, 3) uint8 of a view before, after, and (h, w) bool of the pixels that count,
+            None for all.
+
+    Returns:
+        dE00; None where no pixel counts.
+
+    Example:
+        >>> import numpy as np
+        >>> white, black = (np.full((2, 2, 3), value, np.uint8) for value in (255, 0))
+        >>> left = np.array([[True, False]] * 2)
+        >>> half = np.where(left[..., None], black, white)
+        >>> round(mean_change([(white, half, left)])), round(mean_change([(white, half, None)]))
+        (100, 50)
+    """
+    total, count = 0.0, 0
+    for before, after, mask in pictures:
+        inside = np.ones(before.shape[:2], bool) if mask is None else mask
+        n = int(inside.sum())
+        one, two = (v[inside][:: 1 + n // MOST_PIXELS] for v in (before, after))
+        if n:
+            total += n * float(ciede2000(to_lab(one), to_lab(two)).mean())
+            count += n
+    return total / count if count else None
+
+
+def say_change(change: Change, masked: bool) -> str:
+    """The first line of an edit's page and of its command.
+
+    Example:
+        >>> say_change({"scene": 9.04, "source view": 20.5}, masked=True)
+        'inside the mask the scene changed by 9.0 dE00, the source view by 20.5'
+    """
+    (_, scene), (name, edit) = change.items()
+    where = "inside the mask the" if masked else "the"
+    return f"{where} scene changed by {_short(scene)} dE00, the {name} by {_short(edit)}"
+
+
+def say_little(change: Change) -> str | None:
+    """Advice where next to nothing changed; None where something did.
+
+    Example:
+        >>> say_little({"scene": 0.4, "source view": 20.5})
+        'the splats hardly took the edit: try more --iterations or --stages'
+    """
+    (_, scene), (name, edit) = change.items()
+    if edit is not None and edit < LITTLE:
+        return (
+            f"the editor hardly changed the {name}: try other words, a larger --set"
+            " text_guidance=N, or another --editor; a mask must hold what the words name"
+        )
+    if scene is not None and scene < LITTLE:
+        return "the splats hardly took the edit: try more --iterations or --stages"
+    return None
+
+
+def _short(value: float | None) -> str:
+    return "nothing" if value is None else f"{value:.1f}"
