@@ -65,7 +65,7 @@ def results(study, cells):
 
 
 def unpack_stored(folder):
-    """Put the two stored runs, which report/test_stored_runs.py describes, into a folder."""
+    """Put the stored run, which report/test_stored_runs.py describes, into a folder."""
     data = Path(__file__).parents[1] / "attnwarp_eval" / "data" / "runs.tar.xz"
     with tarfile.open(data) as archive:
         # Python 3.11.3 and before have no filters.

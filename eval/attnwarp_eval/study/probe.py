@@ -5,7 +5,7 @@ How a report shows one is in :mod:`attnwarp_eval.study.probe_report`.
 
 >>> [probe.name for probe in probes()]
 ['audit', 'calibration', 'carry', 'depth', 'editing', 'fit', 'ideal', 'labels', 'masks',
- 'reconstruction', 'sensitivity', 'stability', 'timing', 'warp']
+ 'stability', 'timing', 'warp']
 >>> probe("depth").metric("depth.abs_rel").direction
 'lower'
 """

@@ -397,11 +397,15 @@ def test_a_malformed_baseline_is_one_line_and_exit_code_2(stored, tmp_path, name
 
 
 def test_missing_files_and_runs_of_other_studies_are_exit_code_2(stored, tmp_path):
+    other = tmp_path / "other.jsonl"
+    write_baseline(
+        other, dataclasses.replace(read_snapshot(Store(stored / "variants")), study="other")
+    )
     for arguments, message in (
         ((tmp_path / "none.jsonl", stored / "variants"), "no such baseline"),
         ((stored / "baseline.jsonl", tmp_path), "not a run's folder"),
-        ((stored / "baseline.jsonl", stored / "edits"), "expected 'stored-edits' as the run's"),
-        ((stored / "baseline.jsonl", stored / "edits", "--update"), "a baseline of study"),
+        ((other, stored / "variants"), "expected 'stored' as the run's"),
+        ((other, stored / "variants", "--update"), "a baseline of study"),
         ((stored / "variants", stored / "variants", "--update"), "a folder"),
     ):
         done = gate(*arguments)

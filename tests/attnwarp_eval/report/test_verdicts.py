@@ -100,11 +100,8 @@ def test_raw_results_outlive_the_keys_of_their_study(folder, tmp_path):
     assert read_raw(tmp_path / "older.jsonl.xz").study == read_raw(path).study
 
 
-@pytest.mark.parametrize("name", ["variants", "edits"])
-def test_raw_results_hold_every_figure_of_the_run_and_no_path_of_this_machine(
-    folder, name, tmp_path
-):
-    store = Store(folder / name)
+def test_raw_results_hold_every_figure_of_the_run_and_no_path_of_this_machine(folder, tmp_path):
+    store = Store(folder / "variants")
     done = invoke("report", store.root, "--no-pictures", "--raw", tmp_path / "reports")
     path = tmp_path / "reports" / "results.jsonl.xz"
     assert done.exit_code == 0 and str(path) in done.output
@@ -124,9 +121,8 @@ def test_raw_results_hold_every_figure_of_the_run_and_no_path_of_this_machine(
         assert "0 worse, 0 can't tell, 0 better" in same.output
 
 
-@pytest.mark.parametrize("name", ["variants", "edits"])
-def test_a_folder_of_raw_results_gives_the_report_of_its_run(folder, name, tmp_path):
-    store, raw = Store(folder / name), tmp_path / "reports"
+def test_a_folder_of_raw_results_gives_the_report_of_its_run(folder, tmp_path):
+    store, raw = Store(folder / "variants"), tmp_path / "reports"
     assert invoke("report", store.root, "--no-pictures", "--raw", raw).exit_code == 0
     done = invoke("report", raw)
     assert done.exit_code == 0 and str(raw / "report.html") in done.output
@@ -265,11 +261,12 @@ def test_halves_of_the_committed_populations_contradict_each_other_in_no_verdict
 
 
 def test_raw_results_are_lines_of_json(folder, tmp_path):
-    invoke("report", folder / "edits", "--no-pictures", "--raw", tmp_path / "own.jsonl.xz")
+    invoke("report", folder / "variants", "--no-pictures", "--raw", tmp_path / "own.jsonl.xz")
     text = lzma.decompress((tmp_path / "own.jsonl.xz").read_bytes()).decode()
     head, *cells = map(json.loads, text.splitlines())
-    assert head["study"]["name"] == "stored-edits" and len(cells) == 2
-    assert {cell["record"]["spec"]["probe"] for cell in cells} == {"calibration", "sensitivity"}
+    assert head["study"]["name"] == "stored" and len(cells) == 16
+    probes = {cell["record"]["spec"]["probe"] for cell in cells}
+    assert probes == {"calibration", "depth", "fit", "timing", "warp"}
 
 
 def test_of_200_simulated_runs_of_equal_arms_few_judge_and_no_interval_disagrees(tmp_path):

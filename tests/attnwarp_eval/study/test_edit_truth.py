@@ -10,7 +10,6 @@ from attnwarp_eval.study import Store, parse_study
 from attnwarp_eval.study.edit_truth import edit_truth
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probes.editing import measure as editing
-from attnwarp_eval.study.probes.sensitivity import measure as sensitivity
 from attnwarp_eval.study.probes.timing import measure as timing
 from attnwarp_eval.study.run import plan
 from attnwarp_eval.study.work import compute
@@ -49,14 +48,13 @@ def planned(path, kind, root):
         "spp": 1,
         "views": ["yaw015", "yaw030"],
         "variants": {"alone": {"method": "by_view"}, "more": {"method": "igs2gs"}},
-        "probes": {"editing": ["alone", "more"]}
-        | {kind: [] if kind == "sensitivity" else ["alone", "more"]},
+        "probes": {"editing": ["alone", "more"]} | {kind: ["alone", "more"]},
     }
     cells = plan(parse_study(study), Store(root)).cells
     return next(cell for cell in cells if cell.probe == kind)
 
 
-@pytest.mark.parametrize("kind", ["editing", "timing", "sensitivity"])
+@pytest.mark.parametrize("kind", ["editing", "timing"])
 def test_a_cell_of_an_edit_that_the_file_no_longer_has_is_refused(
     path, tmp_path, kind, monkeypatch
 ):
@@ -65,7 +63,6 @@ def test_a_cell_of_an_edit_that_the_file_no_longer_has_is_refused(
 
     for module in (editing, timing):
         monkeypatch.setattr(module, "splats_of", computed)
-    monkeypatch.setattr(sensitivity, "_Prompts", computed)
     write(path, RED)
     cell = planned(path, kind, tmp_path / "run")
     world(cell.scene_file, 16)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from pydantic import Field, model_validator
 
 from attnwarp.encoders import Kind, kind_of, load_encoder
 from attnwarp.errors import InputError
-from attnwarp_eval.study.probe import Probe
-from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.schema import Part, Study, StudyError
 
 
@@ -32,36 +29,6 @@ class EncodersPart(Part):
             if actual != kind:
                 raise ValueError(f"encoders.{kind}: {name!r} is of kind {actual!r}")
         return self
-
-
-@dataclass(frozen=True)
-class Seconds:
-    """Seconds that one judgement costs, by metric and round, taken in turn."""
-
-    seconds: Mapping[str, list[float]]
-
-    def to_json(self) -> Json:
-        """The entry ``rounds`` of the record's cost."""
-        return {"cost": {"rounds": dict(self.seconds)}} if self.seconds else {}
-
-
-class MetricsProbe(Probe[Seconds]):
-    """Base of probes that judge metrics on pictures that no variant changes."""
-
-    judges_variants = False
-
-    def check(self, study: Study) -> None:
-        """Variants change no metric."""
-        if study.probes.get(self.name):
-            raise ValueError(
-                f"probes.{self.name}: got variants, expected []; it judges metrics, which no"
-                " variant changes"
-            )
-
-    def read_extra(self, data: Json) -> Seconds:
-        """Read from the record's cost."""
-        rounds = data["cost"].get("rounds", {})
-        return Seconds({key: [float(v) for v in values] for key, values in rounds.items()})
 
 
 def encoder_sources(part: EncodersPart) -> dict[str, str]:

@@ -6,7 +6,7 @@ import torch
 from scipy.stats import mannwhitneyu, norm
 from torchmetrics.functional.classification import binary_auroc
 
-from attnwarp_eval.statistics.auroc import auroc
+from attnwarp_lab.probes.audit.auroc import auroc
 
 
 def by_scene(values, scenes):

@@ -8,9 +8,9 @@ from skimage.color import lab2lch, rgb2lab
 
 from attnwarp_eval.colors import to_linear, to_srgb
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.study.flaws import CONDITIONS, FLAWS, Edited
 from attnwarp_eval.truth import Geometry, two_view
 from attnwarp_eval.two_view import HIDDEN
+from attnwarp_lab.probes.audit.flaws import CONDITIONS, COUNTED, FLAWS, Edited
 
 SIZE = 48
 
@@ -19,10 +19,11 @@ SIZE = 48
 def edited():
     scene = load_scene("spheres").with_size(SIZE, SIZE)
     pair = two_view(Geometry(scene), scene.source, scene.camera("yaw030"))
-    source, before, after, other = np.random.default_rng(0).uniform(0.2, 0.8, (4, SIZE, SIZE, 3))
+    pictures = np.random.default_rng(0).uniform(0.2, 0.8, (5, SIZE, SIZE, 3))
+    source, before, after, other, misdirected = pictures
     ids, counts = np.unique(pair.hits.object_id[pair.hits.valid], return_counts=True)
     mask = pair.hits.object_id == ids[np.argsort(counts)[-2]]  # a thing, not the ground
-    return Edited(pair, source, before, after, other, mask)
+    return Edited(pair, source, before, after, other, mask, misdirected=misdirected)
 
 
 def flawed(edited, name):
@@ -41,7 +42,7 @@ def test_a_flaw_is_a_picture_and_most_stay_in_their_place(edited, name):
     assert picture.min() >= 0
     assert picture.max() <= 1
     assert changed(edited, name).any()
-    if name.partition("=")[0] in ("hue", "slid") or name in ("answer=0.1", "answer=0.3"):
+    if name.partition("=")[0] in ("hue", "hue_all", "slid") or name in ("answer=0.1", "answer=0.3"):
         assert not changed(edited, name)[~edited.mask].any()
 
 
@@ -114,15 +115,38 @@ def test_paint_bleeds_by_its_pixels(edited):
     assert changed(edited, "bled=4").sum() > changed(edited, "bled=2").sum()
 
 
-def test_ghosts_are_sums_of_light_and_noise_has_its_size(edited):
-    both = to_linear(flawed(edited, "ghost=0.25"))
-    expected = 0.75 * to_linear(edited.after) + 0.25 * to_linear(edited.other)
-    np.testing.assert_allclose(both, expected, atol=1e-9)
-    assert (flawed(edited, "noise=0.03") - edited.after).std() == pytest.approx(0.03, rel=0.05)
+def test_ghosts_and_weak_edits_are_sums_of_light(edited):
+    for name, share, picture in (("ghost", 0.25, edited.other), ("weak_all", 0.5, edited.before)):
+        expected = (1 - share) * to_linear(edited.after) + share * to_linear(picture)
+        found = to_linear(flawed(edited, f"{name}={share:g}"))
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+    np.testing.assert_allclose(flawed(edited, "weak_all=1"), edited.before, atol=1e-9)
+    np.testing.assert_array_equal(flawed(edited, "misdirected_all=1"), edited.misdirected)
+
+
+def test_noise_has_its_size_and_is_another_in_each_view(edited):
+    noise, other = (
+        flawed(dataclasses.replace(edited, place=place), "noise_all=0.03") - edited.after
+        for place in (0, 1)
+    )
+    assert noise.std() == pytest.approx(0.03, rel=0.05)
+    assert abs(np.corrcoef(noise.ravel(), other.ravel())[0, 1]) < 0.05  # 6912 draws: 0.012
+    np.testing.assert_array_equal(flawed(edited, "noise=0.03") - edited.after, noise)
+
+
+def test_blur_keeps_the_light_and_a_moved_picture_lies_two_pixels_to_the_right(edited):
+    point = np.zeros((SIZE, SIZE, 3))
+    point[24, 24] = 1
+    of = dataclasses.replace(edited, after=point)
+    light = to_linear(flawed(of, "blur=2"))[..., 0]
+    assert light.sum() == pytest.approx(1, rel=1e-6)
+    variance = (light.sum(0) * (np.arange(SIZE) - 24.0) ** 2).sum()
+    assert np.sqrt(variance) == pytest.approx(2, rel=0.01)  # sampled, cut at four sigma
+    np.testing.assert_array_equal(np.argwhere(flawed(of, "moved=2")[..., 0]), [[24, 26]])
 
 
 def test_sizes_rise_and_the_shown_one_is_among_them():
     for flaw in FLAWS:
         assert list(flaw.sizes) == sorted(flaw.sizes)
         assert flaw.reference in flaw.sizes
-    assert sum(flaw.counts for flaw in FLAWS) == 5
+    assert len(COUNTED) == 5 and not any(flaw.alike for flaw in COUNTED)

@@ -1,11 +1,11 @@
-"""Report of the audit: what each consistency metric sees, misses, mistakes and costs."""
+"""Report of the audit: what each figure sees, misses, mistakes, rewards and costs."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -14,15 +14,16 @@ from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.metrics.registry import metric
-from attnwarp_eval.statistics.auroc import Auroc, auroc
 from attnwarp_eval.statistics.intervals import Interval, interval
-from attnwarp_eval.study.flaws import CONDITIONS, FLAWS, Flaw
 from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
-from attnwarp_eval.study.probes.audit.measure import REFIT_SIZE, Seconds
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.shared.encoders import encoders_named
-from attnwarp_eval.study.shared.right_views import METAL, RIGHT, VARNISHED
+from attnwarp_lab.probes.audit.auroc import Auroc, auroc
+from attnwarp_lab.probes.audit.figures import FIGURES, Figure
+from attnwarp_lab.probes.audit.flaws import CONDITIONS, COUNTED, ELSEWHERE, FLAWS, Flaw
+from attnwarp_lab.probes.audit.measure import REFIT_SIZE, Seconds
+from attnwarp_lab.probes.audit.views import METAL, RIGHT, VARNISHED
 
 NEAR = 60.0
 """Largest yaw in degrees that the first table and the recommendation speak of."""
@@ -36,48 +37,6 @@ ALARM = 0.05
 MANY_ALARMS = 0.2
 """Share of glossy pairs that a metric may take for flawed before the recommendation warns of it."""
 
-
-@dataclass(frozen=True)
-class Row:
-    """A metric as tables show it.
-
-    Attributes:
-        key, title: key and title of the metric.
-        needs: inputs beside the edited pictures.
-        truth: whether that is the truth.
-    """
-
-    key: str
-    title: str
-    needs: str
-    truth: bool = False
-
-
-ROWS = (
-    Row("consistency.tsed_2px", "TSED at 2 px", "poses"),
-    Row("consistency.tsed_distance", "epipolar distance", "poses"),
-    Row("consistency.flow_delta_e.dis", "flow warp error, DIS", "originals"),
-    Row("consistency.flow_delta_e.farneback", "flow warp error, Farneback", "originals"),
-    Row("embedding.match_similarity", "DINO match similarity", "originals"),
-    Row("embedding.direction_consistency", "CLIP direction consistency", "originals"),
-    Row("embedding.clip_directional", "CLIP directional similarity", "originals, prompts"),
-    Row("embedding.clip_similarity", "CLIP similarity", "prompt"),
-    Row("embedding.clip_image", "CLIP image similarity", "nothing"),
-    Row("embedding.dino_image", "DINO image similarity", "nothing"),
-    Row("consistency.edit_psnr", "Edit PSNR, colours refitted", "splats"),
-    Row("consistency.features.rendered", "features, rendered depth", "splats"),
-    Row("consistency.perceptual", "perceptual, rendered depth", "splats"),
-    Row("consistency.rendered_delta_e", "colour, rendered depth", "splats"),
-    Row("consistency.edit_delta_e", "colour the edit adds", "splats, originals"),
-    Row("consistency.edit_delta_e_p90", "colour the edit adds, p90", "splats, originals"),
-    Row("consistency.features.exact", "features, exact", "truth", truth=True),
-    Row("consistency.delta_e", "colour, exact", "truth", truth=True),
-    Row("multiview.delta_e_above", "colour above its floor, exact", "truth", truth=True),
-)
-"""Metrics, those that need no truth first."""
-
-COUNTED = tuple(flaw for flaw in FLAWS if flaw.counts)
-"""Flaws that matter most."""
 
 Values = dict[str, list[float]]
 
@@ -94,15 +53,15 @@ class Pairs:
         self.scenes = len({scene for scene, _ in records})
         self.yaws = [float(yaw) for yaw in records[0][1].spec["yaws"]]
         first = records[0][1].views[0].metrics
-        self.rows = [row for row in ROWS if f"{row.key}.{RIGHT[0]}" in first]
+        self.rows = [row for row in FIGURES if f"{row.key}.{RIGHT[0]}" in first]
         self._kept: dict[tuple[object, ...], Auroc] = {}
 
     @cached_property
     def near(self) -> list[float]:
         """Yaws up to :data:`NEAR`; all of them where there is none."""
-        return [yaw for yaw in self.yaws if yaw <= NEAR] or self.yaws
+        return [yaw for yaw in self.yaws if abs(yaw) <= NEAR] or self.yaws
 
-    def plain(self, row: Row, conditions: Sequence[str], yaw: float) -> Values:
+    def plain(self, row: Figure, conditions: Sequence[str], yaw: float) -> Values:
         """Scene -> values of conditions at a yaw, as they are."""
         values: Values = {}
         for scene, record in self.records:
@@ -112,7 +71,7 @@ class Pairs:
                     own += [view.metrics.get(f"{row.key}.{one}", math.nan) for one in conditions]
         return values
 
-    def values(self, row: Row, conditions: Sequence[str], yaw: float) -> Values:
+    def values(self, row: Figure, conditions: Sequence[str], yaw: float) -> Values:
         """Scene -> values that rise with disagreement."""
         sign = -1.0 if metric(row.key).direction == "higher" else 1.0
         plain = self.plain(row, conditions, yaw)
@@ -120,7 +79,7 @@ class Pairs:
 
     def area(
         self,
-        row: Row,
+        row: Figure,
         conditions: Sequence[str],
         yaws: Sequence[float],
         right: Sequence[str] = RIGHT,
@@ -137,19 +96,19 @@ class Pairs:
             )
         return self._kept[key]
 
-    def shown(self, row: Row, flaw: Flaw) -> Auroc:
+    def shown(self, row: Figure, flaw: Flaw) -> Auroc:
         """AUROC of a flaw at the size that tables show, up to :data:`NEAR` degrees."""
         return self.area(row, [flaw.key(flaw.reference)], self.near)
 
-    def counted(self, row: Row, yaws: Sequence[float], right: Sequence[str] = RIGHT) -> Auroc:
+    def counted(self, row: Figure, yaws: Sequence[float], right: Sequence[str] = RIGHT) -> Auroc:
         """Mean AUROC of the flaws that matter most, against right pairs."""
         return self.area(row, [flaw.key(flaw.reference) for flaw in COUNTED], yaws, right)
 
-    def lowest(self, row: Row) -> float:
+    def lowest(self, row: Figure) -> float:
         """Lowest AUROC among the flaws that matter most; NaN where one is undefined."""
         return float(np.min([self.shown(row, flaw).value for flaw in COUNTED]))
 
-    def alarms(self, row: Row, trap: str = VARNISHED) -> float:
+    def alarms(self, row: Figure, trap: str = VARNISHED) -> float:
         """Share of a trap's right pairs above the threshold that :data:`ALARM` of the other right
         pairs pass, mean over the near yaws.
         """
@@ -164,7 +123,7 @@ class Pairs:
                 shares.append(float((shiny > np.quantile(right, 1 - ALARM)).mean()))
         return float(np.mean(shares)) if shares else math.nan
 
-    def smallest(self, row: Row, flaw: Flaw) -> float | None:
+    def smallest(self, row: Figure, flaw: Flaw) -> float | None:
         """Smallest size from which on every size is seen; None where the largest is not."""
         found = None
         for size in reversed(flaw.sizes):
@@ -173,13 +132,27 @@ class Pairs:
             found = size
         return found
 
-    def undefined(self, row: Row, yaw: float) -> float:
+    def follows(self, row: Figure, flaw: Flaw) -> Interval:
+        """Rank correlation of a flaw's size, 0 for the right pair, with disagreement: mean over
+        pairs up to :data:`NEAR` degrees.
+        """
+        names = [RIGHT[0], *map(flaw.key, flaw.sizes)]
+        ranks: Values = {}
+        for yaw in self.near:
+            for scene, own in self.values(row, names, yaw).items():
+                pairs = np.reshape(own, (-1, len(names)))  # one for each seed
+                ranks.setdefault(scene, []).extend(
+                    rank_correlation((0.0, *flaw.sizes), pair) for pair in pairs
+                )
+        return interval(ranks)
+
+    def undefined(self, row: Figure, yaw: float) -> float:
         """Share of the pairs at a yaw, of right ones and of shown flaws, without a value."""
         names = [*RIGHT, *(flaw.key(flaw.reference) for flaw in COUNTED)]
         values = [v for own in self.plain(row, names, yaw).values() for v in own]
         return float(np.isnan(values).mean())
 
-    def seconds(self, row: Row) -> Interval | None:
+    def seconds(self, row: Figure) -> Interval | None:
         """Median seconds of a pair, mean over scenes."""
         taken: Values = {}
         for scene, record in self.records:
@@ -187,12 +160,12 @@ class Pairs:
                 taken.setdefault(scene, []).append(float(np.median(rounds)))
         return interval(taken) if taken else None
 
-    def known(self) -> list[Row]:
+    def known(self) -> list[Figure]:
         """Metrics without truth that have a value."""
         own = [row for row in self.rows if not row.truth]
         return [row for row in own if math.isfinite(self.counted(row, self.near).value)]
 
-    def best(self) -> Row | None:
+    def best(self) -> Figure | None:
         """Metric without truth with the largest mean AUROC of the flaws that matter most."""
         return max(self.known(), key=lambda row: self.counted(row, self.near).value, default=None)
 
@@ -211,13 +184,8 @@ class AuditReport(ProbeReport):
             return
         pairs = Pairs(records)
         yield Place.ANSWER, _answer(results, pairs, layout)
-        yield (
-            Place.INSTRUMENT,
-            Section(
-                "A sentence a metric",
-                ["\n".join(f"- {_sentence(pairs, row)}" for row in pairs.rows)],
-            ),
-        )
+        sentences = "\n".join(f"- {_sentence(pairs, row)}" for row in pairs.rows)
+        yield Place.INSTRUMENT, Section("A sentence a metric", [sentences])
         yield Place.INSTRUMENT, _by_yaw(pairs, layout)
         yield Place.INSTRUMENT, _sizes(pairs)
         if layout.timings:
@@ -253,12 +221,25 @@ def percent(share: float) -> str:
     return f"{100 * share:.0f} %" if math.isfinite(share) else "–"
 
 
+def rank_correlation(sizes: Any, values: Any) -> float:
+    """Spearman's of what is defined; 0 for values that never change, NaN for fewer than three.
+
+    Example:
+        >>> rank_correlation((0, 1, 2, 3, 4), (0.1, 0.2, 0.3, 0.5, 0.4))  # 1 - 6 * 2 / (5 * 24)
+        0.9
+    """
+    known = np.isfinite(values)
+    x, y = np.asarray(sizes)[known], np.asarray(values)[known]
+    if len(y) < 3:
+        return math.nan
+    return float(stats.spearmanr(x, y).statistic) if np.ptp(y) > 0 else 0.0
+
+
 def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
     spec = pairs.records[0][1].spec
-    elsewhere = FLAWS[-1]
     shown = np.array([[pairs.shown(row, flaw).value for flaw in FLAWS] for row in pairs.rows])
     path = layout.figure("audit.svg")
-    with charts.drawing(path, height=1.4 + 0.3 * len(pairs.rows), width=9.6) as (axes,):
+    with charts.drawing(path, height=1.4 + 0.3 * len(pairs.rows), width=12.0) as (axes,):
         charts.heatmap(
             axes,
             shown,
@@ -278,7 +259,7 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
                 area_text(counted),
                 _two(pairs.lowest(row)),
                 percent(counted.paired),
-                area_text(pairs.shown(row, elsewhere), intervals=False),
+                area_text(pairs.shown(row, ELSEWHERE), intervals=False),
                 percent(pairs.alarms(row)),
                 percent(pairs.alarms(row, METAL)),
                 area_text(pairs.counted(row, pairs.near, [METAL]), intervals=False),
@@ -298,12 +279,13 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
             f"Every pair is the source view and one that is turned by"
             f" {', '.join(f'{yaw:g}' for yaw in pairs.yaws)} degrees, of"
             f" {results.study.scenes_in_words}, at {spec['size']} px. Both views show a true edit"
-            f" (`{spec['edit']}`); in a flawed pair the second view has one flaw of known size."
+            f" (`{spec['edit']}`); in a flawed pair the second view has one flaw of known size, or"
+            " both have it alike: then they agree, and a figure of agreement is right to be blind."
             " **AUROC: the probability that a metric ranks a flawed pair below a right one of any"
-            " scene at the same yaw. 1 sees every flaw, 0.5 is blind.** Intervals are of 95 %,"
-            " over scenes. **Within a scene**: the share of pairs with one of the five flaws that"
-            " rank below the mean of the right pairs of their own scene and yaw, as methods are"
-            " compared on the same scenes."
+            " scene at the same yaw. 1 sees every flaw, 0.5 is blind, below 0.5 the flaw is"
+            " preferred.** Intervals are of 95 %, over scenes. **Within a scene**: the share of"
+            " pairs with one of the five flaws that rank below the mean of the right pairs of their"
+            " own scene and yaw, as methods are compared on the same scenes."
         ),
         (
             f"Five flaws are named as those that matter most, and are"
@@ -317,6 +299,12 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
         ),
         encoders_named(results.study, spec),
     ]
+    if spec.get("colmap"):
+        text.append(
+            f"COLMAP reconstructs all {len(pairs.yaws) + 1} views at once, with known intrinsics"
+            f" and unknown poses; in a flawed set {len(pairs.yaws[::2])} of them have the flaw. Its"
+            " figures are those of the set at every yaw, and its seconds too."
+        )
     if pairs.scenes < len(results.study.scenes):
         text.insert(0, f"**Measured on {pairs.scenes} of {len(results.study.scenes)} scenes.**")
     picture = Picture(
@@ -324,10 +312,8 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
         "Which metric sees which flaw: 1 every time, 0.5 blind; framed: the five.",
     )
     timed = ("ms a pair",)
-    return Section(
-        "Which consistency metric can be believed", text, [Table(columns, table, timed=timed)],
-        [picture],
-    )  # fmt: skip
+    tables = [Table(columns, table, timed=timed)]
+    return Section("Which consistency metric can be believed", text, tables, [picture])
 
 
 def _advice(pairs: Pairs) -> list[str]:
@@ -363,11 +349,11 @@ def _advice(pairs: Pairs) -> list[str]:
             )
         )
     # One scene alone has no view of another one.
-    measured = any(math.isfinite(pairs.shown(row, FLAWS[-1]).value) for row in pairs.rows)
+    measured = any(math.isfinite(pairs.shown(row, ELSEWHERE).value) for row in pairs.rows)
     unable = [
         row.title
         for row in pairs.rows
-        if measured and not pairs.shown(row, FLAWS[-1]).value >= SEES and not row.truth
+        if measured and not pairs.shown(row, ELSEWHERE).value >= SEES and not row.truth
     ]
     if unable:
         text.append(
@@ -377,18 +363,23 @@ def _advice(pairs: Pairs) -> list[str]:
     return text
 
 
-def _sentence(pairs: Pairs, row: Row) -> str:
-    flaws = [(flaw, pairs.shown(row, flaw).value) for flaw in FLAWS]
-    sees = [flaw.title for flaw, value in flaws if value >= SEES]
-    blind = [flaw.title for flaw, value in flaws if value < BLIND]
-    lacking = {yaw: pairs.undefined(row, yaw) for yaw in pairs.yaws}
+def _sentence(pairs: Pairs, row: Figure) -> str:
+    values = [(flaw, pairs.shown(row, flaw)) for flaw in FLAWS]
+    alone = [(flaw, area) for flaw, area in values if not flaw.alike]
+    sees = [flaw.title for flaw, area in alone if area.value >= SEES]
     parts = [
-        f"**{row.title}** sees {len(sees)} of {len(FLAWS)} flaws"
+        f"**{row.title}** sees {len(sees)} of {len(alone)} flaws of one view"
         + (f" ({', '.join(sees)})" if sees else "")
     ]
-    if blind:
-        parts.append(f"is blind to {', '.join(blind)}")
+    for text, titles in (
+        ("is blind to", [flaw.title for flaw, area in alone if area.value < BLIND]),
+        ("sees in", [f.title for f, area in values if f.alike and area.value >= SEES]),
+        ("rates above a right edit", [flaw.title for flaw, area in values if area.high < 0.5]),
+    ):
+        if titles:
+            parts.append(f"{text} {', '.join(titles)}")
     parts.append(f"takes highlights for a flaw in {percent(pairs.alarms(row))} of pairs")
+    lacking = {yaw: pairs.undefined(row, yaw) for yaw in pairs.yaws}
     if any(lacking.values()):
         shares = ", ".join(f"{percent(lacking[yaw])} at {yaw:g}" for yaw in pairs.yaws)
         parts.append(f"has no value in {shares} degrees")
@@ -408,53 +399,52 @@ def _by_yaw(pairs: Pairs, layout: Layout) -> Section:
             )
             for row in order
         ]
-        charts.lines(
-            axes, series, x="yaw between the views, degrees", y="AUROC, mean of five flaws",
-            title="The eight best metrics by the yaw between the views", share=True,
-        )  # fmt: skip
-    headings = [f"{yaw:g} degrees" for yaw in pairs.yaws]
+        title = "The eight best metrics by the yaw between the views"
+        y = "AUROC, mean of five flaws"
+        charts.lines(axes, series, x="yaw in degrees", y=y, title=title, share=True)
     areas = [
         [row.title, *(area_text(pairs.counted(row, [yaw])) for yaw in pairs.yaws)]
-        for row in pairs.rows
-    ]
-    lacking = [
-        [row.title, *(percent(pairs.undefined(row, yaw)) for yaw in pairs.yaws)]
         for row in pairs.rows
     ]
     return Section(
         "At which baselines",
         [],
-        [
-            Table(["metric", *headings], areas, "AUROC, mean of the five flaws"),
-            Table(["metric", *headings], lacking, "Pairs without a value", folded=True),
-        ],
+        [Table(["metric", *(f"{yaw:g} degrees" for yaw in pairs.yaws)], areas)],
         [Picture("figures/audit-yaw.svg", "AUROC of the five flaws against the yaw.")],
     )
 
 
-def _interval(value: Auroc) -> Interval:
-    return Interval(
-        value.value, value.low, value.high, value.scenes, value.scenes, 0, math.nan, math.nan
-    )
+def _interval(area: Auroc, missed: bool = False) -> Interval:
+    """Interval of an AUROC, or of 1 minus it, as charts take it."""
+    mean, low, high = area.value, area.low, area.high
+    if missed:
+        mean, low, high = 1 - mean, 1 - high, 1 - low
+    return Interval(mean, low, high, area.scenes, area.scenes, 0, math.nan, math.nan)
 
 
 def _sizes(pairs: Pairs) -> Section:
     graded = [flaw for flaw in FLAWS if len(flaw.sizes) > 1]
-    rows = []
+    columns = ["metric", *(f"{flaw.title}, {flaw.unit} ({_range(flaw)})" for flaw in graded)]
+    smallest, follows = [], []
     for row in pairs.rows:
         found = [pairs.smallest(row, flaw) for flaw in graded]
-        rows.append([row.title, *("none" if size is None else f"{size:g}" for size in found)])
-    columns = [
-        "metric",
-        *(f"{flaw.title}, {flaw.unit} ({_range(flaw)})" for flaw in graded),
-    ]
+        smallest.append([row.title, *("none" if one is None else f"{one:g}" for one in found)])
+        follows.append(
+            [row.title, *(spread(pairs.follows(row, flaw), pairs.scenes) for flaw in graded)]
+        )
+    text = (
+        f"Up to {max(pairs.near):g} degrees; in brackets the sizes tried. Smallest: the size from"
+        f" which on every size has an AUROC of at least {SEES:g}. Rank correlation: Spearman's of a"
+        " flaw's size, 0 for the right pair, with a metric's values on the same pair; 1 when every"
+        " step moves it the right way."
+    )
     return Section(
-        "The smallest flaw that is seen",
+        "Which sizes of a flaw are told apart",
+        [text],
         [
-            f"Smallest size from which on every size has an AUROC of at least {SEES:g}, up to"
-            f" {max(pairs.near):g} degrees; in brackets the sizes tried."
+            Table(columns, smallest, "The smallest flaw that is seen"),
+            Table(columns, follows, "Rank correlation with the size of a flaw"),
         ],
-        [Table(columns, rows)],
     )
 
 
@@ -467,25 +457,19 @@ def _cost(pairs: Pairs, layout: Layout) -> Section:
     for row in pairs.rows:
         seconds, value = pairs.seconds(row), pairs.counted(row, pairs.near)
         if seconds is not None and math.isfinite(value.value) and not row.truth:
-            missed = Interval(
-                1 - value.value, 1 - value.high, 1 - value.low, value.scenes, value.scenes, 0,
-                math.nan, math.nan,
-            )  # fmt: skip
-            points[row.title] = seconds, missed
+            points[row.title] = seconds, _interval(value, missed=True)
     path = layout.figure("audit-cost.svg")
     with charts.drawing(path, height=4.6, width=7.5) as (axes,):
-        on_front = charts.cost_front(
-            axes, points, x="seconds a pair", y="1 - AUROC, mean of five flaws",
-            title="What a metric misses against what it costs", log=False,
-        )  # fmt: skip
+        title, y = "What a metric misses against what it costs", "1 - AUROC, mean of five flaws"
+        front = charts.cost_front(axes, points, x="seconds a pair", y=y, title=title, log=False)
     spec = pairs.records[0][1].spec
     text = [
         f"Wall seconds of one pair at {spec['size']} px: median of {spec['rounds']} rounds in which"
         " all metrics took turns, mean over scenes. Each makes all that it needs anew: keypoints,"
         " embeddings, flow, the depth of both views. On the front, cheapest first:"
-        f" {', '.join(on_front) or 'none'}. Metrics that know the truth are left out."
+        f" {', '.join(front) or 'none'}. Metrics that know the truth are left out."
     ]
-    picture = Picture("figures/audit-cost.svg", "What a metric misses against what it costs.")
+    picture = Picture("figures/audit-cost.svg", f"{title}.")
     return Section("What a metric costs", text, figures=[picture])
 
 
@@ -493,20 +477,13 @@ def _everything(pairs: Pairs) -> Section:
     tables = []
     for yaw in pairs.yaws:
         rows = [
-            [
-                flaw.at(size),
-                *(area_text(pairs.area(row, [name], [yaw])) for row in pairs.rows),
-            ]
+            [flaw.at(size), *(area_text(pairs.area(row, [name], [yaw])) for row in pairs.rows)]
             for name, (flaw, size) in CONDITIONS.items()
         ]
         columns = ["flaw", *(row.title for row in pairs.rows)]
         tables.append(Table(columns, rows, f"AUROC at {yaw:g} degrees", folded=True))
     paired = [
-        [
-            row.title,
-            *(_two(pairs.shown(row, flaw).paired) for flaw in FLAWS),
-        ]
-        for row in pairs.rows
+        [row.title, *(_two(pairs.shown(row, flaw).paired) for flaw in FLAWS)] for row in pairs.rows
     ]
     heads = ["metric", *(flaw.at(flaw.reference) for flaw in FLAWS)]
     within = f"Flawed pairs ranked below the right ones of their own scene, up to {NEAR:g} degrees"
@@ -518,44 +495,8 @@ def _everything(pairs: Pairs) -> Section:
         ]
         for row in pairs.rows
     ]
+    heads = ["metric", *(f"{yaw:g} degrees" for yaw in pairs.yaws)]
     tables.append(
-        Table(
-            ["metric", *(f"{yaw:g} degrees" for yaw in pairs.yaws)],
-            floor,
-            "Floor: values of right pairs, means over scenes",
-            folded=True,
-        )
-    )
-    correlations = _correlations(pairs)
-    tables.append(
-        Table(
-            ["metric", *(row.title for row in pairs.rows)],
-            [
-                [row.title, *map(_two, line)]
-                for row, line in zip(pairs.rows, correlations, strict=True)
-            ],
-            "Rank correlation of metrics over the flaws of a pair, mean over pairs up to"
-            f" {max(pairs.near):g} degrees",
-            folded=True,
-        )
+        Table(heads, floor, "Floor: values of right pairs, means over scenes", folded=True)
     )
     return Section("All figures of the audit", [], tables)
-
-
-def _correlations(pairs: Pairs) -> list[list[float]]:
-    """Spearman's between metrics over all conditions of one pair, mean over pairs."""
-    sums: Mapping[tuple[int, int], list[float]] = {
-        (i, j): [] for i in range(len(pairs.rows)) for j in range(len(pairs.rows))
-    }
-    names = [*RIGHT, *CONDITIONS]
-    for yaw in pairs.near:
-        columns = [pairs.values(row, names, yaw) for row in pairs.rows]
-        for scene in columns[0]:
-            table = np.array([column[scene] for column in columns])
-            for (i, j), found in sums.items():
-                both = np.isfinite(table[i]) & np.isfinite(table[j])
-                x, y = table[i][both], table[j][both]
-                if len(x) > 2 and np.ptp(x) > 0 and np.ptp(y) > 0:
-                    found.append(float(stats.spearmanr(x, y).statistic))
-    size = range(len(pairs.rows))
-    return [[float(np.mean(v)) if (v := sums[i, j]) else math.nan for j in size] for i in size]

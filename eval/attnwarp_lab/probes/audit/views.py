@@ -1,10 +1,8 @@
-"""True pictures of an edit, of which consistency metrics see sets that are right and sets with a
-flaw.
-"""
+"""True pictures of an edit, of which figures see sets that are right and sets with a flaw."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -12,21 +10,20 @@ from attnwarp.camera import Camera
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.metrics.arrays import Array, Mask
 from attnwarp_eval.scene.edits import changed as changed_object
+from attnwarp_eval.scene.edits import pick
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.materials import MetalMaterial
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.scene.spec import ObjectChange
-from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.scene.spec import EditSpec, ObjectChange
 from attnwarp_eval.study.edit_truth import answers_of
-from attnwarp_eval.study.flaws import Edited
 from attnwarp_eval.study.probe import Work
 from attnwarp_eval.study.record import Json
-from attnwarp_eval.study.schema import Study, StudyError
-from attnwarp_eval.study.shared.encoders import MetricsProbe
-from attnwarp_eval.truth import appearance
+from attnwarp_eval.study.schema import StudyError
+from attnwarp_eval.truth import appearance, two_view
 from attnwarp_eval.truth.edits import edit_mask, touched
-from attnwarp_eval.two_view import Hits, TwoView
+from attnwarp_eval.two_view import Hits
 from attnwarp_eval.world import World, changed, turned
+from attnwarp_lab.probes.audit.flaws import Edited
 
 RIGHT = ("right", "right_other")
 """Right pairs without highlights: one answer in both views, and another one in both."""
@@ -46,82 +43,65 @@ of as few would be taken for disagreement."""
 COAT = 0.04
 """Share of light that a coat of refractive index 1.5 reflects where it is seen straight on."""
 
-
-def cells_of_edit(
-    probe: MetricsProbe, study: Study, scenes: Mapping[str, Scene], edit: str, own: Json,
-    sources: Mapping[str, str] | None = None,
-) -> Iterator[Cell]:  # fmt: skip
-    """One cell for each scene and seed. The next scene gives the pictures of another scene.
-
-    Args:
-        probe: its name is the study's key under which ``edit`` stands.
-        edit: one with at least two answers.
-        own: further inputs that decide the probe's numbers.
-        sources: sources of the cells, beside the other scene's file.
-
-    Raises:
-        StudyError: a scene has no such edit.
-    """
-    files = dict(zip(study.scene_names, study.scenes, strict=True))
-    order = list(scenes)
-    for place, (name, scene) in enumerate(scenes.items()):
-        answers = _two_answers(scene, edit, f"{probe.name}.edit")
-        other = order[(place + 1) % len(order)]
-        for seed in study.seeds:
-            spec = {
-                "probe": probe.name,
-                "protocol": probe.protocol,
-                "scene": scene.content_hash,
-                "other": scenes[other].content_hash if other != name else None,
-                "size": study.size,
-                "seed": seed,
-                "spp": study.spp,
-                "edit": edit,
-                "answers": answers,
-                **own,
-            }
-            yield Cell(
-                spec, name, "metrics", probe.name, seed, ("metrics",),
-                sources={**(sources or {}), "other": files[other]},
-            )  # fmt: skip
+Pictures = Mapping[str, Mapping[str, Array]]
+"""State of the scene -> view -> (H, W, 3) sRGB."""
 
 
-def _two_answers(scene: Scene, edit: str, key: str) -> list[list[str]]:
+def two_answers(scene: Scene, edit: str) -> list[list[str]]:
     """Names and contents of an edit's first two answers.
 
     Raises:
-        StudyError: a scene has no such edit; ``key`` is the study's that names it.
+        StudyError: the scene has no such edit.
     """
     names = {one.name for one in scene.edits}
     answers = answers_of(scene, edit) if edit in names else []
     if len(answers) < 2:
         raise StudyError(
-            f"{key}: scene {scene.name!r} has no edit {edit!r} with two answers; there are"
+            f"audit.edit: scene {scene.name!r} has no edit {edit!r} with two answers; there are"
             f" {', '.join(one.name for one in scene.edits if one.answers) or 'none'}"
         )
     return [[name, scene.edited(edit, answer).content_hash] for name, answer in answers[:2]]
 
 
-def true_pictures(work: Work) -> tuple[list[Camera], dict[str, dict[str, Array]]]:
+def edit_of_others(scene: Scene, edit: str) -> list[str] | None:
+    """Name and content of the scene's first edit of other objects; None where it has none."""
+    objects = set(touched(scene, edit))
+    for one in scene.edits:
+        others = _objects(scene, one)
+        if others and not others & objects:
+            return [one.name, scene.edited(one.name).content_hash]
+    return None
+
+
+def _objects(scene: Scene, edit: EditSpec) -> set[int]:
+    """Objects whose surfaces an edit (its first answer) changes; none for an edit of the light."""
+    return set() if (pick(edit) or edit).lights is not None else set(touched(scene, edit.name))
+
+
+def true_pictures(work: Work) -> tuple[list[Camera], Pictures]:
     """Cameras of the cell's yaws, which are added to its world, and pictures from them.
 
     Returns:
         The cameras, and (H, W, 3) sRGB by state of the scene and name of the view, the source's
-        too. States are "before" the edit, those of :data:`PAIRS`, and "elsewhere", another scene,
-        where the cell's spec names one.
+        too. States are "before" the edit, those of :data:`PAIRS`, "misdirected", an edit of other
+        objects, and "elsewhere", another scene, where the cell's spec names them.
+
+    Raises:
+        InputError: a file has changed since the cell was planned.
     """
     spec, world = work.spec, work.world
     cameras = {yaw: turned(world.scene, yaw) for yaw in spec["yaws"]}
     for camera in cameras.values():
         world.add(camera)
     views = [world.source, *cameras.values()]
-    edit = spec["edit"]
-    for name, content in spec["answers"]:
-        if world.edited_hash(edit, name) != content:
+    answers = [(spec["edit"], *answer) for answer in spec["answers"]]
+    others = [(name, None, content) for name, content in filter(None, [spec["other_edit"]])]
+    for edit, answer, content in (*answers, *others):
+        if world.edited_hash(edit, answer) != content:
             raise changed(f"edit {edit!r} of scene {world.scene.name!r}")
-    first, second = (world.scene.edited(edit, name) for name, _ in spec["answers"])
-    states = {"before": world.scene, "right": first, "right_other": second}
-    states[METAL] = _metallic(first, touched(world.scene, edit, spec["answers"][0][0]))
+    edited = [world.scene.edited(edit, answer) for edit, answer, _ in (*answers, *others)]
+    states = {"before": world.scene, **dict(zip((*RIGHT, "misdirected"), edited, strict=False))}
+    states[METAL] = _metallic(edited[0], touched(world.scene, *answers[0][:2]))
     if spec["other"] is not None:
         other = load_scene(work.cell.sources["other"])
         if other.content_hash != spec["other"]:
@@ -145,7 +125,7 @@ def true_pictures(work: Work) -> tuple[list[Camera], dict[str, dict[str, Array]]
             light["right"][camera.name],
             light[METAL][camera.name],
             hits := world.geometry.trace(camera),
-            edit_mask(world.scene, edit, hits, spec["answers"][0][0]),
+            edit_mask(world.scene, spec["edit"], hits, spec["answers"][0][0]),
         )
         for camera in views
     }
@@ -176,21 +156,32 @@ def _metallic(scene: Scene, objects: Sequence[int]) -> Scene:
     return Scene(scene.spec.model_copy(update={"objects": tuple(items)}), scene.path)
 
 
-def edited_target(
-    world: World,
-    spec: Json,
-    pictures: Mapping[str, Mapping[str, Array]],
-    camera: Camera,
-    truth: TwoView,
+def edited_view(
+    world: World, spec: Json, pictures: Pictures, camera: Camera, place: int = 0
 ) -> Edited:
-    """A target of :func:`true_pictures` as flaws take it, with its exact relation to the source."""
+    """A view of :func:`true_pictures` as flaws take it, with its exact relation to the source.
+
+    Args:
+        world: the cell's world.
+        spec: the cell's spec.
+        pictures: pictures by state and view.
+        camera: camera of the view.
+        place: number of the view, 0 for the source.
+    """
+    if place:
+        truth = world.pair(camera.name, spec["size"])
+    else:
+        truth = two_view(world.geometry, camera, camera)
+    name = camera.name
     return Edited(
-        truth,
-        pictures["right"][world.source.name],
-        pictures["before"][camera.name],
-        pictures["right"][camera.name],
-        pictures["right_other"][camera.name],
-        edit_mask(world.scene, spec["edit"], truth.hits, spec["answers"][0][0]),
-        pictures["elsewhere"][camera.name] if "elsewhere" in pictures else None,
-        spec["seed"],
+        pair=truth,
+        source=pictures["right"][world.source.name],
+        before=pictures["before"][name],
+        after=pictures["right"][name],
+        other=pictures["right_other"][name],
+        mask=edit_mask(world.scene, spec["edit"], truth.hits, spec["answers"][0][0]),
+        elsewhere=pictures.get("elsewhere", {}).get(name),
+        misdirected=pictures.get("misdirected", {}).get(name),
+        seed=spec["seed"],
+        place=place,
     )

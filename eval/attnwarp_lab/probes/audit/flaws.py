@@ -1,7 +1,8 @@
-"""Flaws of known size in one view of a true edit, whose other view is right.
+"""Flaws of known size in a true edit: in the target view alone, or in all views alike.
 
 Sizes are of the picture that is flawed: pixels, shares, degrees. A flaw is drawn on the true
-picture, by exact geometry, so its size is known and nothing else differs.
+picture, by exact geometry, so its size is known and nothing else differs. Where all views have it,
+they agree, and a figure that rates it above a right edit can be gamed by it.
 """
 
 from __future__ import annotations
@@ -23,16 +24,18 @@ STEP = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Edited:
-    """A true edit as the target of a pair shows it, and what flaws are made of.
+    """A true edit as a view shows it, and what flaws are made of.
 
     Attributes:
-        pair: pair of source and target.
+        pair: pair of the source and this view.
         source: (h, w, 3) sRGB in [0, 1], the true source after the edit.
-        before, after, other: (H, W, 3) the target before the edit, after it, and with another right
+        before, after, other: (H, W, 3) the view before the edit, after it, and with another right
             answer.
-        mask: (H, W) bool, the edited object in the target.
+        mask: (H, W) bool, the edited object in the view.
         elsewhere: (H, W, 3) a view of another scene; None where there is none.
+        misdirected: (H, W, 3) the view after an edit of other objects; None where there is none.
         seed: seed of what flaws draw.
+        place: number of the view, 0 for the source; each view has noise of its own.
     """
 
     pair: TwoView
@@ -42,7 +45,9 @@ class Edited:
     other: Array
     mask: Mask
     elsewhere: Array | None = None
+    misdirected: Array | None = None
     seed: int = 0
+    place: int = 0
     _kept: dict[str, Array] = field(default_factory=dict)
 
     def grown(self) -> Array:
@@ -90,8 +95,9 @@ class Flaw:
         unit: unit of its sizes.
         sizes: rising.
         reference: the size that tables of all flaws show.
-        make: (H, W, 3) sRGB of the flawed target at a size; None where it cannot be made.
+        make: (H, W, 3) sRGB of the flawed view at a size; None where it cannot be made.
         counts: whether it is one of the flaws that matter most.
+        alike: whether the source has it too, and not the target alone.
     """
 
     name: str
@@ -101,6 +107,7 @@ class Flaw:
     reference: float
     make: Make
     counts: bool = False
+    alike: bool = False
 
     def key(self, size: float) -> str:
         """Condition's name at a size.
@@ -176,10 +183,16 @@ def _blurred(edited: Edited, size: float) -> Array:
     return to_srgb(np.clip(blurred, 0, 1))
 
 
-def _ghost(edited: Edited, size: float) -> Array:
-    """Two answers at once, the other with a weight of ``size`` in linear light."""
-    mixed = (1 - size) * to_linear(edited.after) + size * to_linear(edited.other)
-    return to_srgb(np.clip(mixed, 0, 1))
+def _mixed(picture: Array, other: Array, weight: float) -> Array:
+    """Sum of two pictures in linear light, the other's with a weight."""
+    light = (1 - weight) * to_linear(picture) + weight * to_linear(other)
+    return to_srgb(np.clip(light, 0, 1))
+
+
+def _moved(edited: Edited, size: float) -> Array:
+    """The picture ``size`` px to the right; the left border is repeated."""
+    columns = np.maximum(np.arange(edited.after.shape[1]) - round(size), 0)
+    return edited.after[:, columns]
 
 
 def _bled(edited: Edited, size: float) -> Array:
@@ -191,7 +204,9 @@ def _bled(edited: Edited, size: float) -> Array:
 
 
 def _noisy(edited: Edited, size: float) -> Array:
-    noise = np.random.default_rng([edited.seed, 3]).normal(0, size, edited.after.shape)
+    noise = np.random.default_rng([edited.seed, 3, edited.place]).normal(
+        0, size, edited.after.shape
+    )
     return np.clip(edited.after + noise, 0, 1)
 
 
@@ -199,7 +214,8 @@ FLAWS = (
     Flaw("answer", "another answer", "of the object", (0.1, 0.3, 1.0), 1.0, _answer, counts=True),
     Flaw("unedited", "view left unedited", "", (1.0,), 1.0, lambda e, _: e.before, counts=True),
     Flaw(
-        "ghost", "two answers at once", "of the light", (0.1, 0.25, 0.5), 0.5, _ghost, counts=True
+        "ghost", "two answers at once", "of the light", (0.1, 0.25, 0.5), 0.5,
+        lambda e, size: _mixed(e.after, e.other, size), counts=True,
     ),
     Flaw("hue", "hue shift", "degrees", (5.0, 15.0, 45.0), 45.0, _hue, counts=True),
     Flaw("slid", "texture slid", "px", (0.5, 1.0, 2.0, 4.0, 8.0, 16.0), 4.0, _slid, counts=True),
@@ -207,9 +223,27 @@ FLAWS = (
     Flaw("bled", "paint bled outside", "px", (2.0, 4.0, 8.0), 4.0, _bled),
     Flaw("blur", "blur", "px", (1.0, 2.0, 4.0), 2.0, _blurred),
     Flaw("noise", "noise", "of white", (0.01, 0.03, 0.1), 0.03, _noisy),
+    Flaw("moved", "moved aside", "px", (2.0,), 2.0, _moved),
     Flaw("elsewhere", "another scene", "", (1.0,), 1.0, lambda e, _: e.elsewhere),
-)
-"""Every flaw; those that count first."""
+    Flaw(
+        "weak_all", "all views: edit left out", "of the light", (0.25, 0.5, 1.0), 0.5,
+        lambda e, size: _mixed(e.after, e.before, size), alike=True,
+    ),
+    Flaw("hue_all", "all views: hue shift", "degrees", (180.0,), 180.0, _hue, alike=True),
+    Flaw(
+        "misdirected_all", "all views: another thing edited", "", (1.0,), 1.0,
+        lambda e, _: e.misdirected, alike=True,
+    ),
+    Flaw("blur_all", "all views: blur", "px", (2.0,), 2.0, _blurred, alike=True),
+    Flaw("noise_all", "all views: noise", "of white", (0.03,), 0.03, _noisy, alike=True),
+)  # fmt: skip
+"""Every flaw: of the target alone, those that count first, then of all views."""
+
+ELSEWHERE = next(flaw for flaw in FLAWS if flaw.name == "elsewhere")
+"""View of another scene, which every figure should see."""
+
+COUNTED = tuple(flaw for flaw in FLAWS if flaw.counts)
+"""Flaws that matter most."""
 
 CONDITIONS = {flaw.key(size): (flaw, size) for flaw in FLAWS for size in flaw.sizes}
 """Flaws with their sizes by name."""

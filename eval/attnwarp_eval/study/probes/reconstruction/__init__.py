@@ -1,1 +1,0 @@
-"""COLMAP's reconstructions of right edits and of flawed ones: what its figures see."""

@@ -1,1 +1,0 @@
-"""Sensitivity of metrics to flaws of an edit."""
