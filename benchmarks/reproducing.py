@@ -27,7 +27,7 @@ from attnwarp.methods import METHODS, Budget, Result, preset
 from attnwarp.process import core_count
 from attnwarp_eval.cost import peak_memory_mb, reset_peak_memory
 from attnwarp_eval.reproduce.manifest import Loaded, Row, load_manifest
-from attnwarp_eval.study.editing_methods import with_source_words
+from attnwarp_eval.study.shared.editing_methods import with_source_words
 from benchmarks import command
 from benchmarks.gpu import TINY, Sizes, random_editor, ring
 from benchmarks.render import scene

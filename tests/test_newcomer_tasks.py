@@ -150,7 +150,7 @@ assert "turn.angle" in open("run/report.md").read()
     "method": EDITED
     + """
 from attnwarp.render import render
-from attnwarp_eval.study.editing_methods import EDITING_METHODS
+from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS
 
 assert "softened" in EDITING_METHODS
 alone = edited("by_view")

@@ -13,14 +13,15 @@ import yaml
 from attnwarp.errors import InputError
 from attnwarp_eval import cost, plugins
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.study import Store, editing_methods, parse_study
+from attnwarp_eval.study import Store, parse_study
 from attnwarp_eval.study.probe import probe, unregister
 from attnwarp_eval.study.run import expected, plan, stored_study, verify
+from attnwarp_eval.study.shared import editing_methods
 
 HELPERS = Path(__file__).parents[1] / "helpers"
 PLUGIN = """\
 from chord_probe import Chord
-from attnwarp_eval.study.editing_methods import EDITING_METHODS, Method
+from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, Method
 from attnwarp_eval.study.probe import register
 
 register(Chord)

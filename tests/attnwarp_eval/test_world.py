@@ -12,7 +12,7 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SceneSpec
 from attnwarp_eval.splats.export import orbit
-from attnwarp_eval.study.edit_truth import neighbours
+from attnwarp_eval.study.shared.edit_truth import neighbours
 from attnwarp_eval.truth import Geometry, appearance, two_view
 from attnwarp_eval.truth.mitsuba import build
 from attnwarp_eval.world import World, world

@@ -10,12 +10,12 @@ from pydantic import Field
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.metrics.registry import Metric, Registry
-from attnwarp_eval.study.pictures import jpeg
 from attnwarp_eval.study.probe import Probe, Work
 from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Part, Study, Variant
+from attnwarp_eval.study.shared.pictures import jpeg
 
 CHORD = Metric("chord.length", "scene", "lower", 1e-9, 0, "distance of target and source camera")
 

@@ -10,9 +10,9 @@ from PIL import Image
 from written_runs import record
 
 from attnwarp_eval.study import Store, load_study
-from attnwarp_eval.study.edit_truth import Judgement
 from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.run import expected, plan
+from attnwarp_eval.study.shared.edit_truth import Judgement
 
 METHODS = ("alone", "warped", "third")
 

@@ -15,7 +15,7 @@ from attnwarp.digest import digest
 from attnwarp.errors import InputError
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp_eval.files import write_picture
-from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Method
+from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, EditedScene, Method
 
 
 def settings(preset, fields, seed):

@@ -25,16 +25,16 @@ from attnwarp_eval.document import write
 from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.files import write_atomic, write_picture
-from attnwarp_eval.study.editing_methods import (
+from attnwarp_eval.study.probe_report import report_of
+from attnwarp_eval.study.schema import Study, Variant
+from attnwarp_eval.study.shared import edits, fits, method_run
+from attnwarp_eval.study.shared.editing_methods import (
     EDITING_METHODS,
     EditedScene,
     Job,
     needs_source_words,
     with_source_words,
 )
-from attnwarp_eval.study.probe_report import report_of
-from attnwarp_eval.study.schema import Study, Variant
-from attnwarp_eval.study.shared import edits, fits, method_run
 from attnwarp_eval.study.shared.encoders import EncodersPart
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.user_images import measure

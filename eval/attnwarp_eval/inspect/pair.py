@@ -31,7 +31,7 @@ from attnwarp.warp import (
 from attnwarp.warp.view import near_plane
 from attnwarp_eval.inspect.capture import Capture, Edit, rendered
 from attnwarp_eval.inspect.run import RunEdit
-from attnwarp_eval.study import pictures
+from attnwarp_eval.study.shared import pictures
 from attnwarp_eval.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
 
 if TYPE_CHECKING:

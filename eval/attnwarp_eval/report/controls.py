@@ -8,11 +8,11 @@ from typing import Literal
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES
 from attnwarp_eval.report.compared import between
-from attnwarp_eval.study.controls import OTHER_SEED
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Variant
+from attnwarp_eval.study.shared.controls import OTHER_SEED
 from attnwarp_eval.study.shared.edits import VariantPart
 
 BLIND: Literal["blind"] = "blind"

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from attnwarp_eval.document.model import Gallery, Picture, Section
-from attnwarp_eval.study.pictures import CLASSES, DEPTH_RANGE, EPE_RANGE, ORDER, SHARED
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of, reports
 from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.shared.pictures import CLASSES, DEPTH_RANGE, EPE_RANGE, ORDER, SHARED
 
 
 def galleries(results: Results) -> list[Section]:

@@ -34,9 +34,9 @@ from attnwarp_eval.reproduce.captures import (
 from attnwarp_eval.reproduce.check import Checked
 from attnwarp_eval.reproduce.manifest import Loaded, Manifest, Row
 from attnwarp_eval.study.cell import Cell, merged
-from attnwarp_eval.study.editing_methods import with_source_words
 from attnwarp_eval.study.probe import Probe, Work, register, unregister
 from attnwarp_eval.study.record import Failure, Json, with_nan
+from attnwarp_eval.study.shared.editing_methods import with_source_words
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.user_images import measure
 
@@ -265,7 +265,7 @@ class Job:
         """The source's picture warped into a target by both kinds of splats, with its mask."""
         from attnwarp.methods.scene import near_of, to_float
         from attnwarp.warp import PRESETS, warp_view
-        from attnwarp_eval.study.pictures import carried
+        from attnwarp_eval.study.shared.pictures import carried
 
         capture, folder, target = self.capture, self.folder(), self.cell.spec["target"]
         source = to_float(capture.images[capture.source])

@@ -28,10 +28,10 @@ from attnwarp_eval.metrics.gates import GATES, gated
 from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.report.results import read_results
 from attnwarp_eval.study import Store
-from attnwarp_eval.study.edit_truth import Judgement
 from attnwarp_eval.study.probe import register, unregister
 from attnwarp_eval.study.probe_report import reports
 from attnwarp_eval.study.probes.editing.result import EditResult
+from attnwarp_eval.study.shared.edit_truth import Judgement
 
 DONE = Judgement("red", True, 25.0, 10.0, 10.0)
 

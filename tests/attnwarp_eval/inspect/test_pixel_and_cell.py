@@ -13,7 +13,7 @@ from attnwarp_eval.inspect.cell import cell_of, cell_report
 from attnwarp_eval.inspect.command import inspect_command
 from attnwarp_eval.inspect.pair import ACCEPTED, Pair, blocks
 from attnwarp_eval.inspect.pixel import report
-from attnwarp_eval.study import pictures
+from attnwarp_eval.study.shared import pictures
 from attnwarp_eval.two_view import HIDDEN, VISIBLE
 
 SIZE = 64

@@ -17,9 +17,9 @@ from attnwarp_eval.inspect.cell import cell_report
 from attnwarp_eval.inspect.scene import State
 from attnwarp_eval.inspect.window import Window
 from attnwarp_eval.study import parse_study
-from attnwarp_eval.study.pictures import jpeg, rgb
 from attnwarp_eval.study.probes.editing.result import EditResult, Judgement
 from attnwarp_eval.study.run import execute, plan
+from attnwarp_eval.study.shared.pictures import jpeg, rgb
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.world import world
 

@@ -11,8 +11,8 @@ import written_runs
 
 from attnwarp_eval.document.write import markdown, page
 from attnwarp_eval.report.build import build
-from attnwarp_eval.study.pictures import jpeg
 from attnwarp_eval.study.record import PictureFile
+from attnwarp_eval.study.shared.pictures import jpeg
 
 STUDY = {
     "name": "hand-made",

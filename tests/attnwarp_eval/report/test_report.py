@@ -23,11 +23,11 @@ from attnwarp_eval.report.compared import between
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.judging import claims_section, decided, found, judge, together
 from attnwarp_eval.statistics.intervals import interval
-from attnwarp_eval.study.edit_truth import EditTruth, Judgement
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import Layout, report_of
 from attnwarp_eval.study.probes.editing.report import abilities, by_scene
 from attnwarp_eval.study.probes.editing.result import EditResult
+from attnwarp_eval.study.shared.edit_truth import EditTruth, Judgement
 from attnwarp_eval.study.study import load_study, parse_variant
 
 SCENES = ("one", "two", "three")

@@ -28,7 +28,7 @@ from attnwarp_eval.reproduce.cells import settings_of
 from attnwarp_eval.reproduce.manifest import load_manifest
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.splats.export import orbit
-from attnwarp_eval.study.editing_methods import EDITING_METHODS, Job
+from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, Job
 from attnwarp_eval.truth import appearance
 
 pytestmark = pytest.mark.slow

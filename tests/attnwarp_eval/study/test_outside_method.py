@@ -7,12 +7,12 @@ from tiny_scenes import cameras, pictures, splats
 from attnwarp.errors import InputError
 from attnwarp.io import read_dataset, read_image, read_ply, write_ply
 from attnwarp_eval.files import write_picture
-from attnwarp_eval.study.editing_methods import EDITING_METHODS, Job
+from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, Job
 
 
 def test_a_scene_goes_to_a_folder_and_its_result_comes_from_there(tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "attnwarp_eval.study.editing_methods.EDITING_METHODS", dict(EDITING_METHODS)
+        "attnwarp_eval.study.shared.editing_methods.EDITING_METHODS", dict(EDITING_METHODS)
     )
     import outside_method
 

@@ -17,8 +17,8 @@ from attnwarp.render import render
 from attnwarp_eval.scene.edits import apply
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.study.controls import MovedView
-from attnwarp_eval.study.warping import warp_truth
+from attnwarp_eval.study.shared.controls import MovedView
+from attnwarp_eval.study.shared.warps import warp_truth
 from attnwarp_eval.two_view import HIDDEN
 from attnwarp_eval.world import splats, world
 from attnwarp_lab.ideal.editor import Answers, IdealEditor, schedule, tokens_of

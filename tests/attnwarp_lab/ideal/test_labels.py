@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from attnwarp.warp import preset
-from attnwarp_eval.study.warping import warp_truth
+from attnwarp_eval.study.shared.warps import warp_truth
 from attnwarp_eval.world import world
 from attnwarp_lab.ideal.labels import NONE, carried_labels, label_transport
 from attnwarp_lab.ideal.parts import token_parts

@@ -8,8 +8,8 @@ from torch_threads import on_one_thread
 from attnwarp.methods import attention_warping
 from attnwarp.methods import preset as method_preset
 from attnwarp.warp import preset, warp_view
-from attnwarp_eval.study.controls import MovedView
-from attnwarp_eval.study.warping import warp_truth
+from attnwarp_eval.study.shared.controls import MovedView
+from attnwarp_eval.study.shared.warps import warp_truth
 from attnwarp_eval.two_view import HIDDEN
 from attnwarp_eval.world import splats, world
 from attnwarp_lab.ideal.figures import part_answers, part_figures

@@ -12,7 +12,7 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.run import execute, plan
-from attnwarp_eval.study.warping import warp_truth
+from attnwarp_eval.study.shared.warps import warp_truth
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.world import world
 from attnwarp_lab.ideal.labels import carried_labels, label_transport

@@ -1,1 +1,1 @@
-"""Keys of a study that several probes read, and what several measure with."""
+"""Study keys and helpers shared by several probes."""

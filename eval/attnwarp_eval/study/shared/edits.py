@@ -12,13 +12,19 @@ from pydantic import Field
 
 from attnwarp.errors import InputError
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.study.budgets import BudgetPart
-from attnwarp_eval.study.controls import OTHER_SCENE, OTHER_SEED, SCENE_STEP, SEED_STEP, Control
-from attnwarp_eval.study.edit_truth import answers_of
-from attnwarp_eval.study.editing_methods import EDITING_METHODS
 from attnwarp_eval.study.probe import Probe
 from attnwarp_eval.study.record import Extra, Json
 from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, Whole, did_you_mean
+from attnwarp_eval.study.shared.budgets import BudgetPart
+from attnwarp_eval.study.shared.controls import (
+    OTHER_SCENE,
+    OTHER_SEED,
+    SCENE_STEP,
+    SEED_STEP,
+    Control,
+)
+from attnwarp_eval.study.shared.edit_truth import answers_of
+from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS
 from attnwarp_eval.study.shared.splats import splats_meaning, splats_spec
 
 E = TypeVar("E", bound=Extra)
@@ -90,7 +96,7 @@ class VariantPart(Part):
     ``source`` words. ``mask: truth`` injects where the source truly sees the
     surface, ``geometry: truth`` warps by exact depth. ``budget`` cuts the method short.
     ``control`` takes features from the wrong place or scene, or another seed
-    (:mod:`attnwarp_eval.study.controls`).
+    (:mod:`attnwarp_eval.study.shared.controls`).
     """
 
     method: str = "attention_warping"

@@ -15,20 +15,20 @@ import torch
 from attnwarp import Gaussians
 from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.study.controls import OTHER_SCENE, MovedView
-from attnwarp_eval.study.edit_truth import EditTruth
-from attnwarp_eval.study.editing_methods import (
+from attnwarp_eval.study.probe import Work
+from attnwarp_eval.study.record import Json
+from attnwarp_eval.study.schema import StudyError
+from attnwarp_eval.study.shared.controls import OTHER_SCENE, MovedView
+from attnwarp_eval.study.shared.edit_truth import EditTruth
+from attnwarp_eval.study.shared.editing_methods import (
     EDITING_METHODS,
     Donor,
     EditedScene,
     Job,
     with_source_words,
 )
-from attnwarp_eval.study.probe import Work
-from attnwarp_eval.study.record import Json
-from attnwarp_eval.study.schema import StudyError
 from attnwarp_eval.study.shared.edits import files_digest
-from attnwarp_eval.study.warping import warp_truth
+from attnwarp_eval.study.shared.warps import warp_truth
 from attnwarp_eval.world import World, changed
 
 if TYPE_CHECKING:

@@ -1,11 +1,22 @@
-"""The warps of a variant's cell, view by view."""
+"""The warps of a variant's cell, view by view, and their figures against truth."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from attnwarp.warp import WarpedView, WarpSettings, parts_read, render_surface, warp_view
+import torch
+
+from attnwarp.warp import (
+    Surface,
+    WarpedView,
+    WarpSettings,
+    parts_read,
+    render_surface,
+    warp_surfaces,
+    warp_view,
+)
+from attnwarp_eval import metrics
 from attnwarp_eval.study.probe import Probe, Work
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Study, Variant
@@ -14,8 +25,8 @@ from attnwarp_eval.study.shared.splats import (
     surface_meaning,
     surface_spec,
 )
-from attnwarp_eval.study.warping import warp_truth
 from attnwarp_eval.two_view import TwoView
+from attnwarp_eval.world import World
 
 
 class WarpProbe(Probe[NoExtra]):
@@ -78,3 +89,60 @@ def warped_views(work: Work, grids: Sequence[int]) -> Iterator[tuple[str, TwoVie
                 view.at((grid, grid))
         meter.count(**view.target.counters)
         yield name, truth, view
+
+
+def warp_truth(world: World, truth: TwoView, settings: WarpSettings, **images: Any) -> WarpedView:
+    """Warp by the truth's own depth.
+
+    Args:
+        truth: truth of the pair, (H, W).
+        images: ``source_image`` and ``target_image``, (H, W, 3) sRGB in [0, 1], for photometric
+            rules.
+    """
+    source = world.geometry.trace(truth.source)
+    return warp_surfaces(
+        truth.source,
+        truth.target,
+        Surface(truth.hits.depth, truth.hits.normal, image=images.get("target_image")),
+        Surface(source.depth, source.normal, image=images.get("source_image")),
+        settings,
+        warn_empty=False,
+    )
+
+
+def warp_figures(work: Work, name: str, view: WarpedView) -> dict[str, float]:
+    """Endpoint error, feature error and mask scores, at image size and at every feature size.
+
+    Args:
+        work: the cell; its spec names the feature sizes, their channels and their seed.
+    """
+    spec, world, meter = work.spec, work.world, work.meter
+    size = spec["size"]
+    with meter.stage("checks"):
+        truth = world.pair(name, size)
+        figures = metrics.endpoint_error(
+            view.correspondence.xy, truth.xy, truth.visible, truth.edge
+        )
+        figures |= metrics.mask_error(
+            view.mask, truth.label, truth.hits.valid, truth.behind, truth.edge
+        )
+    channels, seed = spec["feature_channels"], spec["seed"]
+    for layer in spec["feature_sizes"]:
+        with meter.stage("truth"):
+            truth = world.pair(name, layer)
+            features = world.features(world.source.name, layer, channels, seed)
+            exact = world.features(name, layer, channels, seed)
+        with meter.stage("sample"):
+            at_layer = view.at((layer, layer))
+            warped = at_layer.warp(torch.from_numpy(features)).numpy()
+        meter.count(taps=4 * features.size)
+        with meter.stage("checks"):
+            errors = metrics.feature_error(warped, exact, at_layer.mask, truth.visible, truth.edge)
+            if layer != size:
+                xy = at_layer.correspondence.xy
+                errors |= metrics.endpoint_error(xy, truth.xy, truth.visible, image_px=size / layer)
+                errors |= metrics.mask_error(
+                    at_layer.mask, truth.label, truth.hits.valid, truth.behind
+                )
+            figures |= metrics.at_size(errors, layer)
+    return figures

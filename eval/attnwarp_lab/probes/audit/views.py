@@ -15,10 +15,10 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.materials import MetalMaterial
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import EditSpec, ObjectChange
-from attnwarp_eval.study.edit_truth import answers_of
 from attnwarp_eval.study.probe import Work
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.schema import StudyError
+from attnwarp_eval.study.shared.edit_truth import answers_of
 from attnwarp_eval.truth import appearance, two_view
 from attnwarp_eval.truth.edits import edit_mask, touched
 from attnwarp_eval.two_view import Hits

@@ -17,11 +17,11 @@ import torch
 
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.edit_truth import EditTruth
-from attnwarp_eval.study.editing_methods import Donor
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.schema import Study
+from attnwarp_eval.study.shared.edit_truth import EditTruth
+from attnwarp_eval.study.shared.editing_methods import Donor
 from attnwarp_eval.study.shared.edits import (
     MethodProbe,
     VariantPart,

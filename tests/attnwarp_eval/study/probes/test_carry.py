@@ -10,9 +10,9 @@ from skimage.color import deltaE_ciede2000, rgb2lab
 from attnwarp_eval.report.build import build
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import StudyError, cells_of, load_study
-from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.results import Outcome, Results
+from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.world import world
 

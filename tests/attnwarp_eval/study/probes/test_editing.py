@@ -26,14 +26,14 @@ from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
-from attnwarp_eval.study.budgets import Spent, Stopwatch
-from attnwarp_eval.study.edit_truth import edit_truth
-from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probes.editing import measure, result
 from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.run import execute, plan
 from attnwarp_eval.study.shared import edits
+from attnwarp_eval.study.shared.budgets import Spent, Stopwatch
+from attnwarp_eval.study.shared.edit_truth import edit_truth
+from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.truth import Geometry, two_view
 from attnwarp_eval.world import world

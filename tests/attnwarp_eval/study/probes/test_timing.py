@@ -11,12 +11,12 @@ from attnwarp_eval.document.numbers import number
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
-from attnwarp_eval.study.edit_truth import Judgement
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import Layout, report_of
 from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.run import expected, plan, verify
 from attnwarp_eval.study.shared import method_run
+from attnwarp_eval.study.shared.edit_truth import Judgement
 from attnwarp_eval.study.work import compute
 
 ROUNDS = 3

@@ -20,11 +20,11 @@ from attnwarp_eval.scene.materials import NOT_SIMULATED
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.transport import called_for
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.pictures import of_warp
 from attnwarp_eval.study.probe import Probe, Work, metrics_of, register
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.schema import Study
-from attnwarp_eval.study.warping import warp_figures, warp_truth
+from attnwarp_eval.study.shared.pictures import of_warp
+from attnwarp_eval.study.shared.warps import warp_figures, warp_truth
 from attnwarp_eval.truth.llvm import variant
 from attnwarp_eval.truth.mitsuba import position_and_shape
 from attnwarp_eval.truth.plan import everything_on, plan

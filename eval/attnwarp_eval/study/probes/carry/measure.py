@@ -19,12 +19,12 @@ from attnwarp_eval import metrics
 from attnwarp_eval.colors import color_difference
 from attnwarp_eval.metrics.registry import METRICS, Registry
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.study import pictures
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.edit_truth import EditTruth
 from attnwarp_eval.study.probe import Work, register
 from attnwarp_eval.study.record import NoExtra
 from attnwarp_eval.study.schema import Part, Study, Whole
+from attnwarp_eval.study.shared import pictures
+from attnwarp_eval.study.shared.edit_truth import EditTruth
 from attnwarp_eval.study.shared.edits import LEAST_PIXELS, MethodProbe, editor_of
 from attnwarp_eval.study.shared.method_run import own_seconds, run_method
 from attnwarp_eval.study.shared.splats import splats_of

@@ -7,10 +7,10 @@ from typing import Any
 
 from attnwarp.warp import WarpSettings, render_surface
 from attnwarp_eval import metrics
-from attnwarp_eval.study import pictures
 from attnwarp_eval.study.probe import Probe, Work, metrics_of, register
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Study, Variant
+from attnwarp_eval.study.shared import pictures
 from attnwarp_eval.study.shared.splats import (
     check_splats,
     splats_of,

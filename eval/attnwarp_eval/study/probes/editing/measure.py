@@ -19,15 +19,15 @@ from attnwarp.fit import compile_kernels
 from attnwarp.warp import warp_view
 from attnwarp_eval.cost import Meter
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.study.budgets import Spent, Stopwatch, timed
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.controls import OTHER_SCENE
-from attnwarp_eval.study.edit_truth import EditTruth, planned_truth
-from attnwarp_eval.study.editing_methods import EDITING_METHODS
 from attnwarp_eval.study.probe import Work, metrics_of, probe, register
 from attnwarp_eval.study.probes.editing.result import EditResult, Measurement
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.schema import Study, Variant
+from attnwarp_eval.study.shared.budgets import Spent, Stopwatch, timed
+from attnwarp_eval.study.shared.controls import OTHER_SCENE
+from attnwarp_eval.study.shared.edit_truth import EditTruth, planned_truth
+from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS
 from attnwarp_eval.study.shared.edits import (
     EditingPart,
     MethodProbe,

@@ -15,13 +15,13 @@ from attnwarp import Gaussians
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.splats.fitted import rendered_error
-from attnwarp_eval.study import pictures
-from attnwarp_eval.study.budgets import Spent
-from attnwarp_eval.study.edit_truth import EditTruth, Judgement, neighbours
-from attnwarp_eval.study.editing_methods import EditedScene
 from attnwarp_eval.study.probe import Work
 from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.schema import StudyError
+from attnwarp_eval.study.shared import pictures
+from attnwarp_eval.study.shared.budgets import Spent
+from attnwarp_eval.study.shared.edit_truth import EditTruth, Judgement, neighbours
+from attnwarp_eval.study.shared.editing_methods import EditedScene
 from attnwarp_eval.study.shared.edits import LEAST_PIXELS
 
 if TYPE_CHECKING:

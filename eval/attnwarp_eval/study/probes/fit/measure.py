@@ -13,11 +13,10 @@ from attnwarp.warp import WarpSettings, render_surface
 from attnwarp_eval import metrics
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats import export, fitted
-from attnwarp_eval.study import pictures
 from attnwarp_eval.study.probe import Probe, Work, metrics_of, register
 from attnwarp_eval.study.record import Json, finite, with_nan
 from attnwarp_eval.study.schema import Study, Variant
-from attnwarp_eval.study.shared import fits
+from attnwarp_eval.study.shared import fits, pictures
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,11 @@ from attnwarp.warp import lift_masks
 from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.study import pictures
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Probe, Work, metrics_of, register
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Part, Study, Variant, Whole
+from attnwarp_eval.study.shared import pictures
 from attnwarp_eval.study.shared.splats import (
     check_splats,
     splats_meaning,

@@ -9,7 +9,6 @@ from typing import ClassVar
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
-from attnwarp_eval.study.pictures import MARKS
 from attnwarp_eval.study.probe_report import (
     Layout,
     Place,
@@ -19,6 +18,7 @@ from attnwarp_eval.study.probe_report import (
     scenes_side_by_side,
 )
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.shared.pictures import MARKS
 
 PARTS = {
     "Overlap over the whole view": "masks.iou",

@@ -17,11 +17,11 @@ from attnwarp.warp import WarpSettings, render_surface, warp_view
 from attnwarp_eval.cost import AGAIN, Meter, in_turn
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.edit_truth import planned_truth
 from attnwarp_eval.study.probe import InTurn, Probe, Work, probe, register
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Outcome
 from attnwarp_eval.study.schema import Part, Study, Whole
+from attnwarp_eval.study.shared.edit_truth import planned_truth
 from attnwarp_eval.study.shared.edits import VariantPart, editor_of, edits_of, scene_seed
 from attnwarp_eval.study.shared.method_run import PARTS, WHOLE, run_method
 from attnwarp_eval.study.shared.splats import check_splats, splats_of, surface_spec

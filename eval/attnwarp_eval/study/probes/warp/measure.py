@@ -6,12 +6,11 @@ from functools import partial
 
 from pydantic import Field
 
-from attnwarp_eval.study import pictures
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Part, Study, Variant
-from attnwarp_eval.study.shared.warps import WarpProbe, warped_views
-from attnwarp_eval.study.warping import warp_figures
+from attnwarp_eval.study.shared import pictures
+from attnwarp_eval.study.shared.warps import WarpProbe, warp_figures, warped_views
 
 
 class Yaw(Part):

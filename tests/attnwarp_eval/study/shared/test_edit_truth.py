@@ -7,11 +7,11 @@ from ball_scene import ball_scene
 
 from attnwarp.errors import InputError
 from attnwarp_eval.study import Store, parse_study
-from attnwarp_eval.study.edit_truth import edit_truth
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probes.editing import measure as editing
 from attnwarp_eval.study.probes.timing import measure as timing
 from attnwarp_eval.study.run import plan
+from attnwarp_eval.study.shared.edit_truth import edit_truth
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.world import splats, world
 

@@ -6,8 +6,8 @@ from tiny_scenes import cameras, pictures, splats
 
 from attnwarp.editing.small import load_editor
 from attnwarp_eval.study import parse_study
-from attnwarp_eval.study.editing_methods import EDITING_METHODS, Job
 from attnwarp_eval.study.shared import edits
+from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, Job
 
 
 def test_true_pictures_are_the_edits_of_their_views(tmp_path):
