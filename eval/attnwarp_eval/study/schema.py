@@ -104,6 +104,14 @@ class Variant(Part):
         return WarpSettings.from_dict({**PRESETS[name].to_dict(), **self.set})
 
 
+class UnmeasuredError(ValueError):
+    """A table names a variant that its study does not measure; ``key`` is the table's."""
+
+    def __init__(self, key: str, said: str) -> None:
+        self.key = key
+        super().__init__(f"{key}: {said}")
+
+
 class Ablation(Part):
     """A table of the report: variants against a baseline, paired on scene and view.
 
@@ -304,10 +312,11 @@ class Study(Part):
         """
         for name in names:
             if name not in self.variants:
-                raise ValueError(f"{key}: no variant {name!r}{did_you_mean(name, self.variants)}")
+                near = did_you_mean(name, self.variants)
+                raise UnmeasuredError(key, f"no variant {name!r}{near}")
             # A row that is never measured would be missing from its table without a word.
             if probe and name not in self.probes.get(probe, []):
-                raise ValueError(f"{key}: {name!r} is not measured; add it to probes.{probe}")
+                raise UnmeasuredError(key, f"{name!r} is not measured; add it to probes.{probe}")
 
     def splats_of(self, variant: Variant) -> Splats:
         """The study's splats with the variant's own fields."""

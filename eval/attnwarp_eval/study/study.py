@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from importlib import resources
@@ -313,7 +315,7 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
             for name in data["scenes"]
         ]
     try:
-        study = parse_study(data)
+        study, data = _parsed(data, lambda key: line_of(lines, (key,))[0] != path)
     except ValidationError as error:
         place = _place(error.errors()[0])
         file, line = line_of(lines, place) if place else (path, None)
@@ -333,11 +335,33 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
                 )
         # Those of an extended study, of which this one measures fewer.
         kept = {name: value for name, value in data["variants"].items() if name not in idle}
-        study = parse_study({**data, "variants": kept})
+        shown = data.get("pictures", {})
+        rows = [name for name in shown.get("variants", ()) if name not in idle]
+        study = parse_study({**data, "variants": kept, "pictures": {**shown, "variants": rows}})
     if isinstance(every, list):
         called = {scene_name(name) for name in study.scenes}
         study._left_out = tuple(name for name in every if scene_name(name) not in called)
     return study
+
+
+def _parsed(data: dict[str, Any], inherited: Callable[[str], bool]) -> tuple[Study, dict[str, Any]]:
+    """A study, and its data without inherited tables of variants that it does not measure.
+
+    Args:
+        data: data of the study.
+        inherited: True of a key that comes from an extended study.
+    """
+    try:
+        return parse_study(data), data
+    except ValidationError as error:
+        unmeasured = getattr(error.errors()[0].get("ctx", {}).get("error"), "key", "")
+        table = re.match(r"(ablations|fronts|answer|yaw)(?:\[(\d+)\])?", unmeasured)
+        if not table or not inherited(table[1]):
+            raise
+    left = {key: value for key, value in data.items() if key != table[1]}
+    if table[2] is not None:
+        left[table[1]] = [e for i, e in enumerate(data[table[1]]) if i != int(table[2])]
+    return _parsed(left, inherited)
 
 
 def _read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], _Lines]:

@@ -489,3 +489,25 @@ def test_a_study_of_fewer_probes_leaves_out_the_variants_that_it_does_not_measur
     assert list(load_study(extending(tmp_path, child)).variants) == ["corrected"]
     with pytest.raises(StudyError, match=r"child.yaml:5: variants.own: no probe measures it"):
         load_study(extending(tmp_path, f"{child}variants: {{own: {{}}}}\n"))
+
+
+def test_a_study_of_fewer_probes_leaves_out_the_tables_of_what_it_does_not_measure(tmp_path):
+    """Oracle: the tables of the base that name the probe that is left."""
+    ablation = "{title: %s, probe: %s, baseline: corrected, variants: [%s]}"
+    tables = (
+        f"ablations:\n  - {ablation % ('gone', 'warp', 'bare')}\n"
+        f"  - {ablation % ('left', 'depth', 'slipped')}\n"
+        "fronts:\n  - {title: gone, probe: warp, metric: 'warp.feature_visible.{layer}', variants: [bare]}\n"
+        "answer:\n  question: q\n  decides: c\n  variants: {slipped: a, bare: b}\n"
+        "  columns: {c: {metric: occlusion.recall, probe: warp}}\n"
+        "pictures: {variants: [corrected, bare]}\n"
+    )
+    base = BASE.replace("depth: [corrected]", "depth: [corrected, slipped]") + tables
+    child = "extends: base.yaml\nname: a\nprobes: {warp: null}\n"
+    study = load_study(extending(tmp_path, child, base))
+    assert [table.title for table in study.ablations] == ["left"]
+    assert (study.fronts, study.answer, study.yaw.variants) == ([], None, [])
+    assert study.pictures.variants == ["corrected"]
+    own = f"ablations: [{ablation % ('own', 'warp', 'slipped')}]\n"
+    with pytest.raises(StudyError, match=r"child.yaml:.*ablations\[0\]: .* is not measured"):
+        load_study(extending(tmp_path, child + own, base))
