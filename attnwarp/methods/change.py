@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from attnwarp.colors import ciede2000, to_lab
-from attnwarp.methods.pictures import Bytes, Mask, resized, to_bytes
+from attnwarp.methods.pictures import Bytes, Mask, Size, resized, to_bytes
 from attnwarp.methods.work import Work
 
 LITTLE = 3.0
@@ -37,22 +37,25 @@ def change_of(
         The change of renders from before the edit to after, and of the source's picture.
     """
     segments = work.scene.segments
-    masks = None if segments is None else [segment > 0.5 for segment in segments]
+
+    def mask(view: int, size: Size) -> Mask | None:
+        if segments is None:
+            return None
+        inside = np.asarray(segments[view] > 0.5, dtype=np.float32)
+        return np.asarray(resized(inside[..., None].repeat(3, 2), size)[..., 0] > 0.5)
 
     def rendered(views: Iterable[int]) -> float | None:
         read = work.folder.read_picture
         return mean_change(
-            (read(f"renders/before/{names[view]}.png"), read(f"renders/after/{names[view]}.png"),
-             masks and masks[view])
+            (before := read(f"renders/before/{names[view]}.png"),
+             read(f"renders/after/{names[view]}.png"), mask(view, before.shape[:2]))
             for view in views
         )  # fmt: skip
 
     def edit(view: int) -> tuple[Bytes, Bytes, Mask | None]:
-        size = work.sizes[view]
-        mask = (
-            masks and resized(np.float32(masks[view])[..., None].repeat(3, 2), size)[..., 0] > 0.5
-        )
-        return to_bytes(work.picture(view)), edited[view], mask
+        size = edited[view].shape[:2]  # a method may answer at another size than it was asked
+        before = resized(work.scene.picture(view), size)
+        return to_bytes(before), edited[view], mask(view, size)
 
     views = range(len(names))
     scene = rendered(view for view in views if names[view] != source)
