@@ -61,7 +61,6 @@ from attnwarp_eval.metrics.multiview import (
 )
 from attnwarp_eval.metrics.occlusion import COUNTS, YawBin, by_yaw, confusion, mask_error, scores
 from attnwarp_eval.metrics.reconstruction import Reconstruction, reconstruct
-from attnwarp_eval.metrics.refit import refit_psnr
 from attnwarp_eval.metrics.registry import METRICS, at_size, metric
 from attnwarp_eval.metrics.surface import surface_error
 from attnwarp_eval.metrics.warp import endpoint_error, feature_error
@@ -112,7 +111,6 @@ __all__ = [
     "perceptual_consistency",
     "psnr",
     "reconstruct",
-    "refit_psnr",
     "scores",
     "sift_features",
     "sift_matches",

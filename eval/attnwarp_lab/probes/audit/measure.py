@@ -39,6 +39,7 @@ from attnwarp_eval.study.shared.encoders import (
 from attnwarp_eval.world import splats
 from attnwarp_lab.probes.audit.figures import Measure, Pair, Shown
 from attnwarp_lab.probes.audit.flaws import CONDITIONS, COUNTED, ELSEWHERE, Edited
+from attnwarp_lab.probes.audit.refit import refit_psnr
 from attnwarp_lab.probes.audit.views import (
     PAIRS,
     Pictures,
@@ -247,7 +248,7 @@ def _refit(
     import cv2
 
     size = tuple(min(REFIT_SIZE, side) for side in (cameras[0].width, cameras[0].height))
-    return metrics.refit_psnr(
+    return refit_psnr(
         model,
         [camera.resize(*size) for camera in cameras],
         [

@@ -47,13 +47,13 @@ def refit_psnr(
     Example:
         >>> import numpy as np, torch
         >>> from attnwarp import Camera, Gaussians
-        >>> from attnwarp_eval import metrics
+        >>> from attnwarp_lab.probes.audit.refit import refit_psnr
         >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
         ...                  torch.full((1, 2), 9.0), torch.ones(1), torch.zeros(1, 1, 3))
         >>> view = dict(width=16, height=16, fov_y=40, up=(0, 1, 0))
         >>> cameras = [Camera.look_at((x, 0, 3), (0, 0, 0), **view) for x in (0, 1)]
         >>> grey, darker = np.full((16, 16, 3), 0.5), np.full((16, 16, 3), 0.3)
-        >>> one = metrics.refit_psnr(disc, cameras, [(grey, darker)])[0]
+        >>> one = refit_psnr(disc, cameras, [(grey, darker)])[0]
         >>> round(one)  # the disc takes their mean, 0.4
         20
     """

@@ -8,7 +8,7 @@ import torch
 
 from attnwarp import Camera, Gaussians
 from attnwarp.render import render
-from attnwarp_eval import metrics
+from attnwarp_lab.probes.audit.refit import refit_psnr
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def test_what_is_left_is_least_squares(scene):
     rng = np.random.default_rng(0)
     sets = [[rng.random((16, 16, 3)) for _ in cameras] for _ in range(2)]
     weights, covered = matrix(splats, cameras)
-    for found, pictures in zip(metrics.refit_psnr(splats, cameras, sets), sets, strict=True):
+    for found, pictures in zip(refit_psnr(splats, cameras, sets), sets, strict=True):
         wanted = np.concatenate([one.reshape(-1, 3) for one in pictures]) * covered[:, None]
         best = np.linalg.lstsq(weights, wanted, rcond=None)[0]
         error = ((wanted - weights @ best) ** 2).mean()
@@ -60,12 +60,12 @@ def test_pictures_that_the_splats_can_show_leave_nothing(scene):
     _, covered = matrix(splats, cameras)
     # Behind them lies the picture itself: premultiplied colours over coverage.
     pictures = shown / np.maximum(covered, 1e-9).reshape(2, 16, 16, 1)
-    (found,) = metrics.refit_psnr(splats, cameras, [list(np.clip(pictures, 0, 1))])
+    (found,) = refit_psnr(splats, cameras, [list(np.clip(pictures, 0, 1))])
     assert found > 60
 
 
 def test_a_set_of_another_number_of_pictures_is_refused(scene):
     splats, cameras = scene
     with pytest.raises(ValueError, match=r"sets\[0\]: got 1 pictures, expected 2"):
-        metrics.refit_psnr(splats, cameras, [[np.zeros((16, 16, 3))]])
-    assert metrics.refit_psnr(splats, cameras, []) == []
+        refit_psnr(splats, cameras, [[np.zeros((16, 16, 3))]])
+    assert refit_psnr(splats, cameras, []) == []
