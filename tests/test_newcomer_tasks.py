@@ -43,11 +43,11 @@ def edited(method="attention_warping", **changes):
 TASKS = {
     "schedule": EDITED
     + """
-linear = edited()
-cosine = edited(decay="cosine")
+constant = edited(decay="constant")
+cosine = edited()
 for t in range(8):
     assert math.isclose(weights[-1](t, 8), 0.9 * math.cos(math.pi * t / 16) ** 2)
-assert (cosine[0] == linear[0]).all() and (cosine[1] != linear[1]).any()
+assert (cosine[0] == constant[0]).all() and (cosine[1] != constant[1]).any()
 """,
     "last-steps": EDITED
     + """

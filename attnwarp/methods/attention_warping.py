@@ -18,8 +18,9 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.camera import Camera
+from attnwarp.editing import injection
 from attnwarp.editing.editor import Editor
-from attnwarp.editing.injection import TokenWarp, inject
+from attnwarp.editing.injection import TokenWarp
 from attnwarp.editing.recording import record
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
@@ -29,6 +30,9 @@ from attnwarp.methods.sight import Sight
 from attnwarp.methods.stages import draw_stages, released_order
 from attnwarp.methods.view_edits import RecordedSource, ViewEdits
 from attnwarp.methods.work import Work, chunks
+
+CORRECTED = AttentionWarpingSettings()
+"""Settings of who names none."""
 
 
 def attention_warping(
@@ -85,6 +89,61 @@ def attention_warping(
         "attention_warping", make, AttentionWarpingSettings,
         gaussians, cameras, images, editor, instruction, settings, **options,
     )  # fmt: skip
+
+
+def a_t(t: int, T: int, s: AttentionWarpingSettings = CORRECTED) -> float:
+    """Weight of the source's features at step t of T: a_t = a0 (T - t) / T.
+
+    Example:
+        >>> [round(a_t(t, 4), 3) for t in range(4)]
+        [0.9, 0.675, 0.45, 0.225]
+        >>> import numpy as np
+        >>> from attnwarp.editing.editor import edit
+        >>> from attnwarp.editing.layers import choose_layers
+        >>> from attnwarp.editing.recording import RecordingPlan, record
+        >>> from attnwarp.editing.small import load_editor
+        >>> editor, picture = load_editor("small-plain"), np.full((32, 32, 3), 0.5, np.float32)
+        >>> layers, branches = choose_layers(editor.unet), editor.branches
+        >>> plan = RecordingPlan(layers, (8, 8), branches, branches, steps=1)
+        >>> with record(editor.unet, plan) as recording:
+        ...     source = edit(editor, [picture], "make it red", steps=1)
+        >>> with inject(editor.unet, recording, branches=branches, weight=lambda t, T: 1.0):
+        ...     again = edit(editor, [picture], "make it red", steps=1)
+        >>> bool((again.images[0] == source.images[0]).all())  # its own features change no bit
+        True
+    """
+    return s.a0 * (T - t) / T if s.decay == "linear" else s.a0
+
+
+def blend(warp: TokenWarp, F_src: Tensor, F_new: Tensor, a: float) -> Tensor:
+    """F_final = a F_masked + (1 - a) F_new, with F_masked = M F_warp + (1 - M) F_new.
+
+    Args:
+        warp: M and F_warp of the layer, such as :class:`attnwarp.warp.FeatureWarp`.
+        F_src: (1, h w, C) recorded features of the source.
+        F_new: (1, H W, C) features of the target.
+        a: a_t, in [0, 1].
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import Surface, warp_surfaces
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
+        >>> layer = warp_surfaces(source, target, wall, wall).at((4, 4))
+        >>> column = torch.arange(4.0).repeat(4).reshape(1, 16, 1)
+        >>> blend(layer, column, torch.zeros(1, 16, 1), 0.5)[0, :4, 0].tolist()
+        [0.5, 1.0, 1.5, 0.0]
+    """
+    F_warp, aM = warp.warp_tokens(F_src), a * warp.weight.to(F_new)
+    return torch.lerp(F_new, F_warp, aM)  # aM F_warp + (1 - aM) F_new
+
+
+inject = partial(injection.inject, weight=a_t, blend=blend)
+"""Injection as Algorithm 1 has it: :func:`attnwarp.editing.injection.inject`."""
 
 
 class AttentionWarping(Method):
@@ -182,27 +241,20 @@ class AttentionWarping(Method):
         self, stack: ExitStack, recorded: Sequence[RecordedSource], sights: Sequence[Sight | None]
     ) -> None:
         """Blend recorded features into the editor's; no pixel takes those of two sources."""
-        s, editor = self.settings, self.work.editor
-
-        def weight(t: int, T: int) -> float:
-            """a_t = a0 (T - t) / T at step t of T."""
-            return s.a0 * (T - t) / T if s.decay == "linear" else s.a0
-
-        def blend(warp: TokenWarp, F_src: Tensor, F_new: Tensor, a: float) -> Tensor:
-            """F_final = a F_masked + (1 - a) F_new, with F_masked = M F_warp + (1 - M) F_new."""
-            F_warp, aM = warp.warp_tokens(F_src), a * warp.weight.to(F_new)
-            return torch.lerp(F_new, F_warp, aM)  # aM F_warp + (1 - aM) F_new
-
+        editor, weight = self.work.editor, partial(a_t, s=self.settings)
         for number, source in enumerate(recorded):
             if source.recording is None:
                 continue
             warps = [None if sight is None else sight.warp(number) for sight in sights]
             stack.enter_context(
                 inject(
-                    editor.unet, source.recording, branches=editor.branches,
-                    warps=warps, weight=weight, blend=blend,
+                    editor.unet,
+                    source.recording,
+                    branches=editor.branches,
+                    warps=warps,
+                    weight=weight,
                 )
-            )  # fmt: skip
+            )
 
     def clear(self) -> None:
         """Remove recordings on disk."""

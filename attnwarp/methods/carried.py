@@ -120,7 +120,8 @@ def _carry(
     for warp, map_ in zip(warps, maps, strict=False):
         h, w = own.shape[1:]
         layer = warp.at((h, w), source_size=(map_.shape[1], map_.shape[2]))
-        tokens = layer.blend_tokens(map_.flatten(1).T[None].contiguous(), tokens, weight)
+        warped = layer.warp_tokens(map_.flatten(1).T[None].contiguous())
+        tokens = torch.lerp(tokens, warped, weight * layer.weight.to(tokens))
     return tokens[0].T.reshape(own.shape)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -14,7 +13,6 @@ from attnwarp.camera import Camera
 from attnwarp.warp import FeatureWarp, WarpedView, depth_tolerance, sample, sample_depth
 from attnwarp.warp.depth import Array, as_float64, valid_depth
 from attnwarp.warp.masks import axis_weights
-from attnwarp.warp.sampling import work_type
 from attnwarp.warp.surface import needed
 
 Size = tuple[int, int]
@@ -255,33 +253,31 @@ class SourceWarp:
             layer = self.sight.views[self.number].at(size, source_size=source_size)
             choice = self.sight.choice(size, picture=self.picture)
             mask = layer.mask & (choice == self.number)
-            plain = FeatureWarp(layer.correspondence, mask, layer.backend)
-            zeros = self.sight.zeros and not self.picture
-            hard = ZerosOutside(plain) if zeros else plain
-            own: LayerOfSource = hard
+            warp = FeatureWarp(layer.correspondence, mask, layer.backend)
+            weight = warp.weight
             if self.sight.soft:
-                own = SoftWarp(hard, averaged(self.sight.confidence[self.number], size) * mask)
-            self._at[key] = own
+                share = averaged(self.sight.confidence[self.number], size) * mask
+                weight = share.reshape(-1, 1).float()
+            zeros = self.sight.zeros and not self.picture
+            self._at[key] = LayerOfSource(warp, weight, zeros)
         return self._at[key]
 
 
 @dataclass(frozen=True, eq=False)
-class ZerosOutside:
-    """A warp in which zeros stand around the source's features, as zero padding has it.
-
-    A tap beyond the border counts 0, so the border's value, which the warp gives there, is
-    multiplied by the weight of the taps inside.
+class LayerOfSource:
+    """The warp of a layer from one source.
 
     Args:
-        warp: warp of the layer.
+        warp: warp of the layer, with the mask.
+        weight: (h w, 1) float32 in [0, 1], 0 outside the mask.
+        zeros: zeros stand around the source's features, as zero padding has it: a tap beyond the
+            border counts 0, so the border's value, which the warp gives there, is multiplied by the
+            weight of the taps inside.
     """
 
     warp: FeatureWarp
-
-    @property
-    def weight(self) -> Tensor:
-        """(h w, 1) float32: 1 in the mask, 0 elsewhere."""
-        return self.warp.weight
+    weight: Tensor
+    zeros: bool = False
 
     @property
     def mask(self) -> Tensor:
@@ -300,57 +296,7 @@ class ZerosOutside:
     def warp_tokens(self, source: Tensor) -> Tensor:
         """Warp tokens as :meth:`attnwarp.warp.FeatureWarp.warp_tokens` tells."""
         warped = self.warp.warp_tokens(source)
-        return warped * self.inside.to(warped)
-
-    def blend_tokens(self, source: Tensor, new: Tensor, alpha: float) -> Tensor:
-        """a (M warp(source) + (1 - M) new) + (1 - a) new; see :meth:`SoftWarp.blend_tokens`."""
-        return SoftWarp(self, self.mask.double()).blend_tokens(source, new, alpha)
-
-
-@dataclass(frozen=True, eq=False)
-class SoftWarp:
-    """A warp that blends by a weight instead of a mask.
-
-    Args:
-        hard: the warp with its mask.
-        share: (h, w) in [0, 1].
-    """
-
-    hard: FeatureWarp | ZerosOutside
-    share: Tensor
-
-    @cached_property
-    def weight(self) -> Tensor:
-        """(h w, 1) float32 in [0, 1]."""
-        return self.share.reshape(-1, 1).float()
-
-    @property
-    def mask(self) -> Tensor:
-        """(h, w) bool: where the weight may count."""
-        return self.hard.mask
-
-    def warp_tokens(self, source: Tensor) -> Tensor:
-        """Warp tokens as :meth:`attnwarp.warp.FeatureWarp.warp_tokens` tells."""
-        return self.hard.warp_tokens(source)
-
-    def blend_tokens(self, source: Tensor, new: Tensor, alpha: float) -> Tensor:
-        """a C warp(source) + (1 - a C) new with the weight C, in float32 for half precision and
-        rounded once.
-
-        Args:
-            source: (1, h w, C) recorded tokens.
-            new: (1, H W, C) the target's own.
-            alpha: a, in [0, 1].
-        """
-        work = work_type(new.dtype)
-        warped = self.hard.warp_tokens(source.to(work))
-        share = (alpha * self.share).reshape(-1, 1).to(new.device, work)
-        mixed = share * warped + (1 - share) * new.to(work)
-        return torch.where(share > 0, mixed.to(new.dtype), new)
-
-
-LayerOfSource: TypeAlias = FeatureWarp | ZerosOutside | SoftWarp
-"""The warp of a layer from one source."""
+        return warped * self.inside.to(warped) if self.zeros else warped
 
 
 def averaged(values: Tensor, size: Size) -> Tensor:

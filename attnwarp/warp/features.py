@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from numbers import Real
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -49,7 +48,6 @@ class FeatureWarp:
     mask: Tensor
     backend: Backend = "auto"
     _taps: dict[tuple[Any, ...], Taps] = field(default_factory=dict, init=False, repr=False)
-    _masks: dict[torch.device, Tensor] = field(default_factory=dict, repr=False)
 
     @cached_property
     def weight(self) -> Tensor:
@@ -89,7 +87,8 @@ class FeatureWarp:
                 flows back through the result.
 
         Returns:
-            (B, H*W, C) in the source's type, 0 where a pixel has no position in the source.
+            (B, H*W, C) in the source's type, 0 where a pixel has no position in the source. An edit
+            blends them into the target's own: :func:`attnwarp.methods.attention_warping.blend`.
 
         Raises:
             ValueError: another shape than the source grid's, or a type that cannot be blended.
@@ -113,47 +112,6 @@ class FeatureWarp:
         taps = self._tokens_taps(source)
         return self._engine(source).sample_tokens(source, taps).to(source.dtype)
 
-    def blend_tokens(self, source: check.Array, new: check.Array, alpha: float | Tensor) -> Tensor:
-        """Warp, mask and blend: a (M warp(source) + (1 - M) new) + (1 - a) new, M = ``mask``.
-
-        Args:
-            source: (B, h*w, C) or (1, h*w, C) recorded tokens of the source's grid, converted to
-                the type of ``new``.
-            new: (B, H*W, C) the target's own tokens, floating.
-            alpha: a, in [0, 1]. Where it is a () tensor with a gradient, that flows back too.
-
-        Returns:
-            (B, H*W, C) in the type of ``new``, with its bits where the mask is False; sums are in
-            float32 for half precision and rounded once.
-
-        Raises:
-            ValueError: shapes that do not fit, a type that cannot be blended, ``alpha`` out of
-                range.
-
-        Example:
-            >>> import numpy as np, torch
-            >>> from attnwarp import Camera
-            >>> from attnwarp.warp import Surface, warp_surfaces
-            >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-            >>> shift = np.eye(4)
-            >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-            >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-            >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
-            >>> layer = warp_surfaces(source, target, wall, wall).at((4, 4))
-            >>> column = torch.arange(4.0).repeat(4).reshape(1, 16, 1)
-            >>> layer.mask[0].tolist()
-            [True, True, True, False]
-            >>> layer.blend_tokens(column, torch.zeros(1, 16, 1), 0.5)[0, :4, 0].tolist()
-            [0.5, 1.0, 1.5, 0.0]
-        """
-        source, new = check.tensor(source, "source"), check.tensor(new, "new")
-        self._check_tokens(source)
-        self._check_blend(source, new, alpha)
-        work = sampling.work_type(new.dtype)
-        warped = self.warp_tokens(source.to(new.dtype).to(work))
-        mixed = alpha * warped + (1 - alpha) * new.to(work)
-        return torch.where(self._mask_on(new.device)[:, None], mixed.to(new.dtype), new)
-
     def _check_size(self, features: Tensor) -> None:
         h, w = features.shape[-2:]
         if h < 1 or w < 1:
@@ -174,24 +132,6 @@ class FeatureWarp:
 
         return cpu
 
-    def _check_blend(self, source: Tensor, new: Tensor, alpha: float | Tensor) -> None:
-        target = self.correspondence.target
-        check.instance(new, Tensor, "new", "torch.Tensor")
-        check.shape(new, ("B", target.height * target.width, "C"), "new")
-        if source.shape[0] not in (1, new.shape[0]) or source.shape[2] != new.shape[2]:
-            raise ValueError(
-                f"source: got shape {tuple(source.shape)}, expected ({new.shape[0]} or 1,"
-                f" {source.shape[1]}, {new.shape[2]}) for new tokens {tuple(new.shape)}"
-            )
-        if not new.dtype.is_floating_point:
-            raise ValueError(f"new: got {new.dtype}, expected a floating type")
-        if source.device != new.device:
-            raise ValueError(f"source: lies on {source.device}, new on {new.device}")
-        if isinstance(alpha, Tensor):
-            check.shape(alpha, (), "alpha")
-        if not isinstance(alpha, Real | Tensor) or not 0 <= alpha <= 1:
-            raise ValueError(f"alpha: got {alpha!r}, expected a number in [0, 1]")
-
     def _check_tokens(self, source: Tensor) -> None:
         camera = self.correspondence.source
         check.instance(source, Tensor, "source", "torch.Tensor")
@@ -210,8 +150,3 @@ class FeatureWarp:
             engine = self._engine(features)
             self._taps[key] = engine.taps_at(self.correspondence, (h, w), dtype, features.device)
         return self._taps[key]
-
-    def _mask_on(self, device: torch.device) -> Tensor:
-        if device not in self._masks:
-            self._masks[device] = self.mask.reshape(-1).to(device)
-        return self._masks[device]

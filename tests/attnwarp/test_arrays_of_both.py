@@ -54,7 +54,6 @@ CALLS = {
     "photometric": (lambda a, b: warp.photometric(WALL, a, b), IMAGE, OTHER),
     "FeatureWarp.warp": (LAYER.warp, RANDOM.random((3, 4, 4))),
     "FeatureWarp.warp_tokens": (LAYER.warp_tokens, TOKENS),
-    "FeatureWarp.blend_tokens": (lambda a, b: LAYER.blend_tokens(a, b, 0.5), TOKENS, TOKENS[::-1]),
 }  # fmt: skip
 
 

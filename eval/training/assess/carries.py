@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -19,9 +19,11 @@ import torch
 from torch import Tensor
 
 from attnwarp.editing.editor import Image, edit
-from attnwarp.editing.injection import constant, decay, inject
+from attnwarp.editing.injection import Identity, Weight
 from attnwarp.editing.layers import choose_layers
 from attnwarp.editing.recording import Recording, RecordingPlan, record
+from attnwarp.methods.attention_warping import CORRECTED, a_t, inject
+from attnwarp.warp import resize_mask
 from training.assess.card_sections import Kept, asked_for, percent, short_of
 from training.assess.editors import SEED
 from training.assess.figures import Figure, figure
@@ -41,9 +43,6 @@ MOST_ROUNDS = 20
 """Largest number of rounds of pictures; an editor that seldom answers two colours would never come
 to an end.
 """
-
-CONSTANT = 0.9
-"""The weight of features where it does not fall."""
 
 LEAST_SHARE = 0.03
 """Least share of the picture: a smaller thing in it, or in a half, is not judged."""
@@ -134,20 +133,22 @@ class Swap:
 
     def injected(
         self, recording: Recording, cases: Sequence[Case], noise: Tensor, *,
-        mask: Mask | None = None, warps: Sequence[Any] | None = None, weight: Any = None,
+        warp: Any = None, weight: Weight = a_t,
     ) -> list[Image]:  # fmt: skip
-        """The edited pictures with features of a recording, by the paper's decay if no weight is given."""
+        """The edited pictures with features of a recording, along one warp, as a scene's edit injects them."""
         with inject(
             self.editor.unet, recording, branches=recording.plan.branches,
-            warps=[None] * len(cases) if warps is None else warps, weight=weight or decay(),
-            mask=None if mask is None else torch.from_numpy(mask),
+            warps=[warp] * len(cases), weight=weight,
         ):  # fmt: skip
             return self.run(cases, noise)
 
 
+HELD = replace(CORRECTED, decay="constant")
+"""Settings of a weight that does not fall."""
+
 QUESTIONS: dict[str, tuple[str, dict[str, float]]] = {
     "same": ("features of the same picture make it their colour", {"asked": 0.8}),
-    "held": (f"... with a constant weight of {CONSTANT:g}", {}),
+    "held": (f"... with a constant weight of {HELD.a0:g}", {}),
     "follows": ("injected in the left half, that half follows", {"asked": 0.75}),
     "keeps": ("... and the other half keeps its own", {"asked": 0.75}),
     "other": ("features of another picture make it their colour", {"at_most": 0.15}),
@@ -212,8 +213,8 @@ def _swapped(swap: Swap, batch: Sequence[Case], seed: int, number: int) -> Marks
     order = [(k + shift) % len(batch) for k in range(len(batch))]
     strange = swap.injected(recording, [batch[k] for k in order], noise_b[order])
     whole = swap.injected(recording, batch, noise_b)
-    constantly = swap.injected(recording, batch, noise_b, weight=constant(CONSTANT))
-    half = swap.injected(recording, batch, noise_b, mask=left)
+    constantly = swap.injected(recording, batch, noise_b, weight=partial(a_t, s=HELD))
+    half = swap.injected(recording, batch, noise_b, warp=Within(left))
     for k, case in enumerate(batch):
         a, b = case.answer(run_a[k]), case.answer(run_b[k])
         if 0 in (a, b) or a == b:
@@ -246,6 +247,23 @@ def _same_color(image: Image, mask: Mask, case: Case) -> int:
     return int(np.argmin([deltaE_ciede2000(own, mean_lab(a, case.thing)) for a in case.answers]))
 
 
+class Within(Identity):
+    """The identity, with features inside a mask alone.
+
+    Args:
+        mask: (H, W).
+    """
+
+    def __init__(self, mask: Mask) -> None:
+        self.mask = torch.from_numpy(mask)
+
+    def at(self, size: tuple[int, int], *, source_size: tuple[int, int] | None = None) -> Within:
+        """The identity of a grid, with the mask resized to it."""
+        super().at(size, source_size=source_size)
+        self.weight = resize_mask(self.mask, size).reshape(-1, 1).float()
+        return self
+
+
 class Displaced:
     """A warp that reads an eighth of the picture beside the place it should.
 
@@ -263,12 +281,12 @@ class Displaced:
 
 class _Rolled:
     def __init__(self, warp: Any, size: tuple[int, int]) -> None:
-        self.warp, self.size = warp, size
+        self.warp, self.size, self.weight = warp, size, warp.weight
 
-    def blend_tokens(self, source: Tensor, new: Tensor, alpha: float) -> Tensor:
+    def warp_tokens(self, source: Tensor) -> Tensor:
         h, w = self.size
         grid = source.view(len(source), h, w, -1).roll(w // 8, dims=2)
-        return self.warp.blend_tokens(grid.flatten(1, 2).contiguous(), new, alpha)
+        return self.warp.warp_tokens(grid.flatten(1, 2).contiguous())
 
 
 def warped_figure(
@@ -292,8 +310,8 @@ def warped_figure(
         seeds = [90_000 + 100 * source.world + k for k in range(noises)]
         run_a, recording = swap.recorded(sources, swap.noise(seeds, source.before))
         noise_b = swap.noise([s + 50 for s in seeds], source.before)
-        right = swap.injected(recording, targets, noise_b, warps=[view] * noises)
-        wrong = swap.injected(recording, targets, noise_b, warps=[Displaced(view)] * noises)
+        right = swap.injected(recording, targets, noise_b, warp=view)
+        wrong = swap.injected(recording, targets, noise_b, warp=Displaced(view))
         gain = np.array(
             [
                 _disagreement(w, a, grid) - _disagreement(r, a, grid)

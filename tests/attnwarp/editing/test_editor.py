@@ -21,7 +21,6 @@ from tiny_editors import controlnet, nearest_steps, pix2pix, unet
 from attnwarp.editing.controlnet import DepthControlNet, control_image
 from attnwarp.editing.editor import edit, own_size, shared_noise, side_multiple
 from attnwarp.editing.folder import load_parts
-from attnwarp.editing.injection import constant, inject
 from attnwarp.editing.layers import PIX2PIX_BRANCHES, all_layers
 from attnwarp.editing.pix2pix import InstructPix2Pix
 from attnwarp.editing.recording import RecordingPlan, record
@@ -35,6 +34,7 @@ from attnwarp.editing.schedule import (
 )
 from attnwarp.editing.small import WEIGHTS, bundled, guide_of, load_editor
 from attnwarp.errors import InputError, InputWarning
+from attnwarp.methods.attention_warping import inject
 
 H, W = 16, 24
 
@@ -564,11 +564,11 @@ def test_sides_of_two_halvings_are_enough_for_stable_diffusions_three():
     for layer in layers:
         features = recording.features(editor.timesteps(3)[0], layer, "text")
         assert features.shape == (1, np.prod(layer.size((12, 20))), 16)
-    with inject(pipe.unet, recording, branches=PIX2PIX_BRANCHES, weight=constant(1.0)):
+    with inject(pipe.unet, recording, branches=PIX2PIX_BRANCHES, weight=lambda t, T: 1.0):
         again = edit(editor, [guide], "a bear", steps=3, noise=noise)
     plain = edit(editor, [guide], "a bear", steps=3, noise=noise)
     assert torch.equal(again.latents, plain.latents)
-    with inject(pipe.unet, recording, branches=PIX2PIX_BRANCHES, weight=constant(1.0)):
+    with inject(pipe.unet, recording, branches=PIX2PIX_BRANCHES, weight=lambda t, T: 1.0):
         other = edit(editor, [1 - guide], "a bear", steps=3, noise=noise)
     alone = edit(editor, [1 - guide], "a bear", steps=3, noise=noise)
     assert (other.latents - alone.latents).abs().max() > 1e-3

@@ -190,10 +190,10 @@ def test_a_picture_edited_by_hand_can_be_the_source():
     from tiny_editors import pix2pix
 
     from attnwarp.editing.editor import edit
-    from attnwarp.editing.injection import constant, inject
     from attnwarp.editing.layers import PIX2PIX_BRANCHES, choose_layers
     from attnwarp.editing.pix2pix import InstructPix2Pix
     from attnwarp.editing.recording import RecordingPlan, record
+    from attnwarp.methods.attention_warping import inject
 
     pipe = pix2pix()
     editor = InstructPix2Pix(pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler)
@@ -209,7 +209,7 @@ def test_a_picture_edited_by_hand_can_be_the_source():
         source = replay(editor.schedule, task.predict, noise)
     assert torch.allclose(source, wanted, rtol=0, atol=1e-5)
     alone = edit(editor, [other], "a bear", steps=4).latents
-    with inject(editor.unet, recording, branches=PIX2PIX_BRANCHES, weight=constant(0.9)):
+    with inject(editor.unet, recording, branches=PIX2PIX_BRANCHES, weight=lambda t, T: 0.9):
         assert not torch.allclose(
             edit(editor, [other], "a bear", steps=4).latents, alone, atol=1e-3
         )

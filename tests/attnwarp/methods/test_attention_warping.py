@@ -1066,7 +1066,7 @@ def test_half_precision_halves_the_features_and_rounds_them_once(scene, editor, 
 
 def test_features_of_chosen_steps_alone_reach_a_target(scene, editor, tmp_path):
     """Oracle: a recording of all steps, with the first steps' weights alone, and no warp."""
-    from attnwarp.editing.injection import decay, inject
+    from attnwarp.methods.attention_warping import a_t, inject
 
     settings = replace(QUICK, feature_steps=(0.0, 0.5), stages=1, iterations=0, batch=1)
     everything = recorded(scene, editor, tmp_path, QUICK)
@@ -1083,7 +1083,7 @@ def test_features_of_chosen_steps_alone_reach_a_target(scene, editor, tmp_path):
         editor.unet,
         everything,
         branches=editor.branches,
-        weight=lambda step, steps: decay()(step, steps) if step in first else 0.0,
+        weight=lambda step, steps: a_t(step, steps) if step in first else 0.0,
     ):
         expected = edit(editor, [images[1]], "a bear", steps=QUICK.steps).images[0]
     assert np.abs(some.edited[1] / 255 - expected).max() < 0.5 / 255 + 1e-4

@@ -1,4 +1,4 @@
-"""Tokens against feature maps sampled by torch, and the formula of the blend in float64."""
+"""Tokens against feature maps sampled by torch."""
 
 import dataclasses
 
@@ -50,19 +50,6 @@ def test_tokens_warp_as_torch_samples_their_maps(layer):
     assert 0.1 < layer.mask.float().mean() < 0.9
 
 
-@pytest.mark.parametrize("alpha", [0.0, 0.3, 1.0])
-def test_the_blend_is_its_formula(layer, alpha):
-    maps, own = random_maps(layer), random_maps(layer, seed=1)
-    new = tokens_of(own)
-    blended = layer.blend_tokens(tokens_of(maps), new, alpha)
-    M = layer.mask.reshape(-1, 1).double()
-    warped = tokens_of(grid_sampled(layer, maps))
-    formula = alpha * (M * warped + (1 - M) * new) + (1 - alpha) * new
-    assert (blended - formula).abs().max() < 1e-5
-    outside = ~layer.mask.reshape(-1)
-    assert torch.equal(blended[:, outside], new[:, outside])
-
-
 # The kernels against the definition: products and sums come in one order, so bits are equal
 
 FLOATS = [torch.float32, torch.float16, torch.bfloat16, torch.float64]
@@ -88,14 +75,11 @@ def test_kernels_have_the_bits_of_the_definition(layer, dtype, channels):
     maps = random_maps(layer, dtype=dtype, channels=channels)
     maps[0, 0, 3:5, 4:7] = torch.tensor([torch.nan, torch.inf, -torch.inf])
     maps[1, -1, 6] = 0.0
-    new = tokens_of(random_maps(layer, dtype=dtype, channels=channels, seed=1))
     rows = tokens_of(maps)
     for call in (
         lambda warp: warp.warp(maps),
         lambda warp: warp.warp(maps[0]),
         lambda warp: warp.warp_tokens(rows),
-        lambda warp: warp.blend_tokens(rows, new, 0.7),
-        lambda warp: warp.blend_tokens(rows[:1], new, 0.7),
     ):
         kernels, definition = both(layer, call)
         assert kernels.dtype == dtype
@@ -154,9 +138,7 @@ def test_bits_do_not_depend_on_threads(layer, dtype):
     def results():
         source = tokens_of(random_maps(layer, dtype=dtype, channels=1300)).requires_grad_()
         maps = random_maps(layer, dtype=dtype, channels=70).requires_grad_()
-        new = tokens_of(random_maps(layer, dtype=dtype, channels=1300, seed=1))
-        outputs = [layer.warp_tokens(source), layer.blend_tokens(source, new, 0.6)]
-        outputs.append(layer.warp(maps))
+        outputs = [layer.warp_tokens(source), layer.warp(maps)]
         torch.autograd.backward(outputs, [torch.ones_like(output) for output in outputs])
         return [bits(t.detach()) for t in (*outputs, source.grad, maps.grad)]
 
@@ -171,91 +153,38 @@ def test_bits_do_not_depend_on_threads(layer, dtype):
 
 def test_gradients_are_those_of_torchs_own_sampling(layer):
     maps = random_maps(layer, dtype=torch.float64).requires_grad_()
-    own = random_maps(layer, dtype=torch.float64, seed=1).requires_grad_()
     weigh = random_maps(layer, dtype=torch.float64, seed=2)
-    M = layer.mask.double()
-    warped = grid_sampled(layer, maps)
-    blend = 0.7 * (M * warped + (1 - M) * own) + (1 - 0.7) * own
-    oracle = {
-        "maps": (warped * weigh).sum(),
-        "tokens": (warped * weigh).sum(),
-        "blend": (blend * weigh).sum(),
-    }
-    ours = {
-        "maps": (layer.warp(maps) * weigh).sum(),
-        "tokens": (layer.warp_tokens(tokens_of(maps)) * tokens_of(weigh)).sum(),
-        "blend": (
-            layer.blend_tokens(tokens_of(maps), tokens_of(own), 0.7) * tokens_of(weigh)
-        ).sum(),
-    }
-    for name, loss in ours.items():
-        gradients = torch.autograd.grad(loss, (maps, own), allow_unused=True)
-        expected = torch.autograd.grad(
-            oracle[name], (maps, own), allow_unused=True, retain_graph=True
-        )
-        for got, want in zip(gradients, expected, strict=True):
-            assert (got is None) == (want is None)
-            if want is not None:
-                # SNAP moves a position by up to 1e-7 px.
-                assert (got - want).abs().max() < 1e-5
-
-
-@pytest.mark.parametrize("backend", ["auto", "reference"])
-def test_a_weight_that_is_a_tensor_gets_its_gradient(layer, backend):
-    layer = dataclasses.replace(layer, backend=backend)
-    maps, own, weigh = (random_maps(layer, dtype=torch.float64, seed=k) for k in range(3))
-    alpha = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
-    blended = layer.blend_tokens(tokens_of(maps), tokens_of(own), alpha)
-    (gradient,) = torch.autograd.grad((blended * tokens_of(weigh)).sum(), alpha)
-    # The blend is linear in a: new + a M (warped - new).
-    slope = layer.mask.double() * (grid_sampled(layer, maps) - own)
-    assert float(gradient) == pytest.approx(float((slope * weigh).sum()), rel=1e-5)
-    plain = layer.blend_tokens(tokens_of(maps), tokens_of(own), alpha.detach())
-    assert torch.equal(blended.detach(), plain)
-
-
-def test_one_source_for_all_gathers_the_gradient_of_all(layer):
-    source = tokens_of(random_maps(layer, batch=1)).requires_grad_()
-    new = tokens_of(random_maps(layer, batch=3, seed=1))
-    one = layer.blend_tokens(source, new, 0.5).square().sum()
-    three = layer.blend_tokens(source.expand(3, -1, -1), new, 0.5).square().sum()
-    got, expected = (torch.autograd.grad(loss, source)[0] for loss in (one, three))
-    assert (got - expected).abs().max() < 1e-5
+    (expected,) = torch.autograd.grad((grid_sampled(layer, maps) * weigh).sum(), maps)
+    for loss in (
+        (layer.warp(maps) * weigh).sum(),
+        (layer.warp_tokens(tokens_of(maps)) * tokens_of(weigh)).sum(),
+    ):
+        (gradient,) = torch.autograd.grad(loss, maps)
+        # SNAP moves a position by up to 1e-7 px.
+        assert (gradient - expected).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (
-            lambda w, s, n: w.warp_tokens(s[0]),
+            lambda w, s: w.warp_tokens(s[0]),
             r"source: got shape \(192, 5\), expected \(B, 192, C\)",
         ),
-        (lambda w, s, n: w.warp_tokens(s[:, 1:]), r"source: got shape \(2, 191, 5\)"),
-        (lambda w, s, n: w.warp_tokens(s.long()), r"source: got torch\.int64, expected a floating"),
+        (lambda w, s: w.warp_tokens(s[:, 1:]), r"source: got shape \(2, 191, 5\)"),
+        (lambda w, s: w.warp_tokens(s.long()), r"source: got torch\.int64, expected a floating"),
         (
-            lambda w, s, n: w.warp(torch.ones(5, 12, 16, dtype=torch.int64)),
+            lambda w, s: w.warp(torch.ones(5, 12, 16, dtype=torch.int64)),
             r"features: got torch\.int64, expected a floating",
         ),
-        (lambda w, s, n: w.warp(s[0]), r"features: got shape \(192, 5\)"),
-        (lambda w, s, n: w.blend_tokens(s, n[:, 1:], 1), r"new: got shape \(2, 191, 5\)"),
-        (lambda w, s, n: w.blend_tokens(s[:, :, 1:], n, 1), r"source: got shape .*for new tokens"),
-        (
-            lambda w, s, n: w.blend_tokens(s, n[:1], 1),
-            r"source: got shape .*expected \(1 or 1, 192, 5",
-        ),
-        (lambda w, s, n: w.blend_tokens(s, n, 1.5), r"alpha: got 1\.5"),
-        (lambda w, s, n: w.blend_tokens(s, n, None), r"alpha: got None, expected a number in"),
-        (lambda w, s, n: w.warp(torch.rand(3, 0, 80)), "features: got 0 x 80 .* at least 1 x 1"),
-        (
-            lambda w, s, n: w.blend_tokens(s, n, torch.full((2,), 0.5)),
-            r"alpha: got shape \(2,\), expected \(\)",
-        ),
+        (lambda w, s: w.warp(s[0]), r"features: got shape \(192, 5\)"),
+        (lambda w, s: w.warp(torch.rand(3, 0, 80)), "features: got 0 x 80 .* at least 1 x 1"),
     ],
 )
 def test_the_doors_for_tokens_say_what_came_and_what_was_expected(layer, call, message):
     source = tokens_of(random_maps(layer))
     with pytest.raises(ValueError, match=message):
-        call(layer, source, source.clone())
+        call(layer, source)
 
 
 def test_lists_in_place_of_tensors_are_named(layer):
@@ -263,8 +192,6 @@ def test_lists_in_place_of_tensors_are_named(layer):
     for call, name in (
         (lambda: layer.warp(rows.tolist()), "features"),
         (lambda: layer.warp_tokens(rows.tolist()), "source"),
-        (lambda: layer.blend_tokens(rows.tolist(), rows, 0.5), "source"),
-        (lambda: layer.blend_tokens(rows, rows.tolist(), 0.5), "new"),
     ):
         with pytest.raises(TypeError, match=f"{name}: got list, expected (a )?torch.Tensor"):
             call()
@@ -301,6 +228,5 @@ def test_a_layer_makes_its_taps_once(layer, monkeypatch):
     for dtype in (torch.float32, torch.float16, torch.float32):
         rows = tokens_of(random_maps(layer, dtype=dtype))
         fresh.warp_tokens(rows)
-        fresh.blend_tokens(rows, rows, 0.5)
         fresh.warp(random_maps(layer, dtype=dtype))
     assert len(made) == 1

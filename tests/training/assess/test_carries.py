@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 import torch
 
+from attnwarp.editing.injection import Identity
 from attnwarp.editing.small import load_editor
 from training.assess import carries as editor_carries
 from training.assess.card_sections import Kept
 from training.assess.carries import (
     Displaced,
     Swap,
+    Within,
     carried_section,
     cases_of,
     swap_figures,
@@ -64,12 +66,14 @@ class Scripted:
     def recorded(self, cases, noise):
         return self.answers(cases, noise), (cases, noise)
 
-    def injected(self, recording, cases, noise, *, mask=None, warps=None, weight=None):
+    def injected(self, recording, cases, noise, *, warp=None, weight=None):
         own, given = self.answers(cases, noise), self.answers(*recording)
         if self.obeys == "ignore":
             return own
-        mask = np.ones(own[0].shape[:2], bool) if mask is None or self.obeys == "anywhere" else mask
-        if warps is not None and isinstance(warps[0], Displaced):
+        mask = np.ones(own[0].shape[:2], bool)
+        if isinstance(warp, Within) and self.obeys != "anywhere":
+            mask = warp.mask.numpy()
+        if isinstance(warp, Displaced):
             given = [np.roll(g, 8, axis=1) for g in given]
         return [np.where(mask[:, :, None], g, o) for g, o in zip(given, own, strict=True)]
 
@@ -162,17 +166,10 @@ def test_the_noise_draws_an_answer_over_the_thing_alone(worlds):
 
 
 def test_a_displaced_warp_reads_an_eighth_to_the_left():
-    class Identity:
-        def at(self, size, *, source_size=None):
-            return self
-
-        def blend_tokens(self, source, new, alpha):
-            return alpha * source + (1 - alpha) * new
-
     grid = np.random.default_rng(1).normal(size=(1, 8, 16, 3)).astype(np.float32)
     tokens = torch.from_numpy(grid.reshape(1, 128, 3))
-    moved = Displaced(Identity()).at((8, 16)).blend_tokens(tokens, torch.zeros(1, 128, 3), 0.5)
-    assert np.array_equal(moved.numpy().reshape(grid.shape), 0.5 * np.roll(grid, 2, axis=2))
+    moved = Displaced(Identity()).at((8, 16)).warp_tokens(tokens)
+    assert np.array_equal(moved.numpy().reshape(grid.shape), np.roll(grid, 2, axis=2))
 
 
 def test_things_that_are_too_small_are_left_out(worlds):

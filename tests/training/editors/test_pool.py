@@ -7,8 +7,8 @@ import pytest
 import torch
 from picked_answers import picked
 
-from attnwarp.editing.injection import decay
 from attnwarp.editing.layers import Layer
+from attnwarp.methods.attention_warping import a_t
 from training.assess.pictures import Pictures, Row
 from training.editors.answers import KIND_NAMES, codes, settled
 from training.editors.injection import WAYS, Moves, draw_moves, falling_weight
@@ -215,12 +215,11 @@ def test_an_unrelated_picture_is_of_its_own_row_and_asks_for_the_same_kind(pool)
 
 
 def test_the_weight_of_features_falls_as_the_papers_does():
-    alone = decay(0.9)
     t = torch.arange(999, -1, -50).repeat_interleave(500)
     weight = falling_weight(t, generator()).reshape(20, 500)
     for step, drawn in enumerate(weight):
         # Uniform by 0.15: 500 draws have a standard error of 0.004; the least weight moves the last ones.
-        paper = alone(step, 20)
+        paper = a_t(step, 20)
         assert float(drawn.mean()) == pytest.approx(max(paper, 0.1), abs=0.05), step
         assert float((drawn - paper).abs().max()) < 0.2
 

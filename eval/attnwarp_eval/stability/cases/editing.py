@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from functools import partial
 from typing import get_args
 
 import mpmath
@@ -10,10 +12,11 @@ import numpy as np
 import torch
 
 from attnwarp.camera import Camera
-from attnwarp.editing.injection import constant, inject
+from attnwarp.editing.injection import blended
 from attnwarp.editing.layers import Layer
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.schedule import Prediction, Schedule
+from attnwarp.methods.attention_warping import CORRECTED, a_t, blend, inject
 from attnwarp.warp import FeatureWarp, Surface, WarpedView, warp_surfaces
 from attnwarp_eval.stability.bilinear import Extended, extended, sampling_matrix
 from attnwarp_eval.stability.case import Bound, Way, exact, hard, ways
@@ -53,6 +56,13 @@ def _tokens(way: Way, magnitude: float = 1.0) -> tuple[torch.Tensor, torch.Tenso
     return values[:1], values[1:]
 
 
+def first_step(
+    layer: FeatureWarp, source: torch.Tensor, new: torch.Tensor, a0: float
+) -> torch.Tensor:
+    """(1, H W, C) tokens at the first step of an edit, by the method's own weight and blend."""
+    return blended(blend, layer, source, new, a_t(0, 1, replace(CORRECTED, a0=a0)))
+
+
 def _exact_blend(
     layer: FeatureWarp, source: torch.Tensor, new: torch.Tensor, weight: float
 ) -> torch.Tensor:
@@ -66,14 +76,14 @@ def _exact_blend(
 def _magnitude(magnitude: float, way: Way) -> float:
     """Error of blended tokens in steps of their type."""
     layer, (source, new) = _layer(way), _tokens(way, magnitude)
-    result = layer.blend_tokens(source, new, 0.7)[0]
+    result = first_step(layer, source, new, 0.7)[0]
     return float(in_steps(result, _exact_blend(layer, source, new, 0.7), way).max())
 
 
 def _weight(weight: float, way: Way) -> float:
     """Error in steps of the type; at 0 and 1 the bits must be those of the two sides."""
     layer, (source, new) = _layer(way), _tokens(way)
-    result = layer.blend_tokens(source, new, weight)
+    result = first_step(layer, source, new, weight)
     if weight in (0, 1):
         side = layer.warp_tokens(source) if weight else new
         inside = layer.mask.reshape(-1)
@@ -88,7 +98,7 @@ def _outside(share: float, way: Way) -> float:
     mask[torch.from_numpy(chosen)] = True
     layer = _layer(way, mask.reshape(SIZE, SIZE))
     source, new = _tokens(way)
-    result = layer.blend_tokens(source + 2, new, 1.0)
+    result = first_step(layer, source + 2, new, 1.0)
     return float(
         (result[:, ~mask] != new[:, ~mask]).sum() + (result[:, mask] == new[:, mask]).sum()
     )
@@ -152,11 +162,12 @@ def _views_of_a_batch(views: float, way: Way) -> float:
     with torch.no_grad():
         with record(unet, plan) as recording:
             unet(latents[-1:], 0.0)
-        with inject(unet, recording, branches=("text",), warps=warps, weight=constant(0.6)):
+        weight = partial(a_t, s=replace(CORRECTED, a0=0.6))
+        with inject(unet, recording, branches=("text",), warps=warps, weight=weight):
             together = unet(latents[:count], 0.0)
         alone = []
         for k, warp in enumerate(warps):
-            with inject(unet, recording, branches=("text",), warps=[warp], weight=constant(0.6)):
+            with inject(unet, recording, branches=("text",), warps=[warp], weight=weight):
                 alone.append(unet(latents[k : k + 1], 0.0))
     tokens = exact_tokens(unet, latents)
     expected = np.stack(
@@ -202,10 +213,10 @@ def _apart(yaw: float, way: Way) -> float:
     visible = ahead & (px >= 0) & (px <= SIZE) & (py >= 0) & (py <= SIZE)
     layer = view.at((SIZE, SIZE))
     source_tokens, new = _tokens(way)
-    blended = layer.blend_tokens(source_tokens + 2, new, 1.0)
+    result = first_step(layer, source_tokens + 2, new, 1.0)
     untouched = torch.from_numpy(~visible).reshape(-1)
     wrong = int((layer.mask.numpy() != visible).sum())
-    return float(wrong + (blended[:, untouched] != new[:, untouched]).sum())
+    return float(wrong + (result[:, untouched] != new[:, untouched]).sum())
 
 
 def _latents(size: float, way: Way) -> float:

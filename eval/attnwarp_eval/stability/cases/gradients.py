@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 import torch
 
 from attnwarp.camera import Camera
-from attnwarp.editing.injection import constant, inject
 from attnwarp.editing.layers import Layer
 from attnwarp.editing.recording import RecordingPlan, record
+from attnwarp.methods.attention_warping import CORRECTED, a_t, inject
 from attnwarp.warp import Correspondence, FeatureWarp, Surface, preset, warp_surfaces
+from attnwarp.warp.sampling import work_type
 from attnwarp_eval.stability.bilinear import Extended, extended, sampling_matrix
 from attnwarp_eval.stability.case import Bound, Way, hard
-from attnwarp_eval.stability.cases.editing import Unet, layer_weights
+from attnwarp_eval.stability.cases.editing import Unet, first_step, layer_weights
 from attnwarp_eval.stability.cases.warps import HALVES, engine_of, random_features
 from attnwarp_eval.stability.closed_forms import orbit
 
@@ -132,15 +135,20 @@ def _readers(count: float, way: Way) -> float:
     return _gradient_error(xy, (4, 4), upstream, way)
 
 
+def _held(weight: float, way: Way) -> np.longdouble:
+    """A weight as the sums' type holds it: near 1, what it leaves of 1 has few digits."""
+    return np.longdouble(torch.tensor(weight, dtype=work_type(way.dtype)).item())
+
+
 def _blend_error(layer: FeatureWarp, weight: float, way: Way, upstream: torch.Tensor) -> float:
     """Error of the gradients in source and target tokens of a blend."""
     source, new = (
         values[None].clone().requires_grad_()
         for values in random_features((2, SIZE**2, CHANNELS), way, seed=6)
     )
-    layer.blend_tokens(source, new, weight).backward(upstream[None])
+    first_step(layer, source, new, weight).backward(upstream[None])
     assert source.grad is not None and new.grad is not None
-    share = np.longdouble(weight) * layer.mask.numpy().reshape(-1, 1)
+    share = _held(weight, way) * layer.mask.numpy().reshape(-1, 1)
     shares = sampling_matrix(extended(layer.correspondence.xy), SIZE, SIZE)
     gradient = extended(upstream)
     return max(
@@ -205,10 +213,11 @@ def _injected(weight: float, way: Way) -> float:
     with torch.no_grad(), record(unet, plan) as recording:
         unet(latents[:1], 0.0)
     target = latents[1:].clone().requires_grad_()
-    with inject(unet, recording, branches=("text",), warps=[_At(warp)], weight=constant(weight)):
+    a = partial(a_t, s=replace(CORRECTED, a0=weight))
+    with inject(unet, recording, branches=("text",), warps=[_At(warp)], weight=a):
         unet(target, 0.0).backward(upstream[None])
     assert target.grad is not None
-    share = 1 - np.longdouble(weight) * warp.mask.numpy().reshape(-1, 1)
+    share = 1 - _held(weight, way) * warp.mask.numpy().reshape(-1, 1)
     matrix, gradient = layer_weights(unet)[0], share * extended(upstream)
     errors = np.abs(extended(target.grad[0].flatten(1)).T - gradient @ matrix)
     magnitudes = np.abs(gradient) @ np.abs(matrix)
