@@ -203,7 +203,7 @@ def against_one_by_one(
     in_turn(
         [
             lambda turn: run("propagation", warped, turn),
-            lambda turn: run("one by one", replace(warped, method="each view alone"), turn),
+            lambda turn: run("one by one", replace(warped, a0=0.0), turn),
         ],
         rounds,
     )

@@ -202,7 +202,7 @@ def costs(loaded: Loaded, sizes: Sizes, editors: Sequence[str] = (*MEASURED,)) -
         torch.set_num_threads(thread_count(editor))
         rows = loaded.manifest.methods
         for name in (ALONE, *names, ALONE):
-            alone = {"method": ALONE} if name == ALONE else {}
+            alone = {"a0": 0.0} if name == ALONE else {}
             yield measure(name, rows[names[0] if alone else name], editor, sizes, **alone)
         del editor
 

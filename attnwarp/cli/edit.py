@@ -197,14 +197,15 @@ def edit(
         options: dict[str, Any] = {
             "stages": stages, "views_per_stage": views_per_stage, "steps": steps,
             "iterations": iterations, "size": size, "seed": seed,
-            "method": "each view alone" if alone else None,
         }  # fmt: skip
         changes = {name: value for name, value in options.items() if value is not None}
         flags = {name: f"--{name.replace('_', '-')}" for name in options}
+        if alone:
+            changes["a0"], flags["a0"] = 0.0, "--each-view-alone"
         bundled = str(data) in scenes() and not data.exists()
         if bundled:
             changes.setdefault("size", SIZE)
-        changes |= assignments(change or [], {**flags, "method": "--each-view-alone"})
+        changes |= assignments(change or [], flags)
         _check_splat_options(
             ply,
             of_fit={"--fit-iterations": fit_iterations, "--max-splats": max_splats},
@@ -231,13 +232,14 @@ def edit(
 
         edit_options = editing.checked()
         check.one_of(method, list(methods.METHODS), "--method")
-        settings = methods.preset(method, preset, **changes)
-        budget = methods.Budget(seconds, network_rows)
         given = {"source_picture": source_picture, "store": store and store.value}
         own: dict[str, Any] = {k: v for k, v in given.items() if v is not None}
-        if own and method != "attention_warping":
-            name = next(iter(own)).replace("_", "-")
+        used = [*own, *["each_view_alone"] * alone]
+        if used and method != "attention_warping":
+            name = used[0].replace("_", "-")
             raise ValueError(f"--{name}: is of attention_warping, not of {method}; leave it out")
+        settings = methods.preset(method, preset, **changes)
+        budget = methods.Budget(seconds, network_rows)
         use_threads(editing.threads)
         for path in files:
             existing_file(path)
@@ -270,7 +272,7 @@ def edit(
             warnings.warn(little, InputWarning, stacklevel=1)
         views = len(result.edited)
         carried = ""
-        if getattr(settings, "method", None) == "warp" and views > 1:
+        if getattr(settings, "a0", 0) > 0 and views > 1:
             share = result.counters["injected"]
             carried = f"; {share:.0%} of the targets' pixels got features of the source"
             if share < NO_FEATURES:

@@ -19,7 +19,6 @@ from torch import Tensor
 from attnwarp import check
 
 Kind = Literal["self", "cross"]
-Block = Literal["down", "mid", "up"]
 Size = tuple[int, int]
 
 PIX2PIX_BRANCHES = ("text", "image", "uncond")
@@ -37,7 +36,8 @@ class Layer:
         name: name of the module, such as ``up_blocks.3.attentions.2.transformer_blocks.0.attn2``.
         kind: "self" or "cross".
         level: how often the latents are halved before it; its size is that fraction of theirs.
-        channels: channel counts of its output.
+        channels: channels of its output.
+        block: number of its block, as the editor counts them.
 
     Example:
         >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 1, 64)
@@ -49,6 +49,7 @@ class Layer:
     kind: Kind
     level: int
     channels: int
+    block: int = 0
 
     def size(self, latent_size: Size) -> Size:
         """(h, w) of the layer. Each stride of 2 rounds an odd side up.
@@ -84,49 +85,41 @@ def all_layers(unet: torch.nn.Module) -> tuple[Layer, ...]:
             continue
         module = unet.get_submodule(name)
         kind: Kind = "cross" if name.endswith("attn2") else "self"
-        layers.append(Layer(name, kind, level, module.to_out[0].out_features))  # type: ignore
+        channels: int = module.to_out[0].out_features  # type: ignore
+        layers.append(Layer(name, kind, level, channels, index))
     return tuple(layers)
 
 
 def choose_layers(
     unet: torch.nn.Module,
     *,
-    fractions: Sequence[float] = (1.0, 0.5),
-    kinds: Sequence[Kind] = ("self", "cross"),
-    blocks: Sequence[Block] = ("up",),
+    kinds: Sequence[Kind] | None = None,
+    blocks: Sequence[int] | None = None,
 ) -> tuple[Layer, ...]:
-    """Layers by their size as a fraction of the latents'; by default those of the paper.
+    """Layers of the paper: those of the up-sampling blocks at the latents' size and at half of it.
 
     Args:
         unet: a diffusers UNet.
-        fractions: fractions of the latents' side: 1, 0.5, 0.25, ...
-        kinds: kinds of attention.
-        blocks: "down", "mid" or "up".
+        kinds: kinds of attention to choose; None for all.
+        blocks: numbers of up-sampling blocks; None for all.
 
     Raises:
-        ValueError: an unknown kind or block, or a choice that no layer matches.
+        ValueError: an unknown kind, or a choice that no layer matches.
 
     An example is at :func:`record`.
     """
-    for kind in kinds:
+    for kind in kinds or ():
         check.one_of(kind, get_args(Kind), "kinds")
-    for block in blocks:
-        check.one_of(block, get_args(Block), "blocks")
-    layers = all_layers(unet)
+    up = [one for one in all_layers(unet) if one.name.startswith("up_blocks") and one.level <= 1]
     chosen = tuple(
         layer
-        for layer in layers
-        if 2.0**-layer.level in tuple(fractions)
-        and layer.kind in kinds
-        and layer.name.partition("_")[0] in blocks
+        for layer in up
+        if (kinds is None or layer.kind in kinds) and (blocks is None or layer.block in blocks)
     )
     if not chosen:
-        there = sorted({(layer.name.partition("_")[0], 2.0**-layer.level) for layer in layers})
-        listed = ", ".join(f"{block} at {fraction:g}" for block, fraction in there) or "none"
-        raise ValueError(
-            f"fractions: no {' or '.join(kinds)} attention at {tuple(fractions)} in the"
-            f" {' or '.join(blocks)} blocks; this UNet has {listed}"
-        )
+        there = sorted({(one.block, one.kind) for one in up})
+        listed = ", ".join(f"{kind} in block {block}" for block, kind in there) or "none"
+        raise ValueError(f"kinds, blocks: got {kinds} in {blocks}; the editor offers {listed}")
     return chosen
 
 

@@ -26,7 +26,7 @@ class Features:
         store: "device", "cpu", or a folder.
 
     Attributes:
-        layers: to record; none where every view is edited alone.
+        layers: to record; none where their weight is 0.
 
     Raises:
         ValueError: layers or branches that the editor lacks.
@@ -37,8 +37,8 @@ class Features:
     ) -> None:
         self.editor, self.settings, self.store = editor, settings, store
         self.layers: tuple[Layer, ...] = ()
-        if settings.method == "warp":
-            self.layers = choose_layers(editor.unet, kinds=settings.kinds)
+        if settings.a0 > 0:
+            self.layers = choose_layers(editor.unet, kinds=settings.kinds, blocks=settings.blocks)
             self._check_branches()
 
     def source_guidance(self, *, further: bool) -> float | None:

@@ -119,8 +119,6 @@ class AttentionWarpingSettings(MethodSettings):
     """Settings of :func:`attnwarp.methods.attention_warping`; the defaults are ``corrected``.
 
     Args:
-        method: "warp" carries the source's features into each view; "each view alone" edits each
-            view by itself, with all else equal: the control.
         stages: stages of editing and tuning.
         views_per_stage: new views that a stage edits. None: an equal share of the views, at most
             40. A stage for which no view is left is dropped.
@@ -170,9 +168,12 @@ class AttentionWarpingSettings(MethodSettings):
             its estimate, since pixels there mix near and far; a share of its shorter side, rounded
             to whole pixels.
         depth_from: the model before the edit ("frozen") or as tuned so far ("current").
-        a0: weight of the injected features at the first step.
+        a0: weight of the injected features at the first step. At 0 nothing is recorded, and each
+            view is edited by itself, with all else equal: the control.
         decay: "linear", a_t = a0 (T - t) / T, or "constant".
-        kinds: kinds of attention, :func:`attnwarp.editing.layers.choose_layers`.
+        kinds: kinds of attention whose features are carried, such as ["self"]; None for all.
+        blocks: numbers of the editor's blocks whose features are carried; None for all that it
+            offers, such as the up-sampling blocks of a UNet at the latents' size and at half of it.
         feature_steps: (from, until) shares of the steps whose features are recorded and injected.
             The others leave every view its own: [0, 0.5] halves the memory.
         branches: guidance branches that get features. None: text and image of InstructPix2Pix,
@@ -206,7 +207,6 @@ class AttentionWarpingSettings(MethodSettings):
     normal: Weight = 0.05
     distortion: Weight = 0.01
     color_rate: Weight = 4.0
-    method: Literal["warp", "each view alone"] = "warp"
     stages: Count = 3
     views_per_stage: Count | None = None
     fill_last_stage: bool = False
@@ -232,7 +232,8 @@ class AttentionWarpingSettings(MethodSettings):
     depth_from: Literal["frozen", "current"] = "frozen"
     a0: Share = 0.9
     decay: Literal["linear", "constant"] = "linear"
-    kinds: tuple[Kind, ...] = ("self", "cross")
+    kinds: tuple[Kind, ...] | None = None
+    blocks: tuple[int, ...] | None = None
     feature_steps: tuple[float, float] = (0.0, 1.0)
     branches: tuple[str, ...] | None = None
     feature_type: Literal["float32", "float16", "bfloat16"] = "float32"

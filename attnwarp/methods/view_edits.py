@@ -49,7 +49,7 @@ class RecordedSource:
 
     Attributes:
         picture: (h, w, 3) in [0, 1].
-        recording: its features; None where every view is edited alone.
+        recording: its features; None where their weight is 0.
         estimates: (C, h, w) clean latents that were predicted at each step.
         sight: sight of the sources before; None for the first.
     """
@@ -239,8 +239,7 @@ class ViewEdits:
     def sight(self, sources: int, view: int, model: Gaussians) -> Sight | None:
         """The view as the first sources see it; None where nothing is warped."""
         s = self.settings
-        alone = s.method != "warp" and s.noise != "surface" and s.estimate == 0
-        if alone or not sources:
+        if not sources or (s.a0 == 0 and s.noise != "surface" and s.estimate == 0):
             return None
         return self.geometry.sight(self.sources[:sources], view, model)
 

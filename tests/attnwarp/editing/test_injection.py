@@ -82,17 +82,14 @@ def test_layers_of_stable_diffusion_are_the_papers_twelve_and_take_the_memory_th
     assert "12 layers, 2 branches (text, image), 20 steps in float16: 900.0 MiB" in str(plan)
 
 
-def test_layers_are_found_by_fraction_kind_and_block():
+def test_layers_are_chosen_by_kind_and_by_their_blocks_number():
     net = unet()
     assert {layer.kind for layer in choose_layers(net, kinds=("cross",))} == {"cross"}
-    assert {layer.level for layer in choose_layers(net, fractions=(0.5,))} == {1}
-    everything = choose_layers(net, fractions=(1, 0.5), blocks=("down", "mid", "up"))
-    assert everything == all_layers(net)
-    assert len(everything) == len(net.attn_processors)
-    with pytest.raises(
-        ValueError, match=r"fractions: no self or cross attention at \(0.25,\).*up at 0.5"
-    ):
-        choose_layers(net, fractions=(0.25,))
+    assert {layer.level for layer in choose_layers(net, blocks=(0,))} == {1}
+    assert {layer.name.split(".")[0] for layer in choose_layers(net)} == {"up_blocks"}
+    assert len(all_layers(net)) == len(net.attn_processors) > len(choose_layers(net))
+    with pytest.raises(ValueError, match=r"kinds, blocks: got None in \(2,\); .* cross in block 0"):
+        choose_layers(net, blocks=(2,))
     with pytest.raises(ValueError, match="did you mean 'cross'"):
         choose_layers(net, kinds=("crss",))
 

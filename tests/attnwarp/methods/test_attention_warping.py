@@ -197,22 +197,19 @@ def test_a_splat_that_no_picture_shows_changes_no_edit(scene, editor):
         assert np.array_equal(picture, other.edited[view])
 
 
-def test_weight_zero_is_each_view_alone_bit_for_bit(scene, editor, tmp_path):
-    run(scene, editor, tmp_path / "zero", replace(QUICK, a0=0.0))
-    run(scene, editor, tmp_path / "alone", replace(QUICK, method="each view alone"))
-    zero, alone = files(tmp_path / "zero"), files(tmp_path / "alone")
-    same = [name for name in alone if name.startswith(("views/", "rounds/", "edited"))]
-    assert sum(name.endswith(".png") for name in same) == 10
-    assert "edited.ply" in same
-    for name in same:
-        if not name.endswith(".json"):
-            assert zero[name] == alone[name], name
-    # Injection does change the views, or the test above would show nothing.
+def test_weight_zero_records_nothing_and_edits_each_view_as_the_editor_alone_does(
+    scene, editor, tmp_path
+):
+    result = run(scene, editor, tmp_path / "zero", replace(QUICK, a0=0.0))
+    assert result.counters["feature_bytes"] == result.counters["injected"] == 0
+    assert not any((tmp_path / "zero" / folder).exists() for folder in ("features", "masks"))
     full = run(scene, editor, settings=replace(QUICK, a0=1.0))
-    for view in plan(full).stages[0]:
-        name = Path(scene[1][view].name).stem
-        picture = read_image(tmp_path / "alone" / "views" / f"{name}.png")
-        assert not np.array_equal(full.edited[view], picture)
+    for view in plan(full).edited:
+        (alone,) = edit(editor, [scene[2][view]], "a bear", steps=QUICK.steps, seed=0).images
+        # Views of one batch differ from views alone in the last bits.
+        assert np.abs(result.edited[view] / 255 - alone).max() < 1 / 255
+    # Injection does change the views, or the test above would show nothing.
+    assert all((full.edited[v] != result.edited[v]).any() for v in plan(full).stages[0])
 
 
 def wall():
@@ -339,7 +336,7 @@ def test_counters_are_what_was_done(scene, editor):
     assert result.counters["iterations"] == 6
     assert result.counters["views"] == 5
     # Each view alone takes the same passes: carrying the edit asks nothing more of the network.
-    settings = replace(settings, method="each view alone", iterations=0)
+    settings = replace(settings, a0=0.0, iterations=0)
     alone, _ = rows_of(editor.unet, lambda: run(scene, editor, settings=settings))
     assert alone == rows
 
@@ -984,7 +981,7 @@ def test_inverted_latents_are_those_of_diffusers_with_the_source_prompt(
         depth_editor, "task", lambda g, words: guides.append((words, g)) or task(g, words)
     )
     settings = quick(
-        "corrected", method="each view alone", text_guidance=3.0, iterations=0,
+        "corrected", a0=0.0, text_guidance=3.0, iterations=0,
         latents="inversion", source_prompt="a bear",
     )  # fmt: skip
     rows, result = rows_of(
@@ -1010,9 +1007,7 @@ def test_features_are_carried_between_inverted_views(scene, depth_editor, tmp_pa
     settings = quick("corrected", stages=1, latents="inversion", a0=1.0, decay="constant")
     result = run(twins, depth_editor, tmp_path / "whole", settings)
     assert np.abs(result.edited[0].astype(int) - result.edited[1]).max() <= 1
-    other = run(
-        twins, depth_editor, tmp_path / "alone", replace(settings, method="each view alone")
-    )
+    other = run(twins, depth_editor, tmp_path / "alone", replace(settings, a0=0.0))
     assert not np.array_equal(other.edited[2], result.edited[2])
 
 
@@ -1254,9 +1249,7 @@ def test_the_estimate_of_a_twin_is_the_sources(scene, editor):
     _, views, images = scene
     twin = Camera(views[0].K, views[0].world_to_camera, 32, 32, "twin")
     other = 1 - images[0]  # guided by another picture, it would become another
-    settings = replace(
-        QUICK, method="each view alone", stages=1, iterations=0, estimate=1.0, estimate_until=1e9
-    )
+    settings = replace(QUICK, a0=0.0, stages=1, iterations=0, estimate=1.0, estimate_until=1e9)
 
     def difference(settings):
         pair = [views[0], twin], [images[0], other]
@@ -1276,9 +1269,7 @@ def test_an_estimate_warped_as_a_picture_lands_on_its_pixel_within_a_cell():
         pose[:3, 3] = (x, 0, 4)  # the wall lies at depth 4
     views = [Camera(K, pose, size, size, name) for name, pose in zip("ab", poses, strict=True)]
     images = [np.random.default_rng(k).random((size, size, 3), np.float32) for k in range(2)]
-    settings = replace(
-        QUICK, method="each view alone", stages=1, iterations=0, estimate=1.0, estimate_until=1e9
-    )
+    settings = replace(QUICK, a0=0.0, stages=1, iterations=0, estimate=1.0, estimate_until=1e9)
 
     def difference(**changes):
         result = attention_warping(
@@ -1298,7 +1289,7 @@ def test_an_estimate_warped_as_a_picture_changes_nothing_that_no_source_sees(sce
     """Though this autoencoder does not give back the picture that it is given."""
     _, views, images = scene
     away = Camera.look_at((0, 0, 8), (0, 0, 9), width=32, height=32, fov_y=40, up=(0, 1, 0))
-    settings = replace(QUICK, method="each view alone", stages=1, iterations=0)
+    settings = replace(QUICK, a0=0.0, stages=1, iterations=0)
     pair = [views[0], replace(away, name="away")], images[:2]
 
     def edited(weight):

@@ -416,7 +416,7 @@ METHODS = {
     },
     "igs2gs": {"method": "igs2gs", "options": {"iterations": 9}},
     "igs2gs, long": {"method": "igs2gs", "options": {"iterations": 90}},
-    "alone": {"options": {"method": "each view alone"}},
+    "alone": {"options": {"a0": 0.0}},
     "paper": {"preset": "paper"},
     "mine": {"options": {"iterations": 5}},
 }
@@ -427,7 +427,7 @@ OWN_CLAIM = Claim(
     "embedding.dino_image.render",
     {"method": "igs2gs"},
     "higher",
-    {"options": {"method": "warp"}},
+    {"options": {"a0": 0.9}},
     settings="own",
 )
 

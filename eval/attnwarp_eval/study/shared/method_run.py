@@ -46,9 +46,6 @@ PARTS = (*EDITING_PARTS, "tune")
 WHOLE = "whole"
 """Stage of :class:`~attnwarp_eval.study.probe.InTurn`: all parts of an edit together."""
 
-OWN = "each view alone"
-"""The method of settings that edits every view by itself: the control."""
-
 FLOOR = "by_view"
 """The method of a comparison that does so."""
 
@@ -189,5 +186,5 @@ def is_alone(spec: Mapping[str, Any]) -> bool:
     """Return True if a variant's spec says that it edits each view by itself, and as long as it
     likes.
     """
-    itself = spec["method"] == FLOOR or spec["settings"].get("method") == OWN
+    itself = spec["method"] == FLOOR or spec["settings"].get("a0") == 0
     return itself and "budget" not in spec

@@ -141,7 +141,7 @@ def test_the_documents_method_edits_each_view_as_the_control_does(folder, tmp_pa
         record = record_of(folder, tmp_path, variants={"one": variant}, probes={"editing": ["one"]})
         return figure(record, "fidelity.mse.edit")
 
-    control = pictures(options={"method": "each view alone"})
+    control = pictures(options={"a0": 0.0})
     assert pictures(method="mine") == pytest.approx(control, rel=1e-3)
     monkeypatch.setitem(EDITING_METHODS, "mine", planned([]))
     with pytest.raises(StudyError, match="^method 'mine' gave no edited view"):
@@ -399,10 +399,7 @@ def test_studies_that_compare_methods_tune_attention_warping_alike(name):
     for label in study.probes["editing"]:
         variant = study.variants[label]
         fields = edits.settings_of(study, variant, 0)
-        if (
-            variant.part(edits.VariantPart).method == "attention_warping"
-            and fields["method"] == "warp"
-        ):
+        if variant.part(edits.VariantPart).method == "attention_warping" and fields["a0"] > 0:
             left = len(study.views) + 1 - fields["sources"]
             stages = min(fields["stages"], math.ceil(left / fields["views_per_stage"]))
             totals[label] = stages * fields["iterations"]
