@@ -32,6 +32,7 @@ class Metric:
         pictures: folders of ``attnwarp-eval metrics`` that it is computed from, of "renders", "edited", "originals".
         function: function that computes it from a view's pictures, (H, W, 3) sRGB in [0, 1] in the
             order of ``pictures``, such as "attnwarp_eval.metrics.image:psnr".
+        squared: whether it is the mean squared error behind a PSNR; its means are shown in decibels.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Metric:
     column: str = ""
     pictures: tuple[str, ...] = ()
     function: str = ""
+    squared: bool = False
 
     @property
     def is_count(self) -> bool:
@@ -122,7 +124,7 @@ _SPECS = (
     Metric("occlusion.ambiguous_accepted", "pixels", "none", 0, 0, "ambiguous pixels accepted, not scored"),
     Metric("occlusion.ambiguous_rejected", "pixels", "none", 0, 0, "ambiguous pixels rejected, not scored"),
     Metric("fit.psnr", "dB", "higher", 1e-2, 1e-3, "PSNR of a view held out from the fit"),
-    Metric("fit.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of a view held out from the fit"),
+    Metric("fit.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of a view held out from the fit", squared=True),
     Metric("fit.ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM of a view held out from the fit (11 x 11, sigma 1.5)"),
     Metric("depth.abs_rel", "ratio", "lower", 1e-5, 1e-2, "mean of |z - z*| / z*"),
     Metric("depth.rmse", "scene", "lower", 1e-5, 1e-2, "root mean square of z - z*"),
@@ -158,9 +160,9 @@ _SPECS = (
     Metric("cost.network_rows", "rows", "lower", 0, 0, "rows through the editor's network, inversions included"),
     Metric("perceptual.distance", "ratio", "lower", 1e-4, 1e-2, "perceptual distance of edited picture and render"),
     # Image metrics, consistency and fidelity: attnwarp_eval.metrics, docs/measuring/metrics.md.
-    Metric("image.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of sRGB values"),
+    Metric("image.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of sRGB values", squared=True),
     Metric("image.psnr", "dB", "higher", 1e-2, 1e-3, "PSNR of sRGB values; infinite for equal pictures"),
-    Metric("image.mse_linear", "ratio", "lower", 1e-6, 1e-2, "mean squared error in linear light"),
+    Metric("image.mse_linear", "ratio", "lower", 1e-6, 1e-2, "mean squared error in linear light", squared=True),
     Metric("image.psnr_linear", "dB", "higher", 1e-2, 1e-3, "PSNR in linear light; infinite for equal pictures"),
     Metric("image.ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM of sRGB values (11 x 11, sigma 1.5, whole windows)"),
     Metric("image.ms_ssim", "ratio", "higher", 1e-4, 1e-3, "MS-SSIM of sRGB values, five scales, from 176 px"),
@@ -168,7 +170,7 @@ _SPECS = (
     Metric("edit.psnr_pooled", "dB", "higher", 1e-2, 1e-3, "Edit PSNR: PSNR of the mean MSE over the views"),
     Metric("edit.psnr_mean", "dB", "higher", 1e-2, 1e-3, "Edit PSNR: mean of the views' finite PSNRs"),
     Metric("edit.psnr", "dB", "higher", 1e-2, 1e-3, "Edit PSNR of one view, whose name stands behind"),
-    Metric("edit.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of one view, whose name stands behind"),
+    Metric("edit.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of one view, whose name stands behind", squared=True),
     Metric("edit.views", "views", "none", 0, 0, "edited views that were compared"),
     Metric("edit.views_identical", "views", "none", 0, 0, "of them, views whose pictures are equal (PSNR infinite)"),
     Metric("edit.views_undefined", "views", "none", 0, 0, "of them, views with nothing to measure"),
@@ -205,13 +207,14 @@ _SPECS = (
     Metric("multiview.share", "share", "none", 1e-4, 0, "share of the pixels asked about that was compared"),
     Metric("multiview.pixels", "pixels", "none", 0, 0, "pixels compared"),
     Metric("multiview.same_answer", "share", "higher", 1e-4, 0, "views whose nearest answer is the source's"),
-    Metric("fidelity.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error against the truth of the edit"),
+    Metric("fidelity.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error against the truth of the edit", squared=True),
     Metric("fidelity.psnr", "dB", "higher", 1e-2, 1e-3, "PSNR against the truth of the edit"),
     Metric("fidelity.ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM against the truth of the edit"),
     Metric("fidelity.ms_ssim", "ratio", "higher", 1e-4, 1e-3, "MS-SSIM against the truth of the edit"),
     Metric("fidelity.distance", "ratio", "lower", 1e-4, 1e-2, "perceptual distance to the truth of the edit"),
     Metric(
-        "fidelity.preserved_mse", "ratio", "lower", 1e-6, 1e-2, "MSE against the unedited picture, outside the object"
+        "fidelity.preserved_mse", "ratio", "lower", 1e-6, 1e-2, "MSE against the unedited picture, outside the object",
+        squared=True,
     ),
     Metric(
         "fidelity.preserved_psnr", "dB", "higher", 1e-2, 1e-3, "PSNR against the unedited picture, outside the object"

@@ -15,7 +15,7 @@ from attnwarp_eval.report.controls import BLIND, blind
 from attnwarp_eval.report.judging import Comparison, JudgedClaim, of_comparisons
 from attnwarp_eval.statistics.contrasts import EQUAL_LEVEL, Contrast
 from attnwarp_eval.statistics.intervals import benjamini_hochberg
-from attnwarp_eval.study.probe_report import is_mse, mean_values, report_of
+from attnwarp_eval.study.probe_report import mean_values, report_of
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Ablation
 
@@ -67,7 +67,8 @@ def ablations(results: Results, compared: Sequence[Sequence[Row]]) -> list[Secti
     """A section for each ablation that the study names."""
     sections = list(map(partial(_section, results), results.study.ablations, compared))
     for section, ablation in zip(sections, results.study.ablations, strict=True):
-        if any(map(is_mse, report_of(ablation.probe).columns_at(results.layer).values())):
+        own = report_of(ablation.probe)
+        if any(own.probe.metric(m).squared for m in own.columns_at(results.layer).values()):
             section.text.append(POOLED)
             break
     return sections

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import importlib
-import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -19,6 +19,7 @@ from typing import Any, ClassVar, TypeVar
 from attnwarp_eval.document.model import Grid, Picture, Section, Table
 from attnwarp_eval.document.numbers import pooled, spread
 from attnwarp_eval.study.probe import Probe, probe, probes
+from attnwarp_eval.study.record import Record, View
 from attnwarp_eval.study.results import Results
 
 K = TypeVar("K", bound="type[ProbeReport]")
@@ -180,14 +181,32 @@ def reports() -> list[ProbeReport]:
     return [report_of(each.name) for each in probes()]
 
 
-def in_degrees(view: str) -> str:
-    """A view's name as the head of a column.
+def in_degrees(names: Iterable[str], views: Iterable[View]) -> list[str]:
+    """Heads of columns of views: each one's degrees from the source, or its name where that says
+    more: it has none, or not the same in all records, or another view has as many.
+
+    Args:
+        names: views, without a task before them.
+        views: records' figures of them.
 
     Example:
-        >>> in_degrees("yaw030"), in_degrees("source")
-        ('30°', 'source')
+        >>> views = [View("near", 12.2, {}), View("left", 30, {}), View("right", 30, {})]
+        >>> in_degrees(["source", "near", "left"], views)
+        ['source', '12°', 'left']
     """
-    return re.sub(r"^yaw0*(\d+)$", r"\1°", view)
+    found: dict[str, set[int]] = {}
+    for view in views:
+        found.setdefault(view.name.rpartition("/")[2], set()).add(round(view.yaw))
+    times = Counter(yaw for yaws in found.values() for yaw in yaws if yaw)
+    heads = {
+        name: f"{yaw}°" for name, (yaw, *others) in found.items() if not others and times[yaw] == 1
+    }
+    return [heads.get(name, name) for name in names]
+
+
+def views_of(records: Iterable[Record[Any]]) -> Iterator[View]:
+    """Views of records."""
+    return (view for record in records for view in record.views)
 
 
 def side_by_side(
@@ -208,29 +227,31 @@ def side_by_side(
         first: label of a row before them -> what it shows, the same for all variants.
     """
     found: dict[str, dict[str, dict[tuple[str, str], str]]] = {}
+    records: dict[str, list[Record[Any]]] = {}
     for variant in variants:
         for name, _, record in results.records(probe, variant):
             if record.pictures:
+                records.setdefault(name, []).append(record)
                 own = found.setdefault(name, {}).setdefault(variant, {})
                 for picture in record.pictures:
                     own.setdefault((picture.view, picture.content), picture.path)
     if not found:
         return None
-    rows = found.get(scene) or next(iter(found.values()))
+    shown_scene = scene if scene in found else next(iter(found))
+    rows = found[shown_scene]
     views = list(dict.fromkeys(view for own in rows.values() for view, _ in own))
+    heads = in_degrees(views, views_of(records[shown_scene]))
 
     def row(label: str, own: Mapping[tuple[str, str], str], shown: str) -> list[Picture | None]:
         return [
-            Picture(own[view, shown], f"{label}, {in_degrees(view)}")
-            if (view, shown) in own
-            else None
-            for view in views
+            Picture(own[view, shown], f"{label}, {head}") if (view, shown) in own else None
+            for view, head in zip(views, heads, strict=True)
         ]
 
     shared = next(iter(rows.values()))
     above = [(label, row(label, shared, shown)) for label, shown in first.items()]
     below = [(name, row(name, own, content)) for name, own in rows.items()]
-    return Grid(caption, [in_degrees(view) for view in views], above + below)
+    return Grid(caption, heads, above + below)
 
 
 def scenes_side_by_side(
@@ -247,13 +268,10 @@ def mean_values(results: Results, probe: str, name: str, metrics: Iterable[str])
     """Cells of a table: the means over scenes of a variant's metrics, with their intervals. A mean
     squared error is shown in decibels, as a pooled PSNR.
     """
-    scenes = len(results.study.scenes)
+    scenes, metrics_of = len(results.study.scenes), report_of(probe).probe.metrics
     return [
-        (pooled if is_mse(metric) else spread)(results.mean(probe, name, metric), scenes)
+        (pooled if metrics_of[metric].squared else spread)(
+            results.mean(probe, name, metric), scenes
+        )
         for metric in metrics
     ]
-
-
-def is_mse(metric: str) -> bool:
-    """Return True if a figure is the mean squared error behind a PSNR."""
-    return "mse" in metric.split(".")[1].split("_")

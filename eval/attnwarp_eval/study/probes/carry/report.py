@@ -14,6 +14,7 @@ from attnwarp_eval.study.probe_report import (
     in_degrees,
     register_report,
     scenes_side_by_side,
+    views_of,
 )
 from attnwarp_eval.study.probes.carry.measure import LEAST_CHANGE
 from attnwarp_eval.study.results import Results
@@ -41,7 +42,8 @@ class CarryReport(ProbeReport):
                 ([cell.scene, cell.variants[0], record.spec["edit"]["instruction"]], values)
             )
         if rows:
-            columns = ["scene", "variant", "words", *map(in_degrees, views)]
+            seen = views_of(record for _, record in results.finished(self.name))
+            columns = ["scene", "variant", "words", *in_degrees(views, seen)]
             table = [[*row, *(number(values.get(view)) for view in views)] for row, values in rows]
             text = (
                 "Mean CIEDE2000 between an edited view and the edited source, at the same points of"

@@ -19,8 +19,9 @@ from attnwarp_eval.study.probe_report import (
     Place,
     ProbeReport,
     in_degrees,
-    is_mse,
     register_report,
+    report_of,
+    views_of,
 )
 from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.record import PictureFile, Record
@@ -278,7 +279,8 @@ def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
         for name in measured:
             table = results.views(probe, name, metric)
             means = [over_scenes({s: table.get(s, {})}).mean for s in scenes]
-            one, overall = (decibels, pooled) if is_mse(metric) else (number, spread)
+            squared = report_of(probe).probe.metric(metric).squared
+            one, overall = (decibels, pooled) if squared else (number, spread)
             rows.append([name, *map(one, means), overall(over_scenes(table))])
         tables.append(Table(["variant", *scenes, "all scenes"], rows, title))
     tables.insert(0, _ratios(results, probe, measured))
@@ -388,13 +390,13 @@ def _grid(caption: str, methods: Mapping[str, Record[EditResult]]) -> Grid:
         for name, record in methods.items()
     }
     views = list(dict.fromkeys(view for own in files.values() for _, view in own))
+    heads = [SOURCE, *in_degrees(views, views_of(methods.values()))]
 
     def row(
         label: str, own: Mapping[tuple[str, str], PictureFile], shown: str, source: str = ""
     ) -> tuple[str, list[Picture | None]]:
         first = next((p for (content, _), p in own.items() if content == source), None)
         pictures = [first, *(own.get((shown, view)) for view in views)]
-        heads = [SOURCE, *map(in_degrees, views)]
         return label, [
             None if picture is None else Picture(picture.path, f"{label}, {head}")
             for picture, head in zip(pictures, heads, strict=True)
@@ -410,7 +412,7 @@ def _grid(caption: str, methods: Mapping[str, Record[EditResult]]) -> Grid:
     for names in truths.values():
         label = "truth" if len(truths) == 1 else f"truth: {', '.join(names)}"
         rows.append(row(label, files[names[0]], "truth"))
-    return Grid(caption, [SOURCE, *map(in_degrees, views)], rows)
+    return Grid(caption, heads, rows)
 
 
 def parts_of_time(results: Results, probe: str) -> Section:

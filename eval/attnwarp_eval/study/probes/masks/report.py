@@ -16,6 +16,7 @@ from attnwarp_eval.study.probe_report import (
     in_degrees,
     register_report,
     scenes_side_by_side,
+    views_of,
 )
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.shared.pictures import MARKS
@@ -72,7 +73,8 @@ class MasksReport(ProbeReport):
             if by_view:
                 rows.append((name, by_view))
         cells = [[name, *(_median(own.get(view, [])) for view in views)] for name, own in rows]
-        return Table(["variant", *map(in_degrees, views)], cells, title)
+        seen = views_of(one for name in names for *_, one in results.records(self.name, name))
+        return Table(["variant", *in_degrees(views, seen)], cells, title)
 
     def gallery(self, results: Results) -> Section | None:
         """Masks of each scene, in the colours of right, lost and wrong."""
