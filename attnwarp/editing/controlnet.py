@@ -23,6 +23,7 @@ from attnwarp.editing.editor import (
     tensor_of,
 )
 from attnwarp.editing.layers import CONTROLNET_BRANCHES
+from attnwarp.editing.schedule import Time
 
 
 def control_image(depth: npt.NDArray[Any]) -> Image:
@@ -180,11 +181,11 @@ class ControlTask:
         """The guidance branches in the order of the UNet's batch."""
         return self.editor.branches
 
-    def predict(self, latents: Tensor, timestep: int) -> Tensor:
+    def predict(self, latents: Tensor, timestep: Time) -> Tensor:
         """The guided output for (B, C, h, w) latents at a step."""
         editor = self.editor
         noisy = torch.cat([latents] * len(self.branches))
-        step = torch.tensor(timestep, device=latents.device)
+        step = torch.tensor(int(timestep), device=latents.device)
         down, middle = editor.controlnet(
             noisy,
             step,

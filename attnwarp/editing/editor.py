@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -16,7 +15,7 @@ import torch
 from torch import Tensor
 
 from attnwarp import check
-from attnwarp.editing.schedule import Grid, Schedule, following, steps_as_published
+from attnwarp.editing.schedule import DDIM, Grid, Schedule, Time, following
 from attnwarp.errors import InputWarning
 
 Image = npt.NDArray[np.float32]
@@ -44,7 +43,7 @@ class Task(Protocol):
         """(B, C, h, w) of the latents of the views."""
         ...
 
-    def predict(self, latents: Tensor, timestep: int) -> Tensor:
+    def predict(self, latents: Tensor, timestep: Time) -> Tensor:
         """The network's guided output for (B, C, h, w) latents at a step."""
         ...
 
@@ -54,11 +53,15 @@ class Editor(Protocol):
     :class:`~attnwarp.editing.controlnet.DepthControlNet`."""
 
     unet: Any
-    schedule: Schedule
     factor: int
     """Pixels along the side of a latent."""
     guide: Guide
     """Kind of guide that :meth:`task` takes: a view's picture or its depth map."""
+
+    @property
+    def schedule(self) -> Schedule:
+        """Noise schedule."""
+        ...
 
     @property
     def branches(self) -> tuple[str, ...]:
@@ -85,10 +88,6 @@ class Editor(Protocol):
         """(B, C, h, w) scaled latents of (B, 3, H, W) pixels, whose values may leave [0, 1]."""
         ...
 
-    def timesteps(self, steps: int) -> list[int]:
-        """Steps from pure noise, as the model's own scheduler spaces them."""
-        ...
-
 
 @dataclass(frozen=True, eq=False)
 class Edit:
@@ -102,7 +101,7 @@ class Edit:
 
     images: list[Image]
     latents: Tensor
-    timesteps: list[int]
+    timesteps: Sequence[Time]
 
 
 def shared_noise(shape: tuple[int, int, int, int], seed: int) -> Tensor:
@@ -161,7 +160,7 @@ def edit(
         seed: seed of the noise, which the views share.
         start: Stable Diffusion's timestep T to start from, as publications give it. The views' own
             latents are noised to T's share of signal, then ``steps`` steps follow
-            (:func:`attnwarp.editing.schedule.steps_as_published`). Left out, the edit starts from
+            (:meth:`attnwarp.editing.schedule.Schedule.published`). Left out, the edit starts from
             pure noise.
         grid: grid of the steps below ``start``; noise is added at ``start`` in either.
         pictures: (H, W, 3) that ``start`` begins from; ``guides`` if left out.
@@ -189,7 +188,6 @@ def edit(
         >>> result.images[0].shape, result.latents.shape, len(result.timesteps)
         ((32, 32, 3), torch.Size([2, 48, 8, 8]), 2)
     """
-    check.number(steps, 1, len(editor.schedule.alphas), "steps", whole=True)
     for name, value in (("start", start), ("noise", noise)):
         if latents is not None and value is not None:
             raise ValueError(f"latents: got latents and {name}, expected one of them")
@@ -199,10 +197,11 @@ def edit(
     own: Any = editor
     task = own.task(guides, prompt, regions) if pools else editor.task(guides, prompt)
     device, dtype = editor.unet.device, editor.unet.dtype
+    schedule = editor.schedule
     timesteps = (
-        editor.timesteps(steps)
+        schedule.timesteps(steps, (task.shape[2], task.shape[3]))
         if start is None
-        else steps_as_published(editor.schedule, start, steps, grid)
+        else schedule.published(start, steps, grid)
     )
     if noise is None:
         noise = shared_noise(task.shape, seed)
@@ -216,12 +215,14 @@ def edit(
     else:
         before = editor.encode(guides if pictures is None else pictures)
         check.shape(before, task.shape, "pictures")
-        (noised,) = steps_as_published(editor.schedule, start, 1)
-        x = editor.schedule.add_noise(before, noise, noised)
+        (noised,) = schedule.published(start, 1)
+        x = schedule.add_noise(before, noise, noised)
     with torch.no_grad():
         for number, (now, then) in enumerate(following(timesteps)):
-            change = None if estimate is None else partial(estimate, number)
-            x = editor.schedule.step(task.predict(x, now), x, now, then, change)
+            output, clean = task.predict(x, now), None
+            if estimate is not None:
+                clean = estimate(number, schedule.estimate(output, x, now))
+            x = schedule.step(output, x, now, then, clean)
             if on_step is not None:
                 on_step(number, len(timesteps), x)
     return Edit(editor.decode(x), x, timesteps)
@@ -374,26 +375,10 @@ class Latent:
         self.unet, self.vae, self.text_encoder = unet, vae, text_encoder
         self.tokenizer, self.scheduler = tokenizer, scheduler
         check_scheduler(scheduler)
-        self.schedule = Schedule.of(scheduler)
+        self.schedule = DDIM.of(scheduler)
         self.factor = 2 ** (len(vae.config.block_out_channels) - 1)
         for part in (unet, vae, text_encoder):
             part.eval().requires_grad_(False)
-
-    def timesteps(self, steps: int) -> list[int]:
-        """Steps from pure noise, as the model's own scheduler spaces them.
-
-        Raises:
-            ValueError: more steps than the scheduler has.
-        """
-        self.scheduler.set_timesteps(steps)
-        timesteps = [int(t) for t in self.scheduler.timesteps]
-        last = len(self.schedule.alphas) - 1
-        if max(timesteps) > last:  # an offset moves the first of as many as were trained
-            raise ValueError(
-                f"steps: got {steps}, the first of which would be timestep {max(timesteps)} of this"
-                f" editor's schedule, that ends at {last}; take fewer"
-            )
-        return timesteps
 
     def raw_latents(self, pictures: Tensor) -> Tensor:
         """(B, C, h, w) of (B, 3, H, W) in [0, 1], the mode, not scaled.

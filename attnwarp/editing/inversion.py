@@ -6,7 +6,7 @@ while its own noise is replayed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from attnwarp import check
-from attnwarp.editing.editor import Editor, Image, drawn, guided, shared_noise
-from attnwarp.editing.schedule import Schedule, following
+from attnwarp.editing.editor import Editor, Image, Task, drawn, guided, shared_noise
+from attnwarp.editing.schedule import Schedule, Time, following
 
-Predict = Callable[[Tensor, int], Tensor]
+Predict = Callable[[Tensor, Time], Tensor]
 """A network's output for latents at a step, such as ``Task.predict``."""
 
 
@@ -26,14 +26,15 @@ def ddim_invert(
     schedule: Schedule,
     predict: Predict,
     latents: Tensor,
-    timesteps: list[int],
-    begin: int | None = None,
+    timesteps: Sequence[Time],
+    begin: Time | None = None,
 ) -> Tensor:
-    """(B, C, h, w) latents at the first of ``timesteps`` from which DDIM reconstructs the picture.
+    """(B, C, h, w) latents at the first of ``timesteps`` from which the steps of a schedule
+    reconstruct the picture.
 
-    Each step predicts the noise at the latents it starts from (Song et al. 2021, section 4.3), so
-    the reconstruction is exact for small steps only. Guidance above 1 increases its error: invert
-    with a task that has none.
+    Each step takes the network's output at the latents it starts from (Song et al. 2021, section
+    4.3), so the reconstruction is exact for small steps only. Guidance above 1 increases its error:
+    invert with a task that has none.
 
     Args:
         schedule: schedule of the model; its network predicts noise or v. One that predicts the
@@ -48,7 +49,8 @@ def ddim_invert(
         ValueError: a network that predicts the picture, of clean latents.
 
     Example:
-        >>> schedule = Schedule(torch.linspace(0.99, 0.01, 1000), "epsilon", 1.0)
+        >>> from attnwarp.editing.schedule import DDIM
+        >>> schedule = DDIM(torch.linspace(0.99, 0.01, 1000), "epsilon", 1.0)
         >>> steps = [900, 600, 300]
         >>> latents = torch.randn(1, 4, 2, 2, generator=torch.Generator().manual_seed(0))
         >>> predict = lambda x, timestep: torch.zeros_like(x)  # a network that sees no noise
@@ -58,18 +60,16 @@ def ddim_invert(
         >>> bool((x - latents).abs().max() < 1e-5)
         True
     """
-    if schedule.prediction == "sample" and begin is None:
+    if schedule.needs_noise and begin is None:
         raise ValueError(
-            "schedule: this network predicts the picture, and DDIM inversion needs its noise;"
+            "schedule: this network predicts the picture, and an inversion needs its noise;"
             " use edit_friendly_invert, or begin at noised latents"
         )
-    x, last = latents, schedule.alpha(begin)
+    x, last = latents, begin
     with torch.no_grad():
         for timestep in reversed(timesteps):
-            x0, noise = schedule.split(predict(x, timestep), x, last)
-            last = schedule.alpha(timestep)
-            a = last.to(x0)
-            x = (a.sqrt() * x0 + (1 - a).sqrt() * noise).to(x.dtype)
+            x = schedule.step(predict(x, timestep), x, last, timestep)
+            last = timestep
     return x
 
 
@@ -90,7 +90,8 @@ def invert_view(
         picture: (H, W, 3) of the view, in [0, 1].
         prompt: description of the picture; "" names nothing.
         steps: number of steps of the edit.
-        seed: seed of the noise of :func:`inversion_steps`, the same for all views.
+        seed: seed of the noise that latents get where the schedule needs some, the same for all
+            views.
 
     Example:
         >>> import numpy as np
@@ -99,9 +100,11 @@ def invert_view(
         >>> invert_view(load_editor("small-depth"), depth, grey, "a bear", steps=2).shape
         torch.Size([1, 48, 8, 8])
     """
-    timesteps, begin = inversion_steps(editor, steps)
     latents = editor.encode([picture])
-    if begin is not None:
+    timesteps = editor.schedule.timesteps(steps, (latents.shape[2], latents.shape[3]))
+    begin = None
+    if editor.schedule.needs_noise:
+        *timesteps, begin = timesteps
         noise = shared_noise((1, *latents.shape[1:]), seed).to(latents)
         latents = editor.schedule.add_noise(latents, noise, begin)
     with guided(editor, 1.0):
@@ -109,21 +112,15 @@ def invert_view(
         return ddim_invert(editor.schedule, task.predict, latents, timesteps, begin)
 
 
-def inversion_steps(editor: Editor, steps: int) -> tuple[list[int], int | None]:
-    """The timesteps of a view's inversion, falling, and the one that it is noised to before.
-
-    A network that predicts the picture says nothing of a clean picture's noise. Its inversion
-    begins at the lowest timestep, others' at the clean latents: None.
+def inversion_rows(editor: Editor, steps: int) -> int:
+    """Rows through the network for the inversion of a view.
 
     Example:
         >>> from attnwarp.editing.small import load_editor
-        >>> inversion_steps(load_editor("small-depth"), 4)
-        ([999, 749, 499], 249)
+        >>> inversion_rows(load_editor("small-depth"), 4)  # it begins at the lowest of four steps
+        3
     """
-    timesteps = editor.timesteps(steps)
-    if editor.schedule.prediction == "sample":
-        return timesteps[:-1], timesteps[-1]
-    return timesteps, None
+    return steps - 1 if editor.schedule.needs_noise else steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +134,7 @@ class NoiseMaps:
             is 0, what the step itself lacks. Float32 where the latents have half precision.
     """
 
-    timesteps: list[int]
+    timesteps: Sequence[Time]
     start: Tensor
     maps: Tensor
 
@@ -146,7 +143,7 @@ def edit_friendly_invert(
     schedule: Schedule,
     predict: Predict,
     latents: Tensor,
-    timesteps: list[int],
+    timesteps: Sequence[Time],
     *,
     noises: Tensor | None = None,
     seed: int = 0,
@@ -160,8 +157,8 @@ def edit_friendly_invert(
         predict: the network's output.
         latents: (B, C, h, w) scaled latents of the picture.
         timesteps: falling. To skip the noisiest, leave them out: the paper takes
-            ``editor.timesteps(100)[36:]`` of Stable Diffusion, text guidance 3.5 with a prompt for
-            the picture, and 15 in the replay with one for its edit.
+            ``schedule.timesteps(100)[36:]`` of Stable Diffusion, text guidance 3.5 with a prompt
+            for the picture, and 15 in the replay with one for its edit.
         noises: (steps, B, C, h, w) white noise of the steps, in the order of ``timesteps``; drawn
             from ``seed`` if left out.
         seed: seed of the drawn noises.
@@ -170,7 +167,8 @@ def edit_friendly_invert(
         ValueError: noises of another shape.
 
     Example:
-        >>> schedule = Schedule(torch.linspace(0.99, 0.01, 1000), "epsilon", 1.0)
+        >>> from attnwarp.editing.schedule import DDIM
+        >>> schedule = DDIM(torch.linspace(0.99, 0.01, 1000), "epsilon", 1.0)
         >>> latents = torch.randn(1, 4, 2, 2, generator=torch.Generator().manual_seed(0))
         >>> predict = lambda x, timestep: 0.1 * x  # any network
         >>> maps = edit_friendly_invert(schedule, predict, latents, [900, 600, 300])
@@ -190,7 +188,7 @@ def edit_friendly_invert(
     x = start
     with torch.no_grad():
         for step, (now, then) in enumerate(following(timesteps)):
-            mean, sigma = _mean(schedule, predict(x, now), x, now, then)
+            mean, sigma = schedule.noisy_step(predict(x, now), x, now, then)
             scale = sigma if sigma > 0 else torch.ones_like(sigma)
             noise = (states[step + 1] - mean) / scale
             maps.append(noise)
@@ -200,7 +198,7 @@ def edit_friendly_invert(
 
 
 def noise_maps(
-    editor: Any, task: Any, picture: Image, timesteps: list[int], seed: int
+    editor: Editor, task: Task, picture: Image, timesteps: Sequence[Time], seed: int
 ) -> NoiseMaps:
     """Noise maps of a picture made elsewhere, whose first state has the noise of all views.
 
@@ -237,19 +235,9 @@ def replay(
     x = noise.start
     with torch.no_grad():
         for step, (now, then) in enumerate(following(noise.timesteps)):
-            mean, sigma = _mean(schedule, predict(x, now), x, now, then)
+            mean, sigma = schedule.noisy_step(predict(x, now), x, now, then)
             scale = sigma if sigma > 0 else torch.ones_like(sigma)
             x = (mean + scale * noise.maps[step]).to(x.dtype)
             if on_step is not None:
                 on_step(step, len(noise.timesteps), x)
     return x
-
-
-def _mean(
-    schedule: Schedule, output: Tensor, x: Tensor, now: int, then: int | None
-) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of the next state, eta 1; float32 of half precision."""
-    x0, noise = schedule.split(output, x, schedule.alpha(now))
-    sigma = schedule.sigma(now, then).to(x0)
-    a = schedule.alpha(then).to(x0)
-    return a.sqrt() * x0 + (1 - a - sigma**2).clamp_min(0).sqrt() * noise, sigma

@@ -22,6 +22,7 @@ from attnwarp.editing.editor import (
     tensor_of,
 )
 from attnwarp.editing.layers import PIX2PIX_BRANCHES
+from attnwarp.editing.schedule import Time
 
 
 def check_pix2pix(
@@ -181,11 +182,11 @@ class Pix2PixTask:
         _, c, h, w = self.before.shape
         return self.views, c, h, w
 
-    def predict(self, latents: Tensor, timestep: int) -> Tensor:
+    def predict(self, latents: Tensor, timestep: Time) -> Tensor:
         """The guided output for (B, C, h, w) latents at a step."""
         editor = self.editor
         noisy = torch.cat([latents] * len(self.branches))
-        step = torch.tensor(timestep, device=latents.device)
+        step = torch.tensor(int(timestep), device=latents.device)
         if hasattr(editor.unet, "region"):
             editor.unet.region = self.region
         output = editor.unet(

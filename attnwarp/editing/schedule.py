@@ -1,16 +1,19 @@
-"""Noise schedules, and the DDIM steps of an editor's own loop."""
+"""Noise schedules, and the steps of an editor's own loop."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from attnwarp import check
 from attnwarp.warp.sampling import work_type
+
+Size = tuple[int, int]
+T = TypeVar("T")
 
 Prediction = Literal["epsilon", "sample", "v_prediction"]
 
@@ -24,47 +27,192 @@ PUBLISHED_STEPS = 1000
 """Steps of Stable Diffusion, whose numbers publications give."""
 
 
-@dataclass(frozen=True, eq=False)
-class Schedule:
-    """Noise schedule that a diffusion model was trained with.
+Time = float
+"""A step's time: the number of a training step (DDIM), or the share of noise (flow)."""
 
-    Steps of half precision are computed in float32 and rounded once: float16 has no number between
-    0.9995 and 1, where alpha-bar of the last steps lies, and 1 - alpha-bar would be 0.
+
+class Schedule(Protocol):
+    """Path from noise to a picture, and the steps along it: :class:`DDIM` or :class:`Flow`.
+
+    Steps of half precision are computed in float32 and rounded once.
+    """
+
+    @property
+    def needs_noise(self) -> bool:
+        """True where the network says nothing of a clean picture's noise: an inversion has to begin
+        at a noised one.
+        """
+        ...
+
+    def timesteps(self, steps: int, size: Size) -> Sequence[Time]:
+        """Falling times from pure noise.
+
+        Args:
+            steps: number of steps.
+            size: (h, w) of the latents; some models' steps depend on it.
+
+        Raises:
+            ValueError: more steps than there are.
+        """
+        ...
+
+    def published(self, start: int, steps: int, grid: Grid = "even") -> Sequence[Time]:
+        """Times that stand for steps of Stable Diffusion, as publications give them.
+
+        A method noises a picture to a published timestep T. It relies on the share of the picture
+        that is left there and not on the number T. So each of Stable Diffusion's steps
+        (:func:`published_steps`) becomes the time at which as much of the picture is left, for the
+        same noise. Of a range, T is drawn on Stable Diffusion's clock, and each draw becomes a time
+        here. So shares of signal come as often as published.
+
+        Args:
+            start: Stable Diffusion's first timestep, in [0, 999].
+            steps: number of steps.
+            grid: grid of the steps, :data:`Grid`.
+
+        Raises:
+            ValueError: no such timestep, or more steps than there are from there.
+        """
+        ...
+
+    def add_noise(self, x: Tensor, noise: Tensor, timestep: Time) -> Tensor:
+        """Clean latents noised to a time, in the type of ``x``."""
+        ...
+
+    def estimate(self, output: Tensor, x: Tensor, timestep: Time) -> Tensor:
+        """Clean latents that a network's output at ``x`` predicts; float32 of half precision."""
+        ...
+
+    def step(
+        self,
+        output: Tensor,
+        x: Tensor,
+        timestep: Time | None,
+        following: Time | None,
+        clean: Tensor | None = None,
+    ) -> Tensor:
+        """One deterministic step, in either direction.
+
+        Args:
+            output: output of the network at ``x``.
+            x: latents at ``timestep``.
+            timestep: time of ``x``; None for clean latents.
+            following: time to go to; None for clean latents.
+            clean: latents taken in place of the predicted clean ones; the noise is then what they
+                leave of ``x``.
+
+        Returns:
+            Latents at ``following``, in the type of ``x``.
+        """
+        ...
+
+    def noisy_step(
+        self, output: Tensor, x: Tensor, timestep: Time, following: Time | None
+    ) -> tuple[Tensor, Tensor]:
+        """Mean and () standard deviation of the next state where steps add noise; float32 of half
+        precision. The deviation is 0 where they add none.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class DDIM:
+    """Noise schedule of a diffusion model, with the steps of DDIM (Song et al. 2021).
+
+    float16 has no number between 0.9995 and 1, where alpha-bar of the last steps lies, and 1 -
+    alpha-bar would be 0: hence float32.
 
     Args:
         alphas: (N,) float32 alpha-bar of the training steps: x_t = sqrt(alpha-bar) x_0 +
             sqrt(1 - alpha-bar) noise.
         prediction: prediction type of the network, in diffusers' words.
         final_alpha: alpha-bar after the last step.
+        spacing: falling timesteps of a number of steps; even ones if left out.
     """
 
     alphas: Tensor
     prediction: Prediction
     final_alpha: float
+    spacing: Callable[[int], Sequence[int]] | None = None
 
     @classmethod
-    def of(cls, scheduler: Any) -> Schedule:
-        """The schedule of a diffusers DDIMScheduler."""
+    def of(cls, scheduler: Any) -> DDIM:
+        """The schedule of a diffusers DDIMScheduler, with its spacing."""
         kind = scheduler.config.prediction_type
         check.one_of(kind, ("epsilon", "sample", "v_prediction"), "prediction_type")
-        return cls(scheduler.alphas_cumprod, kind, float(scheduler.final_alpha_cumprod))
 
-    def alpha(self, timestep: int | None) -> Tensor:
+        def spacing(steps: int) -> list[int]:
+            scheduler.set_timesteps(steps)
+            return [int(t) for t in scheduler.timesteps]
+
+        return cls(scheduler.alphas_cumprod, kind, float(scheduler.final_alpha_cumprod), spacing)
+
+    @property
+    def needs_noise(self) -> bool:
+        """True of a network that predicts the picture."""
+        return self.prediction == "sample"
+
+    def timesteps(self, steps: int, size: Size | None = None) -> list[int]:
+        """Steps from pure noise, as the model's own scheduler spaces them: see :class:`Schedule`.
+
+        Example:
+            >>> DDIM(torch.linspace(0.99, 0.01, 1000), "epsilon", 1.0).timesteps(4)
+            [999, 749, 499, 249]
+        """
+        count = len(self.alphas)
+        check.number(steps, 1, count, "steps", whole=True)
+        if self.spacing is None:
+            return steps_from(count - 1, steps)
+        timesteps = list(self.spacing(steps))
+        if max(timesteps) >= count:  # an offset moves the first of as many as were trained
+            raise ValueError(
+                f"steps: got {steps}, the first of which would be timestep {max(timesteps)} of this"
+                f" editor's schedule, that ends at {count - 1}; take fewer"
+            )
+        return timesteps
+
+    def published(self, start: int, steps: int, grid: Grid = "even") -> list[int]:
+        """Steps of the nearest alpha-bar: see :meth:`Schedule.published`. With Stable Diffusion's
+        own schedule they are the same steps.
+
+        Stable Diffusion's last step still shows some of the picture, and methods rely on it. So it
+        does not become the pure noise that another schedule may end in. Where neighbours have the
+        same nearest step, each is one below the other, so that no step is taken twice.
+
+        Example:
+            >>> alphas = stable_diffusion_alphas()
+            >>> DDIM(alphas, "epsilon", 1.0).published(980, 4)
+            [980, 735, 489, 244]
+            >>> clearer = 4 * alphas / (1 + 3 * alphas)  # twice the signal for the same noise
+            >>> DDIM(clearer, "epsilon", 1.0).published(700, 4)
+            [856, 713, 558, 360]
+        """
+        own = self.alphas.double().cpu()
+        result: list[int] = []
+        for alpha in published_alphas(start, steps, grid):
+            nearest = int((own - alpha).abs().argmin())
+            result.append(min(nearest, result[-1] - 1) if result else nearest)
+        if result[-1] < 0:
+            raise ValueError(
+                f"steps: got {steps} from {start}, which is step {result[0]} of this editor's"
+                f" schedule; take at most {result[0] + 1}"
+            )
+        return result
+
+    def alpha(self, timestep: Time | None) -> Tensor:
         """() alpha-bar of a step; None is what comes after the last."""
-        if timestep is None:
-            return self.alphas.new_tensor(self.final_alpha)
-        return self.alphas[timestep]
+        return torch.tensor(self.final_alpha) if timestep is None else self.alphas[int(timestep)]
 
-    def add_noise(self, x: Tensor, noise: Tensor, timestep: int) -> Tensor:
+    def add_noise(self, x: Tensor, noise: Tensor, timestep: Time) -> Tensor:
         """sqrt(alpha-bar) x + sqrt(1 - alpha-bar) noise, in the type of ``x``."""
         clean = widened(x)
-        a = self.alphas[timestep].to(clean)
+        a = self.alpha(timestep).to(clean)
         return (a.sqrt() * clean + (1 - a).sqrt() * widened(noise)).to(x.dtype)
 
-    def split(self, output: Tensor, x: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    def split(self, output: Tensor, x: Tensor, timestep: Time | None) -> tuple[Tensor, Tensor]:
         """The predicted x_0 and noise, from a network's output at x; float32 of half precision."""
         x, output = widened(x), widened(output)
-        a = alpha.to(x)
+        a = self.alpha(timestep).to(x)
         match self.prediction:
             case "epsilon":
                 return (x - (1 - a).sqrt() * output) / a.sqrt(), output
@@ -72,40 +220,111 @@ class Schedule:
                 return output, (x - a.sqrt() * output) / (1 - a).sqrt()
         return a.sqrt() * x - (1 - a).sqrt() * output, a.sqrt() * output + (1 - a).sqrt() * x
 
+    def estimate(self, output: Tensor, x: Tensor, timestep: Time) -> Tensor:
+        """The predicted x_0; float32 of half precision."""
+        return self.split(output, x, timestep)[0]
+
     def step(
         self,
         output: Tensor,
         x: Tensor,
-        timestep: int,
-        following: int | None,
-        change: Callable[[Tensor], Tensor] | None = None,
+        timestep: Time | None,
+        following: Time | None,
+        clean: Tensor | None = None,
     ) -> Tensor:
-        """One deterministic DDIM step (Song et al. 2021, eq. 12 with eta 0).
-
-        Args:
-            output: output of the network at ``x``.
-            timestep: timestep of ``x``.
-            following: the step that follows, None after the last.
-            change: takes the predicted x_0 and returns what stands in its place; the noise is then
-                what that x_0 leaves of ``x``.
-
-        Returns:
-            What follows, in the type of ``x``.
-        """
+        """A step with eta 0 (Song et al. 2021, eq. 12): see :meth:`Schedule.step`."""
         before = widened(x)
         now, then = self.alpha(timestep).to(before), self.alpha(following).to(before)
-        x0, noise = self.split(output, x, now)
-        if change is not None:
-            changed = change(x0)
+        x0, noise = self.split(output, x, timestep)
+        if clean is not None:
             # By the difference, so that what is unchanged keeps the bits of its noise.
-            noise = noise - (now / (1 - now)).sqrt() * (changed - x0)
-            x0 = changed
+            noise = noise - (now / (1 - now)).sqrt() * (clean - x0)
+            x0 = clean
         return (then.sqrt() * x0 + (1 - then).sqrt() * noise).to(x.dtype)
 
-    def sigma(self, timestep: int, following: int | None) -> Tensor:
-        """() standard deviation of the noise of a DDIM step with eta 1 (eq. 16)."""
+    def noisy_step(
+        self, output: Tensor, x: Tensor, timestep: Time, following: Time | None
+    ) -> tuple[Tensor, Tensor]:
+        """A step with eta 1, as DDPM has it (eq. 12 and 16): see :meth:`Schedule.noisy_step`."""
         now, then = self.alpha(timestep), self.alpha(following)
-        return ((1 - then) / (1 - now) * (1 - now / then)).clamp_min(0).sqrt()
+        x0, noise = self.split(output, x, timestep)
+        sigma = ((1 - then) / (1 - now) * (1 - now / then)).clamp_min(0).sqrt().to(x0)
+        a = then.to(x0)
+        return a.sqrt() * x0 + (1 - a - sigma**2).clamp_min(0).sqrt() * noise, sigma
+
+
+def even_shares(steps: int, size: Size) -> list[float]:
+    """Falling shares of noise, evenly from 1 to 1 / steps.
+
+    Example:
+        >>> even_shares(4, (64, 64))
+        [1.0, 0.75, 0.5, 0.25]
+    """
+    return [(steps - k) / steps for k in range(steps)]
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """Straight path between picture and noise, x_s = (1 - s) x_0 + s noise, of a network that gives
+    the velocity noise - x_0 (Lipman et al. 2023, Liu et al. 2023). Times are the shares s.
+
+    Args:
+        spacing: falling shares in (0, 1] of a number of steps at (h, w) latents. Models that shift
+            them by the number of tokens have a function of their own.
+
+    Example:
+        >>> x, noise = torch.tensor([2.0]), torch.tensor([4.0])
+        >>> flow = Flow()
+        >>> flow.add_noise(x, noise, 0.25), flow.step(noise - x, noise, 1.0, None)
+        (tensor([2.5000]), tensor([2.]))
+    """
+
+    spacing: Callable[[int, Size], Sequence[float]] = even_shares
+    needs_noise: bool = False
+
+    def timesteps(self, steps: int, size: Size) -> list[float]:
+        """Shares from pure noise: see :class:`Schedule`."""
+        check.number(steps, 1, PUBLISHED_STEPS, "steps", whole=True)
+        return list(self.spacing(steps, size))
+
+    def published(self, start: int, steps: int, grid: Grid = "even") -> list[float]:
+        """Shares that leave as much of the picture: see :meth:`Schedule.published`.
+
+        Example:
+            >>> [round(share, 3) for share in Flow().published(980, 2)]
+            [0.927, 0.541]
+        """
+        alphas = published_alphas(start, steps, grid)
+        noise, signal = (1 - alphas).sqrt(), alphas.sqrt()
+        return list((noise / (noise + signal)).tolist())
+
+    def add_noise(self, x: Tensor, noise: Tensor, timestep: Time) -> Tensor:
+        """(1 - s) x + s noise, in the type of ``x``."""
+        return ((1 - timestep) * widened(x) + timestep * widened(noise)).to(x.dtype)
+
+    def estimate(self, output: Tensor, x: Tensor, timestep: Time) -> Tensor:
+        """x - s velocity; float32 of half precision."""
+        return widened(x) - timestep * widened(output)
+
+    def step(
+        self,
+        output: Tensor,
+        x: Tensor,
+        timestep: Time | None,
+        following: Time | None,
+        clean: Tensor | None = None,
+    ) -> Tensor:
+        """A step of Euler, x + (s' - s) velocity: see :meth:`Schedule.step`."""
+        before, now = widened(x), timestep or 0.0
+        velocity = widened(output) if clean is None else (before - clean) / now
+        return (before + ((following or 0.0) - now) * velocity).to(x.dtype)
+
+    def noisy_step(
+        self, output: Tensor, x: Tensor, timestep: Time, following: Time | None
+    ) -> tuple[Tensor, Tensor]:
+        """Step of Euler; it adds no noise."""
+        before = widened(x)
+        return self.step(output, before, timestep, following), before.new_zeros(())
 
 
 def widened(x: Tensor) -> Tensor:
@@ -168,55 +387,17 @@ def published_steps(start: int, steps: int, grid: Grid = "even") -> list[int]:
     return [start // steps * k + 1 for k in reversed(range(steps))]
 
 
-def steps_as_published(
-    schedule: Schedule, start: int, steps: int, grid: Grid = "even"
-) -> list[int]:
-    """The steps of a schedule that stand for steps of Stable Diffusion, as publications give them.
-
-    A method noises a picture to a published timestep T. It relies on the share of the picture that
-    is left there, sqrt(alpha-bar), and not on the number T. So each of Stable Diffusion's steps
-    (:func:`published_steps`) becomes the step of the nearest alpha-bar. With Stable Diffusion's own
-    schedule that is the same step.
-
-    Stable Diffusion's last step still shows some of the picture, and methods rely on it. So it does
-    not become the pure noise that another schedule may end in. Where neighbours have the same
-    nearest step, each is one below the other, so that no step is taken twice. Of a range, T is
-    drawn on Stable Diffusion's clock, and each draw becomes a step here. So shares of signal come
-    as often as published.
-
-    Args:
-        schedule: schedule of the editor.
-        start: Stable Diffusion's first timestep, in [0, 999].
-        steps: how many.
-        grid: see :data:`Grid`.
+def published_alphas(start: int, steps: int, grid: Grid) -> Tensor:
+    """(steps,) float64 alpha-bar of :func:`published_steps`.
 
     Raises:
-        ValueError: no such timestep, or more steps than the schedule has from there.
-
-    Example:
-        >>> alphas = stable_diffusion_alphas()
-        >>> steps_as_published(Schedule(alphas, "epsilon", 1.0), 980, 4)
-        [980, 735, 489, 244]
-        >>> clearer = 4 * alphas / (1 + 3 * alphas)  # twice the signal for the same noise
-        >>> steps_as_published(Schedule(clearer, "epsilon", 1.0), 700, 4)
-        [856, 713, 558, 360]
+        ValueError: no such timestep, or fewer timesteps than steps.
     """
     check.number(start, 0, PUBLISHED_STEPS - 1, "start", whole=True)
-    published = stable_diffusion_alphas()[published_steps(start, steps, grid)]
-    own = schedule.alphas.double().cpu()
-    result: list[int] = []
-    for alpha in published:
-        nearest = int((own - alpha).abs().argmin())
-        result.append(min(nearest, result[-1] - 1) if result else nearest)
-    if result[-1] < 0:
-        raise ValueError(
-            f"steps: got {steps} from {start}, which is step {result[0]} of this editor's schedule;"
-            f" take at most {result[0] + 1}"
-        )
-    return result
+    return stable_diffusion_alphas()[published_steps(start, steps, grid)]
 
 
-def following(timesteps: list[int]) -> list[tuple[int, int | None]]:
+def following(timesteps: Sequence[T]) -> list[tuple[T, T | None]]:
     """Each timestep with the one that follows it; None after the last.
 
     Example:

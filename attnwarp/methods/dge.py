@@ -15,7 +15,7 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor
-from attnwarp.editing.schedule import following, published_steps, steps_as_published
+from attnwarp.editing.schedule import following, published_steps
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
 from attnwarp.methods.matching import key_views
@@ -99,8 +99,8 @@ class DGE(Method):
         """Edit the views of a round, from their noised renders."""
         work, s = self.work, self.settings
         editor: Any = work.editor
-        timesteps = steps_as_published(editor.schedule, self._start(number), s.steps, s.grid)
-        (noised,) = steps_as_published(editor.schedule, self._start(number), 1)
+        timesteps = editor.schedule.published(self._start(number), s.steps, s.grid)
+        (noised,) = editor.schedule.published(self._start(number), 1)
         cameras = [work.scene.cameras[view] for view in group]
         batches = chunks(range(len(group)), s.batch)
         generator = work.generator(KEYS, number)

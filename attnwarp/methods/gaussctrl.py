@@ -16,7 +16,7 @@ from torch import Tensor
 
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor, edit
-from attnwarp.editing.inversion import inversion_steps, invert_view
+from attnwarp.editing.inversion import inversion_rows, invert_view
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.attention import aligned, self_attention
 from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
@@ -100,7 +100,7 @@ class GaussCtrl(Method):
         edits = (len(self.references) + views) * s.steps * self.work.branches()
         if s.latents == "random":
             return edits
-        return edits + inversions * len(inversion_steps(self.work.editor, s.steps)[0])
+        return edits + inversions * inversion_rows(self.work.editor, s.steps)
 
     def edit(
         self, group: Sequence[int], model: Gaussians, step: Callable[[], None]

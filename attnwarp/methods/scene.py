@@ -15,6 +15,7 @@ import torch
 from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.digest import digest, digest_each
+from attnwarp.editing.schedule import Schedule
 from attnwarp.fit import FitSettings, Views, extent_of
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.pictures import Image, Segment
@@ -179,17 +180,22 @@ def editor_digest(editor: Any) -> str:
     settings = ("text_guidance", "image_guidance", "guidance", "control_scale", "negative_prompt")
     # One list: numbers one after another could be read as others, 1.5 and 12 as 1.51 and 2.
     values = [type(editor).__name__, *(getattr(editor, name, None) for name in settings)]
-    schedule = editor.schedule
-    # How the model's scheduler spaces its steps shows in a few numbers of them.
-    spacing = [editor.timesteps(n) for n in (1, 2, 7, 20) if n < len(schedule.alphas)]
-    values += [schedule.prediction, schedule.final_alpha, spacing, _tokens(editor)]
-    parts: list[Any] = [values, schedule.alphas.cpu().numpy()]
+    values += [*_identity(editor.schedule), _tokens(editor)]
+    parts: list[Any] = [values]
     for name in ("unet", "vae", "text_encoder", "controlnet"):
         network = getattr(editor, name, None)
         parts.append(_configuration(network))
         for key, value in sorted(network.state_dict().items()) if network is not None else ():
             parts += [key, value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy()]
     return digest(*parts)
+
+
+def _identity(schedule: Schedule) -> list[Any]:
+    """Fields of a schedule. How it spaces its steps shows in a few numbers of them."""
+    fields = {k: v for k, v in sorted(vars(schedule).items()) if not callable(v)}
+    numbers = {k: v.tolist() if isinstance(v, torch.Tensor) else v for k, v in fields.items()}
+    spacing = [list(schedule.timesteps(n, (64, 64))) for n in (1, 2, 7)]
+    return [type(schedule).__name__, numbers, spacing]
 
 
 def _configuration(network: Any) -> list[tuple[str, str]]:

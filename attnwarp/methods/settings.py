@@ -32,7 +32,7 @@ class MethodSettings(Settings):
 
     Timesteps are Stable Diffusion's, in [0, 999]. On the editor's own schedule each becomes the
     step that leaves as much of the picture
-    (:func:`attnwarp.editing.schedule.steps_as_published`).
+    (:meth:`attnwarp.editing.schedule.Schedule.published`).
 
     Args:
         seed: seed of everything random.
@@ -136,7 +136,7 @@ class AttentionWarpingSettings(MethodSettings):
         start: (lowest, highest) timestep of Stable Diffusion, of which one is drawn for all views,
             to start from in place of pure noise. On the editor's own schedule it becomes the step
             that leaves as much of the picture
-            (:func:`attnwarp.editing.schedule.steps_as_published`).
+            (:meth:`attnwarp.editing.schedule.Schedule.published`).
         grid: grid of the steps below ``start``, :data:`attnwarp.editing.schedule.Grid`.
         start_picture: picture that is noised to ``start`` or inverted: the "original", the current
             "render" (IGS2GS), or "by_stage": the original in the first stage, the render after it.

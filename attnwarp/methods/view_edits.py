@@ -16,9 +16,9 @@ from torch import Tensor
 from attnwarp import check
 from attnwarp.digest import digest
 from attnwarp.editing.editor import edit, side_multiple
-from attnwarp.editing.inversion import NoiseMaps, inversion_steps, invert_view, noise_maps, replay
+from attnwarp.editing.inversion import NoiseMaps, inversion_rows, invert_view, noise_maps, replay
 from attnwarp.editing.recording import Recording, in_words
-from attnwarp.editing.schedule import steps_as_published
+from attnwarp.editing.schedule import Time
 from attnwarp.gaussians import Gaussians
 from attnwarp.io.names import file_stems
 from attnwarp.methods.base import ViewEdit, edit_file
@@ -101,7 +101,7 @@ def check_editor(editor: Any, settings: AttentionWarpingSettings) -> int | None:
     generator = torch.Generator().manual_seed(s.seed)
     timestep = int(torch.randint(low, high + 1, (1,), generator=generator))
     # Refuses more steps than there are timesteps.
-    steps_as_published(editor.schedule, timestep, s.steps, s.grid)
+    editor.schedule.published(timestep, s.steps, s.grid)
     return timestep
 
 
@@ -316,12 +316,12 @@ class ViewEdits:
         )
         return result.images, kept
 
-    def _timesteps(self) -> list[int]:
-        editor: Any = self.work.editor
+    def _timesteps(self) -> Sequence[Time]:
+        """Times of the source's edit."""
+        s, schedule = self.settings, self.work.editor.schedule
         if self.timestep is None:
-            return list(editor.timesteps(self.settings.steps))
-        s = self.settings
-        return steps_as_published(editor.schedule, self.timestep, s.steps, s.grid)
+            return schedule.timesteps(s.steps, self.latent_size(self.sources[0]))
+        return schedule.published(self.timestep, s.steps, s.grid)
 
     def latent_size(self, view: int) -> Size:
         """(h, w) of a view's latents."""
@@ -339,7 +339,7 @@ class ViewEdits:
         s = self.settings
         rows = views * s.steps * len(self.features.branches(guidance))
         if s.inverts(stage):
-            rows += views * len(inversion_steps(self.work.editor, s.steps)[0])
+            rows += views * inversion_rows(self.work.editor, s.steps)
         return rows
 
     # --- what is left for people

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from attnwarp.editing.editor import Editor, guided, shared_noise, side_multiple
-from attnwarp.editing.schedule import Grid, steps_as_published
+from attnwarp.editing.schedule import Grid
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.noise import FRESH, own_seed
 from attnwarp.methods.pictures import Image, Segment, Size, composite, edit_size, resized
@@ -144,7 +144,7 @@ class Work:
         """
         steps = self.settings.steps
         try:
-            steps_as_published(self.editor.schedule, lowest, steps, self.grid)
+            self.editor.schedule.published(lowest, steps, self.grid)
         except ValueError:
             raise ValueError(
                 f"{field}: {lowest} leaves too few timesteps for {steps} steps on this editor's"

@@ -30,7 +30,7 @@ from torch import Tensor
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from attnwarp.editing.editor import Guide, Image, tensor_of
-from attnwarp.editing.schedule import PUBLISHED_STEPS, Schedule, stable_diffusion_alphas, steps_from
+from attnwarp.editing.schedule import DDIM, Time, stable_diffusion_alphas
 
 FACTOR = 4
 """Pixels along the side of a token, as of the bundled editors."""
@@ -223,7 +223,7 @@ def tokens_of(picture: Tensor) -> Tensor:
     return pixel_unshuffle(2 * picture - 1, FACTOR)[0].flatten(1).T.contiguous()
 
 
-def schedule(share: float = 1.0) -> Schedule:
+def schedule(share: float = 1.0) -> DDIM:
     """Noise schedule of the ideal editor: Stable Diffusion's, whose last step is noise alone (Lin
     et al. 2024, algorithm 1), with a share of its signal.
 
@@ -242,7 +242,7 @@ def schedule(share: float = 1.0) -> Schedule:
     roots = stable_diffusion_alphas().sqrt()
     first, last = roots[0], roots[-1]
     a = ((roots - last) * first / (first - last)).square()
-    return Schedule((share * a / (share * a + 1 - a)).float(), "sample", 1.0)
+    return DDIM((share * a / (share * a + 1 - a)).float(), "sample", 1.0)
 
 
 class IdealEditor:
@@ -300,10 +300,6 @@ class IdealEditor:
         """(H, W, 3) pictures in [0, 1] of latents."""
         return list(self.pixels(latents).clamp(0, 1).permute(0, 2, 3, 1).cpu().numpy())
 
-    def timesteps(self, steps: int) -> list[int]:
-        """Steps from pure noise, evenly."""
-        return steps_from(PUBLISHED_STEPS - 1, steps)
-
 
 @dataclass(frozen=True, eq=False)
 class IdealTask:
@@ -329,7 +325,7 @@ class IdealTask:
         h, w = (side // FACTOR for side in config["sample_size"])
         return len(self.views), config["out_channels"], h, w
 
-    def predict(self, latents: Tensor, timestep: int) -> Tensor:
+    def predict(self, latents: Tensor, timestep: Time) -> Tensor:
         """(B, C, h, w) clean latents, predicted at a step."""
         result: Tensor = self.editor.unet(latents, timestep, views=self.views)
         return result

@@ -25,11 +25,10 @@ from attnwarp.editing.layers import PIX2PIX_BRANCHES, all_layers
 from attnwarp.editing.pix2pix import InstructPix2Pix
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.schedule import (
-    Schedule,
+    DDIM,
     following,
     published_steps,
     stable_diffusion_alphas,
-    steps_as_published,
     steps_from,
 )
 from attnwarp.editing.small import WEIGHTS, bundled, guide_of, load_editor
@@ -160,14 +159,14 @@ STABLE_DIFFUSION = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "be
 
 
 def test_published_steps_are_those_of_diffusers_stable_diffusion():
-    schedule = Schedule.of(DDIMScheduler(**STABLE_DIFFUSION))
+    schedule = DDIM.of(DDIMScheduler(**STABLE_DIFFUSION))
     for step in range(1000):
-        assert steps_as_published(schedule, step, 1) == [step]
-    assert steps_as_published(schedule, 980, 20) == steps_from(980, 20)
-    assert steps_as_published(schedule, 999, 1000) == list(range(999, -1, -1))
+        assert schedule.published(step, 1) == [step]
+    assert schedule.published(980, 20) == steps_from(980, 20)
+    assert schedule.published(999, 1000) == list(range(999, -1, -1))
     for start in (-1, 1000):
         with pytest.raises(ValueError, match=rf"start: got {start}, expected a whole number in"):
-            steps_as_published(schedule, start, 1)
+            schedule.published(start, 1)
 
 
 @pytest.mark.parametrize("start", [700, 853, 980])
@@ -177,8 +176,8 @@ def test_the_grid_of_a_scheduler_is_that_of_diffusers_with_so_many_training_step
     scheduler.register_to_config(num_train_timesteps=start)
     scheduler.set_timesteps(20)
     assert published_steps(start, 20, "scheduler") == scheduler.timesteps.tolist()
-    schedule = Schedule.of(DDIMScheduler(**STABLE_DIFFUSION))
-    assert steps_as_published(schedule, start, 20, "scheduler") == scheduler.timesteps.tolist()
+    schedule = DDIM.of(DDIMScheduler(**STABLE_DIFFUSION))
+    assert schedule.published(start, 20, "scheduler") == scheduler.timesteps.tolist()
     with pytest.raises(ValueError, match="start, steps: got 19, 20"):
         published_steps(19, 20, "scheduler")
 
@@ -211,23 +210,23 @@ def schedulers():
 def test_a_published_step_is_the_one_that_leaves_as_much_of_the_picture():
     published = [0, 1, 20, 100, 299, 500, 700, 820, 980, 998, 999]
     for scheduler in schedulers():
-        schedule = Schedule.of(scheduler)
-        steps = [steps_as_published(schedule, step, 1)[0] for step in published]
+        schedule = DDIM.of(scheduler)
+        steps = [schedule.published(step, 1)[0] for step in published]
         assert steps == nearest_steps(schedule.alphas, published)
         # Stable Diffusion never hides a picture wholly, so no step becomes pure noise.
         assert schedule.alphas[steps[-1]] > 0
         # Those that methods take fall evenly on Stable Diffusion's clock.
         falling = [round(981 * k / 4) - 1 for k in (4, 3, 2, 1)]
-        assert steps_as_published(schedule, 980, 4) == nearest_steps(schedule.alphas, falling)
+        assert schedule.published(980, 4) == nearest_steps(schedule.alphas, falling)
 
 
 def test_published_steps_with_one_nearest_step_fall_one_by_one():
-    schedule = Schedule.of(DDIMScheduler(num_train_timesteps=50, beta_schedule="squaredcos_cap_v2"))
-    steps = steps_as_published(schedule, 980, 40)
+    schedule = DDIM.of(DDIMScheduler(num_train_timesteps=50, beta_schedule="squaredcos_cap_v2"))
+    steps = schedule.published(980, 40)
     assert len(steps) == 40
     assert all(after < before for before, after in itertools.pairwise(steps))
     with pytest.raises(ValueError, match=r"steps: got 60 from 980, which is step 47 .*at most 48"):
-        steps_as_published(schedule, 980, 60)
+        schedule.published(980, 60)
 
 
 @pytest.mark.parametrize("prediction", ["epsilon", "sample", "v_prediction"])
@@ -236,7 +235,7 @@ def test_a_step_is_diffusers_step(prediction):
         prediction_type=prediction, clip_sample=False, timestep_spacing="trailing"
     )
     scheduler.set_timesteps(10)
-    schedule = Schedule.of(scheduler)
+    schedule = DDIM.of(scheduler)
     generator = torch.Generator().manual_seed(0)
     x, output = (torch.randn((2, 4, 3, 3), generator=generator) for _ in range(2))
     for now, then in following(scheduler.timesteps.tolist()):
@@ -251,7 +250,7 @@ HALF = pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 @pytest.mark.parametrize("prediction", ["epsilon", "sample", "v_prediction"])
 def test_a_step_in_half_precision_is_the_formula_in_float64_rounded_once(prediction, dtype):
     alphas = stable_diffusion_alphas().float()
-    schedule = Schedule(alphas, prediction, 1.0)
+    schedule = DDIM(alphas, prediction, 1.0)
     generator = torch.Generator().manual_seed(0)
     x, output = (torch.randn((1, 4, 8, 8), generator=generator).to(dtype) for _ in range(2))
     wide, out = x.double(), output.double()
@@ -311,7 +310,7 @@ def test_what_does_not_fit_is_refused_by_name():
     # The scheduler's offset of 1 would move the first of 1000 steps beyond the last that it has.
     with pytest.raises(ValueError, match="steps: got 1000, .* timestep 1000 .* ends at 999"):
         edit(editor, [picture()], "a bear", steps=1000)
-    assert max(editor.timesteps(999)) == 999
+    assert max(editor.schedule.timesteps(999)) == 999
     latents = torch.zeros(1, 4, H // 2, W // 2)
     for name, value in (("start", 700), ("noise", latents)):
         with pytest.raises(ValueError, match=f"latents: got latents and {name}, expected one of"):
@@ -562,7 +561,7 @@ def test_sides_of_two_halvings_are_enough_for_stable_diffusions_three():
     with record(pipe.unet, plan) as recording:
         edit(editor, [guide], "a bear", steps=3, noise=noise)
     for layer in layers:
-        features = recording.features(editor.timesteps(3)[0], layer, "text")
+        features = recording.features(editor.schedule.timesteps(3)[0], layer, "text")
         assert features.shape == (1, np.prod(layer.size((12, 20))), 16)
     with inject(pipe.unet, recording, branches=PIX2PIX_BRANCHES, weight=lambda t, T: 1.0):
         again = edit(editor, [guide], "a bear", steps=3, noise=noise)
@@ -604,7 +603,7 @@ def test_a_scheduler_without_ddim_steps_is_refused_with_the_remedy_which_works()
         ):
             InstructPix2Pix(**parts, scheduler=other)
         remedy = DDIMScheduler.from_config({**other.config, "clip_sample": False})
-        assert InstructPix2Pix(**parts, scheduler=remedy).timesteps(3) == [667, 334, 1]
+        assert InstructPix2Pix(**parts, scheduler=remedy).schedule.timesteps(3) == [667, 334, 1]
     clipping = DDIMScheduler.from_config({**pipe.scheduler.config, "clip_sample": True})
     with pytest.warns(InputWarning, match="clip_sample of its configuration is left out"):
         InstructPix2Pix(**parts, scheduler=clipping)

@@ -8,7 +8,7 @@ from PIL import Image
 from tiny_editors import parts, unet
 
 from attnwarp.editing.inversion import ddim_invert, edit_friendly_invert, replay
-from attnwarp.editing.schedule import Schedule, following, stable_diffusion_alphas
+from attnwarp.editing.schedule import DDIM, following, stable_diffusion_alphas
 
 
 def network(net, seed=2, *, strength=1.0):
@@ -35,7 +35,7 @@ def test_ddim_inversion_is_diffusers_inverse_scheduler(prediction):
     x = latents()
     for timestep in inverse.timesteps:
         x = inverse.step(predict(x, int(timestep)), int(timestep), x).prev_sample
-    ours = ddim_invert(Schedule.of(scheduler), predict, latents(), scheduler.timesteps.tolist())
+    ours = ddim_invert(DDIM.of(scheduler), predict, latents(), scheduler.timesteps.tolist())
     assert torch.allclose(ours, x, rtol=0, atol=1e-5)
 
 
@@ -44,7 +44,7 @@ def test_ddim_inversion_of_gaussian_data_is_its_closed_form_and_leads_back():
     standard deviations, sqrt(alpha-bar s^2 + 1 - alpha-bar) / s."""
     scheduler = DDIMScheduler.from_config(parts()["scheduler"].config, set_alpha_to_one=True)
     scheduler.set_timesteps(100)
-    schedule, timesteps = Schedule.of(scheduler), scheduler.timesteps.tolist()
+    schedule, timesteps = DDIM.of(scheduler), scheduler.timesteps.tolist()
     spread = 0.8
 
     def predict(x, timestep):
@@ -79,7 +79,7 @@ def test_a_picture_that_a_network_drew_is_inverted_and_rebuilt(monkeypatch):
     pipe = controlnet()
     names = ("unet", "vae", "text_encoder", "tokenizer", "scheduler", "controlnet")
     editor = DepthControlNet(*(getattr(pipe, name) for name in names), guidance=1.0)
-    editor.schedule = Schedule(torch.linspace(0.9999, 0.6, 1000), "epsilon", 1.0)
+    editor.schedule = DDIM(torch.linspace(0.9999, 0.6, 1000), "epsilon", 1.0)
     depth = np.random.default_rng(0).uniform(1, 3, (16, 16))
     drawn = edit(editor, [depth], "a bear", steps=10, seed=5)
     # An autoencoder of random weights would not give the picture back.
@@ -94,7 +94,7 @@ def test_a_picture_that_a_network_drew_is_inverted_and_rebuilt(monkeypatch):
 
 
 def test_ddim_inversion_needs_a_network_that_predicts_noise():
-    schedule = Schedule(parts()["scheduler"].alphas_cumprod, "sample", 1.0)
+    schedule = DDIM(parts()["scheduler"].alphas_cumprod, "sample", 1.0)
     with pytest.raises(ValueError, match="DDIM inversion needs its noise"):
         ddim_invert(schedule, network(unet()), latents(), [500, 0])
 
@@ -135,9 +135,7 @@ def test_edit_friendly_inversion_is_that_of_diffusers(skip):
         def predict(x, timestep):
             return pipe.unet(x, torch.tensor(timestep), text).sample
 
-        ours = edit_friendly_invert(
-            Schedule.of(pipe.scheduler), predict, x0, timesteps, noises=noises
-        )
+        ours = edit_friendly_invert(DDIM.of(pipe.scheduler), predict, x0, timesteps, noises=noises)
     assert torch.allclose(ours.start, pipe.init_latents, rtol=0, atol=1e-5)
     # A map is a difference over sigma, which is as small as 0.04 at the last steps.
     assert torch.allclose(ours.maps, pipe.zs, rtol=0, atol=2e-4)
@@ -155,7 +153,7 @@ def test_edit_friendly_inversion_is_that_of_diffusers(skip):
 def test_replaying_the_maps_gives_the_picture_back_to_float_error(changes):
     scheduler = DDIMScheduler.from_config(parts()["scheduler"].config, **changes)
     scheduler.set_timesteps(20)
-    schedule, predict = Schedule.of(scheduler), network(unet())
+    schedule, predict = DDIM.of(scheduler), network(unet())
     noise = edit_friendly_invert(schedule, predict, latents(), scheduler.timesteps.tolist(), seed=1)
     assert torch.allclose(replay(schedule, predict, noise), latents(), rtol=0, atol=1e-5)
     other = replay(schedule, network(unet(), seed=9), noise)
@@ -170,7 +168,7 @@ def test_inversions_in_half_precision_keep_their_coefficients():
     alphas = stable_diffusion_alphas().float()
     x = latents().bfloat16()
     inverted = ddim_invert(
-        Schedule(alphas, "epsilon", 1.0), lambda x, timestep: torch.ones_like(x), x, [1]
+        DDIM(alphas, "epsilon", 1.0), lambda x, timestep: torch.ones_like(x), x, [1]
     )
     a = float(alphas[1])
     exact = a**0.5 * x.double() + (1 - a) ** 0.5
@@ -180,7 +178,7 @@ def test_inversions_in_half_precision_keep_their_coefficients():
     def predict(x, timestep):
         return 0.3 * x
 
-    picture = Schedule(alphas, "sample", 1.0)
+    picture = DDIM(alphas, "sample", 1.0)
     maps = edit_friendly_invert(picture, predict, x, [900, 500, 100, 1])
     assert torch.equal(replay(picture, predict, maps), x)
 
@@ -199,7 +197,7 @@ def test_a_picture_edited_by_hand_can_be_the_source():
     editor = InstructPix2Pix(pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler)
     rng = np.random.default_rng(0)
     before, by_hand, other = (rng.uniform(size=(16, 24, 3)).astype(np.float32) for _ in range(3))
-    task, timesteps = editor.task([before], "a bear"), editor.timesteps(4)
+    task, timesteps = editor.task([before], "a bear"), editor.schedule.timesteps(4)
     wanted = editor.encode([by_hand])
     noise = edit_friendly_invert(editor.schedule, task.predict, wanted, timesteps)
     plan = RecordingPlan(

@@ -26,7 +26,7 @@ import attnwarp.warp
 from attnwarp import Camera, Gaussians
 from attnwarp.digest import digest
 from attnwarp.editing.editor import edit, shared_noise
-from attnwarp.editing.schedule import Schedule
+from attnwarp.editing.schedule import DDIM
 from attnwarp.editing.small import load_editor
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.fit import FitSettings
@@ -264,7 +264,7 @@ def test_one_step_is_the_written_out_injection_in_float64(editor, monkeypatch):
     exact = copy.copy(editor)
     exact.unet = copy.deepcopy(editor.unet).double()
     exact.vae = copy.deepcopy(editor.vae).double()
-    timestep = editor.timesteps(1)[0]
+    timestep = editor.schedule.timesteps(1)[0]
     texts = editor.embed(["a bear", ""]).double()[[0, 1, 1]]
     noise = shared_noise((1, 4, 16, 16), 0).double()
 
@@ -727,7 +727,7 @@ def test_the_released_start_is_one_timestep_in_the_range(scene, editor):
 def test_the_released_start_is_a_share_of_signal(scene, editor, monkeypatch):
     # At every step twice the signal that Stable Diffusion has for the same noise.
     alphas = 4 * editor.schedule.alphas / (1 + 3 * editor.schedule.alphas)
-    monkeypatch.setattr(editor, "schedule", Schedule(alphas, "epsilon", 1.0))
+    monkeypatch.setattr(editor, "schedule", DDIM(alphas, "epsilon", 1.0))
     steps = []
     handle = editor.unet.register_forward_pre_hook(lambda module, args: steps.append(int(args[1])))
     settings = replace(QUICK, stages=1, iterations=0, steps=4, start=(700, 700))

@@ -16,7 +16,7 @@ from tiny_scenes import cameras
 from attnwarp import Camera, Gaussians, methods
 from attnwarp.editing.editor import edit
 from attnwarp.editing.inversion import ddim_invert
-from attnwarp.editing.schedule import Schedule
+from attnwarp.editing.schedule import DDIM
 from attnwarp.io import read_ply
 from attnwarp.methods import (
     METHODS,
@@ -118,7 +118,7 @@ def test_published_timesteps_stand_for_the_share_of_the_picture_that_is_left(
     # At every step twice the signal that Stable Diffusion has for the same noise.
     alphas = 4 * editor.schedule.alphas / (1 + 3 * editor.schedule.alphas)
     with_its_own = run("dge", replace(SETTINGS["dge"], steps=4, iterations=0)).counters
-    monkeypatch.setattr(editor, "schedule", Schedule(alphas, "epsilon", 1.0))
+    monkeypatch.setattr(editor, "schedule", DDIM(alphas, "epsilon", 1.0))
     clock = [700, 525, 349, 174]
     for name, settings in {
         "by_view": ByViewSettings(start=(700, 700)),
@@ -300,7 +300,7 @@ def test_inversion_from_noised_latents_follows_the_exact_flow(spread, kind):
     x keeps its ratio to the standard deviation sqrt(a s^2 + 1 - a) (Song et al. 2021, eq. 14).
     """
     alphas = torch.linspace(0.999, 0.001, 1000, dtype=torch.float64)
-    schedule = Schedule(alphas, kind, 1.0)
+    schedule = DDIM(alphas, kind, 1.0)
 
     def predict(x, timestep):
         # The inversion's network is asked at the latents that the step starts from.
@@ -324,7 +324,7 @@ def test_gaussctrl_inverts_an_editor_that_predicts_the_picture_from_its_lowest_t
 ):
     schedule = depth_editor.schedule
     monkeypatch.setattr(
-        depth_editor, "schedule", Schedule(schedule.alphas, "sample", schedule.final_alpha)
+        depth_editor, "schedule", DDIM(schedule.alphas, "sample", schedule.final_alpha)
     )
     steps = []
     handle = depth_editor.unet.register_forward_pre_hook(
@@ -334,7 +334,7 @@ def test_gaussctrl_inverts_an_editor_that_predicts_the_picture_from_its_lowest_t
         result = run("gaussctrl", replace(QUICK["gaussctrl"], steps=3, iterations=0))
     finally:
         handle.remove()
-    first, second, third = depth_editor.timesteps(3)
+    first, second, third = depth_editor.schedule.timesteps(3)
     inversions = [timestep for rows, timestep in steps if rows == 1]
     assert inversions == [second, first] * 3
     assert [timestep for rows, timestep in steps if rows > 1] == [first, second, third] * 2

@@ -306,7 +306,7 @@ def test_propagation_is_the_loop_written_out_in_float64(thing, wide, share, choi
     edited = propagate(settings)
 
     alphas = editor.schedule.alphas.double().numpy()
-    timesteps = editor.timesteps(8)
+    timesteps = editor.schedule.timesteps(8)
     noise = torch.randn((1, 48, 16, 16), generator=torch.Generator().manual_seed(5))[0]
     start = noise.flatten(1).T.double().numpy()
 

@@ -15,7 +15,7 @@ from attnwarp.camera import Camera
 from attnwarp.editing.injection import blended
 from attnwarp.editing.layers import Layer
 from attnwarp.editing.recording import RecordingPlan, record
-from attnwarp.editing.schedule import Prediction, Schedule
+from attnwarp.editing.schedule import DDIM, Prediction
 from attnwarp.methods.attention_warping import CORRECTED, a_t, blend, inject
 from attnwarp.warp import FeatureWarp, Surface, WarpedView, warp_surfaces
 from attnwarp_eval.stability.bilinear import Extended, extended, sampling_matrix
@@ -268,7 +268,7 @@ def _step(alpha: float, way: Way) -> float:
     for prediction in get_args(Prediction):
         if prediction == "epsilon" and not alpha:
             continue  # noise alone tells nothing of x_0
-        result = Schedule(alphas, prediction, 1.0).step(output, x, 1, 0)
+        result = DDIM(alphas, prediction, 1.0).step(output, x, 1, 0)
         for got, one, out in zip(result.double(), x.double(), output.double(), strict=True):
             terms = _step_terms(prediction, float(one), float(out), *map(float, alphas))
             scale = max(map(abs, terms)) * torch.finfo(way.dtype).eps
