@@ -110,7 +110,7 @@ def measure(
     images = [views.target(k, torch.zeros(3)).numpy() for k in range(len(views))]
     editor = load_editor(editor_name)
     torch.set_num_threads(thread_count(editor))
-    size = editor.unet.config.sample_size * editor.factor
+    size = editor.own_size
     chosen = preset("attention_warping", iterations=plan.tuning, size=size)
     wall, cpu = time.perf_counter(), time.process_time()
     result = attention_warping(fitted.gaussians, views.cameras, images, editor, INSTRUCTION, chosen)
@@ -191,7 +191,7 @@ def against_one_by_one(
     model = splats("bear", pixels, 0, kind="2d", count=count, position_noise=0.1, normal_noise=3.0)
     editor = load_editor(editor_name)
     torch.set_num_threads(thread_count(editor))
-    size = editor.unet.config.sample_size * editor.factor
+    size = editor.own_size
     warped = preset("attention_warping", steps=steps, iterations=0, size=size)
     figures: dict[str, list[dict[str, float]]] = {"propagation": [], "again": [], "one by one": []}
 

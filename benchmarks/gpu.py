@@ -267,12 +267,12 @@ def random_editor(device: str, sizes: Sizes, dtype: torch.dtype, depth: bool = F
     from diffusers.utils import logging
     from transformers import CLIPTextConfig, CLIPTextModel
 
-    from attnwarp.editing.controlnet import DepthControlNet
-    from attnwarp.editing.pix2pix import InstructPix2Pix
+    from attnwarp.editing.editors.controlnet import DepthControlNet
+    from attnwarp.editing.editors.pix2pix import InstructPix2Pix
     from attnwarp.editing.small import load_editor
 
     logging.set_verbosity_error()
-    tokenizer = load_editor("small-plain").tokenizer
+    tokenizer = load_editor("small-plain").parts["tokenizer"]
     tokenizer.model_max_length = 77  # as Stable Diffusion's
     torch.manual_seed(0)
     levels = len(sizes.channels)

@@ -24,7 +24,6 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import STEPS, edit
-from attnwarp.editing.layers import choose_layers
 from attnwarp.editing.recording import Recording, RecordingPlan, record
 from attnwarp.editing.small import load_editor, thread_count
 from attnwarp.methods.attention_warping import inject
@@ -82,22 +81,21 @@ def measure(editor: Any, size: int, *, steps: int = STEPS, rounds: int = 5) -> R
         rounds: that are kept; one more comes first.
     """
     view = np.random.default_rng(0).random((size, size, 3), dtype=np.float32)
-    side = size // editor.factor
-    branches = editor.branches
-    keep = tuple(name for name in branches if name != "uncond")
-    plan = RecordingPlan(choose_layers(editor.unet), (side, side), branches, keep, steps)
+    _, h, w = editor.noise_shape((size, size))
+    keep = tuple(name for name in editor.branches if name in editor.carries)
+    plan = RecordingPlan(editor.layers(), (h, w), keep, steps)
     warp = plane_warp(size)
-    with record(editor.unet, plan) as recording:
+    with record(editor, plan) as recording:
         edit(editor, [view], INSTRUCTION, steps=steps)
     runs: Runs = {name: [] for name in (PLAIN, RECORDED, INJECTED, WARPED, ITSELF)}
 
     def around(name: str) -> AbstractContextManager[Recording | None]:
         if name == RECORDED:
-            return record(editor.unet, plan)
+            return record(editor, plan)
         if name == PLAIN:
             return nullcontext()
         warps = [warp if name == WARPED else None]
-        return inject(editor.unet, recording, branches=branches, warps=warps)
+        return inject(editor, recording, warps=warps)
 
     def run(name: str, turn: int) -> None:
         wall, cpu = time.perf_counter(), time.process_time()

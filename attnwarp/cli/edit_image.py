@@ -122,7 +122,7 @@ def edit_image(
 
     from attnwarp import check
     from attnwarp.devices import choose, type_of
-    from attnwarp.editing.editor import edit, own_size, side_multiple
+    from attnwarp.editing.editor import edit
     from attnwarp.editing.segment import load_segmenter
     from attnwarp.editing.small import load_editor, thread_count
     from attnwarp.methods.pictures import enlarged_change
@@ -135,10 +135,10 @@ def edit_image(
     )
     model.check_text(instruction)
     torch.set_num_threads(thread_count(model, threads))
-    longest = size or own_size(model)
-    whole, image = image, _fit(image, longest, side_multiple(model))
+    longest = size or model.own_size
+    whole, image = image, _fit(image, longest, model.side_multiple)
     h, w = image.shape[:2]
-    _tell_stretch(whole.shape, image.shape, side_multiple(model))
+    _tell_stretch(whole.shape, image.shape, model.side_multiple)
     share: Any = None
     if mask is not None:
         bright = bright_of(mask, picture, "--mask")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +16,8 @@ import torch
 from torch import Tensor
 
 from attnwarp import check
-from attnwarp.editing.schedule import DDIM, Grid, Schedule, Time, following
+from attnwarp.editing.layers import Call, Layer, Network, paper_layers, unet_call
+from attnwarp.editing.schedule import DDIM, Grid, Schedule, Size, Time, following
 from attnwarp.errors import InputWarning
 
 Image = npt.NDArray[np.float32]
@@ -48,15 +50,13 @@ class Task(Protocol):
         ...
 
 
-class Editor(Protocol):
-    """A diffusion model that edits views: :class:`~attnwarp.editing.pix2pix.InstructPix2Pix`,
-    :class:`~attnwarp.editing.controlnet.DepthControlNet`."""
+class Editor(Network, Protocol):
+    """A diffusion model that edits views. Each is a file in :mod:`attnwarp.editing.editors`."""
 
-    unet: Any
-    factor: int
-    """Pixels along the side of a latent."""
-    guide: Guide
-    """Kind of guide that :meth:`task` takes: a view's picture or its depth map."""
+    @property
+    def guide(self) -> Guide:
+        """Kind of guide that :meth:`task` takes: a view's picture or its depth map."""
+        ...
 
     @property
     def schedule(self) -> Schedule:
@@ -64,12 +64,56 @@ class Editor(Protocol):
         ...
 
     @property
-    def branches(self) -> tuple[str, ...]:
-        """The guidance branches in the order of the UNet's batch."""
+    def carries(self) -> tuple[str, ...]:
+        """Guidance branches whose features methods carry, unless told otherwise."""
         ...
 
-    def task(self, guides: Sequence[npt.NDArray[Any]], prompt: str) -> Task:
-        """An edit of views; ``guide`` tells whether the guides are pictures or depth maps."""
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Names of its attributes that decide its edits, which :func:`guided` sets: of
+        ``text_guidance``, ``image_guidance`` and ``negative_prompt`` those that it has, and others.
+        """
+        ...
+
+    @property
+    def parts(self) -> Mapping[str, Any]:
+        """Networks and tokenizers by diffusers' names of them."""
+        ...
+
+    @property
+    def own_size(self) -> int:
+        """Longest side in px of the pictures that it was made for."""
+        ...
+
+    @property
+    def side_multiple(self) -> int:
+        """Pixels that the sides of a picture are rounded to a multiple of."""
+        ...
+
+    def noise_shape(self, size: Size) -> tuple[int, int, int]:
+        """(C, h, w) of the noise of an (H, W) px view. Layers have the size (h, w), halved as often
+        as they say.
+        """
+        ...
+
+    def check_text(self, text: str) -> None:
+        """Raise ValueError for a text that is longer than the model takes."""
+        ...
+
+    def task(
+        self,
+        guides: Sequence[npt.NDArray[Any]],
+        prompt: str,
+        regions: Sequence[npt.NDArray[Any]] | None = None,
+    ) -> Task:
+        """An edit of views.
+
+        Args:
+            guides: pictures or depth maps, as :attr:`guide` says.
+            prompt: instruction or description.
+            regions: (H, W) of each view in [0, 1]: what is edited; None for all of it. Editors
+                that make nothing of it pass over it.
+        """
         ...
 
     def encode(self, pictures: Sequence[Image]) -> Tensor:
@@ -171,7 +215,7 @@ def edit(
         estimate: called with the step and the (B, C, h, w) clean latents that are predicted there;
             what it returns takes their place.
         regions: (H, W) of each view in [0, 1]: what is edited, over which a bundled editor's noise
-            draws what the prompt leaves open. None for all of it; other editors pass over it.
+            draws what the prompt leaves open; None for all of it.
 
     Returns:
         The edited views.
@@ -193,10 +237,8 @@ def edit(
             raise ValueError(f"latents: got latents and {name}, expected one of them")
     if pictures is not None and start is None:
         raise ValueError("pictures: got pictures without start, which alone begins from them")
-    pools = regions is not None and hasattr(editor.unet, "region")
-    own: Any = editor
-    task = own.task(guides, prompt, regions) if pools else editor.task(guides, prompt)
-    device, dtype = editor.unet.device, editor.unet.dtype
+    task = editor.task(guides, prompt, regions)
+    device, dtype = editor.network.device, editor.network.dtype
     schedule = editor.schedule
     timesteps = (
         schedule.timesteps(steps, (task.shape[2], task.shape[3]))
@@ -229,18 +271,24 @@ def edit(
 
 
 @contextmanager
-def guided(editor: Any, value: float | None) -> Iterator[None]:
-    """Use another text guidance while the block runs; None leaves the editor's own."""
-    name = "text_guidance" if hasattr(editor, "text_guidance") else "guidance"
-    if value is None:
-        yield
-        return
-    before = getattr(editor, name)
-    setattr(editor, name, float(value))
+def guided(editor: Any, **values: Any) -> Iterator[None]:
+    """Set options of an editor while the block runs; None leaves its own.
+
+    Raises:
+        ValueError: the editor has no such option.
+    """
+    given = {name: value for name, value in values.items() if value is not None}
+    for name in given:
+        if name not in editor.options:
+            raise ValueError(f"{name}: this editor has none; leave it out")
+    before = {name: getattr(editor, name) for name in given}
     try:
+        for name, value in given.items():
+            setattr(editor, name, value)
         yield
     finally:
-        setattr(editor, name, before)
+        for name, value in before.items():
+            setattr(editor, name, value)
 
 
 def tensor_of(images: Sequence[npt.NDArray[Any]], name: str, multiple: int) -> Tensor:
@@ -282,22 +330,6 @@ def tensor_of(images: Sequence[npt.NDArray[Any]], name: str, multiple: int) -> T
     if stacked.min() < 0 or stacked.max() > 1:
         raise ValueError(f"{name}: got values to {stacked.max():g}, expected sRGB in [0, 1]")
     return torch.from_numpy(stacked).permute(0, 3, 1, 2).contiguous()
-
-
-def side_multiple(editor: Any) -> int:
-    """Pixels that the sides of a picture are rounded to a multiple of: two halvings of the latents
-    are exact, as many as layers with attention need, and further ones are padded by the UNet.
-    """
-    halvings = len(editor.unet.config.block_out_channels) - 1
-    return int(editor.factor * 2 ** min(2, halvings))
-
-
-def own_size(editor: Any) -> int:
-    """Longest side in px of the pictures that an editor was made for; 64 latents where its UNet
-    names none.
-    """
-    size = getattr(editor.unet.config, "sample_size", None) or 64
-    return int((max(size) if isinstance(size, list | tuple) else size) * editor.factor)
 
 
 def check_networks(
@@ -366,8 +398,8 @@ def check_scheduler(scheduler: Any) -> None:
         )
 
 
-class Latent:
-    """Pictures to latents and back, and texts to tokens: what both kinds of editor share."""
+class Latent(ABC):
+    """A UNet with an autoencoder and a text encoder: what both kinds of Stable Diffusion share."""
 
     def __init__(
         self, unet: Any, vae: Any, text_encoder: Any, tokenizer: Any, scheduler: Any
@@ -379,6 +411,51 @@ class Latent:
         self.factor = 2 ** (len(vae.config.block_out_channels) - 1)
         for part in (unet, vae, text_encoder):
             part.eval().requires_grad_(False)
+
+    @property
+    def network(self) -> Any:
+        """The UNet."""
+        return self.unet
+
+    @property
+    @abstractmethod
+    def branches(self) -> tuple[str, ...]:
+        """Guidance branches in the order of the UNet's batch."""
+
+    def layers(self) -> tuple[Layer, ...]:
+        """Layers of the paper, :func:`attnwarp.editing.layers.paper_layers`."""
+        return paper_layers(self.unet)
+
+    def call(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:
+        """The pass that the UNet is called for."""
+        return unet_call(self.branches, args, kwargs)
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """Networks and tokenizer."""
+        names = ("unet", "vae", "text_encoder", "tokenizer")
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def own_size(self) -> int:
+        """Longest side in px of the pictures that the UNet was made for; 64 latents where it names
+        none.
+        """
+        size = getattr(self.unet.config, "sample_size", None) or 64
+        return int((max(size) if isinstance(size, list | tuple) else size) * self.factor)
+
+    @property
+    def side_multiple(self) -> int:
+        """Pixels that sides are multiples of: two halvings of the latents are exact, as many as
+        layers with attention need, and further ones are padded by the UNet.
+        """
+        halvings = len(self.unet.config.block_out_channels) - 1
+        return int(self.factor * 2 ** min(2, halvings))
+
+    def noise_shape(self, size: Size) -> tuple[int, int, int]:
+        """(C, h, w) of the latents of an (H, W) px view."""
+        h, w = size
+        return int(self.unet.config.out_channels), h // self.factor, w // self.factor
 
     def raw_latents(self, pictures: Tensor) -> Tensor:
         """(B, C, h, w) of (B, 3, H, W) in [0, 1], the mode, not scaled.

@@ -144,6 +144,19 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
     return network.to(device)
 
 
+def pipeline_of(folder: Path) -> str | None:
+    """The pipeline that a folder's model_index.json names; None where there is no such file.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    path = folder / "model_index.json"
+    if not path.is_file():
+        return None
+    with readable(folder):
+        return str(json.loads(read_text(path))["_class_name"])
+
+
 def config_of(folder: str | Path, name: str) -> dict[str, Any]:
     """The configuration of a network in a folder; empty where it is missing, which loading says.
 

@@ -9,8 +9,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from attnwarp.editing.layers import Call, Layer, Size, hooked
+from attnwarp.editing.layers import Call, Layer, Network, Steps, check_rows, hooked
 from attnwarp.editing.recording import Recording
+from attnwarp.editing.schedule import Size
 from attnwarp.warp.sampling import work_type
 
 
@@ -75,24 +76,22 @@ def blended(blend: Blend, warp: TokenWarp, source: Tensor, new: Tensor, a: float
 
 @contextmanager
 def inject(
-    unet: torch.nn.Module,
+    editor: Network,
     recording: Recording,
     *,
-    branches: Sequence[str],
     weight: Weight,
     blend: Blend,
     warps: Sequence[LayerWarp | None] = (None,),
 ) -> Iterator[None]:
-    """Blend recorded features into the UNet's attention while the block runs, at each layer's own
-    size. Steps whose features were not chosen stay as they are.
+    """Blend recorded features into an editor's attention while the block runs, at each layer's own
+    size. Steps whose features were not chosen stay as they are, and so do branches that were not
+    recorded.
 
     :func:`attnwarp.methods.attention_warping.inject` is this with the paper's weight and blend.
 
     Args:
-        unet: the UNet that the features came from, or one of its shape.
+        editor: the editor that the features came from, or one of its shape.
         recording: features of the source view.
-        branches: the guidance branches in the order of the batch; those that were recorded get
-            features. One whose share of the guidance is 0 may be missing.
         weight: a_t; where it is 0 features stay as they are.
         blend: blend of a layer's tokens; half precision comes to it as float32.
         warps: warps of the pictures of a batch, one each: :class:`attnwarp.warp.WarpedView` or None
@@ -104,51 +103,45 @@ def inject(
 
     An example is at :func:`attnwarp.methods.attention_warping.a_t`.
     """
-    plan, recorded = recording.plan, recording.plan.recorded
+    plan, recorded, views = recording.plan, recording.plan.recorded, len(warps)
     if len(recording.timesteps) < plan.steps:
         raise ValueError(
             f"steps: the recorded run had {len(recording.timesteps)} of {plan.steps} planned steps,"
             " so weights would not fall as they should; plan as many as it has"
         )
-    shared = [branch for branch in plan.keep if branch in branches]
-    if not shared:
+    if not set(plan.keep).intersection(editor.branches):
         raise ValueError(
-            f"branches: recorded are {', '.join(plan.keep)}, the batch has {', '.join(branches)}"
+            f"branches: recorded are {', '.join(plan.keep)}, the editor has"
+            f" {', '.join(editor.branches)}"
         )
-    step = -1
-    last: list[Call] = []
-    views = len(warps)
     if plan.views not in (1, views):
         raise ValueError(f"warps: got {views}, expected {plan.views}, one for each recorded view")
+    step, steps = -1, Steps()
 
-    def change(layer: Layer, features: Tensor, call: Call) -> Tensor:
+    def change(layer: Layer, features: Tensor, call: Call) -> Tensor | None:
         nonlocal step
-        rows = len(branches) * views
-        if call.batch != rows:
-            raise ValueError(
-                f"batch: got {call.batch} rows, expected {rows}: {views} views in"
-                f" {len(branches)} branches ({', '.join(branches)})"
-            )
-        if last != [call]:
+        check_rows(call, views)
+        if steps.begins(call):
             step = recording.step_of(call.timestep, step + 1)
-            last[:] = [call]
         if step not in recorded:
-            return features
+            return None
         a = weight(step, plan.steps)
         if not 0 <= a <= 1:
             raise ValueError(f"weight: got {a}, expected a number in [0, 1]")
         if a == 0:
-            return features
+            return None
         size, source_size = layer.size(call.latent_size), layer.size(plan.latent_size)
         result = features.clone()
-        for branch in shared:
+        for number, branch in enumerate(call.branches):
+            if branch not in plan.keep:
+                continue
             source = recording._features_of(step, layer, branch).to(features.device, features.dtype)
             for view, warp in enumerate(warps):
-                row = list(branches).index(branch) * views + view
+                row = number * views + view
                 own = source[view if plan.views > 1 else 0]
                 at = (warp or Identity()).at(size, source_size=source_size)
                 result[row] = blended(blend, at, own[None], features[row][None], a)[0]
         return result
 
-    with hooked(unet, plan.layers, change):
+    with hooked(editor, plan.layers, change):
         yield

@@ -107,7 +107,7 @@ def invert_view(
         *timesteps, begin = timesteps
         noise = shared_noise((1, *latents.shape[1:]), seed).to(latents)
         latents = editor.schedule.add_noise(latents, noise, begin)
-    with guided(editor, 1.0):
+    with guided(editor, text_guidance=1.0):
         task = editor.task([guide], prompt)
         return ddim_invert(editor.schedule, task.predict, latents, timesteps, begin)
 

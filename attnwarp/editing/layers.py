@@ -1,8 +1,8 @@
-"""Attention layers of a diffusers UNet, and hooks on their outputs.
+"""Attention layers of a network, and hooks on their image tokens.
 
 The feature map of a layer is the attention's output after its projection and before the residual,
-(B, H W, C), for self- and cross-attention alike. Forward hooks on the attention modules see exactly
-what their processors return, so every processor works, and none has to be replaced.
+(B, H W, C), for self-, cross- and joint attention alike. Forward hooks on the attention modules see
+exactly what their processors return, so every processor works, and none has to be replaced.
 """
 
 from __future__ import annotations
@@ -11,15 +11,19 @@ import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import torch
 from torch import Tensor
 
 from attnwarp import check
+from attnwarp.editing.schedule import Size
 
-Kind = Literal["self", "cross"]
-Size = tuple[int, int]
+Kind = Literal["self", "cross", "joint"]
+
+Rows = Literal["image", "image first", "after text"]
+"""Rows of a layer's sequence that are the image's: all of them, the first ones (those of reference
+pictures or of the text follow), or those after the text's."""
 
 PIX2PIX_BRANCHES = ("text", "image", "uncond")
 """Order of the guidance branches in the batch of diffusers' InstructPix2Pix pipeline."""
@@ -28,16 +32,44 @@ CONTROLNET_BRANCHES = ("uncond", "text")
 """Order of the guidance branches in the batch of diffusers' ControlNet and plain pipelines."""
 
 
+@dataclass(frozen=True, eq=False)
+class Call:
+    """One pass of a network.
+
+    Attributes:
+        timesteps: timesteps as the network got them.
+        latent_size: (h, w).
+        batch: rows.
+        branches: guidance branches in the order of the batch. An editor that runs them one after
+            another has one in each pass.
+        text: tokens of the text, which stand before the image's in some layers.
+    """
+
+    timesteps: Any
+    latent_size: Size
+    batch: int
+    branches: tuple[str, ...]
+    text: int = 0
+
+    @functools.cached_property
+    def timestep(self) -> float:
+        """Timestep of the pass. Reading it waits for a GPU, so only hooks that need it do."""
+        return float(torch.as_tensor(self.timesteps).reshape(-1)[0])
+
+
 @dataclass(frozen=True)
 class Layer:
-    """An attention layer of a UNet.
+    """An attention layer of a network.
 
     Attributes:
         name: name of the module, such as ``up_blocks.3.attentions.2.transformer_blocks.0.attn2``.
-        kind: "self" or "cross".
+        kind: "self", "cross" or "joint".
         level: how often the latents are halved before it; its size is that fraction of theirs.
-        channels: channels of its output.
+        channels: C of its features.
         block: number of its block, as the editor counts them.
+        at: whether the features are the module's "output", or its "input": those of parallel
+            blocks, whose output has more in it, come into their projection.
+        rows: which rows of the sequence are the image's.
 
     Example:
         >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 1, 64)
@@ -50,6 +82,8 @@ class Layer:
     level: int
     channels: int
     block: int = 0
+    at: Literal["output", "input"] = "output"
+    rows: Rows = "image"
 
     def size(self, latent_size: Size) -> Size:
         """(h, w) of the layer. Each stride of 2 rounds an odd side up.
@@ -62,6 +96,91 @@ class Layer:
         for _ in range(self.level):
             h, w = (h + 1) // 2, (w + 1) // 2
         return h, w
+
+    def image_tokens(self, value: Any, call: Call) -> Tensor:
+        """(B, h w, C) image tokens of the module's output or input: of a tuple its first tensor, of
+        that the image's rows and the first C channels.
+
+        Example:
+            >>> layer = Layer("attn", "joint", 0, 2, rows="after text")
+            >>> call = Call(999, (1, 2), 1, ("text",), text=1)
+            >>> sequence = torch.arange(12.0).reshape(1, 4, 3)  # text, image, image, another
+            >>> layer.image_tokens((sequence, None), call).tolist()
+            [[[3.0, 4.0], [6.0, 7.0]]]
+        """
+        tensor = value[0] if isinstance(value, tuple) else value
+        tokens: Tensor = tensor if self.rows == "image" else tensor[:, self._span(call)]
+        if self.at == "input":
+            tokens = tokens[..., : self.channels]
+        h, w = self.size(call.latent_size)
+        check.shape(tokens, (call.batch, h * w, self.channels), self.name)
+        return tokens
+
+    def put_back(self, value: Any, tokens: Tensor, call: Call) -> Any:
+        """The module's output or input with other image tokens; all others keep their bits."""
+        tensor = value[0] if isinstance(value, tuple) else value
+        if tensor.shape == tokens.shape:
+            changed = tokens
+        else:
+            changed = tensor.clone()
+            changed[:, self._span(call), : self.channels] = tokens
+        return (changed, *value[1:]) if isinstance(value, tuple) else changed
+
+    def _span(self, call: Call) -> slice:
+        h, w = self.size(call.latent_size)
+        first = call.text if self.rows == "after text" else 0
+        return slice(first, first + h * w)
+
+
+class Network(Protocol):
+    """A network whose attention is recorded and replaced: any editor, or :class:`BareUNet`."""
+
+    @property
+    def network(self) -> Any:
+        """The torch module that each pass calls."""
+        ...
+
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """Guidance branches of a step, in the order in which they run."""
+        ...
+
+    def layers(self) -> tuple[Layer, ...]:
+        """Layers whose features a method may carry."""
+        ...
+
+    def call(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:
+        """The pass that the network is called for, from its arguments."""
+        ...
+
+
+@dataclass(frozen=True)
+class BareUNet:
+    """A diffusers UNet in a pipeline or a loop of one's own.
+
+    Args:
+        network: the UNet.
+        branches: guidance branches in the order of its batch, such as :data:`PIX2PIX_BRANCHES`;
+            ("text",) without guidance.
+    """
+
+    network: Any
+    branches: tuple[str, ...] = ("text",)
+
+    def layers(self) -> tuple[Layer, ...]:
+        """Layers of the paper, :func:`paper_layers`."""
+        return paper_layers(self.network)
+
+    def call(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:
+        """The pass of a UNet, :func:`unet_call`."""
+        return unet_call(self.branches, args, kwargs)
+
+
+def unet_call(branches: tuple[str, ...], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:
+    """The pass of a diffusers UNet, from its arguments."""
+    sample = args[0] if args else kwargs["sample"]
+    timestep = args[1] if len(args) > 1 else kwargs["timestep"]
+    return Call(timestep, (sample.shape[-2], sample.shape[-1]), sample.shape[0], branches)
 
 
 def all_layers(unet: torch.nn.Module) -> tuple[Layer, ...]:
@@ -90,69 +209,60 @@ def all_layers(unet: torch.nn.Module) -> tuple[Layer, ...]:
     return tuple(layers)
 
 
+def paper_layers(unet: torch.nn.Module) -> tuple[Layer, ...]:
+    """Layers of a diffusers UNet that the paper carries: those of the up-sampling blocks at the
+    latents' size and at half of it.
+    """
+    layers = all_layers(unet)
+    return tuple(one for one in layers if one.name.startswith("up_blocks") and one.level <= 1)
+
+
 def choose_layers(
-    unet: torch.nn.Module,
+    layers: Sequence[Layer],
     *,
     kinds: Sequence[Kind] | None = None,
     blocks: Sequence[int] | None = None,
 ) -> tuple[Layer, ...]:
-    """Layers of the paper: those of the up-sampling blocks at the latents' size and at half of it.
+    """Some of an editor's layers.
 
     Args:
-        unet: a diffusers UNet.
+        layers: layers that the editor offers.
         kinds: kinds of attention to choose; None for all.
-        blocks: numbers of up-sampling blocks; None for all.
+        blocks: numbers of blocks; None for all.
 
     Raises:
         ValueError: an unknown kind, or a choice that no layer matches.
 
-    An example is at :func:`record`.
+    Example:
+        >>> from attnwarp.editing.small import load_editor
+        >>> layers = load_editor("small-plain").layers()
+        >>> {layer.kind for layer in choose_layers(layers, kinds=("self",))}
+        {'self'}
     """
     for kind in kinds or ():
         check.one_of(kind, get_args(Kind), "kinds")
-    up = [one for one in all_layers(unet) if one.name.startswith("up_blocks") and one.level <= 1]
     chosen = tuple(
         layer
-        for layer in up
+        for layer in layers
         if (kinds is None or layer.kind in kinds) and (blocks is None or layer.block in blocks)
     )
     if not chosen:
-        there = sorted({(one.block, one.kind) for one in up})
+        there = sorted({(layer.block, layer.kind) for layer in layers})
         listed = ", ".join(f"{kind} in block {block}" for block, kind in there) or "none"
         raise ValueError(f"kinds, blocks: got {kinds} in {blocks}; the editor offers {listed}")
     return chosen
 
 
-Hook = Callable[[Layer, Tensor, "Call"], Tensor | None]
-
-
-@dataclass(frozen=True, eq=False)
-class Call:
-    """One pass of the UNet.
-
-    Attributes:
-        timesteps: as the UNet got them.
-        latent_size: (h, w).
-        batch: rows.
-    """
-
-    timesteps: Any
-    latent_size: Size
-    batch: int
-
-    @functools.cached_property
-    def timestep(self) -> float:
-        """Timestep of the pass. Reading it waits for a GPU, so only hooks that need it do."""
-        return float(torch.as_tensor(self.timesteps).reshape(-1)[0])
+Hook = Callable[[Layer, Tensor, Call], Tensor | None]
 
 
 @contextmanager
-def hooked(unet: torch.nn.Module, layers: Sequence[Layer], hook: Hook) -> Iterator[None]:
-    """Call ``hook(layer, features, call)`` on every output of the layers while the block runs.
+def hooked(editor: Network, layers: Sequence[Layer], hook: Hook) -> Iterator[None]:
+    """Call ``hook(layer, features, call)`` on the image tokens of the layers while the block runs.
 
     Args:
-        unet: a diffusers UNet.
-        layers: layers of it, by :func:`all_layers` or :func:`choose_layers`.
+        editor: editor whose network is hooked.
+        layers: layers of that network.
         hook: its (batch, H W, C) result replaces the features; None leaves them. Gradients flow
             through.
 
@@ -160,52 +270,86 @@ def hooked(unet: torch.nn.Module, layers: Sequence[Layer], hook: Hook) -> Iterat
         RuntimeError: at the end, if something kept a layer's hook from being called; the message
             names the likely cause.
     """
-    now: list[Call] = []
+    network, now = editor.network, list[Call]()
     called: set[str] = set()
 
     def begin(_: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
-        sample = args[0] if args else kwargs["sample"]
-        timestep = args[1] if len(args) > 1 else kwargs["timestep"]
-        now[:] = [Call(timestep, (sample.shape[-2], sample.shape[-1]), sample.shape[0])]
+        now[:] = [editor.call(args, kwargs)]
 
-    def after(layer: Layer) -> Callable[..., Tensor | None]:
-        def call(_: Any, __: Any, output: Tensor) -> Tensor | None:
-            if not now:
-                raise RuntimeError(
-                    f"{layer.name}: was called outside a call of the UNet itself; call unet(...),"
-                    " not unet.forward(...)"
-                )
-            called.add(layer.name)
-            h, w = layer.size(now[0].latent_size)
-            check.shape(output, (now[0].batch, h * w, layer.channels), layer.name)
-            return hook(layer, output, now[0])
+    def see(layer: Layer, value: Any) -> Any:
+        if not now:
+            raise RuntimeError(
+                f"{layer.name}: was called outside a call of the network itself; call"
+                " network(...), not network.forward(...)"
+            )
+        called.add(layer.name)
+        changed = hook(layer, layer.image_tokens(value, now[0]), now[0])
+        return None if changed is None else layer.put_back(value, changed, now[0])
 
-        return call
+    def before(layer: Layer, _: Any, args: tuple[Any, ...]) -> Any:
+        changed = see(layer, args[0])
+        return None if changed is None else (changed, *args[1:])
+
+    def after(layer: Layer, _: Any, __: Any, output: Any) -> Any:
+        return see(layer, output)
 
     with ExitStack() as stack:
-        stack.callback(unet.register_forward_pre_hook(begin, with_kwargs=True).remove)
+        stack.callback(network.register_forward_pre_hook(begin, with_kwargs=True).remove)
         for layer in layers:
-            module = unet.get_submodule(layer.name)
-            stack.callback(module.register_forward_hook(after(layer)).remove)
+            module = network.get_submodule(layer.name)
+            handle = (
+                module.register_forward_hook(functools.partial(after, layer))
+                if layer.at == "output"
+                else module.register_forward_pre_hook(functools.partial(before, layer))
+            )
+            stack.callback(handle.remove)
         yield
     missing = [layer.name for layer in layers if layer.name not in called]
     if missing:
-        raise RuntimeError(_cause(unet, missing, passes=bool(now)))
+        raise RuntimeError(_cause(network, missing, passes=bool(now)))
 
 
-def _cause(unet: torch.nn.Module, missing: Sequence[str], *, passes: bool) -> str:
+class Steps:
+    """Counter of denoising steps by the passes of a network: a branch that runs again begins the
+    next step.
+    """
+
+    def __init__(self) -> None:
+        self._last: Call | None = None
+        self._ran: set[str] = set()
+
+    def begins(self, call: Call) -> bool:
+        """Return True at the first layer of a step's first pass."""
+        if call is self._last:
+            return False
+        self._last = call
+        first = not self._ran or not self._ran.isdisjoint(call.branches)
+        self._ran = set(call.branches) | (set() if first else self._ran)
+        return first
+
+
+def check_rows(call: Call, views: int) -> None:
+    """Raise ValueError unless a pass has a row for each view in each of its branches."""
+    if call.batch != len(call.branches) * views:
+        raise ValueError(
+            f"batch: got {call.batch} rows, expected {len(call.branches) * views}: {views} views in"
+            f" {len(call.branches)} branches ({', '.join(call.branches)})"
+        )
+
+
+def _cause(network: torch.nn.Module, missing: Sequence[str], *, passes: bool) -> str:
     """Reason why hooks of layers were not called."""
-    modules = [unet, *map(unet.get_submodule, missing)]
+    modules = [network, *map(network.get_submodule, missing)]
     compiled = any(
         hasattr(module, "_orig_mod") or getattr(module, "_compiled_call_impl", None) is not None
         for module in modules
     )
     listed = f"{missing[0]}{f' and {len(missing) - 1} more' if len(missing) > 1 else ''}"
     if compiled:
-        return f"{listed}: not called, as the UNet is compiled; use it before torch.compile"
+        return f"{listed}: not called, as the network is compiled; use it before torch.compile"
     if not passes:
         return (
-            f"{listed}: not called, as no pass went through this UNet; hand over the module that"
+            f"{listed}: not called, as no pass went through this network; hand over the module that"
             " the pipeline calls, not a copy or what a wrapper such as torch.compile was made of"
         )
     return (

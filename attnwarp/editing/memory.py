@@ -7,19 +7,21 @@ from typing import Any
 import torch
 
 from attnwarp.devices import device_of
+from attnwarp.editing.editor import Editor
 from attnwarp.errors import optional_imports
 
-NETWORKS: dict[str, dict[str, Any]] = {
-    "unet": {"offload_type": "block_level", "num_blocks_per_group": 1},
-    "controlnet": {"offload_type": "block_level", "num_blocks_per_group": 1},
-    # Their parts are called from outside the network's own forward.
-    "vae": {"offload_type": "leaf_level"},
-    "text_encoder": {"offload_type": "leaf_level"},
-}
-"""Networks of an editor, and what of each is moved together."""
+BLOCKS = {"offload_type": "block_level", "num_blocks_per_group": 1}
+
+LEAVES = {"offload_type": "leaf_level"}
+"""Offloading of networks whose parts are called from outside their own forward."""
 
 
-def weight_bytes(editor: Any) -> int:
+def networks_of(editor: Editor) -> dict[str, Any]:
+    """Networks of an editor by name."""
+    return {k: part for k, part in editor.parts.items() if isinstance(part, torch.nn.Module)}
+
+
+def weight_bytes(editor: Editor) -> int:
     """Bytes of an editor's weights as loaded; what layers compute comes on top.
 
     Example:
@@ -29,13 +31,12 @@ def weight_bytes(editor: Any) -> int:
     """
     return sum(
         tensor.numel() * tensor.itemsize
-        for name in NETWORKS
-        if (network := getattr(editor, name, None)) is not None
+        for network in networks_of(editor).values()
         for tensor in network.state_dict().values()
     )
 
 
-def save_memory(editor: Any, device: str) -> None:
+def save_memory(editor: Editor, device: str) -> None:
     """Keep an editor's weights in main memory, and compute on a device all the same.
 
     Each block of a network is moved to the device while it computes (diffusers' group offloading),
@@ -52,17 +53,18 @@ def save_memory(editor: Any, device: str) -> None:
 
     Example:
         >>> from attnwarp.editing.small import load_editor
-        >>> load_editor("small-plain", low_memory=True).unet.device  # on a GPU: cuda
+        >>> load_editor("small-plain", low_memory=True).network.device  # on a GPU: cuda
         device(type='cpu')
     """
     with optional_imports():
         import accelerate  # noqa: F401
     from diffusers.hooks import apply_group_offloading
 
-    if hasattr(editor.vae, "enable_tiling"):
-        editor.vae.enable_tiling()
-    for name, how in NETWORKS.items():
-        if (network := getattr(editor, name, None)) is not None:
-            apply_group_offloading(
-                network, onload_device=device_of(device), offload_device=torch.device("cpu"), **how
-            )
+    for name, network in networks_of(editor).items():
+        coder = name.startswith(("vae", "text_encoder"))
+        if hasattr(network, "enable_tiling"):
+            network.enable_tiling()
+        apply_group_offloading(
+            network, onload_device=device_of(device), offload_device=torch.device("cpu"),
+            **(LEAVES if coder else BLOCKS),
+        )  # fmt: skip

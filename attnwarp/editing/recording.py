@@ -9,13 +9,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from attnwarp import check
-from attnwarp.editing.layers import Call, Layer, Size, hooked
+from attnwarp.editing.layers import Call, Layer, Network, Steps, check_rows, hooked
+from attnwarp.editing.schedule import Size
 
 
 @dataclass(frozen=True)
@@ -23,11 +24,9 @@ class RecordingPlan:
     """Plan of a recording: features to keep, and the memory they take, before anything runs.
 
     Args:
-        layers: to record, see :func:`choose_layers`.
+        layers: layers to record, :func:`choose_layers`.
         latent_size: (h, w) of the latents.
-        branches: the guidance branches in the order of the batch, such as
-            :data:`PIX2PIX_BRANCHES`; ("text",) without guidance.
-        keep: those of them to record.
+        keep: guidance branches to record, such as ("text", "image"); ("text",) without guidance.
         steps: number of steps of denoising.
         views: pictures in a batch.
         dtype: dtype of what is stored. Half precision halves the memory and rounds.
@@ -41,7 +40,7 @@ class RecordingPlan:
 
     Example:
         >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
-        >>> plan = RecordingPlan((layer,), (32, 32), ("uncond", "text"), ("text",), steps=20)
+        >>> plan = RecordingPlan((layer,), (32, 32), ("text",), steps=20)
         >>> plan.bytes == 20 * 32 * 32 * 64 * 4
         True
         >>> print(plan)
@@ -53,7 +52,6 @@ class RecordingPlan:
 
     layers: tuple[Layer, ...]
     latent_size: Size
-    branches: tuple[str, ...]
     keep: tuple[str, ...]
     steps: int
     views: int = 1
@@ -64,8 +62,6 @@ class RecordingPlan:
     def __post_init__(self) -> None:
         if not self.layers:
             raise ValueError("layers: got none, expected at least one")
-        for branch in self.keep:
-            check.one_of(branch, self.branches, "keep")
         if not self.keep:
             raise ValueError("keep: got no branch, expected at least one")
         if not isinstance(self.store, Path) and self.store not in ("device", "cpu"):
@@ -89,7 +85,7 @@ class RecordingPlan:
 
         Example:
             >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
-            >>> sorted(RecordingPlan((layer,), (8, 8), ("text",), ("text",), steps=3).recorded)
+            >>> sorted(RecordingPlan((layer,), (8, 8), ("text",), steps=3).recorded)
             [0, 1, 2]
         """
         return frozenset(range(self.steps) if self.chosen is None else self.chosen)
@@ -115,7 +111,7 @@ def in_words(plans: Sequence[RecordingPlan]) -> str:
 
     Example:
         >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
-        >>> plan = RecordingPlan((layer,), (32, 32), ("uncond", "text"), ("text",), steps=20)
+        >>> plan = RecordingPlan((layer,), (32, 32), ("text",), steps=20)
         >>> print(in_words([plan, plan]))
         recording 2 sources, 1 layer, 1 branch (text), 20 steps in float32: 10.0 MiB on the device
     """
@@ -153,7 +149,7 @@ class Recording:
 
     plan: RecordingPlan
     timesteps: list[float] = field(default_factory=list)
-    _features: dict[tuple[int, str], Tensor | Path] = field(default_factory=dict)
+    _features: dict[tuple[int, str, str], Tensor | Path] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Recording({len(self.timesteps)} steps so far of: {self.plan})"
@@ -194,22 +190,12 @@ class Recording:
         if layer not in self.plan.layers:
             raise ValueError(f"layer: {layer.name} was not recorded")
         check.one_of(branch, self.plan.keep, "branch")
-        value = self._features[(number, layer.name)]
+        value = self._features[number, layer.name, branch]
         if isinstance(value, Path):
-            from safetensors import safe_open
+            from safetensors.torch import load_file
 
-            with safe_open(value, "pt") as stored:
-                # The other branches stay on disk.
-                return self._of_branch(stored.get_slice("features"), branch)
-        return self._of_branch(value, branch)
-
-    def _of_branch(self, value: Any, branch: str) -> Tensor:
-        """The rows of a branch, of a tensor or a slice of a file."""
-        rows = value.shape[0] if isinstance(value, Tensor) else value.get_shape()[0]
-        views = rows // len(self.plan.keep)
-        row = self.plan.keep.index(branch) * views
-        part: Tensor = value[row : row + views]
-        return part
+            return load_file(value)["features"]
+        return value
 
     def step_of(self, timestep: float, begin: int = 0) -> int:
         """The number of a timestep among those of the recorded run, from 0.
@@ -243,10 +229,10 @@ class Recording:
             " range of float32, or in float32"
         )
 
-    def _put(self, number: int, layer: Layer, features: Tensor) -> None:
-        """Store (branches x views, H W, C) features of the kept branches."""
+    def _put(self, number: int, layer: Layer, branch: str, features: Tensor) -> None:
+        """Store (views, H W, C) features of a branch."""
         plan = self.plan
-        key = (number, layer.name)
+        key = (number, layer.name, branch)
         # A copy of its own: a slice would keep the whole batch's memory alive.
         stored = torch.empty_like(features, dtype=plan.dtype, memory_format=torch.contiguous_format)
         stored.copy_(features.detach())
@@ -258,72 +244,61 @@ class Recording:
         else:
             from safetensors.torch import save_file
 
-            path = self._folder / f"{number}-{layer.name}.safetensors"
+            path = self._folder / f"{number}-{layer.name}-{branch}.safetensors"
             save_file({"features": stored.cpu()}, path)
             self._features[key] = path
 
 
 @contextmanager
-def record(unet: torch.nn.Module, plan: RecordingPlan) -> Iterator[Recording]:
-    """Record the outputs of the UNet's attention layers while the block runs.
-
-    An output is taken after its projection and before the residual. No bit of it changes.
+def record(editor: Network, plan: RecordingPlan) -> Iterator[Recording]:
+    """Record the image tokens of attention layers while the block runs. No bit of them changes.
 
     Args:
-        unet: a diffusers UNet; any pipeline or loop may call it.
+        editor: editor whose network is recorded; any loop may call it.
+            :class:`~attnwarp.editing.layers.BareUNet` records the UNet of another pipeline.
         plan: features to record; ``print(plan)`` tells the memory that it takes.
 
     Raises:
-        ValueError: latents of another size, a batch of another number of rows, or more steps, than
-            planned.
+        ValueError: a branch that the editor lacks; latents of another size, a batch of another
+            number of rows, or more steps, than planned.
 
     Example:
         >>> import numpy as np
         >>> from attnwarp.editing.editor import edit
+        >>> from attnwarp.editing.layers import choose_layers
         >>> from attnwarp.editing.small import load_editor
         >>> editor = load_editor("small-plain")
-        >>> from attnwarp.editing.layers import choose_layers
-        >>> layers = choose_layers(editor.unet, fractions=(1,), kinds=("self",))
-        >>> plan = RecordingPlan(layers, (8, 8), editor.branches, ("text",), steps=1)
-        >>> with record(editor.unet, plan) as recording:
+        >>> layers = choose_layers(editor.layers(), kinds=("self",))
+        >>> plan = RecordingPlan(layers, (8, 8), ("text",), steps=1)
+        >>> with record(editor, plan) as recording:
         ...     source = edit(editor, [np.zeros((32, 32, 3), np.float32)], "make it red", steps=1)
-        >>> recording.features(recording.timesteps[0], layers[0], "text").shape[:2]  # (views, H W)
+        >>> recording.features(recording.timesteps[0], layers[-1], "text").shape[:2]  # (views, H W)
         torch.Size([1, 64])
     """
-    recording = Recording(plan)
-    rows, chosen = len(plan.branches) * plan.views, plan.recorded
-
-    last: list[Call] = []
+    for branch in plan.keep:
+        check.one_of(branch, editor.branches, "keep")
+    recording, chosen, steps = Recording(plan), plan.recorded, Steps()
 
     def keep(layer: Layer, features: Tensor, call: Call) -> None:
-        _check_call(plan, call, rows)
-        if last != [call]:
+        if call.latent_size != plan.latent_size:
+            raise ValueError(
+                f"latent_size: got latents of {call.latent_size}, planned {plan.latent_size}"
+            )
+        check_rows(call, plan.views)
+        if steps.begins(call):
             if len(recording.timesteps) == plan.steps:
                 raise ValueError(
                     f"steps: timestep {call.timestep:g} is one more than the {plan.steps} planned;"
-                    " plan a step for each pass through the UNet, len(scheduler.timesteps) of them"
-                    " (some schedulers make more than they are asked for), and record one run"
+                    " plan a step for each timestep of the network, len(scheduler.timesteps) of"
+                    " them (some schedulers make more than they are asked for), and record one run"
                 )
             recording.timesteps.append(call.timestep)
-            last[:] = [call]
         number = len(recording.timesteps) - 1
         if number not in chosen:
             return
-        parts = features.chunk(len(plan.branches))
-        selected = torch.cat([parts[plan.branches.index(branch)] for branch in plan.keep])
-        recording._put(number, layer, selected)
+        for branch, part in zip(call.branches, features.chunk(len(call.branches)), strict=True):
+            if branch in plan.keep:
+                recording._put(number, layer, branch, part)
 
-    with hooked(unet, plan.layers, keep):
+    with hooked(editor, plan.layers, keep):
         yield recording
-
-
-def _check_call(plan: RecordingPlan, call: Call, rows: int) -> None:
-    if call.latent_size != plan.latent_size:
-        raise ValueError(
-            f"latent_size: got latents of {call.latent_size}, planned {plan.latent_size}"
-        )
-    if call.batch != rows:
-        raise ValueError(
-            f"batch: got {call.batch} rows, planned {rows}: {plan.views} views in"
-            f" {len(plan.branches)} branches ({', '.join(plan.branches)})"
-        )

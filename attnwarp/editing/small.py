@@ -16,9 +16,7 @@ from attnwarp.errors import InputError, InputWarning, suggest
 from attnwarp.process import core_count
 
 if TYPE_CHECKING:
-    from attnwarp.editing.controlnet import DepthControlNet
-    from attnwarp.editing.editor import Guide
-    from attnwarp.editing.pix2pix import InstructPix2Pix
+    from attnwarp.editing.editor import Editor, Guide
 
 WEIGHTS = Path(__file__).parent / "weights"
 
@@ -86,7 +84,7 @@ def thread_count(editor: Any, asked: int | None = None) -> int:
     """
     if asked is not None:
         return asked
-    small = sum(p.numel() for p in editor.unet.parameters()) < ONE_THREAD_PARAMETERS
+    small = sum(p.numel() for p in editor.network.parameters()) < ONE_THREAD_PARAMETERS
     return 1 if small else core_count()
 
 
@@ -161,7 +159,7 @@ def _words(text: str) -> list[str]:
 
 
 def guide_of(name_or_folder: str) -> Guide:
-    """Tell the guide of an editor without loading it: a ControlNet means depth maps.
+    """Tell the guide of an editor without loading it.
 
     Args:
         name_or_folder: name or folder of the editor, as :func:`load_editor` takes it.
@@ -173,7 +171,31 @@ def guide_of(name_or_folder: str) -> Guide:
         >>> guide_of("small-depth"), guide_of("small-plain")
         ('depth', 'picture')
     """
-    return "picture" if folders_of(name_or_folder)[1] is None else "depth"
+    folder, control = folders_of(name_or_folder)
+    if control is not None:
+        return "depth"
+    guide: Guide = "picture" if name_or_folder in bundled() else kind_of(folder).guide
+    return guide
+
+
+def kind_of(folder: Path) -> Any:
+    """The class of the editor in a folder, by the pipeline that its model_index.json names;
+    InstructPix2Pix where it names none.
+
+    Raises:
+        InputError: a pipeline that no editor reads.
+    """
+    from attnwarp.editing.editors import kinds
+    from attnwarp.editing.folder import pipeline_of
+
+    known, named = kinds(), pipeline_of(folder)
+    # A UNet's folder may be of any pipeline of Stable Diffusion.
+    if named not in known and named is not None and not (folder / "unet").is_dir():
+        raise InputError(
+            f"{folder}: is of the pipeline {named!r}, which no editor reads; expected one of"
+            f" {', '.join(sorted(known))}"
+        )
+    return known.get(named or "", known["StableDiffusionInstructPix2PixPipeline"])
 
 
 def folders_of(name_or_folder: str) -> tuple[Path, Path | None]:
@@ -216,19 +238,19 @@ def _pair(folders: str) -> tuple[Path, Path]:
     return places[0], places[1]
 
 
-def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | DepthControlNet:
+def load_editor(name_or_folder: str, **settings: Any) -> Editor:
     """An editor by its name, such as "small-plain", or from folders in diffusers' format.
 
     A folder with a folder ``controlnet`` in it gives a
-    :class:`~attnwarp.editing.controlnet.DepthControlNet`; so do two folders.
+    :class:`~attnwarp.editing.editors.controlnet.DepthControlNet`; so do two folders.
 
     Args:
         name_or_folder: a bundled editor's name, a path, or "BASE,CONTROLNET", the paths of a
             Stable Diffusion and of its ControlNet.
-        settings: as in :meth:`attnwarp.editing.pix2pix.InstructPix2Pix.from_folder` or in
-            :meth:`attnwarp.editing.controlnet.DepthControlNet.from_folder`. ``draws=False`` takes
-            from a bundled editor what lets the noise's mean choose an answer; ``low_memory=True``
-            is :func:`attnwarp.editing.memory.save_memory`.
+        settings: ``device``, ``dtype`` and the options of the editor's class, such as
+            ``text_guidance``. ``draws=False`` takes from a bundled editor what lets the noise's
+            mean choose an answer; ``low_memory=True`` is
+            :func:`attnwarp.editing.memory.save_memory`.
 
     Raises:
         InputError: no such editor or folder, or files that are missing, by name.
@@ -242,9 +264,8 @@ def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | Depth
 
     require_diffusers()
 
-    from attnwarp.editing.controlnet import DepthControlNet
+    from attnwarp.editing.editors.controlnet import DepthControlNet
     from attnwarp.editing.memory import save_memory
-    from attnwarp.editing.pix2pix import InstructPix2Pix
 
     folder, control = folders_of(name_or_folder)
     if name_or_folder in bundled():
@@ -252,22 +273,22 @@ def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | Depth
         guidance = (
             {"text_guidance": TEXT_GUIDANCE, "image_guidance": IMAGE_GUIDANCE}
             if control is None
-            else {"guidance": DEPTH_GUIDANCE}
+            else {"text_guidance": DEPTH_GUIDANCE}
         )
         settings = {**guidance, **settings}
     draws, low_memory = settings.pop("draws", True), settings.pop("low_memory", False)
     device = settings.get("device", "cpu")
     if low_memory:
         settings["device"] = "cpu"
-    editor: InstructPix2Pix | DepthControlNet
+    editor: Editor
     if control is not None:
         editor = DepthControlNet.from_folder(folder, control, **settings)
     else:
-        editor = InstructPix2Pix.from_folder(folder, **settings)
+        editor = kind_of(folder).from_folder(folder, **settings)
     if not draws:
-        if not hasattr(editor.unet, "draw"):
+        if not getattr(editor, "draws", False):
             raise InputError(f"draws: the editor {name_or_folder!r} has no draw; leave it out")
-        editor.unet.draw = None
+        editor.network.draw = None
     if low_memory:
         save_memory(editor, device)
     return editor

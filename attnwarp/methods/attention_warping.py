@@ -99,15 +99,13 @@ def a_t(t: int, T: int, s: AttentionWarpingSettings = CORRECTED) -> float:
         [0.9, 0.675, 0.45, 0.225]
         >>> import numpy as np
         >>> from attnwarp.editing.editor import edit
-        >>> from attnwarp.editing.layers import choose_layers
         >>> from attnwarp.editing.recording import RecordingPlan, record
         >>> from attnwarp.editing.small import load_editor
         >>> editor, picture = load_editor("small-plain"), np.full((32, 32, 3), 0.5, np.float32)
-        >>> layers, branches = choose_layers(editor.unet), editor.branches
-        >>> plan = RecordingPlan(layers, (8, 8), branches, branches, steps=1)
-        >>> with record(editor.unet, plan) as recording:
+        >>> plan = RecordingPlan(editor.layers(), (8, 8), editor.branches, steps=1)
+        >>> with record(editor, plan) as recording:
         ...     source = edit(editor, [picture], "make it red", steps=1)
-        >>> with inject(editor.unet, recording, branches=branches, weight=lambda t, T: 1.0):
+        >>> with inject(editor, recording, weight=lambda t, T: 1.0):
         ...     again = edit(editor, [picture], "make it red", steps=1)
         >>> bool((again.images[0] == source.images[0]).all())  # its own features change no bit
         True
@@ -215,7 +213,7 @@ class AttentionWarping(Method):
             if views.features.layers:
                 # After the injection: what the next source gets is what this one went on with.
                 plan = views.features.plan(view, views.latent_size(view), further=number > 0)
-                recording = stack.enter_context(record(work.editor.unet, plan))
+                recording = stack.enter_context(record(work.editor, plan))
             pictures, estimates = views.denoise(start, sights, step)
         views.keep(number, RecordedSource(pictures[0], recording, estimates, sights[0]))
         return [views.result(view, pictures[0], sights[0], number)]
@@ -241,19 +239,13 @@ class AttentionWarping(Method):
         self, stack: ExitStack, recorded: Sequence[RecordedSource], sights: Sequence[Sight | None]
     ) -> None:
         """Blend recorded features into the editor's; no pixel takes those of two sources."""
-        editor, weight = self.work.editor, partial(a_t, s=self.settings)
+        weight = partial(a_t, s=self.settings)
         for number, source in enumerate(recorded):
             if source.recording is None:
                 continue
             warps = [None if sight is None else sight.warp(number) for sight in sights]
             stack.enter_context(
-                inject(
-                    editor.unet,
-                    source.recording,
-                    branches=editor.branches,
-                    warps=warps,
-                    weight=weight,
-                )
+                inject(self.work.editor, source.recording, warps=warps, weight=weight)
             )
 
     def clear(self) -> None:

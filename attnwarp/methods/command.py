@@ -14,7 +14,6 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.devices import choose, device_of, peak_memory, type_of
-from attnwarp.editing.editor import own_size
 from attnwarp.editing.memory import weight_bytes
 from attnwarp.editing.segment import check_marks, segmenter_folders
 from attnwarp.editing.small import bundled, load_editor, thread_count
@@ -150,7 +149,7 @@ def edit_dataset(
     editor = _editor(editor_name, device, options, report)
     editor.check_text(instruction)
     if settings.size is None:
-        settings = settings.changed(size=own_size(editor))
+        settings = settings.changed(size=editor.own_size)
     views = load_views(dataset, max_size=options.max_size)
     images = images_of(views)
     warping = isinstance(settings, AttentionWarpingSettings)
@@ -219,7 +218,7 @@ def _editor(name: str, device: str, options: EditOptions, report: Reporter) -> A
         name, device=device, dtype=type_of(options.dtype, device), low_memory=options.low_memory
     )
     if device != "cpu":
-        kind = str(editor.unet.dtype).removeprefix("torch.")
+        kind = str(editor.network.dtype).removeprefix("torch.")
         place = "main memory" if options.low_memory else "the GPU"
         report.log(
             f"weights of the editor, {kind}: {weight_bytes(editor) / 2**30:.2f} GiB of {place}"

@@ -15,6 +15,7 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor
+from attnwarp.editing.editors.pix2pix import InstructPix2Pix
 from attnwarp.editing.schedule import following, published_steps
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
@@ -76,7 +77,7 @@ class DGE(Method):
     """Views of a round are edited together, through key views."""
 
     def __init__(self, work: Work, settings: DGESettings) -> None:
-        work.takes("dge", "picture")
+        work.takes("dge", "picture", InstructPix2Pix)
         work.one_size("dge")
         self.work, self.settings = work, settings
         rounds = range(len(parts_of(settings.iterations, settings.every)))

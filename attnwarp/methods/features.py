@@ -13,9 +13,6 @@ from attnwarp.editing.recording import RecordingPlan
 from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.methods.sight import Size
 
-BRANCHES = ("text", "image")
-"""Branches of InstructPix2Pix that get features in the released code: not the unconditional one."""
-
 
 class Features:
     """The choice of what is recorded.
@@ -38,7 +35,9 @@ class Features:
         self.editor, self.settings, self.store = editor, settings, store
         self.layers: tuple[Layer, ...] = ()
         if settings.a0 > 0:
-            self.layers = choose_layers(editor.unet, kinds=settings.kinds, blocks=settings.blocks)
+            self.layers = choose_layers(
+                editor.layers(), kinds=settings.kinds, blocks=settings.blocks
+            )
             self._check_branches()
 
     def source_guidance(self, *, further: bool) -> float | None:
@@ -60,7 +59,6 @@ class Features:
         return RecordingPlan(
             self.layers,
             size,
-            branches,
             self._kept(branches),
             s.steps,
             dtype=self._stored(),
@@ -70,21 +68,19 @@ class Features:
 
     def _stored(self) -> torch.dtype:
         """Precision of what is recorded: no wider than the editor's own, which loses nothing."""
-        own, chosen = self.editor.unet.dtype, getattr(torch, self.settings.feature_type)
+        own, chosen = self.editor.network.dtype, getattr(torch, self.settings.feature_type)
         return own if own.itemsize < chosen.itemsize else chosen
 
     def branches(self, guidance: float | None) -> tuple[str, ...]:
         """Guidance branches of a batch with a text guidance."""
-        with guided(self.editor, guidance):
+        with guided(self.editor, text_guidance=guidance):
             return self.editor.branches
 
     def _kept(self, branches: tuple[str, ...]) -> tuple[str, ...]:
         """Branches to record, of a source that has these."""
         if self.settings.branches is not None:
             return self.settings.branches
-        if self.editor.guide == "picture":
-            return tuple(branch for branch in BRANCHES if branch in branches)
-        return branches
+        return tuple(branch for branch in self.editor.carries if branch in branches)
 
     def _check_branches(self) -> None:
         guidance = self.source_guidance(further=False)

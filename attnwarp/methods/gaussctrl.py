@@ -16,6 +16,7 @@ from torch import Tensor
 
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor, edit
+from attnwarp.editing.editors.controlnet import DepthControlNet
 from attnwarp.editing.inversion import inversion_rows, invert_view
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.attention import aligned, self_attention
@@ -41,9 +42,9 @@ def gaussctrl(
     Args:
         gaussians, cameras, images, options: see :func:`by_view`. ``images`` serve the segments and
             the detail that an edit at a smaller size lacks; guides are of the splats.
-        editor: a :class:`~attnwarp.editing.controlnet.DepthControlNet`. Where its network predicts
-            the picture, which says nothing of a clean picture's noise, inversion begins at the
-            lowest timestep, to which all views are noised alike.
+        editor: a :class:`~attnwarp.editing.editors.controlnet.DepthControlNet`. Where its network
+            predicts the picture, which says nothing of a clean picture's noise, inversion begins at
+            the lowest timestep, to which all views are noised alike.
         instruction: a prompt.
         settings: :class:`GaussCtrlSettings`, its defaults if left out.
 
@@ -75,7 +76,7 @@ class GaussCtrl(Method):
     """Views are edited with attention to reference views."""
 
     def __init__(self, work: Work, settings: GaussCtrlSettings) -> None:
-        work.takes("gaussctrl", "depth")
+        work.takes("gaussctrl", "depth", DepthControlNet)
         work.one_size("gaussctrl")
         self.work, self.settings = work, settings
         generator = work.generator(VIEWS)
@@ -134,7 +135,7 @@ class GaussCtrl(Method):
         """(1, C, h, w) that the edit of a view starts from, computed once a sitting."""
         work, s = self.work, self.settings
         if s.latents == "random":
-            return work.noise(0, [view]).to(work.editor.unet.device, work.editor.unet.dtype)
+            return work.noise(0, [view])
         if view not in self._latents:
             prompt = work.prompt if s.source_prompt is None else s.source_prompt
             self._latents[view] = invert_view(

@@ -15,6 +15,7 @@ import torch
 from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.digest import digest, digest_each
+from attnwarp.editing.editor import Editor
 from attnwarp.editing.schedule import Schedule
 from attnwarp.fit import FitSettings, Views, extent_of
 from attnwarp.gaussians import Gaussians
@@ -175,17 +176,18 @@ def render_picture(gaussians: Gaussians, camera: Camera, near: float, backend: s
     return np.asarray(color.clamp(0, 1).float().cpu().numpy())
 
 
-def editor_digest(editor: Any) -> str:
-    """SHA-256 of an editor's networks, schedule, guidance, and what it makes tokens of."""
-    settings = ("text_guidance", "image_guidance", "guidance", "control_scale", "negative_prompt")
+def editor_digest(editor: Editor) -> str:
+    """SHA-256 of an editor's networks, layers, schedule, options, and what it makes tokens of."""
     # One list: numbers one after another could be read as others, 1.5 and 12 as 1.51 and 2.
-    values = [type(editor).__name__, *(getattr(editor, name, None) for name in settings)]
-    values += [*_identity(editor.schedule), _tokens(editor)]
+    values = [type(editor).__name__, {name: getattr(editor, name) for name in editor.options}]
+    values += [*map(repr, editor.layers()), *_identity(editor.schedule)]
     parts: list[Any] = [values]
-    for name in ("unet", "vae", "text_encoder", "controlnet"):
-        network = getattr(editor, name, None)
-        parts.append(_configuration(network))
-        for key, value in sorted(network.state_dict().items()) if network is not None else ():
+    for name, part in sorted(editor.parts.items()):
+        if not isinstance(part, torch.nn.Module):
+            parts += [name, _tokens(part)]
+            continue
+        parts += [name, _configuration(part)]
+        for key, value in sorted(part.state_dict().items()):
             parts += [key, value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy()]
     return digest(*parts)
 
@@ -207,12 +209,9 @@ def _configuration(network: Any) -> list[tuple[str, str]]:
     return sorted((k, repr(v)) for k, v in said.items() if k not in about and k[0] != "_")
 
 
-def _tokens(editor: Any) -> Any:
+def _tokens(tokenizer: Any) -> Any:
     """Identity of a tokenizer: vocabulary, merges, rules, padding, and length."""
-    tokenizer = getattr(editor, "tokenizer", None)
-    if tokenizer is None:
-        return None
-    padding = [tokenizer.pad_token_id, getattr(editor, "text_limit", None)]
+    padding = [tokenizer.pad_token_id, tokenizer.model_max_length]
     backend = getattr(tokenizer, "backend_tokenizer", None)
     if backend is None:
         return [padding, sorted(tokenizer.get_vocab().items())]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.digest import digest
-from attnwarp.editing.editor import edit, side_multiple
+from attnwarp.editing.editor import Editor, edit
 from attnwarp.editing.inversion import NoiseMaps, inversion_rows, invert_view, noise_maps, replay
 from attnwarp.editing.recording import Recording, in_words
 from attnwarp.editing.schedule import Time
@@ -79,7 +79,7 @@ class Start:
     replayed: tuple[Image, Any, NoiseMaps] | None = None
 
 
-def check_editor(editor: Any, settings: AttentionWarpingSettings) -> int | None:
+def check_editor(editor: Editor, settings: AttentionWarpingSettings) -> int | None:
     """Draw Stable Diffusion's timestep that all edits start from; None for pure noise.
 
     Raises:
@@ -88,7 +88,7 @@ def check_editor(editor: Any, settings: AttentionWarpingSettings) -> int | None:
     """
     s = settings
     if s.latents != "random":
-        if s.source_prompt and hasattr(editor, "check_text"):
+        if s.source_prompt:
             editor.check_text(s.source_prompt)
         if editor.guide != "depth":
             raise ValueError(
@@ -190,7 +190,7 @@ class ViewEdits:
         if asked.size is not None and longest != asked.size:
             lines.append(
                 f"size: {longest} px in place of {asked.size}, as this editor's sides are multiples"
-                f" of {side_multiple(self.work.editor)}"
+                f" of {self.work.editor.side_multiple}"
             )
         if len(self.sources) < asked.sources:
             lines.append(
@@ -260,9 +260,8 @@ class ViewEdits:
         before = work.frozen if s.depth_from == "frozen" else model
         guides = [work.guide(view, before, s.warp) for view in views]
         if by_hand and self.by_hand is not None:
-            editor: Any = work.editor
-            task = editor.task(guides, work.prompt)
-            maps = noise_maps(editor, task, self.by_hand, self._timesteps(), s.seed)
+            task = work.editor.task(guides, work.prompt)
+            maps = noise_maps(work.editor, task, self.by_hand, self._timesteps(), s.seed)
             return Start(views, guides, replayed=(self.by_hand, task, maps))
         if not s.inverts(stage) and self.timestep is None:
             return Start(views, guides)
@@ -298,7 +297,7 @@ class ViewEdits:
             replay(work.editor.schedule, task.predict, maps, on_step=lambda *_: step())
             return [picture], [work.editor.encode([picture])[0]] * s.steps
         kept: list[Tensor] = []
-        shape = (work.editor.unet.config.out_channels, *self.latent_size(start.views[0]))
+        shape = work.editor.noise_shape(work.sizes[start.views[0]])
         sources = 0 if sights[0] is None else len(sights[0].views)
         result = edit(
             work.editor,
@@ -325,8 +324,7 @@ class ViewEdits:
 
     def latent_size(self, view: int) -> Size:
         """(h, w) of a view's latents."""
-        h, w = self.work.sizes[view]
-        return h // self.work.editor.factor, w // self.work.editor.factor
+        return self.work.editor.noise_shape(self.work.sizes[view])[1:]
 
     def rows_of_source(self, number: int) -> int:
         """Rows through the UNet for the edit of a source; one made by hand is inverted first."""

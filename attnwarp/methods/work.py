@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from attnwarp.editing.editor import Editor, guided, shared_noise, side_multiple
+from attnwarp.editing.editor import Editor, guided, shared_noise
 from attnwarp.editing.schedule import Grid
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.noise import FRESH, own_seed
@@ -62,7 +62,7 @@ class Work:
         self.frozen, self.scene, self.editor = gaussians.detach(), scene, editor
         self.folder, self.report = folder, report
         self.instruction, self.settings, self.backend = instruction, settings, backend
-        multiple = side_multiple(editor)
+        multiple = editor.side_multiple
         self.sizes: list[Size] = [
             edit_size(camera.height, camera.width, settings.size, multiple)
             for camera in scene.cameras
@@ -126,13 +126,17 @@ class Work:
                 " pictures to one shape"
             )
 
-    def takes(self, method: str, guide: str) -> None:
-        """Raise ValueError unless the editor is of the kind that a method is made for."""
+    def takes(self, method: str, guide: str, kind: type[Any] | None = None) -> None:
+        """Raise ValueError unless the editor has the guide, or is of the class, that a method is
+        made for.
+        """
         kinds = {"picture": "InstructPix2Pix, which takes pictures", "depth": "a depth ControlNet"}
-        if self.editor.guide != guide:
+        editor = self.editor
+        if editor.guide != guide or not (kind is None or isinstance(editor, kind)):
+            got = type(editor).__name__ if editor.guide == guide else kinds[editor.guide]
             raise ValueError(
-                f"editor: {method} is made for {kinds[guide]}, got {kinds[self.editor.guide]};"
-                " choose another editor or method"
+                f"editor: {method} is made for {kinds[guide]}, got {got}; choose another editor or"
+                " method"
             )
 
     def starts_at(self, lowest: int, field: str) -> None:
@@ -165,8 +169,7 @@ class Work:
         In the first round it is that of attention warping with noise of each view's own, so that
         methods can be compared at equal noise.
         """
-        h, w = (side // self.editor.factor for side in self.sizes[views[0]])
-        one = (1, self.editor.unet.config.out_channels, h, w)
+        one = (1, *self.editor.noise_shape(self.sizes[views[0]]))
         if self.settings.noise == "shared":
             return shared_noise((len(views), *one[1:]), self.settings.seed)
         purpose = (NOISE, number) if number else (FRESH,)
@@ -193,29 +196,16 @@ class Work:
         grid: Grid = getattr(self.settings, "grid", "even")
         return grid
 
-    @contextmanager
-    def guided(self, text: float | None) -> Iterator[None]:
-        """Use a text guidance, and the settings' image guidance and negative prompt, while the
-        block runs; None leaves the editor's own.
+    def guided(self, text: float | None) -> AbstractContextManager[None]:
+        """Use a text guidance, and the settings' image guidance and negative prompt, while a block
+        runs; None leaves the editor's own.
         """
-        editor: Any = self.editor
-        own = {
-            "image_guidance": self.settings.image_guidance,
-            "negative_prompt": getattr(self.settings, "negative_prompt", None),
-        }
-        own = {name: value for name, value in own.items() if value is not None}
-        for name in own:
-            if not hasattr(editor, name):
-                raise ValueError(f"{name}: this editor has none; leave it out")
-        before = {name: getattr(editor, name) for name in own}
-        with guided(editor, text):
-            try:
-                for name, value in own.items():
-                    setattr(editor, name, value)
-                yield
-            finally:
-                for name, value in before.items():
-                    setattr(editor, name, value)
+        return guided(
+            self.editor,
+            text_guidance=text,
+            image_guidance=self.settings.image_guidance,
+            negative_prompt=getattr(self.settings, "negative_prompt", None),
+        )
 
     def branches(self) -> int:
         """Rows of the UNet's batch for one view."""

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from tiny_editors import pix2pix
 
-from attnwarp.editing.pix2pix import InstructPix2Pix
+from attnwarp.editing.editors.pix2pix import InstructPix2Pix
 from benchmarks.injection import Case, Seconds, measure, plane_warp, table
 
 NAMES = ("plain", "recorded", "injected", "injected along a warp", "plain again")

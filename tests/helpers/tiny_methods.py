@@ -7,8 +7,8 @@ from diffusers import ControlNetModel
 from tiny_editors import parts, unet
 from tiny_scenes import cameras, pictures, splats
 
-from attnwarp.editing.controlnet import DepthControlNet
-from attnwarp.editing.pix2pix import InstructPix2Pix
+from attnwarp.editing.editors.controlnet import DepthControlNet
+from attnwarp.editing.editors.pix2pix import InstructPix2Pix
 from attnwarp.methods import (
     METHODS,
     AttentionWarpingSettings,
@@ -84,7 +84,7 @@ def depth_editor():
     torch.nn.init.normal_(control.controlnet_cond_embedding.conv_out.weight, std=0.1)
     loud(net)
     loud(control)
-    return DepthControlNet(net, **parts(), controlnet=control, guidance=3.0)
+    return DepthControlNet(net, **parts(), controlnet=control, text_guidance=3.0)
 
 
 @pytest.fixture(scope="session")

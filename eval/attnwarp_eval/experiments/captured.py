@@ -274,7 +274,6 @@ def _edit(
     folder: Path,
     seconds: dict[str, float],
 ) -> EditedScene:
-    from attnwarp.editing.editor import own_size
     from attnwarp.methods import Budget
 
     variant = study.variants[name]
@@ -283,7 +282,7 @@ def _edit(
         edits.settings_of(study, variant, study.seeds[0]), words.source or ""
     )
     if settings.get("size") is None:
-        settings["size"] = own_size(editor)
+        settings["size"] = editor.own_size
     budget = None
     if own.budget is not None:
         limit = own.budget.seconds

@@ -19,7 +19,7 @@ independent.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -30,7 +30,8 @@ from torch import Tensor
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from attnwarp.editing.editor import Guide, Image, tensor_of
-from attnwarp.editing.schedule import DDIM, Time, stable_diffusion_alphas
+from attnwarp.editing.layers import Call, Layer, unet_call
+from attnwarp.editing.schedule import DDIM, Size, Time, stable_diffusion_alphas
 
 FACTOR = 4
 """Pixels along the side of a token, as of the bundled editors."""
@@ -53,23 +54,8 @@ class Answers:
     parts: npt.NDArray[Any]
 
 
-class _Config(dict[str, Any]):
-    """A configuration whose entries are attributes too, as diffusers' are."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name not in self:
-            raise AttributeError(name)
-        return self[name]
-
-
-class _Attention(torch.nn.Module):
+class _Output(torch.nn.Module):
     """The output of an attention layer, where hooks read and replace it."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        projection = torch.nn.Identity()
-        projection.out_features = channels  # type: ignore[assignment]
-        self.to_out = torch.nn.ModuleList([projection])
 
     def forward(self, features: Tensor) -> Tensor:
         """(B, n, C) as they are."""
@@ -77,7 +63,7 @@ class _Attention(torch.nn.Module):
 
 
 class IdealUNet(torch.nn.Module):
-    """The network: its layers have the names of a diffusers UNet's.
+    """The network.
 
     Args:
         views: views of one size, with the same number of answers.
@@ -98,7 +84,6 @@ class IdealUNet(torch.nn.Module):
         after = torch.stack(
             [torch.stack([tokens_of(_picture(one)) for one in view.after]) for view in views]
         )
-        count, channels = after.shape[1], after.shape[-1]
         self.cross: Cross = cross
         # Buffers, so that a digest of the network knows its answers.
         self.register_buffer("before", before)  # (V, n, C)
@@ -108,23 +93,8 @@ class IdealUNet(torch.nn.Module):
         self.register_buffer("members", _members(parts))  # (V, n) tokens of the token's part
         self.register_buffer("energy", self.change.square().sum(dim=-1))  # (V, K, n)
         self.register_buffer("alphas", alphas)
-        block = torch.nn.Module()
-        block.attn1 = _Attention(count)
-        block.attn2 = _Attention(channels if cross == "paint" else count)
-        inner, outer = torch.nn.Module(), torch.nn.Module()
-        inner.transformer_blocks = torch.nn.ModuleList([block])
-        outer.attentions = torch.nn.ModuleList([inner])
-        self.up_blocks = torch.nn.ModuleList([outer])
-        size = [int(side) * FACTOR for side in views[0].parts.shape]
-        self.config = _Config(
-            out_channels=channels, block_out_channels=(channels,), sample_size=size, cross=cross
-        )
-
-    @property
-    def attn_processors(self) -> dict[str, Any]:
-        """Names of the two attention layers, as diffusers gives them."""
-        name = "up_blocks.0.attentions.0.transformer_blocks.0"
-        return {f"{name}.{kind}.processor": None for kind in ("attn1", "attn2")}
+        self.self_attention, self.cross_attention = _Output(), _Output()
+        self.size = int(views[0].parts.shape[0]), int(views[0].parts.shape[1])
 
     @property
     def device(self) -> torch.device:
@@ -147,19 +117,18 @@ class IdealUNet(torch.nn.Module):
         Returns:
             (B, C, h, w).
         """
-        block: Any = self.get_submodule("up_blocks.0.attentions.0.transformer_blocks.0")
         rows = list(views)
         x = sample.flatten(2).transpose(1, 2)  # (B, n, C)
         evidence = self.evidence(x, int(timestep), rows)
-        s = block.attn1(part_means(evidence, self.parts[rows]))
+        s = self.self_attention(part_means(evidence, self.parts[rows]))
         w = torch.softmax(self.members[rows][..., None] * s, dim=-1)  # (B, n, K)
         inside = (self.parts[rows] >= 0)[..., None]
         if self.cross == "word":
-            w = block.attn2(torch.where(inside, w, 0.0))
+            w = self.cross_attention(torch.where(inside, w, 0.0))
         u = torch.einsum("bnk,bknc->bnc", w, self.change[rows])
         u = torch.where(inside, u, 0.0)
         if self.cross == "paint":
-            u = block.attn2(u)
+            u = self.cross_attention(u)
         clean = self.before[rows] + u
         return clean.transpose(1, 2).unflatten(2, sample.shape[2:])
 
@@ -256,8 +225,9 @@ class IdealEditor:
 
     guide: Guide = "picture"
     branches: tuple[str, ...] = ("text",)
-    factor = FACTOR
-    guidance = 1.0
+    carries: tuple[str, ...] = ("text",)
+    options: tuple[str, ...] = ()
+    side_multiple = FACTOR
 
     def __init__(
         self, views: Sequence[Answers], share: float = 1.0, cross: Cross = "paint"
@@ -266,16 +236,52 @@ class IdealEditor:
         self.unet = IdealUNet(views, self.schedule.alphas, cross)
         self._numbers = {_key(view.before): number for number, view in enumerate(views)}
 
+    @property
+    def network(self) -> IdealUNet:
+        """The network."""
+        return self.unet
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """The network; words are not read."""
+        return {"unet": self.unet}
+
+    @property
+    def own_size(self) -> int:
+        """Longest side in px of the views."""
+        return FACTOR * max(self.unet.size)
+
+    def layers(self) -> tuple[Layer, ...]:
+        """The two layers of attention."""
+        count, channels = self.unet.change.shape[1], self.unet.change.shape[-1]
+        return (
+            Layer("self_attention", "self", 0, count),
+            Layer("cross_attention", "cross", 0, channels if self.unet.cross == "paint" else count),
+        )
+
+    def call(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:
+        """The pass that the network is called for."""
+        return unet_call(self.branches, args, kwargs)
+
+    def noise_shape(self, size: Size) -> tuple[int, int, int]:
+        """(C, h, w) of the latents of an (H, W) px view."""
+        return 3 * FACTOR**2, size[0] // FACTOR, size[1] // FACTOR
+
     def check_text(self, text: str) -> None:
         """Take any words: the answers are what it knows."""
 
-    def task(self, guides: Sequence[npt.NDArray[Any]], prompt: str) -> IdealTask:
+    def task(
+        self,
+        guides: Sequence[npt.NDArray[Any]],
+        prompt: str,
+        regions: Sequence[npt.NDArray[Any]] | None = None,
+    ) -> IdealTask:
         """An edit of views by their pictures before it.
 
         Raises:
             ValueError: a picture that is none of the views'.
         """
-        tensor_of(guides, "guides", self.factor)
+        tensor_of(guides, "guides", FACTOR)
         numbers = [self._numbers.get(_key(guide)) for guide in guides]
         if None in numbers:
             raise ValueError(
@@ -286,15 +292,15 @@ class IdealEditor:
 
     def encode(self, pictures: Sequence[Image]) -> Tensor:
         """(B, C, h, w) latents of (H, W, 3) pictures in [0, 1]."""
-        return self.latents(tensor_of(pictures, "pictures", self.factor))
+        return self.latents(tensor_of(pictures, "pictures", FACTOR))
 
     def latents(self, pixels: Tensor) -> Tensor:
         """(B, C, h, w) latents of (B, 3, H, W) pixels."""
-        return pixel_unshuffle(2 * pixels - 1, self.factor)
+        return pixel_unshuffle(2 * pixels - 1, FACTOR)
 
     def pixels(self, latents: Tensor) -> Tensor:
         """(B, 3, H, W) of latents."""
-        return pixel_shuffle(latents, self.factor) / 2 + 0.5
+        return pixel_shuffle(latents, FACTOR) / 2 + 0.5
 
     def decode(self, latents: Tensor) -> list[Image]:
         """(H, W, 3) pictures in [0, 1] of latents."""
@@ -321,9 +327,7 @@ class IdealTask:
     @property
     def shape(self) -> tuple[int, int, int, int]:
         """(B, C, h, w) of the latents."""
-        config = self.editor.unet.config
-        h, w = (side // FACTOR for side in config["sample_size"])
-        return len(self.views), config["out_channels"], h, w
+        return len(self.views), self.editor.unet.before.shape[-1], *self.editor.unet.size
 
     def predict(self, latents: Tensor, timestep: Time) -> Tensor:
         """(B, C, h, w) clean latents, predicted at a step."""

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from attnwarp.editing.editor import Image, edit
 from attnwarp.editing.injection import Identity, Weight
-from attnwarp.editing.layers import choose_layers
 from attnwarp.editing.recording import Recording, RecordingPlan, record
 from attnwarp.methods.attention_warping import CORRECTED, a_t, inject
 from attnwarp.warp import resize_mask
@@ -100,17 +99,12 @@ class Swap:
 
     def __init__(self, editor: Any) -> None:
         self.editor = editor
-        self.layers = choose_layers(editor.unet)
 
     def noise(self, seeds: Sequence[int], before: Image) -> Tensor:
         """(B, C, h, w) white noise, one seed a picture."""
-        channels = self.editor.vae.config.latent_channels
-        h, w = (side // self.editor.factor for side in before.shape[:2])
+        shape = self.editor.noise_shape(before.shape[:2])
         return torch.stack(
-            [
-                torch.randn((channels, h, w), generator=torch.Generator().manual_seed(s))
-                for s in seeds
-            ]
+            [torch.randn(shape, generator=torch.Generator().manual_seed(s)) for s in seeds]
         )
 
     def run(self, cases: Sequence[Case], noise: Tensor) -> list[Image]:
@@ -122,12 +116,10 @@ class Swap:
 
     def recorded(self, cases: Sequence[Case], noise: Tensor) -> tuple[list[Image], Recording]:
         """The edited pictures and their features."""
-        branches = self.editor.branches
-        keep = tuple(b for b in branches if b != "uncond")
-        plan = RecordingPlan(
-            self.layers, (noise.shape[2], noise.shape[3]), branches, keep, STEPS, len(cases)
-        )
-        with record(self.editor.unet, plan) as recording:
+        keep = tuple(b for b in self.editor.branches if b in self.editor.carries)
+        size = (noise.shape[2], noise.shape[3])
+        plan = RecordingPlan(self.editor.layers(), size, keep, STEPS, len(cases))
+        with record(self.editor, plan) as recording:
             images = self.run(cases, noise)
         return images, recording
 
@@ -136,10 +128,7 @@ class Swap:
         warp: Any = None, weight: Weight = a_t,
     ) -> list[Image]:  # fmt: skip
         """The edited pictures with features of a recording, along one warp, as a scene's edit injects them."""
-        with inject(
-            self.editor.unet, recording, branches=recording.plan.branches,
-            warps=[warp] * len(cases), weight=weight,
-        ):  # fmt: skip
+        with inject(self.editor, recording, warps=[warp] * len(cases), weight=weight):
             return self.run(cases, noise)
 
 

@@ -50,7 +50,7 @@ def assess_depth(editor: Any, prompts: Prompts) -> list[tuple[Figure, Figure]]:
     """Held-out figures, each with the one of the control beside it.
 
     Args:
-        editor: a :class:`attnwarp.editing.controlnet.DepthControlNet`.
+        editor: a :class:`attnwarp.editing.editors.controlnet.DepthControlNet`.
         prompts: prompts of test worlds.
 
     Returns:
@@ -138,8 +138,8 @@ def assess_depth_editor(
     from attnwarp.editing.small import DEPTH_GUIDANCE, load_editor
 
     torch.set_num_threads(1)
-    editor = load_editor(str(folder), guidance=DEPTH_GUIDANCE)
-    size = editor.unet.config.sample_size * editor.factor
+    editor = load_editor(str(folder), text_guidance=DEPTH_GUIDANCE)
+    size = editor.own_size
     tests = load_pairs(data, "edit-test", count=worlds)
     results = assess_depth(editor, Prompts(tests, size))
     return depth_card(folder.name, results, {**facts, "size": size, "guidance": DEPTH_GUIDANCE})

@@ -195,7 +195,7 @@ def assess_editor(
 
     torch.set_num_threads(1)
     editor = load_editor(str(folder), text_guidance=TEXT_GUIDANCE, image_guidance=IMAGE_GUIDANCE)
-    size = editor.unet.config.sample_size * editor.factor
+    size = editor.own_size
     own: list[Figure] = []
     control: list[Figure] = []
     tested = 0
@@ -216,7 +216,7 @@ def assess_editor(
         return float(sum(p.numel() for p in net.parameters()) / 1e6)
 
     given = {
-        "unet": millions(editor.unet), "text": millions(editor.text_encoder), "size": size, "tested": tested,
+        "unet": millions(editor.network), "text": millions(editor.parts["text_encoder"]), "size": size, "tested": tested,
         "text_guidance": TEXT_GUIDANCE, "image_guidance": IMAGE_GUIDANCE,
     }  # fmt: skip
     return editor_card(folder.name, own, control, {**given, **facts})

@@ -18,7 +18,7 @@ import numpy.typing as npt
 import torch
 from tokenizers import Tokenizer
 
-from attnwarp.editing.controlnet import control_image
+from attnwarp.editing.editors.controlnet import control_image
 from attnwarp.editing.latents import BLOCK, CHANNELS
 from attnwarp_eval.drawn.worlds import sentence
 from training.assess.pictures import Pictures, Row
@@ -199,7 +199,7 @@ class PromptPool(PicturePool):
         self.depth = torch.from_numpy(worlds.depth).to(self.device).view(-1)
 
     def control(self, rows: Rows, size: int) -> Tensor:
-        """(B, 3, S, S) control pictures, see :func:`attnwarp.editing.controlnet.control_image`."""
+        """(B, 3, S, S) control pictures, see :func:`attnwarp.editing.editors.controlnet.control_image`."""
         number = (rows.world * VIEWS + rows.view)[:, None, None] * SIZE**2
         # One pixel of each block: a mean over an edge would be a depth where nothing is.
         depth = self.depth[number + self.pixels(rows, size, SIZE // size)[..., -1]]

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from attnwarp.editing.latents import BLOCK, CHANNELS
-from attnwarp.editing.layers import Call, Layer, choose_layers, hooked
+from attnwarp.editing.layers import BareUNet, Call, Layer, hooked
 from training.editors.answers import settled
 from training.editors.net import T_STEPS, EditorNet, draw_steps, loss_of, noised
 from training.editors.pool import Batch, PairPool, Rows
@@ -230,11 +230,12 @@ def injected_loss(
     def blend(layer: Layer, features: Tensor, call: Call) -> Tensor:
         return moves.blend(layer, recorded[layer.name], features)
 
-    layers = choose_layers(net.unet)
-    with hooked(net.unet, layers, keep):
+    unet = BareUNet(net.unet)
+    layers = unet.layers()
+    with hooked(unet, layers, keep):
         first = net(x["noisy A"], x["before A"], x["t"], x["tokens"])
     loss_a = loss_of(first, x["target A"], x["weight A"], x["alpha"])
-    with hooked(net.unet, layers, blend if inject else keep):
+    with hooked(unet, layers, blend if inject else keep):
         second = net(x["noisy B"], x["before B"], x["t"], x["tokens"])
     loss_b = loss_of(second, x["target B"], x["weight B"], x["alpha"])
     return loss_a + loss_b, {"recorded": loss_a.detach(), "injected": loss_b.detach()}

@@ -18,11 +18,11 @@ from diffusers import (
 )
 from tiny_editors import controlnet, nearest_steps, pix2pix, unet
 
-from attnwarp.editing.controlnet import DepthControlNet, control_image
-from attnwarp.editing.editor import edit, own_size, shared_noise, side_multiple
+from attnwarp.editing.editor import edit, shared_noise
+from attnwarp.editing.editors.controlnet import DepthControlNet, control_image
+from attnwarp.editing.editors.pix2pix import InstructPix2Pix
 from attnwarp.editing.folder import load_parts
-from attnwarp.editing.layers import PIX2PIX_BRANCHES, all_layers
-from attnwarp.editing.pix2pix import InstructPix2Pix
+from attnwarp.editing.layers import all_layers
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.schedule import (
     DDIM,
@@ -98,7 +98,7 @@ def test_the_loop_gives_what_diffusers_controlnet_gives(guidance, scale):
         "a bear", image=tensor(control_image(depth_map())), num_inference_steps=5, guidance_scale=guidance,
         controlnet_conditioning_scale=scale, negative_prompt="blurred", latents=noise, output_type="np", height=H, width=W,
     ).images[0]  # fmt: skip
-    editor = editor_of(pipe, guidance=guidance, control_scale=scale, negative_prompt="blurred")
+    editor = editor_of(pipe, text_guidance=guidance, control_scale=scale, negative_prompt="blurred")
     ours = edit(editor, [depth_map()], "a bear", steps=5, noise=noise)
     assert np.abs(ours.images[0] - theirs).max() < 1e-5
     blind = edit(editor, [depth_map().T.reshape(H, W)], "a bear", steps=5, noise=noise)
@@ -344,8 +344,8 @@ def test_a_base_and_a_controlnet_in_two_folders_are_one_editor(tmp_path):
     (tmp_path / "base" / "controlnet").rename(tmp_path / "depth")
     both = f"{tmp_path / 'base'},{tmp_path / 'depth'}"
     assert guide_of(both) == "depth"
-    ours = edit(load_editor(both, guidance=3.0), [depth_map()], "a bear", steps=2).images[0]
-    expected = edit(editor_of(pipe, guidance=3.0), [depth_map()], "a bear", steps=2).images[0]
+    ours = edit(load_editor(both, text_guidance=3.0), [depth_map()], "a bear", steps=2).images[0]
+    expected = edit(editor_of(pipe, text_guidance=3.0), [depth_map()], "a bear", steps=2).images[0]
     assert np.array_equal(ours, expected)
     (tmp_path / "depth" / "config.json").unlink()
     with pytest.raises(InputError, match="lacks depth/config.json; fetch the ControlNet again"):
@@ -494,7 +494,7 @@ def test_networks_are_refused_before_their_weights_are_read(tmp_path):
 def test_an_editors_own_size_is_that_of_its_longest_side(said, size):
     editor = editor_of(pix2pix())
     editor.unet.register_to_config(sample_size=said)
-    assert own_size(editor) == size  # its autoencoder halves once
+    assert editor.own_size == size  # its autoencoder halves once
 
 
 def test_where_a_tokenizer_names_no_limit_the_text_encoders_is_one(tmp_path):
@@ -543,8 +543,8 @@ def test_sides_of_two_halvings_are_enough_for_stable_diffusions_three():
     pipe = pix2pix()
     pipe.register_modules(unet=unet(8, **DEEP))
     editor = editor_of(pipe)
-    assert side_multiple(editor) == 2 * 4  # its autoencoder halves once
-    assert side_multiple(editor_of(pix2pix())) == 2 * 2
+    assert editor.side_multiple == 2 * 4  # its autoencoder halves once
+    assert editor_of(pix2pix()).side_multiple == 2 * 2
     guide = np.random.default_rng(3).uniform(size=(24, 40, 3)).astype(np.float32)
     noise = torch.randn((1, 4, 12, 20), generator=torch.Generator().manual_seed(8))
     theirs = pipe(
@@ -557,17 +557,17 @@ def test_sides_of_two_halvings_are_enough_for_stable_diffusions_three():
     # Features of every layer are recorded and injected at such a size, the odd ones among them.
     layers = all_layers(editor.unet)
     assert {layer.size((12, 20)) for layer in layers} == {(12, 20), (6, 10), (3, 5), (2, 3)}
-    plan = RecordingPlan(layers, (12, 20), PIX2PIX_BRANCHES, ("text", "image"), 3)
-    with record(pipe.unet, plan) as recording:
+    plan = RecordingPlan(layers, (12, 20), ("text", "image"), 3)
+    with record(editor, plan) as recording:
         edit(editor, [guide], "a bear", steps=3, noise=noise)
     for layer in layers:
         features = recording.features(editor.schedule.timesteps(3)[0], layer, "text")
         assert features.shape == (1, np.prod(layer.size((12, 20))), 16)
-    with inject(pipe.unet, recording, branches=PIX2PIX_BRANCHES, weight=lambda t, T: 1.0):
+    with inject(editor, recording, weight=lambda t, T: 1.0):
         again = edit(editor, [guide], "a bear", steps=3, noise=noise)
     plain = edit(editor, [guide], "a bear", steps=3, noise=noise)
     assert torch.equal(again.latents, plain.latents)
-    with inject(pipe.unet, recording, branches=PIX2PIX_BRANCHES, weight=lambda t, T: 1.0):
+    with inject(editor, recording, weight=lambda t, T: 1.0):
         other = edit(editor, [1 - guide], "a bear", steps=3, noise=noise)
     alone = edit(editor, [1 - guide], "a bear", steps=3, noise=noise)
     assert (other.latents - alone.latents).abs().max() > 1e-3

@@ -16,9 +16,11 @@ from attnwarp.camera import Camera
 from attnwarp.editing.layers import (
     CONTROLNET_BRANCHES,
     PIX2PIX_BRANCHES,
+    BareUNet,
     all_layers,
     choose_layers,
     hooked,
+    paper_layers,
 )
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.methods.attention_warping import a_t, inject
@@ -28,18 +30,12 @@ SIZE = (6, 8)
 """Latents that are not square."""
 
 
-def plan_of(
-    net,
-    *,
-    layers=None,
-    size=SIZE,
-    branches=PIX2PIX_BRANCHES,
-    keep=("text", "image"),
-    steps=2,
-    **more,
-):
-    layers = layers or choose_layers(net)
-    return RecordingPlan(layers, size, branches, keep, steps, **more)
+def plan_of(net, *, layers=None, size=SIZE, keep=("text", "image"), steps=2, **more):
+    return RecordingPlan(layers or paper_layers(net), size, keep, steps, **more)
+
+
+def of(net, branches=PIX2PIX_BRANCHES):
+    return BareUNet(net, branches)
 
 
 def run(net, *, seed=0, timesteps=(981, 481), rows=3, size=SIZE):
@@ -70,35 +66,33 @@ def test_layers_of_stable_diffusion_are_the_papers_twelve_and_take_the_memory_th
         net = UNet2DConditionModel(
             cross_attention_dim=768, attention_head_dim=8
         )  # the defaults are SD 1.5's
-    layers = choose_layers(net)
+    layers = paper_layers(net)
     assert len(layers) == 12
     assert {layer.name.split(".")[1] for layer in layers} == {"2", "3"}
     assert {layer.size((64, 64)) for layer in layers} == {(64, 64), (32, 32)}
     # 6 layers of 320 channels at 64 x 64 and 6 of 640 at 32 x 32; two branches in half precision for 20 steps.
-    plan = RecordingPlan(
-        layers, (64, 64), PIX2PIX_BRANCHES, ("text", "image"), 20, dtype=torch.float16
-    )
+    plan = RecordingPlan(layers, (64, 64), ("text", "image"), 20, dtype=torch.float16)
     assert plan.bytes == 6 * (64 * 64 * 320 + 32 * 32 * 640) * 2 * 2 * 20
     assert "12 layers, 2 branches (text, image), 20 steps in float16: 900.0 MiB" in str(plan)
 
 
 def test_layers_are_chosen_by_kind_and_by_their_blocks_number():
     net = unet()
-    assert {layer.kind for layer in choose_layers(net, kinds=("cross",))} == {"cross"}
-    assert {layer.level for layer in choose_layers(net, blocks=(0,))} == {1}
-    assert {layer.name.split(".")[0] for layer in choose_layers(net)} == {"up_blocks"}
-    assert len(all_layers(net)) == len(net.attn_processors) > len(choose_layers(net))
+    assert {layer.kind for layer in choose_layers(paper_layers(net), kinds=("cross",))} == {"cross"}
+    assert {layer.level for layer in choose_layers(paper_layers(net), blocks=(0,))} == {1}
+    assert {layer.name.split(".")[0] for layer in paper_layers(net)} == {"up_blocks"}
+    assert len(all_layers(net)) == len(net.attn_processors) > len(paper_layers(net))
     with pytest.raises(ValueError, match=r"kinds, blocks: got None in \(2,\); .* cross in block 0"):
-        choose_layers(net, blocks=(2,))
+        choose_layers(paper_layers(net), blocks=(2,))
     with pytest.raises(ValueError, match="did you mean 'cross'"):
-        choose_layers(net, kinds=("crss",))
+        choose_layers(paper_layers(net), kinds=("crss",))
 
 
 @pytest.mark.parametrize("size", [(6, 8), (5, 7), (8, 8)])
 def test_a_recording_holds_what_the_processors_return(size):
     net = unet(8)
     plan = plan_of(net, size=size)
-    with record(net, plan) as recording:
+    with record(of(net), plan) as recording:
         run(net, size=size)
     processors = {name: Kept() for name in net.attn_processors}
     net.set_attn_processor(dict(processors))
@@ -121,7 +115,7 @@ def test_recording_changes_no_bit_and_leaves_no_hook(rows):
     net = unet(8)
     branches = PIX2PIX_BRANCHES[:rows]
     before = run(net, rows=rows)
-    with record(net, plan_of(net, branches=branches, keep=("text",))) as recording:
+    with record(of(net, branches), plan_of(net, keep=("text",))) as recording:
         during = run(net, rows=rows)
     assert torch.equal(before, during)
     assert recording.bytes > 0
@@ -147,11 +141,12 @@ def test_recording_changes_no_bit_of_diffusers_own_pipelines(pipeline):
         ).images  # fmt: skip
 
     before = images()
-    plan = plan_of(pipe.unet, size=(8, 12), branches=branches, keep=keep, steps=3)
-    with record(pipe.unet, plan) as recording:
+    plan = plan_of(pipe.unet, size=(8, 12), keep=keep, steps=3)
+    passes = of(pipe.unet, branches)
+    with record(passes, plan) as recording:
         assert np.array_equal(before, images())
     assert len(recording.timesteps) == 3
-    with inject(pipe.unet, recording, branches=branches, weight=lambda t, T: 1.0):
+    with inject(passes, recording, weight=lambda t, T: 1.0):
         assert np.array_equal(before, images())
 
 
@@ -182,11 +177,11 @@ def test_of_a_scheduler_with_more_passes_than_steps_each_pass_has_its_own_featur
     plan = plan_of(
         pipe.unet,
         size=(8, 12),
-        branches=CONTROLNET_BRANCHES,
         keep=CONTROLNET_BRANCHES,
         steps=passes,
     )
-    with record(pipe.unet, plan) as recording:
+    bare = of(pipe.unet, CONTROLNET_BRANCHES)
+    with record(bare, plan) as recording:
         assert np.array_equal(before, images())
     given = recording.timesteps
     assert given == [float(t) for t in pipe.scheduler.timesteps]
@@ -196,7 +191,7 @@ def test_of_a_scheduler_with_more_passes_than_steps_each_pass_has_its_own_featur
         weights.append((step, count))
         return 1.0
 
-    with inject(pipe.unet, recording, branches=CONTROLNET_BRANCHES, weight=weight):
+    with inject(bare, recording, weight=weight):
         assert np.array_equal(before, images())
         assert np.array_equal(before, images())  # a second run begins anew
     numbers = [step for step, _ in weights[:: len(plan.layers)]]
@@ -225,18 +220,14 @@ def between(source, target, depth=2.0):
 def test_a_views_own_features_at_full_weight_with_the_identity_change_no_bit():
     net = unet(8)
     plain = run(net)
-    with record(net, plan_of(net)) as recording:
+    with record(of(net), plan_of(net)) as recording:
         run(net)
     identity = between(camera(), camera())
     for warp in (None, identity):
-        with inject(
-            net, recording, branches=PIX2PIX_BRANCHES, warps=(warp,), weight=lambda t, T: 1.0
-        ):
+        with inject(of(net), recording, warps=(warp,), weight=lambda t, T: 1.0):
             assert torch.equal(plain, run(net))
         # Another run's features do change it, or the test above would show nothing.
-        with inject(
-            net, recording, branches=PIX2PIX_BRANCHES, warps=(warp,), weight=lambda t, T: 1.0
-        ):
+        with inject(of(net), recording, warps=(warp,), weight=lambda t, T: 1.0):
             assert not torch.equal(run(net, seed=1), plain)
 
 
@@ -247,9 +238,9 @@ def test_a_recorded_branch_that_the_batch_lacks_leaves_the_others_their_features
     net = unet(8)
     outputs = []
     for keep in (("text", "image"), ("text",)):
-        with record(net, plan_of(net, keep=keep)) as recording:
+        with record(of(net), plan_of(net, keep=keep)) as recording:
             run(net)
-        with inject(net, recording, branches=("text",), weight=lambda t, T: 0.5):
+        with inject(of(net, ("text",)), recording, weight=lambda t, T: 0.5):
             outputs.append(run(net, seed=1, rows=1))
     assert torch.equal(*outputs)
     assert not torch.equal(outputs[0], run(net, seed=1, rows=1))
@@ -257,17 +248,17 @@ def test_a_recorded_branch_that_the_batch_lacks_leaves_the_others_their_features
 
 def test_weight_zero_changes_no_bit():
     net = unet(8)
-    with record(net, plan_of(net)) as recording:
+    with record(of(net), plan_of(net)) as recording:
         run(net)
     other = run(net, seed=1)
-    with inject(net, recording, branches=PIX2PIX_BRANCHES, weight=lambda t, T: 0.0):
+    with inject(of(net), recording, weight=lambda t, T: 0.0):
         assert torch.equal(other, run(net, seed=1))
 
 
 def test_injected_features_are_the_written_out_blend_at_each_layers_own_size():
     net = unet(8)
-    first = choose_layers(net)[0]  # its own features hold nothing injected before it
-    with record(net, plan_of(net, layers=(first,), steps=1)) as recording:
+    first = paper_layers(net)[0]  # its own features hold nothing injected before it
+    with record(of(net), plan_of(net, layers=(first,), steps=1)) as recording:
         run(net, timesteps=(500,))
     source, target = camera(), camera(x=0.3)
     view = between(source, target)
@@ -279,11 +270,10 @@ def test_injected_features_are_the_written_out_blend_at_each_layers_own_size():
     def keep(into):
         return lambda layer, features, call: into.__setitem__(layer.name, features.clone())
 
-    with hooked(net, [first], keep(own)):
+    with hooked(of(net), [first], keep(own)):
         run(net, seed=1, timesteps=(500,))
-    with inject(
-        net, recording, branches=PIX2PIX_BRANCHES, warps=(view,), weight=lambda t, T: 0.7
-    ), hooked(net, [first], keep(blended)):  # fmt: skip
+    with inject(of(net), recording, warps=(view,), weight=lambda t, T: 0.7
+    ), hooked(of(net), [first], keep(blended)):  # fmt: skip
         run(net, seed=1, timesteps=(500,))
     h, w = first.size(SIZE)
     new, got = own[first.name].double(), blended[first.name].double()
@@ -315,21 +305,23 @@ def test_injected_features_are_the_written_out_blend_at_each_layers_own_size():
 def test_a_blend_without_a_warp_in_half_precision_is_rounded_once(dtype):
     """Oracle: the formula in float64. A second rounding would be another half step."""
     net = unet(8).to(dtype)
-    first = choose_layers(net)[0]
+    first = paper_layers(net)[0]
     tokens = {}
 
     def run_half(name, seed):
         generator = torch.Generator().manual_seed(seed)
         x = torch.randn((3, 8, *SIZE), generator=generator).to(dtype)
         text = torch.randn((3, 5, 32), generator=generator).to(dtype)
-        keep = hooked(net, [first], lambda _, features, __: tokens.update({name: features.clone()}))
+        keep = hooked(
+            of(net), [first], lambda _, features, __: tokens.update({name: features.clone()})
+        )
         with torch.no_grad(), keep:
             net(x, torch.tensor(500), encoder_hidden_states=text)
 
-    with record(net, plan_of(net, layers=(first,), steps=1)) as recording:
+    with record(of(net), plan_of(net, layers=(first,), steps=1)) as recording:
         run_half("source", seed=0)
     run_half("new", seed=1)
-    with inject(net, recording, branches=PIX2PIX_BRANCHES, weight=lambda t, T: 0.9):
+    with inject(of(net), recording, weight=lambda t, T: 0.9):
         run_half("blend", seed=1)
     source, new, blend = (tokens[name][:2] for name in ("source", "new", "blend"))
     expected = 0.9 * source.double() + (1 - 0.9) * new.double()
@@ -340,10 +332,10 @@ def test_a_blend_without_a_warp_in_half_precision_is_rounded_once(dtype):
 
 def test_one_source_serves_several_views_each_with_its_own_warp():
     net = unet(8)
-    with record(net, plan_of(net)) as recording:
+    with record(of(net), plan_of(net)) as recording:
         run(net)
     views = (between(camera(), camera(x=0.3)), None)
-    with inject(net, recording, branches=PIX2PIX_BRANCHES, warps=views, weight=lambda t, T: 0.5):
+    with inject(of(net), recording, warps=views, weight=lambda t, T: 0.5):
         together = run(net, rows=6, seed=2)
     # Rows of a batch do not mix, so each view alone gives the same up to the order of sums.
     x = torch.Generator().manual_seed(2)
@@ -353,9 +345,7 @@ def test_one_source_serves_several_views_each_with_its_own_warp():
         rows = [k, 2 + k, 4 + k]
         with (
             torch.no_grad(),
-            inject(
-                net, recording, branches=PIX2PIX_BRANCHES, warps=(view,), weight=lambda t, T: 0.5
-            ),
+            inject(of(net), recording, warps=(view,), weight=lambda t, T: 0.5),
         ):
             alone = torch.stack(
                 [net(sample[rows], torch.tensor(t), text[rows]).sample for t in (981, 481)]
@@ -365,8 +355,8 @@ def test_one_source_serves_several_views_each_with_its_own_warp():
 
 def test_a_blend_leaves_what_the_processor_returned_and_has_one_result_with_and_without_gradient():
     net = unet(8)
-    first, view = choose_layers(net)[0], between(camera(), camera(x=0.3))
-    with record(net, plan_of(net, layers=(first,), steps=1)) as recording:
+    first, view = paper_layers(net)[0], between(camera(), camera(x=0.3))
+    with record(of(net), plan_of(net, layers=(first,), steps=1)) as recording:
         run(net, timesteps=(500,))
     processor = Kept()
     net.get_submodule(first.name).set_processor(processor)
@@ -376,7 +366,7 @@ def test_a_blend_leaves_what_the_processor_returned_and_has_one_result_with_and_
         with torch.set_grad_enabled(gradient):
             return net(sample, torch.tensor(500), text).sample.detach()
 
-    with inject(net, recording, branches=PIX2PIX_BRANCHES, warps=(view,)):
+    with inject(of(net), recording, warps=(view,)):
         blended = [output(gradient) for gradient in (False, True)]
     assert torch.equal(*blended)
     assert not torch.equal(blended[0], output(False))
@@ -399,10 +389,10 @@ def test_the_memory_is_what_was_planned_and_features_come_back_from_where_they_l
     plan = plan_of(
         net, size=(16, 24), dtype=dtype, store=tmp_path / "features" if store == "disk" else store
     )
-    with record(net, plan) as recording:
+    with record(of(net), plan) as recording:
         run(net, size=(16, 24))
     assert recording.bytes == pytest.approx(plan.bytes, rel=0.1)  # files have headers
-    with record(net, plan_of(net, size=(16, 24))) as full:
+    with record(of(net), plan_of(net, size=(16, 24))) as full:
         run(net, size=(16, 24))
     for layer in plan.layers:
         stored = recording.features(981.0, layer, "image")
@@ -410,16 +400,16 @@ def test_the_memory_is_what_was_planned_and_features_come_back_from_where_they_l
         assert torch.equal(stored, full.features(981.0, layer, "image").to(dtype))
     if store == "disk":
         files = list((tmp_path / "features").rglob("*.safetensors"))
-        assert len(files) == 2 * len(plan.layers)
+        assert len(files) == 2 * 2 * len(plan.layers)  # of each step, a file a branch
 
 
 def test_chosen_steps_alone_are_stored_and_injected():
     """Oracle: the whole recording, injected with a weight of 0 at the other steps."""
     net = unet(8)
     timesteps = (981, 721, 481, 241)
-    with record(net, plan_of(net, steps=4)) as whole:
+    with record(of(net), plan_of(net, steps=4)) as whole:
         run(net, timesteps=timesteps)
-    with record(net, plan_of(net, steps=4, chosen=[2, 0])) as some:
+    with record(of(net), plan_of(net, steps=4, chosen=[2, 0])) as some:
         run(net, timesteps=timesteps)
     assert some.timesteps == whole.timesteps
     assert some.bytes == some.plan.bytes == whole.bytes / 2
@@ -430,9 +420,9 @@ def test_chosen_steps_alone_are_stored_and_injected():
         some.features(721.0, layer, "text")
 
     weights = [0.9, 0.0, 0.45, 0.0]
-    with inject(net, whole, branches=PIX2PIX_BRANCHES, weight=lambda step, steps: weights[step]):
+    with inject(of(net), whole, weight=lambda step, steps: weights[step]):
         expected = run(net, seed=1, timesteps=timesteps)
-    with inject(net, some, branches=PIX2PIX_BRANCHES):  # the paper's weights, by the run's steps
+    with inject(of(net), some):  # the paper's weights, by the run's steps
         got = run(net, seed=1, timesteps=timesteps)
     assert torch.equal(got, expected)
     alone = run(net, seed=1, timesteps=timesteps)
@@ -446,7 +436,7 @@ def test_recordings_in_one_folder_keep_their_own_features(tmp_path):
     on_disk, in_memory = [], []
     for seed in (0, 1):
         for plan, into in zip(plans, (on_disk, in_memory), strict=True):
-            with record(net, plan) as recording:
+            with record(of(net), plan) as recording:
                 run(net, seed=seed, timesteps=(500,))
             into.append(recording)
     for layer in plans[0].layers:
@@ -459,19 +449,18 @@ def test_recordings_in_one_folder_keep_their_own_features(tmp_path):
 
 def test_what_does_not_match_the_recording_is_refused_by_name():
     net = unet(8)
-    with record(net, plan_of(net)) as recording:
+    with record(of(net), plan_of(net)) as recording:
         run(net)
 
     def again(**how):
-        told = {"branches": PIX2PIX_BRANCHES, **how}
-        passes = told.pop("passes", {})
-        with inject(net, recording, **told):
+        passes, branches = how.pop("passes", {}), how.pop("branches", PIX2PIX_BRANCHES)
+        with inject(of(net, branches), recording, **how):
             run(net, **passes)
 
     with pytest.raises(ValueError, match="timestep: got 980, recorded are 981, 481"):
         again(passes={"timesteps": (980,)})
     with pytest.raises(
-        ValueError, match="branches: recorded are text, image, the batch has uncond, txt"
+        ValueError, match="branches: recorded are text, image, the editor has uncond, txt"
     ):
         again(branches=("uncond", "txt"))
     with pytest.raises(ValueError, match=r"batch: got 2 rows, expected 3: 1 views in 3 branches"):
@@ -484,28 +473,34 @@ def test_what_does_not_match_the_recording_is_refused_by_name():
         again(weight=lambda step, steps: 1.2)
     with (
         pytest.raises(ValueError, match=r"latent_size: got latents of \(8, 8\), planned \(6, 8\)"),
-        record(net, plan_of(net)),
+        record(of(net), plan_of(net)),
     ):
         run(net, size=(8, 8))
-    with pytest.raises(ValueError, match="batch: got 2 rows, planned 3"), record(net, plan_of(net)):
+    with (
+        pytest.raises(ValueError, match="batch: got 2 rows, expected 3"),
+        record(of(net), plan_of(net)),
+    ):
         run(net, rows=2)
     with (
         pytest.raises(ValueError, match="steps: timestep 481 is one more than the 1 planned"),
-        record(net, plan_of(net, steps=1)),
+        record(of(net), plan_of(net, steps=1)),
     ):
         run(net)
-    with record(net, plan_of(net, steps=3)) as short:
+    with record(of(net), plan_of(net, steps=3)) as short:
         run(net)
     with (
         pytest.raises(ValueError, match="steps: the recorded run had 2 of 3 planned steps"),
-        inject(net, short, branches=PIX2PIX_BRANCHES),
+        inject(of(net), short),
     ):
         pass
     for chosen, message in (([2], "got 2"), ([-1], "got -1"), ([0.5], "got 0.5"), ([], "no step")):
         with pytest.raises(ValueError, match=f"chosen: .*{message}"):
             plan_of(net, chosen=chosen)
-    with pytest.raises(ValueError, match="keep: got 'control'"):
-        plan_of(net, keep=("control",))
+    with (
+        pytest.raises(ValueError, match="keep: got 'control'"),
+        record(of(net), plan_of(net, keep=("control",))),
+    ):
+        pass
     for store in ("gpu", "disk", "a/folder"):  # no word is taken for a folder's name
         with pytest.raises(ValueError, match=f"store: got '{store}', expected 'device', 'cpu' or"):
             plan_of(net, store=store)
@@ -527,11 +522,9 @@ def test_a_feature_beyond_float16_is_refused_by_layer_step_and_type(store, tmp_p
     net = unet(8)
     place = tmp_path if store == "disk" else store
     plan = loud_plan(net, torch.float16)
-    plan = RecordingPlan(
-        plan.layers, SIZE, plan.branches, plan.keep, 2, dtype=torch.float16, store=place
-    )
+    plan = RecordingPlan(plan.layers, SIZE, plan.keep, 2, dtype=torch.float16, store=place)
     said = r"step 0 \(timestep 981\) of up_blocks.* beyond float16's 65504; record in bfloat16"
-    with pytest.raises(ValueError, match=said), record(net, plan):
+    with pytest.raises(ValueError, match=said), record(of(net), plan):
         run(net)
 
 
@@ -539,9 +532,9 @@ def test_bfloat16_holds_features_beyond_float16_and_rounds_them_once():
     """Oracle: torch's own conversion of a recording in float32."""
     net = unet(8)
     exact, rounded = (loud_plan_once(net, dtype) for dtype in (torch.float32, torch.bfloat16))
-    with record(net, exact) as whole:
+    with record(of(net), exact) as whole:
         run(net)
-    with record(net, rounded) as half:
+    with record(of(net), rounded) as half:
         run(net)
     largest = 0.0
     for layer in exact.layers:
@@ -583,8 +576,8 @@ def with_another_forward(net):
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (nothing, "no pass went through this UNet"),
-        (past_its_hooks, r"call unet\(\.\.\.\), not unet\.forward"),
+        (nothing, "no pass went through this network"),
+        (past_its_hooks, r"call network\(\.\.\.\), not network\.forward"),
         (of_a_copy, "hand over the module that the pipeline calls, not a copy"),
         (with_another_forward, "not called in any pass; its forward was replaced"),
     ],
@@ -592,11 +585,11 @@ def with_another_forward(net):
 def test_what_keeps_hooks_from_running_is_an_error_that_names_it(call, said):
     net = unet(8)
     plan = plan_of(net, steps=1)
-    with record(net, plan) as recording:
+    with record(of(net), plan) as recording:
         run(net, timesteps=(981,))
     for context in (
-        record(net, plan),
-        inject(net, recording, branches=PIX2PIX_BRANCHES, warps=[None]),
+        record(of(net), plan),
+        inject(of(net), recording, warps=[None]),
     ):
         with pytest.raises(RuntimeError, match=said), context:
             call(net)
@@ -608,13 +601,13 @@ def test_a_compiled_unet_is_named_as_such():
     net = unet(8)
     net.compile(backend="eager")
     net._compiled_call_impl = lambda *args, **kwargs: None  # what the compiled graph would give
-    said = pytest.raises(RuntimeError, match="the UNet is compiled; use it before torch.compile")
-    with said, record(net, plan_of(net, steps=1)):
+    said = pytest.raises(RuntimeError, match="the network is compiled; use it before torch.compile")
+    with said, record(of(net), plan_of(net, steps=1)):
         net()
 
 
 @pytest.mark.door
 def test_an_error_inside_the_block_is_not_covered_by_another():
     net = unet(8)
-    with pytest.raises(ZeroDivisionError), record(net, plan_of(net)):
+    with pytest.raises(ZeroDivisionError), record(of(net), plan_of(net)):
         1 / 0  # noqa: B018

@@ -72,13 +72,13 @@ def test_a_picture_that_a_network_drew_is_inverted_and_rebuilt(monkeypatch):
     """
     from tiny_editors import controlnet
 
-    from attnwarp.editing.controlnet import DepthControlNet
     from attnwarp.editing.editor import edit
+    from attnwarp.editing.editors.controlnet import DepthControlNet
     from attnwarp.editing.inversion import invert_view
 
     pipe = controlnet()
     names = ("unet", "vae", "text_encoder", "tokenizer", "scheduler", "controlnet")
-    editor = DepthControlNet(*(getattr(pipe, name) for name in names), guidance=1.0)
+    editor = DepthControlNet(*(getattr(pipe, name) for name in names), text_guidance=1.0)
     editor.schedule = DDIM(torch.linspace(0.9999, 0.6, 1000), "epsilon", 1.0)
     depth = np.random.default_rng(0).uniform(1, 3, (16, 16))
     drawn = edit(editor, [depth], "a bear", steps=10, seed=5)
@@ -95,7 +95,7 @@ def test_a_picture_that_a_network_drew_is_inverted_and_rebuilt(monkeypatch):
 
 def test_ddim_inversion_needs_a_network_that_predicts_noise():
     schedule = DDIM(parts()["scheduler"].alphas_cumprod, "sample", 1.0)
-    with pytest.raises(ValueError, match="DDIM inversion needs its noise"):
+    with pytest.raises(ValueError, match="an inversion needs its noise"):
         ddim_invert(schedule, network(unet()), latents(), [500, 0])
 
 
@@ -188,8 +188,7 @@ def test_a_picture_edited_by_hand_can_be_the_source():
     from tiny_editors import pix2pix
 
     from attnwarp.editing.editor import edit
-    from attnwarp.editing.layers import PIX2PIX_BRANCHES, choose_layers
-    from attnwarp.editing.pix2pix import InstructPix2Pix
+    from attnwarp.editing.editors.pix2pix import InstructPix2Pix
     from attnwarp.editing.recording import RecordingPlan, record
     from attnwarp.methods.attention_warping import inject
 
@@ -200,14 +199,12 @@ def test_a_picture_edited_by_hand_can_be_the_source():
     task, timesteps = editor.task([before], "a bear"), editor.schedule.timesteps(4)
     wanted = editor.encode([by_hand])
     noise = edit_friendly_invert(editor.schedule, task.predict, wanted, timesteps)
-    plan = RecordingPlan(
-        choose_layers(editor.unet), (8, 12), PIX2PIX_BRANCHES, ("text", "image"), 4
-    )
-    with record(editor.unet, plan) as recording:
+    plan = RecordingPlan(editor.layers(), (8, 12), ("text", "image"), 4)
+    with record(editor, plan) as recording:
         source = replay(editor.schedule, task.predict, noise)
     assert torch.allclose(source, wanted, rtol=0, atol=1e-5)
     alone = edit(editor, [other], "a bear", steps=4).latents
-    with inject(editor.unet, recording, branches=PIX2PIX_BRANCHES, weight=lambda t, T: 0.9):
+    with inject(editor, recording, weight=lambda t, T: 0.9):
         assert not torch.allclose(
             edit(editor, [other], "a bear", steps=4).latents, alone, atol=1e-3
         )

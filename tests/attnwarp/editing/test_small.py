@@ -11,8 +11,8 @@ from diffusers import StableDiffusionControlNetPipeline, StableDiffusionInstruct
 
 import attnwarp.editing.latents
 import attnwarp.editing.small_unet  # noqa: F401  diffusers imports no module that a folder names
-from attnwarp.editing.controlnet import control_image
 from attnwarp.editing.editor import edit
+from attnwarp.editing.editors.controlnet import control_image
 from attnwarp.editing.small import (
     DEPTH_GUIDANCE,
     IMAGE_GUIDANCE,

@@ -3,7 +3,7 @@ from tiny_editors import pix2pix
 from tiny_scenes import cameras, pictures, splats
 from torch_threads import on_one_thread
 
-from attnwarp.editing.pix2pix import InstructPix2Pix
+from attnwarp.editing.editors.pix2pix import InstructPix2Pix
 
 one_thread = pytest.fixture(on_one_thread, autouse=True, scope="package")
 

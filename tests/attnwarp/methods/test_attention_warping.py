@@ -202,12 +202,13 @@ def test_weight_zero_records_nothing_and_edits_each_view_as_the_editor_alone_doe
 ):
     result = run(scene, editor, tmp_path / "zero", replace(QUICK, a0=0.0))
     assert result.counters["feature_bytes"] == result.counters["injected"] == 0
-    assert not any((tmp_path / "zero" / folder).exists() for folder in ("features", "masks"))
+    left = {path.parent.name for path in (tmp_path / "zero").rglob("*.png")}
+    assert left.isdisjoint({"features", "masks"})
     full = run(scene, editor, settings=replace(QUICK, a0=1.0))
-    for view in plan(full).edited:
-        (alone,) = edit(editor, [scene[2][view]], "a bear", steps=QUICK.steps, seed=0).images
-        # Views of one batch differ from views alone in the last bits.
-        assert np.abs(result.edited[view] / 255 - alone).max() < 1 / 255
+    for views in ([plan(full).source], *plan(full).stages):  # a stage is one batch
+        alone = edit(editor, [scene[2][k] for k in views], "a bear", steps=QUICK.steps).images
+        for view, picture in zip(views, alone, strict=True):
+            assert np.abs(result.edited[view] - 255 * picture).max() <= 0.5 + 1e-4  # 8 bits
     # Injection does change the views, or the test above would show nothing.
     assert all((full.edited[v] != result.edited[v]).any() for v in plan(full).stages[0])
 
@@ -865,11 +866,11 @@ def depth_editor():
     """A ControlNet whose own guidance, which has one branch, runs in no pass of an edit."""
     from tiny_editors import controlnet
 
-    from attnwarp.editing.controlnet import DepthControlNet
+    from attnwarp.editing.editors.controlnet import DepthControlNet
 
     pipe = controlnet()
     names = ("unet", "vae", "text_encoder", "tokenizer", "scheduler", "controlnet")
-    return DepthControlNet(*(getattr(pipe, name) for name in names), guidance=1.0)
+    return DepthControlNet(*(getattr(pipe, name) for name in names), text_guidance=1.0)
 
 
 SHORT = {"suffix": ", good", "negative_prompt": "blur"}
@@ -881,7 +882,7 @@ def test_a_controlnet_is_guided_by_depth_with_both_branches_and_its_released_gui
 ):
     settings = quick("released-controlnet", **SHORT)
     values, result = guidance_of_passes(
-        depth_editor, "guidance", lambda: run(scene, depth_editor, tmp_path, settings)
+        depth_editor, "text_guidance", lambda: run(scene, depth_editor, tmp_path, settings)
     )
     assert values == [7.5, 12.5, 1.0, 12.5]  # the second stage inverts its views unguided
     source = record(tmp_path, "v0")
@@ -908,7 +909,9 @@ def test_latents_by_stage_are_random_first_and_the_renders_own_later(
     monkeypatch.setattr(
         depth_editor,
         "task",
-        lambda g, words: prompts.append((words, depth_editor.negative_prompt)) or task(g, words),
+        lambda g, words, regions=None: (
+            prompts.append((words, depth_editor.negative_prompt)) or task(g, words)
+        ),
     )
     settings = quick("released-controlnet", color_rate=40.0, **SHORT)
     result = run(scene, depth_editor, None, settings)
@@ -954,7 +957,7 @@ def inverted_by_diffusers(net, depth, picture, prompt, steps):
     """(1, C, h, w) at the noisiest step, by diffusers' own inverse scheduler and models."""
     from diffusers import DDIMInverseScheduler
 
-    from attnwarp.editing.controlnet import control_image
+    from attnwarp.editing.editors.controlnet import control_image
 
     inverse = DDIMInverseScheduler.from_config(net.scheduler.config)
     inverse.set_timesteps(steps)
@@ -978,7 +981,9 @@ def test_inverted_latents_are_those_of_diffusers_with_the_source_prompt(
 ):
     guides, task = [], depth_editor.task
     monkeypatch.setattr(
-        depth_editor, "task", lambda g, words: guides.append((words, g)) or task(g, words)
+        depth_editor,
+        "task",
+        lambda g, words, regions=None: guides.append((words, g)) or task(g, words),
     )
     settings = quick(
         "corrected", a0=0.0, text_guidance=3.0, iterations=0,
@@ -988,10 +993,10 @@ def test_inverted_latents_are_those_of_diffusers_with_the_source_prompt(
         depth_editor.unet, lambda: run(scene, depth_editor, None, settings, "a red bear")
     )
     assert result.counters["network_rows"] == sum(rows)
-    assert (rows.count(1), depth_editor.guidance) == (5 * 2, 1.0)  # views are inverted unguided
+    assert rows.count(1) == 5 * 2 and depth_editor.text_guidance == 1.0  # inverted unguided
     assert [words for words, _ in guides].count("a bear") == 5
     _, first = guides[0]
-    monkeypatch.setattr(depth_editor, "guidance", 3.0)
+    monkeypatch.setattr(depth_editor, "text_guidance", 3.0)
     x = inverted_by_diffusers(depth_editor, first[0], scene[2][0], "a bear", 2)
     expected = edit(depth_editor, first, "a red bear", steps=2, latents=x).images[0]
     assert np.abs(result.edited[0] - 255 * expected).max() < 1
@@ -1042,7 +1047,7 @@ def recorded(scene, editor, tmp_path, settings):
     from attnwarp.methods.features import Features
 
     plan = Features(editor, settings, "cpu").plan(0, (16, 16), further=False)
-    with keep(editor.unet, plan) as recording:
+    with keep(editor, plan) as recording:
         edit(editor, [scene[2][0]], "a bear", steps=settings.steps)
     return recording
 
@@ -1075,9 +1080,8 @@ def test_features_of_chosen_steps_alone_reach_a_target(scene, editor, tmp_path):
     pair = model, [views[0], twin], [images[0], images[1]]
     some = run(pair, editor, settings=settings, warps=lambda source, target: identity)
     with inject(
-        editor.unet,
+        editor,
         everything,
-        branches=editor.branches,
         weight=lambda step, steps: a_t(step, steps) if step in first else 0.0,
     ):
         expected = edit(editor, [images[1]], "a bear", steps=QUICK.steps).images[0]

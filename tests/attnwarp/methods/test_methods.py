@@ -281,7 +281,7 @@ def test_gaussctrl_inverts_without_guidance_and_edits_with_references(run, depth
     inversions, edits = [n for n in rows if n == 1], [n for n in rows if n > 1]
     assert len(inversions) == 3 * 2
     assert edits == [2 * (2 + 2)] * 2 + [2 * (2 + 1)] * 2
-    assert depth_editor.guidance == 3.0
+    assert depth_editor.text_guidance == 3.0
     texts = []
     embed = depth_editor.embed
     depth_editor.embed = lambda prompts: texts.append(list(prompts)) or embed(prompts)
@@ -291,7 +291,7 @@ def test_gaussctrl_inverts_without_guidance_and_edits_with_references(run, depth
     finally:
         del depth_editor.embed
     assert texts == [[""]] * 3 + [["red", "a bear, best"]]
-    assert (depth_editor.guidance, depth_editor.negative_prompt) == (3.0, "")
+    assert (depth_editor.text_guidance, depth_editor.negative_prompt) == (3.0, "")
 
 
 @pytest.mark.parametrize(("spread", "kind"), [(0.5, "sample"), (2.0, "epsilon")])

@@ -12,7 +12,7 @@ from tiny_scenes import cameras
 
 from attnwarp import Camera
 from attnwarp.editing.editor import Editor
-from attnwarp.editing.pix2pix import InstructPix2Pix
+from attnwarp.editing.editors.pix2pix import InstructPix2Pix
 from attnwarp.fit import Views
 from attnwarp.methods.scene import Scene, editor_digest, images_of
 
@@ -118,7 +118,7 @@ def test_a_digest_does_not_change_when_texts_are_embedded_nor_need_more_than_the
     first = editor_digest(own)
     own.embed(["a bear"])  # which leaves its padding in the tokenizer
     assert editor_digest(own) == first
-    members = {name for name in vars(Editor) if name[0] != "_"} | set(Editor.__annotations__)
-    bare = SimpleNamespace(**{name: getattr(own, name) for name in members})
+    members = {name for kind in Editor.__mro__[:2] for name in vars(kind) if name[0] != "_"}
+    bare = SimpleNamespace(**{name: getattr(own, name) for name in members.union(own.options)})
     assert len(editor_digest(bare)) == 64
     assert not hasattr(bare, "vae") and not hasattr(bare, "tokenizer")

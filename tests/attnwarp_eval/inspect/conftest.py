@@ -26,7 +26,7 @@ def folders(tmp_path_factory, one_thread):
     from tiny_editors import pix2pix
     from tiny_scenes import cameras, pictures, splats
 
-    from attnwarp.editing.pix2pix import InstructPix2Pix
+    from attnwarp.editing.editors.pix2pix import InstructPix2Pix
     from attnwarp.io import Dataset, write_ply, write_transforms
     from attnwarp.io.images import encode_png
     from attnwarp.methods import preset

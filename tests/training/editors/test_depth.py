@@ -7,8 +7,8 @@ import pytest
 import torch
 from diffusers import StableDiffusionControlNetPipeline
 
-from attnwarp.editing.controlnet import DepthControlNet, control_image
 from attnwarp.editing.editor import edit
+from attnwarp.editing.editors.controlnet import DepthControlNet, control_image
 from attnwarp.editing.small import DEPTH_GUIDANCE, load_editor
 from attnwarp_eval.drawn.worlds import COLORS, HUES
 from training import steps
@@ -151,7 +151,7 @@ def test_diffusers_own_pipeline_draws_the_same_picture(trained, worlds, tmp_path
     folder = export_depth_editor("depth", trained, tmp_path / "small-depth")
     pipe = StableDiffusionControlNetPipeline.from_pretrained(folder, torch_dtype=torch.float32)
     pipe.set_progress_bar_config(disable=True)
-    ours = load_editor(str(folder), guidance=2.0)
+    ours = load_editor(str(folder), text_guidance=2.0)
     assert isinstance(ours, DepthControlNet)
     depth = worlds.depth[0, 0, ::2, ::2]
     noise = torch.randn((1, 48, 16, 16), generator=torch.Generator().manual_seed(0))

@@ -13,7 +13,7 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.editing.injection import blended
-from attnwarp.editing.layers import Layer
+from attnwarp.editing.layers import BareUNet, Layer
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.schedule import DDIM, Prediction
 from attnwarp.methods.attention_warping import CORRECTED, a_t, blend, inject
@@ -158,16 +158,16 @@ def _views_of_a_batch(views: float, way: Way) -> float:
         [orbit(8.0 * k, size=SIZE, height=1) for k in range(count)],
     )
     warps = [_view(source, target, plane_depth(target, (1, 0, 0), 0.0), way) for target in targets]
-    plan = RecordingPlan((layer,), (SIZE, SIZE), ("text",), ("text",), 1, dtype=way.dtype)
+    plan = RecordingPlan((layer,), (SIZE, SIZE), ("text",), 1, dtype=way.dtype)
     with torch.no_grad():
-        with record(unet, plan) as recording:
+        with record(BareUNet(unet), plan) as recording:
             unet(latents[-1:], 0.0)
         weight = partial(a_t, s=replace(CORRECTED, a0=0.6))
-        with inject(unet, recording, branches=("text",), warps=warps, weight=weight):
+        with inject(BareUNet(unet), recording, warps=warps, weight=weight):
             together = unet(latents[:count], 0.0)
         alone = []
         for k, warp in enumerate(warps):
-            with inject(unet, recording, branches=("text",), warps=[warp], weight=weight):
+            with inject(BareUNet(unet), recording, warps=[warp], weight=weight):
                 alone.append(unet(latents[k : k + 1], 0.0))
     tokens = exact_tokens(unet, latents)
     expected = np.stack(

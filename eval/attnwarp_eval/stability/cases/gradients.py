@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from attnwarp.camera import Camera
-from attnwarp.editing.layers import Layer
+from attnwarp.editing.layers import BareUNet, Layer
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.methods.attention_warping import CORRECTED, a_t, inject
 from attnwarp.warp import Correspondence, FeatureWarp, Surface, preset, warp_surfaces
@@ -209,12 +209,12 @@ def _injected(weight: float, way: Way) -> float:
     latents = random_features((2, CHANNELS, SIZE, SIZE), way, seed=7)
     upstream = random_features((SIZE**2, CHANNELS), way, seed=4)
     warp = _half_masked(0.5, way)
-    plan = RecordingPlan((layer,), (SIZE, SIZE), ("text",), ("text",), 1, dtype=way.dtype)
-    with torch.no_grad(), record(unet, plan) as recording:
+    plan = RecordingPlan((layer,), (SIZE, SIZE), ("text",), 1, dtype=way.dtype)
+    with torch.no_grad(), record(BareUNet(unet), plan) as recording:
         unet(latents[:1], 0.0)
     target = latents[1:].clone().requires_grad_()
     a = partial(a_t, s=replace(CORRECTED, a0=weight))
-    with inject(unet, recording, branches=("text",), warps=[_At(warp)], weight=a):
+    with inject(BareUNet(unet), recording, warps=[_At(warp)], weight=a):
         unet(target, 0.0).backward(upstream[None])
     assert target.grad is not None
     share = 1 - _held(weight, way) * warp.mask.numpy().reshape(-1, 1)

@@ -32,9 +32,7 @@ from attnwarp_eval.study.shared.warps import warp_truth
 from attnwarp_eval.world import World, changed
 
 if TYPE_CHECKING:
-    from attnwarp.editing.controlnet import DepthControlNet
     from attnwarp.editing.editor import Editor
-    from attnwarp.editing.pix2pix import InstructPix2Pix
     from attnwarp.methods import Budget
 
 EDITING_PARTS = ("source", "warp", "edit")
@@ -124,20 +122,16 @@ def own_seconds(result: EditedScene) -> float:
 
 
 @lru_cache(maxsize=2)
-def _loaded(
-    name: str, guidance: tuple[tuple[str, float], ...], draws: bool, device: str
-) -> InstructPix2Pix | DepthControlNet:
-    from attnwarp.editing.small import guide_of, load_editor
+def _loaded(name: str, guidance: tuple[tuple[str, float], ...], draws: bool, device: str) -> Editor:
+    from attnwarp.editing.small import load_editor
 
     given: dict[str, Any] = {f"{kind}_guidance": value for kind, value in guidance}
-    if guide_of(name) == "depth" and "text_guidance" in given:
-        given["guidance"] = given.pop("text_guidance")
     if not draws:
         given["draws"] = False
     return load_editor(name, device=device, **given)
 
 
-def load(name: str, planned: Json, device: str = "cpu") -> InstructPix2Pix | DepthControlNet:
+def load(name: str, planned: Json, device: str = "cpu") -> Editor:
     """An editor whose identity is the planned one.
 
     Raises:

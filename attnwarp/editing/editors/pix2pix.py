@@ -21,6 +21,7 @@ from attnwarp.editing.editor import (
     check_networks,
     tensor_of,
 )
+from attnwarp.editing.editors import reads
 from attnwarp.editing.layers import PIX2PIX_BRANCHES
 from attnwarp.editing.schedule import Time
 
@@ -44,6 +45,7 @@ def check_pix2pix(
     check_networks(unet, text_encoder, channels, "unet", hint)
 
 
+@reads("StableDiffusionInstructPix2PixPipeline")
 class InstructPix2Pix(Latent):
     """An :class:`~attnwarp.editing.editor.Editor` over diffusers' own models.
 
@@ -56,6 +58,8 @@ class InstructPix2Pix(Latent):
     """
 
     guide: Guide = "picture"
+    options = ("text_guidance", "image_guidance")
+    carries = ("text", "image")
 
     def __init__(
         self,
@@ -68,7 +72,10 @@ class InstructPix2Pix(Latent):
         text_guidance: float = 7.5,
         image_guidance: float = 1.5,
     ) -> None:
+        from attnwarp.editing.small_unet import EditUNet
+
         super().__init__(unet, vae, text_encoder, tokenizer, scheduler)
+        self.draws = isinstance(unet, EditUNet)
         check_pix2pix(unet.config, text_encoder.config.to_dict(), vae.config)
         most = MOST_GUIDANCE
         self.text_guidance = check.number(text_guidance, -most, most, "text_guidance")
@@ -126,7 +133,7 @@ class InstructPix2Pix(Latent):
             torch.cat([source[name] for name in shares]).to(self.unet.dtype),
             views,
             shares,
-            None if regions is None else _on_grid(regions, (before.shape[2], before.shape[3])),
+            _on_grid(regions, (before.shape[2], before.shape[3])) if regions else None,
         )
 
 
@@ -187,7 +194,7 @@ class Pix2PixTask:
         editor = self.editor
         noisy = torch.cat([latents] * len(self.branches))
         step = torch.tensor(int(timestep), device=latents.device)
-        if hasattr(editor.unet, "region"):
+        if editor.draws:
             editor.unet.region = self.region
         output = editor.unet(
             torch.cat([noisy, self.before], dim=1),

@@ -22,6 +22,7 @@ from attnwarp.editing.editor import (
     check_networks,
     tensor_of,
 )
+from attnwarp.editing.editors import reads
 from attnwarp.editing.layers import CONTROLNET_BRANCHES
 from attnwarp.editing.schedule import Time
 
@@ -74,6 +75,7 @@ def check_controlnet(
     check_networks(controlnet, text_encoder, channels, "controlnet")
 
 
+@reads("StableDiffusionControlNetPipeline")
 class DepthControlNet(Latent):
     """An :class:`~attnwarp.editing.editor.Editor` over diffusers' own models.
 
@@ -82,12 +84,14 @@ class DepthControlNet(Latent):
             transformers.
         scheduler: a DDIMScheduler.
         controlnet: controlnet of diffusers, for depth.
-        guidance: s of e = e_un + s (e_txt - e_un); 1 turns it off, and the batch is a half.
+        text_guidance: s of e = e_un + s (e_txt - e_un); 1 turns it off, and the batch is a half.
         control_scale: factor of the ControlNet's residuals.
         negative_prompt: negative prompt of the unconditional branch.
     """
 
     guide: Guide = "depth"
+    options = ("text_guidance", "control_scale", "negative_prompt")
+    carries = CONTROLNET_BRANCHES
 
     def __init__(
         self,
@@ -98,7 +102,7 @@ class DepthControlNet(Latent):
         scheduler: Any,
         controlnet: Any,
         *,
-        guidance: float = 5.0,
+        text_guidance: float = 5.0,
         control_scale: float = 1.0,
         negative_prompt: str = "",
     ) -> None:
@@ -106,9 +110,10 @@ class DepthControlNet(Latent):
         words = text_encoder.config.to_dict()
         check_base(unet.config, words, vae.config)
         check_controlnet(controlnet.config, words, vae.config)
-        guidance = check.number(guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "guidance")
+        most = MOST_GUIDANCE
+        self.text_guidance = check.number(text_guidance, -most, most, "text_guidance")
         self.controlnet = controlnet.eval().requires_grad_(False)
-        self.guidance, self.control_scale = guidance, control_scale
+        self.control_scale = control_scale
         self.negative_prompt = negative_prompt
 
     @classmethod
@@ -142,21 +147,30 @@ class DepthControlNet(Latent):
     @property
     def branches(self) -> tuple[str, ...]:
         """The guidance branches in the order of the UNet's batch."""
-        return CONTROLNET_BRANCHES if self.guidance != 1 else ("text",)
+        return CONTROLNET_BRANCHES if self.text_guidance != 1 else ("text",)
 
-    def task(self, guides: Sequence[npt.NDArray[Any]], prompt: str) -> ControlTask:
-        """A picture for each (H, W) depth map, by one prompt."""
+    @property
+    def parts(self) -> dict[str, Any]:
+        """Networks and tokenizer."""
+        return {**super().parts, "controlnet": self.controlnet}
+
+    def task(
+        self,
+        guides: Sequence[npt.NDArray[Any]],
+        prompt: str,
+        regions: Sequence[npt.NDArray[Any]] | None = None,
+    ) -> ControlTask:
+        """A picture for each (H, W) depth map, by one prompt; regions change nothing."""
         control = tensor_of([control_image(depth) for depth in guides], "guides", self.factor)
         control = control.to(self.unet.device, self.controlnet.dtype)
         views = len(control)
         prompts = {"uncond": self.negative_prompt, "text": prompt}
         texts = self.embed([prompts[name] for name in self.branches])
-        size = (control.shape[2] // self.factor, control.shape[3] // self.factor)
         return ControlTask(
             self,
             texts.repeat_interleave(views, dim=0),
             torch.cat([control] * len(texts)),
-            (views, self.unet.config.in_channels, *size),
+            (views, *self.noise_shape((control.shape[2], control.shape[3]))),
         )
 
 
@@ -205,4 +219,4 @@ class ControlTask:
         if len(self.branches) == 1:
             return output
         uncond, text = output.chunk(2)
-        return uncond + editor.guidance * (text - uncond)
+        return uncond + editor.text_guidance * (text - uncond)
