@@ -176,8 +176,6 @@ def test_the_report_says_what_the_editor_is(records, tmp_path):
         ({"probes": {"editing": ["full"]}}, "probes.editing: 'full' has the ideal editor"),
         ({"variants": {"full": {"method": "dge"}}, "probes": {"ideal": ["full"]}, "editing": {"editor": {"ideal": {}}}}, "method 'dge' of 'full' changes attention"),
         ({"variants": {"full": {"control": "upside down"}, "mirrored": {}}}, "control"),
-        ({"variants": {"full": {"control": "mirrored", "options": {"a0": 0.0}}, "mirrored": {}}}, "variants.full.control"),
-        ({"editing": {"editor": {"ideal": {"parts": 8}}, "options": {"text_guidance": 7.5}}}, "text_guidance"),
         ({"editing": {"editor": {"ideal": {"settled": 1.5}}}}, "settled"),
     ],
 )  # fmt: skip
