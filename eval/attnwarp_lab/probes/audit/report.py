@@ -225,7 +225,7 @@ def rank_correlation(sizes: Any, values: Any) -> float:
     """Spearman's of what is defined; 0 for values that never change, NaN for fewer than three.
 
     Example:
-        >>> rank_correlation((0, 1, 2, 3, 4), (0.1, 0.2, 0.3, 0.5, 0.4))  # 1 - 6 * 2 / (5 * 24)
+        >>> round(rank_correlation((0, 1, 2, 3, 4), (1, 2, 3, 5, 4)), 9)  # 1 - 6 * 2 / (5 * 24)
         0.9
     """
     known = np.isfinite(values)
