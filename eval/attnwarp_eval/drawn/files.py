@@ -74,7 +74,7 @@ def _flow(value: Any) -> str:
     return text.removesuffix("...\n").strip()
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(yaml.CSafeDumper if yaml.__with_libyaml__ else yaml.SafeDumper):  # type: ignore[misc]
     """Values written out where they stand: an alias would be one value in two places."""
 
     def ignore_aliases(self, data: Any) -> bool:
