@@ -187,8 +187,12 @@ class Mesh:
             >>> len(mesh.faces)
             4
         """
-        mesh = self
-        while len(mesh.faces) <= MOST_DIVIDED:
+        mesh, corners = self, self.vertices[self.faces]
+        sides = corners[:, 1:] - corners[:, :1]
+        area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum() / 2
+        # No triangle with such edges is larger than the equilateral one.
+        few = area <= MOST_DIVIDED * 3**0.5 / 4 * longest**2
+        while few and len(mesh.faces) <= MOST_DIVIDED:
             ends = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
             count = len(mesh.vertices)
             edges, of_face = np.unique(ends[..., 0] * count + ends[..., 1], return_inverse=True)
