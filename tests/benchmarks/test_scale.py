@@ -21,6 +21,7 @@ def probe_for_these_tests_alone():
     unregister("free")
 
 
+@pytest.mark.door
 def test_every_step_of_the_documents_command_is_measured(monkeypatch, tmp_path, capfd):
     out = tmp_path / "report.md"
     run(monkeypatch, "--cells", "32", "--folder", tmp_path, "--out", out)

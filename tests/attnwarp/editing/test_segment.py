@@ -138,6 +138,7 @@ def test_the_bundled_segmenter_cuts_a_held_out_snowman_out(clip):
     assert clip.segment(large, "snowman").shape == (512, 512)
 
 
+@pytest.mark.door
 def test_the_bundled_segmenter_cuts_parts_of_held_out_things_out(clip):
     """Oracle: the pixels that rays hit. A third of the parts may be missed, as the report has it."""
     overlaps = []

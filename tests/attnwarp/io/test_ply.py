@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from further import further
 
 from attnwarp import Camera, Gaussians
 from attnwarp.errors import InputWarning
@@ -736,7 +737,7 @@ def test_a_screen_filter_is_kept_by_a_file_and_overruled_by_the_caller(tmp_path)
         replace(model(), screen_filter=0)
 
 
-@pytest.mark.parametrize("width", [1e-4, 0.1, 2.0])
+@pytest.mark.parametrize("width", further(0.1, 1e-4, 2.0))
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_any_screen_filter_is_drawn_and_differentiated_as_the_reference_does(width, antialiased):
     """Oracle: torch's own derivatives of the reference in float64."""

@@ -17,6 +17,7 @@ import pytest
 import tiny_models
 import torch
 from edit_folders import Killed, Watched, events, files
+from further import further
 from PIL import Image
 from tiny_editors import nearest_steps
 from tiny_methods import rows_of
@@ -517,7 +518,7 @@ def test_an_argument_of_another_type_is_named(scene, editor, changes, message):
         attention_warping(**{**given, "instruction": "a bear", "settings": QUICK, **changes})
 
 
-@pytest.mark.parametrize("part", ["masks", "features", "features/v0.png"])
+@pytest.mark.parametrize("part", further("features", "masks", "features/v0.png"))
 def test_pictures_of_where_features_went_are_drawn_again(part, finished, scene, editor, tmp_path):
     """Oracle: the bytes of the edit that nobody touched."""
     folder = tmp_path / "folder"
@@ -559,7 +560,7 @@ def test_an_edit_made_again_for_a_picture_beside_it_has_to_be_the_same(
             assert np.array_equal(read_image(path), other)
 
 
-@pytest.mark.parametrize("place", ["rounds/1/v0.png", "rounds/2/*.png"])
+@pytest.mark.parametrize("place", further("rounds/1/v0.png", "rounds/2/*.png"))
 def test_the_same_picture_in_other_bytes_is_the_edit(place, finished, scene, editor, tmp_path):
     folder = tmp_path / "folder"
     shutil.copytree(finished[1], folder)
@@ -571,7 +572,7 @@ def test_the_same_picture_in_other_bytes_is_the_edit(place, finished, scene, edi
     assert files(folder) == before
 
 
-@pytest.mark.parametrize("place", ["rounds/1/v0.png", "rounds/2/*.png"])
+@pytest.mark.parametrize("place", further("rounds/1/v0.png", "rounds/2/*.png"))
 def test_another_picture_in_place_of_an_edit_is_not_taken_for_it(
     place, finished, scene, editor, tmp_path
 ):
@@ -586,7 +587,7 @@ def test_another_picture_in_place_of_an_edit_is_not_taken_for_it(
 
 
 @pytest.mark.parametrize(
-    "name", ["features/v0.png", "edited.ply", "segments/x.png", "views/x.json"]
+    "name", further("features/v0.png", "edited.ply", "segments/x.png", "views/x.json")
 )
 def test_a_persons_files_where_results_go_are_left_alone(name, scene, editor, tmp_path):
     path = tmp_path / name
@@ -625,7 +626,7 @@ def test_segments_leave_the_original_or_black_outside(scene, editor):
         run(scene, editor, settings=settings, segments=[left & False] * 5)
 
 
-@pytest.mark.parametrize("how", ["black", "original"])
+@pytest.mark.parametrize("how", further("black", "original"))
 def test_splats_are_tuned_on_pictures_that_a_small_edit_changes_in_the_segments_alone(
     how, scene, editor, monkeypatch
 ):
@@ -670,7 +671,7 @@ def test_a_picture_by_hand_may_have_any_type_that_images_have(scene, editor):
         run(scene, editor, settings=settings, source_picture=picture.astype(np.int64))
 
 
-@pytest.mark.parametrize("views", [1, 3])
+@pytest.mark.parametrize("views", further(3, 1))
 def test_where_all_views_are_sources_the_splats_are_tuned_on_them(views, scene, editor, tmp_path):
     model, cameras, images = scene
     part = model, cameras[:views], images[:views]
@@ -1141,7 +1142,7 @@ def extended(scene, editor, tmp_path_factory):
     return run(scene, editor, folder, replace(QUICK, **ALL_IDEAS)), folder
 
 
-@pytest.mark.parametrize("store", ["cpu", "disk"])
+@pytest.mark.parametrize("store", further("cpu", "disk"))
 def test_the_memory_of_all_recordings_is_told_once_before_the_first(store, scene, editor, tmp_path):
     """Oracle: features counted by hand, of two views of 32 px and one of twice as many pixels."""
     model, views, images = scene
@@ -1303,7 +1304,7 @@ def test_an_estimate_warped_as_a_picture_changes_nothing_that_no_source_sees(sce
     assert np.array_equal(edited(0.0), edited(1.0))
 
 
-@pytest.mark.parametrize("size", [64, 32])
+@pytest.mark.parametrize("size", further(32, 64))
 def test_the_estimates_margin_is_a_share_of_the_photograph_whatever_the_size_of_the_edit(
     editor, monkeypatch, size
 ):

@@ -77,6 +77,7 @@ def cameras():
     return [Camera.look_at(place, (0.7, 0.7, 0.7), **view) for place in places]
 
 
+@pytest.mark.door
 def test_right_views_are_all_registered_and_those_of_another_scene_are_not(cameras):
     right = [corner(0, camera) for camera in cameras]
     found = metrics.reconstruct(right, cameras)
