@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import importlib.util
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from functools import wraps
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from attnwarp.errors import InputError, MissingExtraError, install_command
 from attnwarp.reporting import SILENT, Reporter
 
 if TYPE_CHECKING:
     import torch
+
+P, T = ParamSpec("P"), TypeVar("T")
 
 TYPES = ("auto", "float32", "float16", "bfloat16")
 
@@ -107,3 +111,30 @@ def peak_memory(device: str) -> str:
     import torch
 
     return f", at most {torch.cuda.max_memory_allocated(device) / 2**30:.1f} GiB of the GPU"
+
+
+def on_cpu_unless_named(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a function so that tensors whose device it does not name lie on the CPU, also in a
+    process that makes them elsewhere (``torch.set_default_device``).
+
+    Example:
+        >>> import torch
+        >>> @on_cpu_unless_named
+        ... def zeros():
+        ...     return torch.zeros(2)
+        >>> with torch.device("meta"):
+        ...     zeros().device
+        device(type='cpu')
+    """
+
+    @wraps(function)
+    def called(*arguments: P.args, **named: P.kwargs) -> T:
+        import torch
+
+        # Under a context every call of torch passes through Python, so it is entered where needed.
+        if torch.get_default_device().type == "cpu":
+            return function(*arguments, **named)
+        with torch.device("cpu"):
+            return function(*arguments, **named)
+
+    return called

@@ -108,10 +108,12 @@ def test_examples_of_the_docstrings_give_what_they_print(name, folder):
     runner = doctest.DocTestRunner(
         optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE | doctest.FAIL_FAST
     )
-    output = []
+    output, finder = [], doctest.DocTestFinder(exclude_empty=True)
+    of_module = finder._from_module  # which takes a decorated function for one of its decorator
+    finder._from_module = lambda module, value: of_module(module, inspect.unwrap(value))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for example in doctest.DocTestFinder(exclude_empty=True).find(module, name):
+        for example in finder.find(module, name):
             runner.run(example, out=output.append)
     assert runner.failures == 0, "".join(output)
     assert runner.tries > 0, f"{name}: no example ran"

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from attnwarp import check
+from attnwarp.devices import on_cpu_unless_named
 from attnwarp.editing.layers import Call, Layer, Network, paper_layers, unet_call
 from attnwarp.editing.schedule import DDIM, Grid, Schedule, Size, Time, following
 from attnwarp.errors import InputWarning
@@ -177,6 +178,7 @@ def drawn(shape: Sequence[int], seed: int) -> Tensor:
     return torch.randn(tuple(shape), generator=generator, dtype=torch.float32)
 
 
+@on_cpu_unless_named
 def edit(
     editor: Editor,
     guides: Sequence[npt.NDArray[Any]],

@@ -12,6 +12,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from attnwarp.devices import on_cpu_unless_named
 from attnwarp.errors import InputError, InputWarning, suggest
 from attnwarp.process import core_count
 
@@ -238,6 +239,7 @@ def _pair(folders: str) -> tuple[Path, Path]:
     return places[0], places[1]
 
 
+@on_cpu_unless_named
 def load_editor(name_or_folder: str, **settings: Any) -> Editor:
     """An editor by its name, such as "small-plain", or from folders in diffusers' format.
 

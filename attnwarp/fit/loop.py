@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from attnwarp import check, losses
+from attnwarp.devices import on_cpu_unless_named
 from attnwarp.errors import InputWarning
 from attnwarp.fit.densify import Density
 from attnwarp.fit.model import Model
@@ -113,6 +114,7 @@ class Fit:
     extent: float
 
 
+@on_cpu_unless_named
 def fit(
     start: Gaussians,
     views: Views,

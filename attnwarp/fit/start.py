@@ -11,6 +11,7 @@ import torch
 
 from attnwarp import check
 from attnwarp.camera import Camera
+from attnwarp.devices import on_cpu_unless_named
 from attnwarp.gaussians import Gaussians, Kind
 
 if TYPE_CHECKING:
@@ -77,6 +78,7 @@ def _at_one_place(centers: Array) -> bool:
     return apart <= ROUNDINGS * float(np.finfo(np.float64).eps * np.abs(centers).max())
 
 
+@on_cpu_unless_named
 def from_points(
     points: npt.ArrayLike,
     colors: npt.ArrayLike | None = None,
@@ -194,6 +196,7 @@ FIRST_POINTS = 10_000
 """Random first points, where a data set has none."""
 
 
+@on_cpu_unless_named
 def first_splats(
     dataset: Dataset,
     cameras: Sequence[Camera],

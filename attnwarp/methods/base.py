@@ -26,6 +26,7 @@ import numpy.typing as npt
 
 from attnwarp import check, losses
 from attnwarp.camera import Camera
+from attnwarp.devices import on_cpu_unless_named
 from attnwarp.editing.editor import Editor
 from attnwarp.encoders import load_encoder
 from attnwarp.fit import compile_kernels
@@ -280,6 +281,7 @@ class Plan:
         self.rounds[number] = Round(**{**vars(self._round(number)), **changes})
 
 
+@on_cpu_unless_named
 def run(
     name: str,
     make: Callable[[Work, Any], Method],

@@ -11,6 +11,7 @@ import torch
 
 from attnwarp import check
 from attnwarp.camera import ORTHONORMAL_TOLERANCE, Camera
+from attnwarp.devices import on_cpu_unless_named
 from attnwarp.gaussians import Gaussians
 from attnwarp.render import constants
 from attnwarp.render.interface import Inputs, Outputs
@@ -127,6 +128,7 @@ class Render:
         return normal_from_depth(self.depth, self.camera, self._pose)
 
 
+@on_cpu_unless_named
 def normal_from_depth(
     depth: check.Array, camera: Camera, pose: check.Array | None = None
 ) -> Tensor:
@@ -175,6 +177,7 @@ def normal_from_depth(
     return torch.nn.functional.pad(inner, (0, 0, 1, 1, 1, 1), value=torch.nan)
 
 
+@on_cpu_unless_named
 def render(
     gaussians: Gaussians,
     camera: Camera,

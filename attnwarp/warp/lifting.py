@@ -19,6 +19,7 @@ import torch
 
 from attnwarp import check
 from attnwarp.camera import Camera
+from attnwarp.devices import on_cpu_unless_named
 from attnwarp.gaussians import SH_C0, Gaussians
 from attnwarp.render import Render, render
 from attnwarp.warp.view import near_plane
@@ -84,6 +85,7 @@ class LiftedMask:
         return _shown(self.gaussians, self.membership, camera, self.near, self.backend)
 
 
+@on_cpu_unless_named
 def lift_masks(
     gaussians: Gaussians,
     cameras: Sequence[Camera],

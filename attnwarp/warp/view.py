@@ -13,6 +13,7 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.camera import Camera
+from attnwarp.devices import on_cpu_unless_named
 from attnwarp.errors import InputWarning
 from attnwarp.gaussians import Gaussians
 from attnwarp.warp.correspondence import (
@@ -149,6 +150,7 @@ class WarpedView:
         return FeatureWarp(layer, mask, self.backend)
 
 
+@on_cpu_unless_named
 def warp_surfaces(
     source: Camera,
     target: Camera,
@@ -245,6 +247,7 @@ def warp_surfaces(
     return view
 
 
+@on_cpu_unless_named
 def warp_view(
     gaussians: Gaussians,
     source: Camera,
@@ -331,6 +334,7 @@ def warp_view(
     return view
 
 
+@on_cpu_unless_named
 def render_surface(
     gaussians: Gaussians,
     camera: Camera,

@@ -1,4 +1,6 @@
-"""Results in a process whose default type of numbers is float64, as some packages set it on import."""
+"""Results in a process whose default type of numbers is float64, as some packages set it on import, or
+whose default device is no CPU. The device meta stands for a GPU: it computes nothing.
+"""
 
 import ast
 from contextlib import contextmanager
@@ -33,6 +35,18 @@ def float64():
         torch.set_default_dtype(before)
 
 
+@contextmanager
+def meta():
+    torch.set_default_device("meta")
+    try:
+        yield
+    finally:
+        torch.set_default_device(None)
+
+
+OTHER_PROCESSES = pytest.mark.parametrize("process", [float64, meta])
+
+
 def same_splats(a, b):
     names = ("means", "quats", "scales", "opacities", "sh")
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in names)
@@ -43,8 +57,9 @@ def methods_but_one_at_the_door():
         yield pytest.param(name, marks=[pytest.mark.door] * (name != "attention_warping"))
 
 
+@OTHER_PROCESSES
 @pytest.mark.parametrize("name", methods_but_one_at_the_door())
-def test_an_edit_has_the_same_bits_in_a_process_of_float64(name):
+def test_an_edit_has_the_same_bits_in_a_process_of_other_defaults(name, process):
     model, views = splats(), cameras(3)
     images = pictures(model, views)
     settings = preset(name, steps=2, iterations=3, background="random")
@@ -59,14 +74,15 @@ def test_an_edit_has_the_same_bits_in_a_process_of_float64(name):
         return METHODS[name](model, views, images, editor, "make it red", settings, **own)
 
     first = edited()
-    with float64():
+    with process():
         again = edited()
     assert all(np.array_equal(again.edited[view], first.edited[view]) for view in first.edited)
     assert same_splats(again.gaussians, first.gaussians)
 
 
+@OTHER_PROCESSES
 @pytest.mark.parametrize("kind", ["2d", pytest.param("3d", marks=pytest.mark.door)])
-def test_a_fit_has_the_same_bits_in_a_process_of_float64(kind):
+def test_a_fit_has_the_same_bits_in_a_process_of_other_defaults(kind, process):
     model, views = splats(), cameras()
     seen = Views(views, pictures(model, views))
     settings = FitSettings(
@@ -80,7 +96,7 @@ def test_a_fit_has_the_same_bits_in_a_process_of_float64(kind):
         return fit(start, seen, settings).gaussians
 
     first = fitted()
-    with float64():
+    with process():
         again = fitted()
     assert len(first) > len(model)  # densified, which draws
     assert same_splats(again, first)
