@@ -287,9 +287,9 @@ class _Run:
                 continue
             if isinstance(expected, dict) and isinstance(stored, dict):
                 differ = [
-                    f"{k}: {stored.get(k)!r}, now {v!r}"
-                    for k, v in expected.items()
-                    if stored.get(k) != v
+                    f"{k}: {stored.get(k)!r}, now {expected.get(k, 'no setting')!r}"
+                    for k in {**stored, **expected}
+                    if k not in expected or stored.get(k) != expected[k]
                 ]
                 name = f"settings ({'; '.join(differ)})"
             raise ValueError(

@@ -18,6 +18,7 @@ from attnwarp.fit import FitSettings, Views, fit, from_points
 from attnwarp.fit.loop import CHECKPOINT, SPLATS
 from attnwarp.io import read_ply
 from attnwarp.render import render
+from attnwarp.workdir import Workdir
 
 from .conftest import blobs, pictures, ring
 
@@ -494,6 +495,16 @@ def test_a_checkpoint_of_other_settings_or_views_is_refused_by_name(scene, tmp_p
     moved = dataclasses.replace(start, means=start.means + 0.01)
     with pytest.raises(ValueError, match="other first splats"):
         fit(moved, scene[0], settings, folder=tmp_path)
+
+
+def test_a_checkpoint_of_a_setting_that_is_gone_is_refused_by_its_name(scene, tmp_path):
+    start, settings = begin(scene, iterations=2, sh_degree=0)
+    fit(start, scene[0], settings, folder=tmp_path)
+    folder = Workdir(tmp_path, "a fit")
+    state = folder.load(CHECKPOINT)
+    folder.save(CHECKPOINT, {**state, "settings": {**state["settings"], "grow": 0.05}})
+    with pytest.raises(ValueError, match=r"other settings \(grow: 0.05, now 'no setting'\)"):
+        fit(start, scene[0], settings, folder=tmp_path)
 
 
 def test_a_fit_that_is_lengthened_is_one_of_that_length_where_no_schedule_depends_on_it(
