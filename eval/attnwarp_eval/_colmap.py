@@ -1,21 +1,75 @@
 """The one place that imports pycolmap: a program of its own, ``python -m attnwarp_eval._colmap
-FOLDER``.
+TASK FOLDER [MODEL]``, which :func:`run` starts.
 
 In one process with other packages pycolmap corrupts memory: its compression library takes the place
 of theirs.
+
+- ``reconstruct`` finds poses and points, and writes their figures to ``result.json``.
+- ``triangulate`` finds points for the poses of ``poses.json``, and writes ``tracks.npz``.
+- ``read`` writes ``tracks.npz`` from a sparse model.
 """
 
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+
+from attnwarp.camera import Camera
+from attnwarp.errors import InputError, MissingExtraError
 
 SEED = 0
 """Seed of RANSAC; with one thread the same pictures give the same reconstruction."""
+
+
+def write_pictures(
+    folder: Path, images: Sequence[npt.NDArray[np.uint8]], cameras: Sequence[Camera]
+) -> list[str]:
+    """Write what :func:`match` reads, and return the pictures' names there.
+
+    Args:
+        folder: receives ``pictures.npz`` and ``cameras.json``.
+        images: (H, W, 3) sRGB.
+        cameras: pinhole cameras, one a picture, of its size.
+    """
+    names = [f"{i:05d}" for i in range(len(images))]
+    alike: dict[tuple[float, ...], list[str]] = {}
+    for name, camera in zip(names, cameras, strict=True):
+        K = camera.K
+        key = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height)
+        alike.setdefault(tuple(map(float, key)), []).append(name)
+    shown: dict[str, Any] = dict(zip(names, images, strict=True))
+    np.savez(folder / "pictures.npz", **shown)
+    (folder / "cameras.json").write_text(
+        json.dumps([[key[:4], names] for key, names in alike.items()])
+    )
+    return names
+
+
+def run(task: str, *paths: Path) -> None:
+    """Run a task of this program.
+
+    Raises:
+        InputError: the package pycolmap stopped, or is missing (MissingExtraError).
+    """
+    if find_spec("pycolmap") is None:
+        raise MissingExtraError("pycolmap", "colmap")
+    done = subprocess.run(
+        [sys.executable, "-m", "attnwarp_eval._colmap", task, *map(str, paths)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        last = (done.stderr.strip() or "nothing").splitlines()[-1]
+        raise InputError(f"{task}: pycolmap stopped with exit status {done.returncode}: {last}")
 
 
 def summary(reconstruction: Any) -> dict[str, float]:
@@ -28,15 +82,14 @@ def summary(reconstruction: Any) -> dict[str, float]:
     }
 
 
-def main(folder: Path) -> None:
-    """Reconstruct the pictures of ``folder`` and write ``result.json`` there.
+def match(folder: Path) -> Any:
+    """The database of the pictures of ``folder``: features, and matches of every pair.
 
     ``pictures.npz`` has (H, W, 3) uint8 arrays; ``cameras.json`` has for each intrinsics the names
     of the arrays that share them: [[fx, fy, cx, cy], names].
     """
     import pycolmap
 
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     images, database = folder / "images", folder / "database.db"
     images.mkdir()
     with np.load(folder / "pictures.npz") as pictures:
@@ -57,13 +110,98 @@ def main(folder: Path) -> None:
     pycolmap.match_exhaustive(
         database, matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=1)
     )
-    options = pycolmap.IncrementalPipelineOptions(
+    return database
+
+
+def options() -> Any:
+    """Mapping options that leave the cameras as they are."""
+    import pycolmap
+
+    return pycolmap.IncrementalPipelineOptions(
         num_threads=1, random_seed=SEED, ba_refine_focal_length=False, ba_refine_extra_params=False
     )
-    found = pycolmap.incremental_mapping(database, images, folder / "models", options)
+
+
+def reconstruct(folder: Path) -> None:
+    """Write the figures of the largest model that the pictures of ``folder`` give."""
+    import pycolmap
+
+    found = pycolmap.incremental_mapping(
+        match(folder), folder / "images", folder / "models", options()
+    )
     largest = max(found.values(), key=lambda one: one.num_reg_images(), default=None)
     (folder / "result.json").write_text(json.dumps(None if largest is None else summary(largest)))
 
 
+def triangulate(folder: Path) -> None:
+    """Write the tracks of the pictures of ``folder`` at the (3, 4) world-to-camera matrices that
+    ``poses.json`` has by name.
+    """
+    import pycolmap
+
+    database = match(folder)
+    posed = pycolmap.Reconstruction()
+    poses = json.loads((folder / "poses.json").read_text())
+    with pycolmap.Database.open(database) as known:
+        for camera in known.read_all_cameras():
+            posed.add_camera_with_trivial_rig(camera)
+        for image in known.read_all_images():
+            pose = pycolmap.Rigid3d(np.array(poses[Path(image.name).stem]))
+            posed.add_image_with_trivial_frame(
+                pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id),
+                pose,
+            )
+    (folder / "model").mkdir()
+    write_tracks(
+        pycolmap.triangulate_points(
+            posed, database, folder / "images", folder / "model", options=options()
+        ),
+        folder,
+    )
+
+
+def read(folder: Path, model: Path) -> None:
+    """Write the tracks of a sparse model."""
+    import pycolmap
+
+    write_tracks(pycolmap.Reconstruction(model), folder)
+
+
+def write_tracks(reconstruction: Any, folder: Path) -> None:
+    """Write ``tracks.npz``: image names; of each observation the image, the point, and its place
+    (x, y) at z = 1 in the camera's axes, the lens undone.
+    """
+    names: list[str] = []
+    image: list[int] = []
+    point: list[int] = []
+    xy = []
+    for one in reconstruction.images.values():
+        seen = [each for each in one.points2D if each.has_point3D()]
+        if seen:
+            image += [len(names)] * len(seen)
+            point += [each.point3D_id for each in seen]
+            xy.append(
+                reconstruction.cameras[one.camera_id].cam_from_img(
+                    np.array([each.xy for each in seen])
+                )
+            )
+        names.append(one.name)
+    places = np.concatenate(xy) if xy else np.zeros((0, 2))
+    np.savez(folder / "tracks.npz", names=names, image=image, point=point, xy=places)
+
+
+def main(task: str, *paths: str) -> None:
+    """Do ``task`` in the folder that comes first in ``paths``."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    tasks: dict[str, Callable[..., None]] = {
+        "reconstruct": reconstruct,
+        "triangulate": triangulate,
+        "read": read,
+    }
+    tasks[task](*map(Path, paths))
+
+
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(*sys.argv[1:])

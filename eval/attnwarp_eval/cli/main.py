@@ -19,6 +19,7 @@ from attnwarp_eval.cli import (
     run,
     scenes,
     stability,
+    tracks,
 )
 
 app = typer.Typer(
@@ -46,6 +47,7 @@ COMMANDS: dict[str, Any] = {
     "compare": compare.compare,
     "stability": stability.stability,
     "metrics": metrics.metrics,
+    "tracks": tracks.tracks,
     "encoders": metrics.encoders,
     "inspect": inspect.inspect,
     "doctor": doctor.doctor,

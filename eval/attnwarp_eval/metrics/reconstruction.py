@@ -9,19 +9,16 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from attnwarp.camera import Camera
-from attnwarp.errors import InputError, MissingExtraError
+from attnwarp_eval import _colmap
 from attnwarp_eval.metrics._pictures import picture
 from attnwarp_eval.metrics.arrays import share
 
@@ -95,34 +92,15 @@ def reconstruct(images: Sequence[Any], cameras: Sequence[Camera]) -> Reconstruct
             f"images: got {len(images)} pictures and {len(cameras)} cameras, expected at least two,"
             " one camera a picture"
         )
-    pictures = {
-        f"{i:05d}": picture(image, f"images[{i}]", shape=(camera.height, camera.width))
+    pictures = [
+        picture(image, f"images[{i}]", shape=(camera.height, camera.width))
         for i, (image, camera) in enumerate(zip(images, cameras, strict=True))
-    }
-    if find_spec("pycolmap") is None:
-        raise MissingExtraError("pycolmap", "colmap")
-    alike: dict[tuple[float, ...], list[str]] = {}
-    for name, camera in zip(pictures, cameras, strict=True):
-        K = camera.K
-        key = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height)
-        alike.setdefault(tuple(map(float, key)), []).append(name)
+    ]
     with tempfile.TemporaryDirectory(prefix="attnwarp-colmap-") as name:
         folder = Path(name)
-        shown = {key: np.round(255 * one).astype(np.uint8) for key, one in pictures.items()}
-        np.savez(folder / "pictures.npz", **shown)  # type: ignore[arg-type]
-        (folder / "cameras.json").write_text(
-            json.dumps([[key[:4], names] for key, names in alike.items()])
+        _colmap.write_pictures(
+            folder, [np.round(255 * one).astype(np.uint8) for one in pictures], cameras
         )
-        done = subprocess.run(
-            [sys.executable, "-m", "attnwarp_eval._colmap", name],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if done.returncode:
-            last = (done.stderr.strip() or "nothing").splitlines()[-1]
-            raise InputError(
-                f"reconstruct: pycolmap stopped with exit status {done.returncode}: {last}"
-            )
+        _colmap.run("reconstruct", folder)
         found = json.loads((folder / "result.json").read_text())
     return Reconstruction(len(pictures), **(found or {}))

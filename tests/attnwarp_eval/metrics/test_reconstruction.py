@@ -121,6 +121,6 @@ def test_a_failure_is_counted(cameras):
 def test_what_cannot_be_reconstructed_is_refused(cameras, monkeypatch):
     with pytest.raises(ValueError, match="got 1 pictures and 6 cameras"):
         metrics.reconstruct([np.zeros((256, 256, 3))], cameras)
-    monkeypatch.setattr("attnwarp_eval.metrics.reconstruction.find_spec", lambda name: None)
+    monkeypatch.setattr("attnwarp_eval._colmap.find_spec", lambda name: None)
     with pytest.raises(InputError, match="needs the package pycolmap"):
         metrics.reconstruct([np.zeros((256, 256, 3))] * 2, cameras[:2])

@@ -1,0 +1,2 @@
+"""Warps and masks of anybody's capture against the tracks of structure from motion. See
+docs/measuring/tracks.md."""
