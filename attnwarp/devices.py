@@ -13,7 +13,8 @@ from attnwarp.reporting import SILENT, Reporter
 if TYPE_CHECKING:
     import torch
 
-P, T = ParamSpec("P"), TypeVar("T")
+P = ParamSpec("P")
+T = TypeVar("T")
 
 TYPES = ("auto", "float32", "float16", "bfloat16")
 
