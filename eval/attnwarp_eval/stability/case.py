@@ -244,6 +244,11 @@ class Outcome:
     must_refuse: bool
 
     @property
+    def must_hold(self) -> bool:
+        """True if the level is required, as a result or as a refusal."""
+        return self.required or self.must_refuse
+
+    @property
     def margin(self) -> float:
         """Decades between the error and its tolerance, cut at :data:`DECADES`; negative where the
         tolerance is exceeded, NaN where a level that need not hold is refused.
@@ -251,7 +256,7 @@ class Outcome:
         if self.refusal or self.must_refuse:
             if bool(self.refusal) == self.must_refuse:
                 return DECADES
-            return -DECADES if self.required or self.must_refuse else math.nan
+            return -DECADES if self.must_hold else math.nan
         if not math.isfinite(self.error):
             return -DECADES
         if self.error == 0:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -56,19 +56,9 @@ class Swept:
     outcomes: tuple[Outcome, ...]
 
     @property
-    def failures(self) -> list[Outcome]:
-        """Levels that had to hold and do not."""
-        return [o for o in self.outcomes if o.verdict == "breaks" and must_hold(o)]
-
-    @property
     def end(self) -> Outcome | None:
         """The first level that breaks or is refused; None where all hold."""
         return next((o for o in self.outcomes if o.verdict != "holds"), None)
-
-
-def must_hold(outcome: Outcome) -> bool:
-    """Return True if a level is required, as a result or as a refusal."""
-    return outcome.required or outcome.must_refuse
 
 
 @register
@@ -109,9 +99,7 @@ class Stability(Probe[Extra]):
                     "protocol": self.protocol,
                     "case": hard.name,
                     "version": hard.version,
-                    "backend": way.backend,
-                    "precision": way.precision,
-                    "direction": way.direction,
+                    **asdict(way),
                     "levels": [level_name(level) for level in levels],
                 }
                 yield Cell(spec, hard.name, way.name, self.name, 0, (way.name,))
@@ -123,20 +111,14 @@ class Stability(Probe[Extra]):
         for level in levels:
             with work.meter.view():
                 outcome = hard.outcome(level, way)
-            name = level_name(level)
+            figures = {
+                "stability.margin": outcome.margin,
+                "stability.error": outcome.error,
+                "stability.refused": float(bool(outcome.refusal)),
+            }
+            work.views.append(View(level_name(level), 0.0, figures))
             if outcome.refusal:
-                refusals[name] = outcome.refusal
-            work.views.append(
-                View(
-                    name,
-                    0.0,
-                    {
-                        "stability.margin": outcome.margin,
-                        "stability.error": outcome.error,
-                        "stability.refused": float(bool(outcome.refusal)),
-                    },
-                )
-            )
+                refusals[level_name(level)] = outcome.refusal
         return Extra(refusals)
 
     def read_extra(self, data: Json) -> Extra:
