@@ -53,6 +53,8 @@ def test_every_shipped_study_loads_and_names_scenes_that_exist(name, monkeypatch
     monkeypatch.setattr(edits, "files_digest", lambda name: name)
     study = load_study(name)
     assert study.title
+    if study.population:  # its scenes are of one generator
+        study = study.model_copy(update={"scenes": study.scenes[:2]})
     planned = cells(study)
     assert len({cell.id for cell in planned}) == len(planned) > 0
 
