@@ -284,10 +284,12 @@ def random_editor(device: str, sizes: Sizes, dtype: torch.dtype, depth: bool = F
         cross_attention_dim=sizes.context, attention_head_dim=8,
     )  # fmt: skip
     vae = AutoencoderKL(
-        block_out_channels=sizes.coder, latent_channels=4, layers_per_block=2,
+        block_out_channels=sizes.coder,
+        latent_channels=4,
+        layers_per_block=2,
         down_block_types=["DownEncoderBlock2D"] * len(sizes.coder),
         up_block_types=["UpDecoderBlock2D"] * len(sizes.coder),
-    )  # fmt: skip
+    )
     text = CLIPTextModel(
         CLIPTextConfig(
             vocab_size=49408, hidden_size=sizes.context, intermediate_size=4 * sizes.context,

@@ -133,11 +133,13 @@ def needs(loaded: Loaded, views: int) -> list[Need]:
         ).rounds  # fmt: skip
         found.append(
             Need(
-                name, cells, sum(part.rows for part in planned),
+                name,
+                cells,
+                sum(part.rows for part in planned),
                 sum(len(part.views) for part in planned),
                 sum(part.iterations for part in planned),
             )
-        )  # fmt: skip
+        )
     return found
 
 

@@ -41,8 +41,10 @@ def problem(words: list[str], folder: Path, run: str | None) -> str | None:
         here += ["--screenshot", "inspect.png"]
     done = subprocess.run(
         [folder / words[0], *(here if soon else [*here, "--help"])],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     one_line = done.returncode == 2 and done.stderr.count("\n") == 1
     if done.returncode == 0 or (one_line and "which comes with the extra" in done.stderr):
         return None

@@ -130,10 +130,12 @@ def _colour(draft: Draft) -> Entry:
     )
     words = _words(look)
     return _edit(
-        draft, "colour", f"make the {thing.kind} {words}",
+        draft,
+        "colour",
+        f"make the {thing.kind} {words}",
         f"a photo of {with_article(words)} {thing.kind} {place(draft.ground)}",
         changes=_over(_body(thing), draft.surface(look)),
-    )  # fmt: skip
+    )
 
 
 def _material(draft: Draft) -> Entry:
@@ -142,10 +144,12 @@ def _material(draft: Draft) -> Entry:
     finish = kinds[index(rng, len(kinds))]
     look = Look(FINISHES.index(finish), -1, -1, draft.ground, draft.time, int(rng.random() * 2**31))
     return _edit(
-        draft, "material", f"turn the {thing.kind} into a {finish} statue",
+        draft,
+        "material",
+        f"turn the {thing.kind} into a {finish} statue",
         f"a photo of a {finish} statue of a {thing.kind} {place(draft.ground)}",
         changes=_over(thing.objects, draft.surface(look)),
-    )  # fmt: skip
+    )
 
 
 def _part(draft: Draft) -> Entry:
@@ -156,10 +160,12 @@ def _part(draft: Draft) -> Entry:
     color = BRIGHT[index(rng, len(BRIGHT))]
     word = PART_NOUNS.get(name, (name,))[0]
     return _edit(
-        draft, "part", f"make the {word} {color}",
+        draft,
+        "part",
+        f"make the {word} {color}",
         f"a photo of a {thing.kind} with {color} {word} {place(draft.ground)}",
         changes=_over([item], _plain(rng, color)),
-    )  # fmt: skip
+    )
 
 
 def _size(item: Entry) -> float:
@@ -174,10 +180,12 @@ def _ground(draft: Draft) -> Entry:
     other = others[index(rng, len(others))]
     look = Look(0, 0, -1, other, draft.time, int(rng.random() * 2**31))
     return _edit(
-        draft, "ground", f"make the ground {GROUNDS[other]}",
+        draft,
+        "ground",
+        f"make the ground {GROUNDS[other]}",
         f"a photo of {described(draft.things[0])} {place(other)}",
         changes=[{"object": "ground", "texture": look.floor}],
-    )  # fmt: skip
+    )
 
 
 def _light(draft: Draft) -> Entry:
@@ -188,10 +196,12 @@ def _light(draft: Draft) -> Entry:
     look = Look(0, 0, -1, draft.ground, other, int(rng.random() * 2**31))
     lights = look.lights if not draft.smooth else [x for x in look.lights if x["type"] == "sky"]
     return _edit(
-        draft, "light", f"make it {_hour(other)}",
+        draft,
+        "light",
+        f"make it {_hour(other)}",
         f"a photo of {described(draft.things[0])} {place(draft.ground)} {HOURS[TIMES[other]][0]}",
         lights=lights,
-    )  # fmt: skip
+    )
 
 
 def _hour(time: int) -> str:
@@ -206,10 +216,12 @@ def _several(draft: Draft) -> Entry:
     words = " and ".join(f"the {one.kind}" for one in others)
     changes = [c for one in others for c in _over(one.objects, _plain(rng, color))]
     return _edit(
-        draft, "several", f"make {words} {color}",
+        draft,
+        "several",
+        f"make {words} {color}",
         f"a photo of {described(draft.things[0])} {place(draft.ground)} with {color} things",
         changes=changes,
-    )  # fmt: skip
+    )
 
 
 def _some_colour(draft: Draft) -> Entry:
@@ -217,10 +229,12 @@ def _some_colour(draft: Draft) -> Entry:
     word = thing.kind
     answers = [
         {
-            "name": color, "target": f"a photo of {with_article(color)} {word} {place(draft.ground)}",
+            "name": color,
+            "target": f"a photo of {with_article(color)} {word} {place(draft.ground)}",
             "changes": _over(_body(thing), _plain(rng, color)),
-        } for color in BRIGHT
-    ]  # fmt: skip
+        }
+        for color in BRIGHT
+    ]
     target = f"a photo of a {word} of one bright color {place(draft.ground)}"
     return _edit(draft, "some_colour", f"make the {word} another color", target, answers=answers)
 
@@ -238,10 +252,11 @@ def _parts(draft: Draft) -> Entry:
         surface = {"texture": {"type": "cells", "centers": centers, "colors": colors}}
         answers.append(
             {
-                "name": f"turn{k}", "target": f"a photo of a patchwork {word} {place(draft.ground)}",
+                "name": f"turn{k}",
+                "target": f"a photo of a patchwork {word} {place(draft.ground)}",
                 "changes": _over(thing.objects, surface),
             }
-        )  # fmt: skip
+        )
     target = f"a photo of a patchwork {word} {place(draft.ground)}"
     instruction = f"paint each part of the {word} red, yellow, green or blue"
     return _edit(draft, "parts", instruction, target, answers=answers)

@@ -260,9 +260,11 @@ class SceneDraft(Draft):
             ball = {"type": "sphere", "center": [x, y, r], "radius": r}
             away = math.hypot(x, y)
             upright = {
-                "type": "rectangle", "center": [x, y, 0.45], "size": [1.8 * wide, 0.9],
+                "type": "rectangle",
+                "center": [x, y, 0.45],
+                "size": [1.8 * wide, 0.9],
                 "facing": [-x / away, -y / away, 0.0],
-            }  # fmt: skip
+            }
             glass = {"type": "glass", "tint": "#f4fbf6"}
             name, shape, material = {
                 "mirror ball": ("mirror_ball", ball, {"type": "mirror", "tint": "#f2f4f6"}),
@@ -306,17 +308,21 @@ class SceneDraft(Draft):
                 middle[1] - uy * step * (count - 1) / 2,
             ]
             texture = {
-                "type": "plain", "color": _hue(rng, SATURATED[index(rng, len(SATURATED))]),
-                "variation": 0.2, "grain": 0.05,
-            }  # fmt: skip
+                "type": "plain",
+                "color": _hue(rng, SATURATED[index(rng, len(SATURATED))]),
+                "variation": 0.2,
+                "grain": 0.05,
+            }
             pickets = {
                 "type": "box", "center": [*start, high / 2], "size": [width, 0.02, high], "yaw": yaw,
                 "repeat": {"count": count, "step": [ux * step, uy * step, 0.0]},
             }  # fmt: skip
             rail = {
-                "type": "box", "center": [*middle, 0.8 * high], "size": [2 * half, 0.025, 0.6 * width],
+                "type": "box",
+                "center": [*middle, 0.8 * high],
+                "size": [2 * half, 0.025, 0.6 * width],
                 "yaw": yaw,
-            }  # fmt: skip
+            }
             self.fences.append({"name": f"fence{k}", "shape": pickets, "texture": texture})
             self.fences.append({"name": f"rail{k}", "shape": rail, "texture": texture})
             # Along its length, so that no wall or camera comes near.
@@ -376,9 +382,11 @@ class SceneDraft(Draft):
                 continue
             x, y = round(math.cos(angle)), round(math.sin(angle))
             shape = {
-                "type": "rectangle", "center": [far * x, far * y, high / 2],
-                "size": [2 * far, high], "facing": [-x, -y, 0],
-            }  # fmt: skip
+                "type": "rectangle",
+                "center": [far * x, far * y, high / 2],
+                "size": [2 * far, high],
+                "facing": [-x, -y, 0],
+            }
             yield {"name": f"wall{k}", "shape": shape, "texture": texture}
 
     def _wall(self, rng: np.random.Generator) -> dict[str, Any]:

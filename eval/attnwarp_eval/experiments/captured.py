@@ -297,9 +297,7 @@ def _edit(
     text = words.target or words.instruction if editor.guide == "depth" else words.instruction
     images = [views.target(k, np.zeros(3)).numpy() for k in range(len(views.cameras))]
     folder.mkdir(parents=True, exist_ok=True)
-    job = Job(
-        splats, views.cameras, images, editor, text, settings, folder, None, {}, budget
-    )  # fmt: skip
+    job = Job(splats, views.cameras, images, editor, text, settings, folder, None, {}, budget)
     return EDITING_METHODS[own.method].run(job)
 
 

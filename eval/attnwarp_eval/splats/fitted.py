@@ -68,10 +68,12 @@ def fit_scene(
     images = [picture(scene, camera, spp) for camera in cameras]
     out = held_out(views)
     parts = [
-        Views([c for c, o in zip(cameras, out, strict=True) if o == side],
-              [i for i, o in zip(images, out, strict=True) if o == side])
+        Views(
+            [c for c, o in zip(cameras, out, strict=True) if o == side],
+            [i for i, o in zip(images, out, strict=True) if o == side],
+        )
         for side in (False, True)
-    ]  # fmt: skip
+    ]
     truth = [geometry.trace(camera) for camera in parts[1].cameras]
 
     def errors(splats: Gaussians) -> dict[str, float]:

@@ -85,9 +85,11 @@ FIGURES = (
 )  # fmt: skip
 
 _OPTIONS = {
-    "poses": "--consistency", "ply": "--ply", "originals": "--originals and --renders",
+    "poses": "--consistency",
+    "ply": "--ply",
+    "originals": "--originals and --renders",
     "colmap": "--colmap",
-}  # fmt: skip
+}
 
 _FOUND_BY: Mapping[Figure, tuple[str, str]] = {
     **dict.fromkeys((*_TSED, _DISTANCE, _FLOW), ("cv2", "eval")),
@@ -134,9 +136,11 @@ def measure_consistency(
     cameras, posed, edited, originals = _files(inputs, done)
     names = list(edited)
     given = {
-        "poses": True, "ply": inputs.ply is not None, "originals": bool(originals),
+        "poses": True,
+        "ply": inputs.ply is not None,
+        "originals": bool(originals),
         "colmap": inputs.colmap,
-    }  # fmt: skip
+    }
     wanted = []
     for figure in FIGURES:
         absent = [_OPTIONS[need] for need in figure.needs if not given[need]]
@@ -353,9 +357,11 @@ class _Pairs:
             if image is not None:
                 try:
                     check.same_aspect(
-                        image.shape[:2], (camera.height, camera.width), str(path),
+                        image.shape[:2],
+                        (camera.height, camera.width),
+                        str(path),
                         "crop it as its camera sees it",
-                    )  # fmt: skip
+                    )
                 except ValueError as error:
                     raise InputError(str(error)) from None
         return _View(edited, original, camera.resize(width, height))

@@ -310,9 +310,11 @@ def warped_figure(
         margin = stats.t.ppf(0.975, noises - 1) * gain.std(ddof=1) / noises**0.5
         clear.append(bool(gain.mean() > margin))
     return figure(
-        "the true warp is clearly better than one displaced by an eighth", clear,
-        [a.world for a, _ in pairs], asked=0.8,
-    )  # fmt: skip
+        "the true warp is clearly better than one displaced by an eighth",
+        clear,
+        [a.world for a, _ in pairs],
+        asked=0.8,
+    )
 
 
 def _disagreement(target: Image, source: Image, grid: Any) -> float:

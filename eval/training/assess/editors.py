@@ -91,10 +91,12 @@ def assess(
         )
     results.append(
         figure(
-            "at least 26 dB to the picture before, outside the thing", np.array(outside) >= 26,
-            np.arange(len(outside)), asked=1.0,
+            "at least 26 dB to the picture before, outside the thing",
+            np.array(outside) >= 26,
+            np.arange(len(outside)),
+            asked=1.0,
         )
-    )  # fmt: skip
+    )
     if noises:
         results.append(_open(answer, pairs, noises))
     return results

@@ -345,8 +345,10 @@ def dino_figures(
     """
     figures = []
     places = {
-        "test-bare": "all on the same grass", "test": "each in its own place", "test-moved": "moved to another ground and time",
-    }  # fmt: skip
+        "test-bare": "all on the same grass",
+        "test": "each in its own place",
+        "test-moved": "moved to another ground and time",
+    }
     for name, words in places.items():
         pictures = sets[name]
         features = {"class token": encoder.images(as_float(pictures.images))}
@@ -451,8 +453,10 @@ def perceptual_figures(
     """
     sources = Sources(photographs(HELD_OUT_PHOTOS), renders)
     distances: dict[str, Distance] = {
-        "perceptual": lambda a, b: float(encoder.distance([a], [b])[0]), "PSNR": psnr_distance, "SSIM": ssim_distance,
-    }  # fmt: skip
+        "perceptual": lambda a, b: float(encoder.distance([a], [b])[0]),
+        "PSNR": psnr_distance,
+        "SSIM": ssim_distance,
+    }
     families: dict[str, tuple[tuple[str, ...], float]] = {
         "all kinds": (TRAIN_KINDS, 0.5),
         "shifts and blurs": (("shift", "turn", "blur", "motion"), 0.5),

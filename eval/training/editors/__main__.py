@@ -122,9 +122,11 @@ def judged(name: str, weights: Path, command: str) -> tuple[Any, int, Kept]:
 
 @app.command()
 def carries(
-    name: str, data: Data = CACHE / "data", weights: Cards = WEIGHTS,
+    name: str,
+    data: Data = CACHE / "data",
+    weights: Cards = WEIGHTS,
     pairs: Annotated[int, typer.Option(min=1, help="Swaps asked of each question.")] = 200,
-) -> None:  # fmt: skip
+) -> None:
     """Judge whether swapped features carry the answer, into the card. 40 minutes; a stopped run goes on."""
     from training.assess import carries as editor_carries
     from training.assess.card_sections import with_section

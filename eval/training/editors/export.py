@@ -40,8 +40,9 @@ def export_depth_editor(stage: str, out: Path, folder: Path) -> Path:
     ).half()
     net.controlnet.save_pretrained(folder / "controlnet")
     parts = {
-        "unet": ["diffusers", "UNet2DConditionModel"], "controlnet": ["diffusers", "ControlNetModel"],
-    }  # fmt: skip
+        "unet": ["diffusers", "UNet2DConditionModel"],
+        "controlnet": ["diffusers", "ControlNetModel"],
+    }
     return _write(folder, net, tokenizer, "StableDiffusionControlNetPipeline", parts, 1)
 
 
@@ -94,16 +95,18 @@ def facts_of(stage: str, out: Path) -> dict[str, object]:
         before.append(_facts(start, out, STAGES[start]))
         start = STAGES[start].start
     return {
-        **own, "before": sum(facts["steps"] for facts in before),
+        **own,
+        "before": sum(facts["steps"] for facts in before),
         "minutes": sum(facts["minutes"] for facts in [own, *before]),
-        "parts": plan.parts, "large": plan.size * 2 if plan.large else 0,
+        "parts": plan.parts,
+        "large": plan.size * 2 if plan.large else 0,
         "injection": {
             "none": "none; what its attention features carry, it learned from editing alone.",
             "features": "trained with injected features, so that its features would carry the answer; the figures of swapped"
             " features say how far they do. No claim about an editor's own working may rest on it alone.",
             "control": "the same steps as the injection stage without the injection.",
         }[plan.inject],
-    }  # fmt: skip
+    }
 
 
 def depth_facts_of(stage: str, out: Path) -> dict[str, object]:

@@ -134,7 +134,9 @@ class PicturePool:
         """(count,) whole numbers from 0 to ``high`` - 1."""
         return torch.randint(high, (count,), generator=generator, device=self.device)
 
-    def point(self, world: Tensor, view: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:  # fmt: skip
+    def point(
+        self, world: Tensor, view: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
         """(B,) y and x of a pixel of the full picture's thing."""
         number = self.integers(POINTS, len(world), generator)
         y, x = self.points[world, view, number].long().unbind(1)
@@ -163,9 +165,7 @@ class PicturePool:
         first = zoom * cells[:, None] + (zoom - 1).clamp(max=1) * tap
         across = torch.where(rows.flip[:, None, None], first.flip(1), first) + rows.x[:, None, None]
         down = first + rows.y[:, None, None]
-        return (
-            SIZE * down[:, :, None, :, None] + across[:, None, :, None, :]
-        ).flatten(3)  # fmt: skip
+        return (SIZE * down[:, :, None, :, None] + across[:, None, :, None, :]).flatten(3)
 
     def pictures(self, rows: Rows, look: Tensor, size: int) -> Tensor:
         """(B, 3, S, S) in [-1, 1]."""
@@ -326,7 +326,9 @@ def cut_regions(thing: Tensor, pool: PicturePool, generator: torch.Generator) ->
     return torch.where(planes[:, None, None], plane, box)
 
 
-def tables_of(worlds: Worlds, tokenizer: Tokenizer, sentences: int = SENTENCES) -> dict[str, Tensor]:  # fmt: skip
+def tables_of(
+    worlds: Worlds, tokenizer: Tokenizer, sentences: int = SENTENCES
+) -> dict[str, Tensor]:
     """Tables that pairs are drawn by.
 
     Returns:
@@ -354,9 +356,10 @@ def tables_of(worlds: Worlds, tokenizer: Tokenizer, sentences: int = SENTENCES) 
         for k, kind in enumerate(KIND_NAMES):
             for source in worlds.sources(w, kind):
                 targets = [
-                    j for j in GROUPS[kind]
+                    j
+                    for j in GROUPS[kind]
                     if valid[j] and j != source and not np.array_equal(looks[j], looks[source])
-                ]  # fmt: skip
+                ]
                 pairs[w, k, int(source), targets] = 1 / max(1, len(targets))
             for j in GROUPS[kind]:
                 part = looks[j, 3:] if kind in ("ground", "time") else looks[j, :3]
@@ -373,9 +376,11 @@ def tables_of(worlds: Worlds, tokenizer: Tokenizer, sentences: int = SENTENCES) 
     flat = [text for row in texts for text in row]
     tokens = torch.tensor([code.ids for code in tokenizer.encode_batch(flat)], dtype=torch.int16)
     return {
-        "pairs": pairs, "clear": clear, "opened": opened,
+        "pairs": pairs,
+        "clear": clear,
+        "opened": opened,
         "sentences": tokens.view(len(texts), sentences, -1),
-    }  # fmt: skip
+    }
 
 
 def points_of(worlds: Worlds) -> Tensor:

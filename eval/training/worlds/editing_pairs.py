@@ -62,10 +62,12 @@ LOOKS = SURFACES + len(GROUNDS) + len(TIMES)
 """Looks of a world: surfaces (11 colours, 6 materials, stripes, checks), 7 grounds, 4 times."""
 
 GROUPS = {
-    "color": range(0, len(COLORS)), "material": range(len(COLORS), len(COLORS) + len(STATUES)),
-    "pattern": range(SURFACES - 2, SURFACES), "ground": range(SURFACES, SURFACES + len(GROUNDS)),
+    "color": range(0, len(COLORS)),
+    "material": range(len(COLORS), len(COLORS) + len(STATUES)),
+    "pattern": range(SURFACES - 2, SURFACES),
+    "ground": range(SURFACES, SURFACES + len(GROUNDS)),
     "time": range(SURFACES + len(GROUNDS), LOOKS),
-}  # fmt: skip
+}
 """Indices of looks by what an edit of that kind ends in. Colours, materials and patterns share ground and time, so an
 edit may lead from any of them to any other."""
 

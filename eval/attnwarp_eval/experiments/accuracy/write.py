@@ -55,8 +55,9 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
     for section in sections:
         section.figures += [
             Picture(path.name, f"{section.title}: error against time")
-            for question, path in drawn if TITLES[question] == section.title
-        ]  # fmt: skip
+            for question, path in drawn
+            if TITLES[question] == section.title
+        ]
     about = environment()
     lead = [
         (
@@ -132,8 +133,10 @@ def _sections(panels: Sequence[Panel]) -> list[Any]:
                 )
                 if question == "pictures":
                     half = 100 * c.more["bias_error"] * stats.t.ppf(0.975, len(c.seconds) - 1)
-                    more = [f"{100 * c.more['bias']:+.2f} % ± {half:.2f}",
-                            "1" if k == 0 else ratio_text(panel.at_equal_error(k))]  # fmt: skip
+                    more = [
+                        f"{100 * c.more['bias']:+.2f} % ± {half:.2f}",
+                        "1" if k == 0 else ratio_text(panel.at_equal_error(k)),
+                    ]
                 elif question == "depth":
                     more = [
                         f"{c.more['median']:.1e}",

@@ -88,9 +88,11 @@ def auroc(groups: Sequence[tuple[Values, Values]], *, seed: int = 0) -> Auroc:
     table = np.stack(areas)
     known = np.isfinite(table)
     means = np.divide(
-        np.where(known, table, 0).sum(axis=0), known.sum(axis=0),
-        out=np.full(table.shape[1], np.nan), where=known.any(axis=0),
-    )  # fmt: skip
+        np.where(known, table, 0).sum(axis=0),
+        known.sum(axis=0),
+        out=np.full(table.shape[1], np.nan),
+        where=known.any(axis=0),
+    )
     low, high = np.nanquantile(means[1:], [0.025, 0.975]) if len(used) >= 6 else (np.nan, np.nan)
     return Auroc(
         float(means[0]), float(low), float(high), len(used), missing / total,

@@ -241,9 +241,11 @@ def _similar(kind: str) -> Measure:
 def _perceptual(pair: Pair, source: Shown, target: Shown) -> float:
     network = pair.encoders["perceptual"]
     return metrics.perceptual_consistency(
-        source.picture, target.picture, *pair.rendered,
+        source.picture,
+        target.picture,
+        *pair.rendered,
         lambda a, b: float(network.distance([a], [b])[0]),
-    )  # fmt: skip
+    )
 
 
 def _preserved(compare: Callable[[Array, Array, Mask], float]) -> Measure:
