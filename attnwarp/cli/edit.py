@@ -14,6 +14,7 @@ from attnwarp.cli.bundled_scene import SIZE, capture, exact_masks, scenes, view_
 from attnwarp.cli.files import (
     check_inputs_stay,
     check_seen,
+    note_held_out,
     read_splats,
     read_views,
     warn_of_misfit,
@@ -227,6 +228,7 @@ def edit(
             check_marked,
             edit_dataset,
             number_of,
+            view_of,
         )
         from attnwarp.methods.marks import Marks
 
@@ -254,10 +256,13 @@ def edit(
                 edit_options = replace(edit_options, marks=marks)
         dataset = read_views(data, reading)
         check_marked(edit_options, dataset)
+        note = ""
         splats = None if ply is None else read_splats(ply, kind, antialiased, screen_filter)
         if ply is not None and splats is not None:
             check_seen(ply, splats, dataset.cameras, report)
             warn_of_misfit(ply, splats, dataset)
+            if note := note_held_out(ply, dataset, view_of(dataset, editing.source)):
+                warnings.warn(note, InputWarning, stacklevel=1)
         result, page = edit_dataset(
             method, dataset, splats, editor, instruction, settings, out, edit_options,
             fit_plan=FitPlan(
@@ -265,7 +270,7 @@ def edit(
                 (kind or Kind.two).value[:2],
                 max_splats or FIT_SPLATS,
             ),
-            budget=budget, report=report, **own,
+            note=note, budget=budget, report=report, **own,
         )  # fmt: skip
         typer.echo(say_change(result.change, edit_options.marks.option != ""))
         if little := say_little(result.change):

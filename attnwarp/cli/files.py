@@ -120,6 +120,29 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera], report:
     raise InputError(f"{path}: its splats cover less than {COVERED:.1%} of each view; {UNSEEN}")
 
 
+def note_held_out(path: Path, dataset: Dataset, index: int) -> str:
+    """Sentence of an edit's source that splats were not fitted to; empty where nothing says so.
+
+    Args:
+        path: path of the splats. A fit writes the views that it held out beside them.
+        dataset: views, with their splits.
+        index: number of the source among those with a picture.
+    """
+    from attnwarp.io.names import file_stems
+
+    there = [k for k, image in enumerate(dataset.image_paths) if image is not None]
+    name = file_stems([dataset.cameras[k] for k in there])[index]
+    if (
+        dataset.splits[there[index]] in (None, "train")
+        and not (path.parent / "held_out" / f"{name}.png").is_file()
+    ):
+        return ""
+    return (
+        f"{path} was not fitted to the source {name}, which was held out: depth, mask and warp are"
+        " less sure there; name a view that was fitted by --source"
+    )
+
+
 def warn_of_misfit(path: Path, splats: Gaussians, dataset: Dataset) -> None:
     """Warn of splats whose renders are unlike the pictures, such as splats that a trainer moved.
 

@@ -118,6 +118,7 @@ def edit_dataset(
     *,
     fit_plan: FitPlan | None = None,
     source_picture: Path | None = None,
+    note: str = "",
     report: Reporter,
     **own: Any,
 ) -> tuple[Result, Path]:
@@ -134,6 +135,7 @@ def edit_dataset(
         options: options of the edit.
         fit_plan: plan of the fit, where splats are None.
         source_picture: file of the source view edited elsewhere, for attention warping.
+        note: warning about the inputs, for the page.
         report: receives how the work stands.
         own: further options of the method, such as "budget".
 
@@ -191,7 +193,7 @@ def edit_dataset(
     control = editor_name in bundled() if options.control is None else options.control
     page = show_edit(
         workdir_of(out), splats, views.cameras, images, turntable=options.turntable, report=report,
-        editor=editor if control else None,
+        editor=editor if control else None, note=note,
     )  # fmt: skip
     return result, page
 

@@ -61,6 +61,7 @@ def show_edit(
     *,
     editor: Editor | None = None,
     turntable: Path | None = None,
+    note: str = "",
     report: Reporter = SILENT,
 ) -> Path:
     """Write the page of a finished edit, ``index.html``, from its folder's files.
@@ -72,6 +73,7 @@ def show_edit(
         images: (H, W, 3) photograph of each view, sRGB, uint8, uint16 or floating in [0, 1].
         editor: edits the page's views each alone, as the control; None for no control.
         turntable: file of the orbit as a film, GIF or MP4; None for none.
+        note: warning that the page begins with.
         report: receives each view of the control.
 
     Returns:
@@ -86,7 +88,7 @@ def show_edit(
     turns = [renders(model, page.turn) for model in (before, page.after)]
     if turntable is not None:
         write_film(turntable, *turns)
-    parts = [page.head(), page.scene(), page.views(), page.agreement(), page.outside()]
+    parts = [page.head(note), page.scene(), page.views(), page.agreement(), page.outside()]
     parts += [page.orbit(turns), page.costs()]
     text = Template(_file("page.html")).substitute(
         title=escape(f"{page.manifest['instruction']} - attnwarp"),
@@ -138,8 +140,8 @@ class _Page:
         method, noise = self.manifest["method"], self.manifest["settings"]["noise"]
         return bool(method == "by_view" and noise == "fresh")
 
-    def head(self) -> str:
-        """The instruction and what was done."""
+    def head(self, note: str) -> str:
+        """The instruction, what was done, and warnings."""
         method = self.manifest["method"]
         cut = self.result["cut"]
         ended = f", cut short by its {cut.replace('_', ' ')}" if cut else ""
@@ -148,7 +150,7 @@ class _Page:
         lines = [
             f"<h1>{escape(self.manifest['instruction'])}</h1>",
             f"<p><b>{said[0].upper()}{said[1:]}.</b></p>",
-            f"<p><b>Warning:</b> {little}.</p>" if little else "",
+            *(f"<p><b>Warning:</b> {escape(text)}.</p>" for text in (little, note) if text),
             f"<p>Edited by the method <code>{escape(method)}</code>: {len(self.edited)} of"
             f" {len(self.names)} views were edited, and the splats were tuned on them{ended}."
             " The edited scene is <code>edited.ply</code> in this folder"

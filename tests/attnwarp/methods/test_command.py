@@ -110,6 +110,28 @@ def test_it_leaves_an_edited_ply_and_a_page(place, tmp_path):
     assert (tmp_path / "index.html").is_file()
 
 
+@pytest.mark.parametrize(
+    "held_out", ["by the fit", pytest.param("by its split", marks=pytest.mark.door)]
+)
+def test_a_source_that_the_fit_held_out_is_told_on_the_page_too(place, tmp_path, held_out):
+    shutil.copytree(place, tmp_path / "place")
+    if held_out == "by the fit":
+        (tmp_path / "place" / "held_out").mkdir()
+        shutil.copy(place / "data/images/v2.png", tmp_path / "place" / "held_out")
+    else:
+        scene = json.loads((place / "data" / "transforms.json").read_text())
+        named = [frame["file_path"] for frame in scene["frames"]]
+        splits = {"test_filenames": named[2:3], "train_filenames": named[:2] + named[3:]}
+        (tmp_path / "place/data/transforms.json").write_text(json.dumps({**scene, **splits}))
+    for source, told in (("v2.png", True), ("v1.png", False)):
+        ply = ("--ply", tmp_path / "place" / "splats.ply")
+        result = run(tmp_path / "place", tmp_path / source, *ply, "--source", source)
+        assert result.exit_code == 0, result.output
+        page = (tmp_path / source / "index.html").read_text()
+        for said in (" ".join(result.stderr.split()), page):
+            assert ("was not fitted to the source v2" in said) == told
+
+
 def test_the_page_is_written_where_the_name_of_a_view_is_no_utf_8(place, tmp_path):
     shutil.copytree(place, tmp_path / "place")
     data, name = tmp_path / "place" / "data", "f\udcfcr.png"  # Latin-1, as Python hands it on
