@@ -99,14 +99,14 @@ class Layer:
 
     def image_tokens(self, value: Any, call: Call) -> Tensor:
         """(B, h w, C) image tokens of the module's output or input: of a tuple its first tensor, of
-        that the image's rows and the first C channels.
+        that the image's rows, and of an input the first C channels.
 
         Example:
             >>> layer = Layer("attn", "joint", 0, 2, rows="after text")
             >>> call = Call(999, (1, 2), 1, ("text",), text=1)
-            >>> sequence = torch.arange(12.0).reshape(1, 4, 3)  # text, image, image, another
+            >>> sequence = torch.arange(8.0).reshape(1, 4, 2)  # text, image, image, another
             >>> layer.image_tokens((sequence, None), call).tolist()
-            [[[3.0, 4.0], [6.0, 7.0]]]
+            [[[2.0, 3.0], [4.0, 5.0]]]
         """
         tensor = value[0] if isinstance(value, tuple) else value
         tokens: Tensor = tensor if self.rows == "image" else tensor[:, self._span(call)]

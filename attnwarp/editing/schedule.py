@@ -292,7 +292,7 @@ class Flow:
 
         Example:
             >>> [round(share, 3) for share in Flow().published(980, 2)]
-            [0.927, 0.541]
+            [0.929, 0.609]
         """
         alphas = published_alphas(start, steps, grid)
         noise, signal = (1 - alphas).sqrt(), alphas.sqrt()
@@ -337,7 +337,7 @@ def steps_from(start: int, steps: int) -> list[int]:
 
     Args:
         start: first timestep, at least ``steps`` - 1.
-        steps: how many.
+        steps: number of steps.
 
     Example:
         >>> steps_from(999, 4)
@@ -368,8 +368,8 @@ def published_steps(start: int, steps: int, grid: Grid = "even") -> list[int]:
 
     Args:
         start: timestep that noise is added at.
-        steps: how many.
-        grid: see :data:`Grid`.
+        steps: number of steps.
+        grid: grid of the steps, :data:`Grid`.
 
     Raises:
         ValueError: fewer timesteps than steps.

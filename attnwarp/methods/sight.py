@@ -209,7 +209,8 @@ class Sight:
 
         Args:
             size: size of the grid.
-            picture: picture of sources' pictures, which :attr:`margins` keep away from depth edges.
+            picture: whether it is of the sources' pictures, which :attr:`margins` keep away from
+                depth edges.
         """
         key = size, picture and self.margins is not None
         if key not in self._choices:
@@ -238,7 +239,7 @@ class SourceWarp:
     Args:
         sight: sight of the target.
         number: number of the source.
-        picture: picture of its picture, not its features.
+        picture: whether the warp is that of its picture, not of its features.
     """
 
     sight: Sight
