@@ -65,7 +65,7 @@ def auroc(groups: Sequence[tuple[Values, Values]], *, seed: int = 0) -> Auroc:
     rng = np.random.default_rng(seed)
     draws = rng.multinomial(len(scenes), np.full(len(scenes), 1 / max(1, len(scenes))), RESAMPLES)
     weights = np.vstack([np.ones(len(scenes)), draws])
-    areas, own, total, missing, used = [], [], 0, 0, set()
+    areas, within, total, missing, used = [], [], 0, 0, set()
     for flawed, right in groups:
         rows = [_split(values, scenes) for values in (flawed, right)]
         for defined, undefined in rows:
@@ -82,7 +82,7 @@ def auroc(groups: Sequence[tuple[Values, Values]], *, seed: int = 0) -> Auroc:
         for scene, p, n in zip(scenes, positive, negative, strict=True):
             if len(p) and len(n):
                 used.add(scene)
-                own.append(float(_above(p, n.mean()).mean()))
+                within.append(float(_above(p, n.mean()).mean()))
     if not areas:
         return Auroc(np.nan, np.nan, np.nan, 0, missing / total if total else np.nan, np.nan)
     table = np.stack(areas)
@@ -96,7 +96,7 @@ def auroc(groups: Sequence[tuple[Values, Values]], *, seed: int = 0) -> Auroc:
     low, high = np.nanquantile(means[1:], [0.025, 0.975]) if len(used) >= 6 else (np.nan, np.nan)
     return Auroc(
         float(means[0]), float(low), float(high), len(used), missing / total,
-        float(np.mean(own)) if own else np.nan,
+        float(np.mean(within)) if within else np.nan,
     )  # fmt: skip
 
 

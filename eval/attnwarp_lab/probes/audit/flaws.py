@@ -29,7 +29,7 @@ class Edited:
     Attributes:
         pair: pair of the source and this view.
         source: (h, w, 3) sRGB in [0, 1], the true source after the edit.
-        before, after, other: (H, W, 3) the view before the edit, after it, and with another right
+        before, after, another: (H, W, 3) the view before the edit, after it, and with another right
             answer.
         mask: (H, W) bool, the edited object in the view.
         elsewhere: (H, W, 3) a view of another scene; None where there is none.
@@ -42,7 +42,7 @@ class Edited:
     source: Array
     before: Array
     after: Array
-    other: Array
+    another: Array
     mask: Mask
     elsewhere: Array | None = None
     misdirected: Array | None = None
@@ -133,7 +133,7 @@ class Flaw:
 def _answer(edited: Edited, size: float) -> Array:
     """Another answer in a spot of the object's surface, ``size`` of its pixels."""
     if size >= 1:
-        return edited.other
+        return edited.another
     inside = np.argwhere(edited.mask)
     if not len(inside):
         return edited.after
@@ -142,7 +142,7 @@ def _answer(edited: Edited, size: float) -> Array:
     near = np.argsort(((points - center) ** 2).sum(axis=1), kind="stable")
     rows, columns = inside[near[: max(1, round(size * len(points)))]].T
     result = edited.after.copy()
-    result[rows, columns] = edited.other[rows, columns]
+    result[rows, columns] = edited.another[rows, columns]
     return result
 
 
@@ -215,7 +215,7 @@ FLAWS = (
     Flaw("unedited", "view left unedited", "", (1.0,), 1.0, lambda e, _: e.before, counts=True),
     Flaw(
         "ghost", "two answers at once", "of the light", (0.1, 0.25, 0.5), 0.5,
-        lambda e, size: _mixed(e.after, e.other, size), counts=True,
+        lambda e, size: _mixed(e.after, e.another, size), counts=True,
     ),
     Flaw("hue", "hue shift", "degrees", (5.0, 15.0, 45.0), 45.0, _hue, counts=True),
     Flaw("slid", "texture slid", "px", (0.5, 1.0, 2.0, 4.0, 8.0, 16.0), 4.0, _slid, counts=True),

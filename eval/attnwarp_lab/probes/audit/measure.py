@@ -128,13 +128,13 @@ class AuditProbe(Probe[Seconds]):
         files = dict(zip(study.scene_names, study.scenes, strict=True))
         order = list(scenes)
         for place, (name, scene) in enumerate(scenes.items()):
-            other = order[(place + 1) % len(order)]
+            neighbour = order[(place + 1) % len(order)]
             for seed in study.seeds:
                 spec = {
                     "probe": self.name,
                     "protocol": self.protocol,
                     "scene": scene.content_hash,
-                    "other": scenes[other].content_hash if other != name else None,
+                    "other": scenes[neighbour].content_hash if neighbour != name else None,
                     "size": study.size,
                     "seed": seed,
                     "spp": study.spp,
@@ -144,7 +144,7 @@ class AuditProbe(Probe[Seconds]):
                     "answers": two_answers(scene, part.audit.edit),
                     "other_edit": edit_of_others(scene, part.audit.edit),
                 }
-                sources = {**encoder_sources(part), "other": files[other]}
+                sources = {**encoder_sources(part), "other": files[neighbour]}
                 yield Cell(spec, name, "metrics", self.name, seed, ("metrics",), sources=sources)
 
     def compute(self, work: Work) -> Seconds:

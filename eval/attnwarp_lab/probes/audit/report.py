@@ -67,15 +67,17 @@ class Pairs:
         for scene, record in self.records:
             for view, at in zip(record.views, self.yaws, strict=True):
                 if at == yaw:
-                    own = values.setdefault(scene, [])
-                    own += [view.metrics.get(f"{row.key}.{one}", math.nan) for one in conditions]
+                    of_scene = values.setdefault(scene, [])
+                    of_scene += [
+                        view.metrics.get(f"{row.key}.{one}", math.nan) for one in conditions
+                    ]
         return values
 
     def values(self, row: Figure, conditions: Sequence[str], yaw: float) -> Values:
         """Scene -> values that rise with disagreement."""
         sign = -1.0 if metric(row.key).direction == "higher" else 1.0
         plain = self.plain(row, conditions, yaw)
-        return {scene: [sign * value for value in own] for scene, own in plain.items()}
+        return {scene: [sign * value for value in numbers] for scene, numbers in plain.items()}
 
     def area(
         self,
@@ -115,7 +117,7 @@ class Pairs:
         shares = []
         for yaw in self.near:
             right, shiny = (
-                np.array([v for own in self.values(row, names, yaw).values() for v in own])
+                np.array([v for numbers in self.values(row, names, yaw).values() for v in numbers])
                 for names in (RIGHT, [trap])
             )
             right, shiny = right[np.isfinite(right)], shiny[np.isfinite(shiny)]
@@ -139,8 +141,8 @@ class Pairs:
         names = [RIGHT[0], *map(flaw.key, flaw.sizes)]
         ranks: Values = {}
         for yaw in self.near:
-            for scene, own in self.values(row, names, yaw).items():
-                pairs = np.reshape(own, (-1, len(names)))  # one for each seed
+            for scene, numbers in self.values(row, names, yaw).items():
+                pairs = np.reshape(numbers, (-1, len(names)))  # one for each seed
                 ranks.setdefault(scene, []).extend(
                     rank_correlation((0.0, *flaw.sizes), pair) for pair in pairs
                 )
@@ -149,7 +151,7 @@ class Pairs:
     def undefined(self, row: Figure, yaw: float) -> float:
         """Share of the pairs at a yaw, of right ones and of shown flaws, without a value."""
         names = [*RIGHT, *(flaw.key(flaw.reference) for flaw in COUNTED)]
-        values = [v for own in self.plain(row, names, yaw).values() for v in own]
+        values = [v for numbers in self.plain(row, names, yaw).values() for v in numbers]
         return float(np.isnan(values).mean())
 
     def seconds(self, row: Figure) -> Interval | None:
@@ -162,8 +164,8 @@ class Pairs:
 
     def known(self) -> list[Figure]:
         """Metrics without truth that have a value."""
-        own = [row for row in self.rows if not row.truth]
-        return [row for row in own if math.isfinite(self.counted(row, self.near).value)]
+        usable = [row for row in self.rows if not row.truth]
+        return [row for row in usable if math.isfinite(self.counted(row, self.near).value)]
 
     def best(self) -> Figure | None:
         """Metric without truth with the largest mean AUROC of the flaws that matter most."""
@@ -274,7 +276,7 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
     ]  # fmt: skip
     what = "; ".join(flaw.at(flaw.reference) for flaw in COUNTED)
     text = [
-        *_advice(pairs),
+        *advice(pairs),
         (
             f"Every pair is the source view and one that is turned by"
             f" {', '.join(f'{yaw:g}' for yaw in pairs.yaws)} degrees, of"
@@ -316,7 +318,8 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
     return Section("Which consistency metric can be believed", text, tables, [picture])
 
 
-def _advice(pairs: Pairs) -> list[str]:
+def advice(pairs: Pairs) -> list[str]:
+    """Advice on the metric to report where there is no truth, and what it and others cannot do."""
     best = pairs.best()
     if best is None:
         return ["**No metric without truth has a value.**"]
@@ -336,15 +339,15 @@ def _advice(pairs: Pairs) -> list[str]:
     alarms = pairs.alarms(best)
     if alarms > MANY_ALARMS:
         careful = [row for row in pairs.known() if pairs.alarms(row) <= MANY_ALARMS]
-        other = max(careful, key=lambda row: pairs.counted(row, pairs.near).value, default=None)
+        calm = max(careful, key=lambda row: pairs.counted(row, pairs.near).value, default=None)
         text.append(
             f"**A threshold of matt pairs does not serve glossy ones**: above it are"
             f" {percent(alarms)} of right pairs whose object is varnished. Against these the five"
             f" flaws have an AUROC of {area_text(pairs.counted(best, pairs.near, [VARNISHED]))}."
             + (
                 f" Of the metrics that do so in at most {percent(MANY_ALARMS)},"
-                f" {other.title!r} sees most: AUROC {area_text(pairs.counted(other, pairs.near))}."
-                if other
+                f" {calm.title!r} sees most: AUROC {area_text(pairs.counted(calm, pairs.near))}."
+                if calm
                 else f" None without truth does so in at most {percent(MANY_ALARMS)}."
             )
         )

@@ -103,10 +103,10 @@ def true_pictures(work: Work) -> tuple[list[Camera], Pictures]:
     states = {"before": world.scene, **dict(zip((*RIGHT, "misdirected"), edited, strict=False))}
     states[METAL] = _metallic(edited[0], touched(world.scene, *answers[0][:2]))
     if spec["other"] is not None:
-        other = load_scene(work.cell.sources["other"])
-        if other.content_hash != spec["other"]:
-            raise changed(f"scene {other.name!r}")
-        states["elsewhere"] = other.with_size(spec["size"], spec["size"])
+        neighbour = load_scene(work.cell.sources["other"])
+        if neighbour.content_hash != spec["other"]:
+            raise changed(f"scene {neighbour.name!r}")
+        states["elsewhere"] = neighbour.with_size(spec["size"], spec["size"])
     # Scene by scene: Mitsuba caches the last one, and loading costs more than rendering.
     light: dict[str, dict[str, Array]] = {
         state: {
@@ -178,7 +178,7 @@ def edited_view(
         source=pictures["right"][world.source.name],
         before=pictures["before"][name],
         after=pictures["right"][name],
-        other=pictures["right_other"][name],
+        another=pictures["right_other"][name],
         mask=edit_mask(world.scene, spec["edit"], truth.hits, spec["answers"][0][0]),
         elsewhere=pictures.get("elsewhere", {}).get(name),
         misdirected=pictures.get("misdirected", {}).get(name),

@@ -29,7 +29,7 @@ from attnwarp_eval.world import turned
 from attnwarp_lab.probes.audit.figures import FIGURES
 from attnwarp_lab.probes.audit.flaws import CONDITIONS, FLAWS
 from attnwarp_lab.probes.audit.measure import IN_SETS
-from attnwarp_lab.probes.audit.report import Pairs, rank_correlation
+from attnwarp_lab.probes.audit.report import Pairs, advice, rank_correlation
 from attnwarp_lab.probes.audit.views import (
     METAL,
     PAIRS,
@@ -85,8 +85,8 @@ def cells(scenes, folder, **changes):
     }
     path = folder / "study.yaml"
     path.write_text(yaml.safe_dump(said))
-    made = load_study(str(path))
-    found = cells_of(made, {name: load_scene(name) for name in made.scenes})
+    study = load_study(str(path))
+    found = cells_of(study, {name: load_scene(name) for name in study.scenes})
     return [cell for cell in found if cell.probe == "audit"]
 
 
@@ -106,10 +106,10 @@ OF_PAIRS = [figure for figure in FIGURES if figure.measure]
 def test_every_metric_has_every_condition_and_its_seconds(record):
     (view,) = record.views
     assert (view.name, view.yaw) == ("turned10", pytest.approx(10))
-    wanted = {f"{figure.key}.{name}" for figure in OF_PAIRS for name in (*PAIRS, *CONDITIONS)}
-    assert set(view.metrics) == wanted
+    expected = {f"{figure.key}.{name}" for figure in OF_PAIRS for name in (*PAIRS, *CONDITIONS)}
+    assert set(view.metrics) == expected
     assert set(record.extra.seconds) == {figure.key for figure in OF_PAIRS}
-    for key in (*wanted, *(figure.key for figure in FIGURES)):
+    for key in (*expected, *(figure.key for figure in FIGURES)):
         assert probe("audit").metric(key).unit
 
 
@@ -311,6 +311,23 @@ def test_the_report_says_what_the_numbers_say(tmp_path):
     assert "TSED" not in cannot
     assert (tmp_path / "figures/audit.svg").is_file()
     assert "## What a metric costs" in text
+
+
+def test_the_advice_warns_of_a_metric_that_fears_highlights_and_names_one_that_does_not():
+    def value(key, name, yaw, scene):
+        if key == "consistency.tsed_2px":
+            return float(name in PAIRS and name != VARNISHED)
+        if key == "consistency.tsed_distance":  # sees all but another hue
+            return 1.0 if name in PAIRS or name.startswith("hue") else 5.0
+        return 1.0
+
+    text = " ".join(advice(pairs_of(by_hand(2, value))))
+    assert "Without truth, report 'TSED at 2 px'" in text
+    assert "above it are 100 % of right pairs whose object is varnished" in text
+    assert (
+        "Of the metrics that do so in at most 20 %, 'epipolar distance' sees most: AUROC 0.90"
+        in text
+    )
 
 
 def test_a_metric_is_ranked_with_the_size_of_a_flaw_and_seeds_are_of_one_scene():

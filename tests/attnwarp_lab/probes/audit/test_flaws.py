@@ -20,10 +20,10 @@ def edited():
     scene = load_scene("spheres").with_size(SIZE, SIZE)
     pair = two_view(Geometry(scene), scene.source, scene.camera("yaw030"))
     pictures = np.random.default_rng(0).uniform(0.2, 0.8, (5, SIZE, SIZE, 3))
-    source, before, after, other, misdirected = pictures
+    source, before, after, another, misdirected = pictures
     ids, counts = np.unique(pair.hits.object_id[pair.hits.valid], return_counts=True)
     mask = pair.hits.object_id == ids[np.argsort(counts)[-2]]  # a thing, not the ground
-    return Edited(pair, source, before, after, other, mask, misdirected=misdirected)
+    return Edited(pair, source, before, after, another, mask, misdirected=misdirected)
 
 
 def flawed(edited, name):
@@ -54,7 +54,7 @@ def test_another_answer_covers_its_share_of_the_object_around_one_point(edited):
     reach = np.linalg.norm(points[place] - center, axis=1).max()
     outside = edited.mask & ~place
     assert np.linalg.norm(points[outside] - center, axis=1).min() > 0.3 * reach
-    np.testing.assert_array_equal(flawed(edited, "answer=1"), edited.other)
+    np.testing.assert_array_equal(flawed(edited, "answer=1"), edited.another)
     np.testing.assert_array_equal(flawed(edited, "unedited=1"), edited.before)
     assert flawed(edited, "elsewhere=1") is None
 
@@ -116,7 +116,7 @@ def test_paint_bleeds_by_its_pixels(edited):
 
 
 def test_ghosts_and_weak_edits_are_sums_of_light(edited):
-    for name, share, picture in (("ghost", 0.25, edited.other), ("weak_all", 0.5, edited.before)):
+    for name, share, picture in (("ghost", 0.25, edited.another), ("weak_all", 0.5, edited.before)):
         expected = (1 - share) * to_linear(edited.after) + share * to_linear(picture)
         found = to_linear(flawed(edited, f"{name}={share:g}"))
         np.testing.assert_allclose(found, expected, atol=1e-9)
