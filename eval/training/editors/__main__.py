@@ -113,11 +113,11 @@ def judged(name: str, weights: Path, command: str) -> tuple[Any, int, Kept]:
         raise typer.BadParameter(message, param_hint="NAME")
     torch.set_num_threads(1)
     guidance = {"text_guidance": small.TEXT_GUIDANCE, "image_guidance": small.IMAGE_GUIDANCE}
-    editor: Any = small.load_editor(str(folder), **guidance)
+    editor = small.load_editor(str(folder), **guidance)
     sums = hashlib.sha256((folder / small.SUMS).read_bytes()).hexdigest()
     path = CACHE / "judged" / f"{name}-{sums[:12]}-{command}.json"
     kept = Kept(path, say=partial(typer.echo, err=True))
-    return editor, editor.unet.config.sample_size * editor.factor, kept
+    return editor, editor.own_size, kept
 
 
 @app.command()

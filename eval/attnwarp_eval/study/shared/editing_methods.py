@@ -303,5 +303,5 @@ EDITING_METHODS: dict[str, Method] = {
     "true pictures": Method(_attention_warping_settings, _true_pictures),
     **{name: _baseline(name) for name in PRESETS if name != "attention_warping"},
 }
-"""Every method by name, as in :mod:`attnwarp.methods`. ``attention_warping`` with ``method: each
-view alone`` is the control."""
+"""Every method by name, as in :mod:`attnwarp.methods`. ``attention_warping`` with ``a0: 0`` is the
+control."""
