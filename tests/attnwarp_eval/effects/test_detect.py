@@ -503,6 +503,7 @@ def test_light_paths_and_camera_paths_agree_on_a_caustic_that_both_can_find():
     assert proof.equivalence(a, b, margin=0.02).equal
 
 
+@pytest.mark.door
 def test_following_only_the_beam_upon_the_glass_shows_the_same_caustic_with_less_noise():
     scene = SCENES["caustics"]().with_size(16, 16)
     narrow = plan(scene, 64)

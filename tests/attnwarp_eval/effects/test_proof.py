@@ -23,6 +23,7 @@ from effect_scenes import (
     make,
     without,
 )
+from further import further
 
 from attnwarp_eval.effects import proof
 from attnwarp_eval.scene.transport import called_for
@@ -71,7 +72,7 @@ def test_blocks_are_means_over_squares_and_over_what_is_left_at_the_border():
         assert np.allclose(got[:, i, j], data[:, 8 * i : 8 * i + 8, 8 * j : 8 * j + 8].mean((1, 2)))
 
 
-@pytest.mark.parametrize("kind", ["normal", "skewed", "sky"])
+@pytest.mark.parametrize("kind", further("skewed", "normal", "sky"))
 def test_over_200_true_nulls_it_refuses_at_its_stated_rate(kind):
     rng = np.random.default_rng(2)
     refused = 0
@@ -193,7 +194,7 @@ def test_over_200_true_nulls_the_whole_ladder_refuses_at_its_stated_rate(kind, a
     assert result.count("certified") == 200 - result.count("refused")
 
 
-@pytest.mark.parametrize("kind", ["normal", "skewed", "sky"])
+@pytest.mark.parametrize("kind", further("skewed", "normal", "sky"))
 def test_the_whole_ladder_refuses_two_percent_more_light_every_time(kind):
     result = [proof.climb(synthetic(1000 + trial, kind, 1.02)) for trial in range(100)]
     assert {one.verdict for one in result} == {"refused"}
@@ -204,7 +205,7 @@ def test_the_whole_ladder_refuses_two_percent_more_light_every_time(kind):
 # --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["diffuse", "refraction", "medium", "depth_of_field"])
+@pytest.mark.parametrize("name", further("refraction", "diffuse", "medium", "depth_of_field"))
 def test_the_plan_of_a_scene_is_certified(name):
     # A budget for a busy machine; a quiet one needs a few seconds of it.
     result = proof.prove(SCENES[name](), seconds=180)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from further import further
 
 from attnwarp.render import render
 from attnwarp.warp import depth_agrees, preset
@@ -23,7 +24,7 @@ def pixels(seed, count=50, size=SIZE):
     return np.random.default_rng(seed).integers(0, size, (count, 2)).tolist()
 
 
-@pytest.mark.parametrize("variant", ["corrected", "released", "paper"])
+@pytest.mark.parametrize("variant", further("corrected", "released", "paper"))
 def test_a_rule_passes_exactly_where_its_margin_is_positive(chosen, variant):
     pair = chosen.pair(variant, "yaw060")
     seen = {True: 0, False: 0}

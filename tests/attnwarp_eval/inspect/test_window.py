@@ -210,6 +210,7 @@ def test_a_pick_on_a_feature_grid_explains_its_cell(window):
     assert window.picked is None
 
 
+@pytest.mark.door
 def test_every_key_that_is_listed_changes_the_picture(window):
     window.look_from_outside()
     actions = window.actions()

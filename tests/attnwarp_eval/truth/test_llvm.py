@@ -5,6 +5,7 @@ import subprocess
 import numpy as np
 import pytest
 from effect_scenes import FLOOR, SCENES, SKY, SUN, make
+from further import further
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 from typer.testing import CliRunner
 
@@ -163,7 +164,7 @@ def both():
 @pytest.mark.parametrize(
     "name",
     [
-        *("spheres", "refraction", "medium", "subsurface", "depth_of_field"),
+        *further("spheres", "refraction", "medium", "subsurface", "depth_of_field"),
         pytest.param("caustics", marks=pytest.mark.slow),
     ],
 )

@@ -5,6 +5,7 @@ import gc
 import numpy as np
 import pytest
 from direct_light import direct
+from further import further
 
 from attnwarp.camera import Camera
 from attnwarp_eval.scene.base import linear_rgb
@@ -120,7 +121,9 @@ def test_a_missed_pixel_shows_the_sky():
     assert np.abs(appearance(scene, up, spp=4) / expected - 1).max() < 1e-3
 
 
-@pytest.mark.parametrize("name", ["spheres", pytest.param("bear", marks=pytest.mark.slow), "fence"])
+@pytest.mark.parametrize(
+    "name", [*further("spheres", "fence"), pytest.param("bear", marks=pytest.mark.slow)]
+)
 def test_pictures_converge_to_albedo_times_the_light_that_ray_casting_finds(name):
     # Catches textures that are flipped or turned in one of the two, shadows that fall elsewhere,
     # light counted twice.
