@@ -67,9 +67,6 @@ PROMPTS = 64
 NAMES_PLACE = 0.8
 """Probability that a prompt names the ground, and that it names the time of day, each."""
 
-GUIDANCE = 2.0
-"""Guidance weight of the bundled editor; ControlNet's own 5 to 7.5 saturates its colours."""
-
 
 @dataclass(frozen=True)
 class DepthStage:
