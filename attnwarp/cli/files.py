@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -27,8 +28,8 @@ LOOK_SIZE = 256
 LOOKS = 6
 """Views whose renders are held against their pictures."""
 
-UNLIKE = 10**-1.8
-"""Mean squared error of renders, 18 dB, below which splats fit their pictures for certain."""
+ALIKE = 18.0
+"""dB of renders above which splats fit their pictures for certain."""
 
 UNSEEN = (
     "check that the splats and the cameras are of one scene, in the same coordinates and the same"
@@ -146,13 +147,27 @@ def note_held_out(path: Path, dataset: Dataset, index: int) -> str:
 def warn_of_misfit(path: Path, splats: Gaussians, dataset: Dataset) -> None:
     """Warn of splats whose renders are unlike the pictures, such as splats that a trainer moved.
 
-    Of some views, where splats cover them, a render that is farther from the picture than one
-    colour a view explains nothing of it.
+    A render that is farther from the picture than one colour a view explains nothing of it.
 
     Args:
         path: path of the splats, for the message.
         splats: splats of the scene.
         dataset: its views.
+    """
+    psnr, plain = likeness(splats, dataset)
+    if psnr < min(plain, ALIKE):
+        warnings.warn(
+            f"{path}: where its splats cover the pictures, their renders are unlike them"
+            f" ({psnr:.1f} dB; one colour a view would have {plain:.1f}); {UNSEEN}: nerfstudio and"
+            " gsplat turn, move and scale a scene before they fit it",
+            InputWarning,
+            stacklevel=2,
+        )
+
+
+def likeness(splats: Gaussians, dataset: Dataset) -> tuple[float, float]:
+    """PSNR in dB of renders of some views against their pictures, where splats cover them, and that
+    of one colour a view; infinite where they cover none.
     """
     import numpy as np
     import torch
@@ -162,9 +177,7 @@ def warn_of_misfit(path: Path, splats: Gaussians, dataset: Dataset) -> None:
     from attnwarp.render import render
 
     there = [k for k, image in enumerate(dataset.image_paths) if image is not None]
-    if not there:
-        return
-    spread_out = np.linspace(0, len(there) - 1, LOOKS).round().astype(int)
+    spread_out = np.linspace(0, len(there) - 1, LOOKS if there else 0).round().astype(int)
     chosen = [there[k] for k in dict.fromkeys(spread_out.tolist())]
     views = load_views(dataset.select(chosen), max_size=LOOK_SIZE)
     near = near_of(dataset.cameras, splats)
@@ -185,15 +198,10 @@ def warn_of_misfit(path: Path, splats: Gaussians, dataset: Dataset) -> None:
         error += float(((view.color.numpy()[shown] / alpha[shown, None] - true) ** 2).sum())
         spread += float(((true - true.mean(0)) ** 2).sum())
         count += true.size
-    if count and error > max(spread, UNLIKE * count):
-        psnr, plain = (-10 * np.log10(value / count) for value in (error, max(spread, 1e-9)))
-        warnings.warn(
-            f"{path}: where its splats cover the pictures, their renders are unlike them"
-            f" ({psnr:.1f} dB; one colour a view would have {plain:.1f}); {UNSEEN}: nerfstudio and"
-            " gsplat turn, move and scale a scene before they fit it",
-            InputWarning,
-            stacklevel=2,
-        )
+    if not count:
+        return math.inf, math.inf
+    psnr, plain = (-10 * math.log10(max(value, 1e-9) / count) for value in (error, spread))
+    return psnr, plain
 
 
 def check_inputs_stay(results: Iterable[Path], read: Iterable[Path | None]) -> None:

@@ -17,6 +17,7 @@ from attnwarp.cli.shell import begin
 
 if TYPE_CHECKING:
     from attnwarp.methods.command import EditOptions
+    from attnwarp.methods.marks import Marks
 
 
 class Kind(StrEnum):
@@ -265,8 +266,8 @@ def check_segmenter(segmenter: str | None, words: str | None) -> None:
 
 
 @dataclass(frozen=True)
-class Editing:
-    """Options of editing a scene by any method."""
+class Marking:
+    """Options of marking what is edited."""
 
     source: Annotated[
         str | None,
@@ -296,6 +297,26 @@ class Editing:
             rich_help_panel=MARKING,
         ),
     ] = None
+
+    def marks(self) -> Marks:
+        """The marks.
+
+        Raises:
+            InputError, ValueError: two ways to mark what is edited, or one that says nothing.
+        """
+        check_segmenter(self.segmenter, self.words)
+        from attnwarp.methods.marks import Marks, numbers
+
+        return Marks(
+            self.masks, self.mask, numbers(self.box, "X0,Y0,X1,Y1", "--box"),
+            numbers(self.at, "X,Y", "--at"), self.words, self.segmenter or SEGMENTER,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Editing(Marking):
+    """Options of editing a scene by any method."""
+
     tune_outside: Annotated[
         bool,
         typer.Option(
@@ -332,16 +353,10 @@ class Editing:
         Raises:
             InputError, ValueError: two ways to mark what is edited, or one that says nothing.
         """
-        check_segmenter(self.segmenter, self.words)
         from attnwarp.methods.command import EditOptions
-        from attnwarp.methods.marks import Marks, numbers
 
-        marks = Marks(
-            self.masks, self.mask, numbers(self.box, "X0,Y0,X1,Y1", "--box"),
-            numbers(self.at, "X,Y", "--at"), self.words, self.segmenter or SEGMENTER,
-        )  # fmt: skip
         return EditOptions(
-            marks, self.tune_outside, self.source, self.max_size, self.device, self.dtype,
+            self.marks(), self.tune_outside, self.source, self.max_size, self.device, self.dtype,
             self.low_memory, self.threads, self.control, self.turntable,
         )  # fmt: skip
 

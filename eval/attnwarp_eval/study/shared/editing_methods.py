@@ -14,14 +14,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.encoders import load_encoder
 from attnwarp.methods.settings import PRESETS
+from attnwarp.reporting import SILENT, Reporter
 
 if TYPE_CHECKING:
     from attnwarp.camera import Camera
     from attnwarp.editing.editor import Editor
     from attnwarp.editing.recording import Recording
     from attnwarp.gaussians import Gaussians
-    from attnwarp.methods import Budget
+    from attnwarp.methods import Budget, Options, Round
     from attnwarp.warp import WarpedView
 
 Image = npt.NDArray[np.float32]
@@ -84,7 +86,11 @@ class Job:
         budget: limits of the method; None for none. Only methods with ``takes_budget`` get one.
         donor: donor of the features that targets get in place of the source's; None for the
             source's.
-        segments: (H, W) bool of each view, outside which nothing may change; None for everywhere.
+        segments: (H, W) share of each view that is edited, outside which nothing may change; None
+            for everywhere.
+        source: number of the source view.
+        report: receives how the method stands.
+        load: gives encoders, as :func:`attnwarp.encoders.load_encoder`.
     """
 
     gaussians: Gaussians
@@ -98,7 +104,18 @@ class Job:
     truth: Mapping[str, Sequence[Image]]
     budget: Budget | None = None
     donor: Donor | None = None
-    segments: Sequence[npt.NDArray[np.bool_]] | None = None
+    segments: Sequence[npt.NDArray[Any]] | None = None
+    source: int = 0
+    report: Reporter = SILENT
+    load: Callable[..., Any] = load_encoder
+
+    @property
+    def options(self) -> Options:
+        """Options that every method of the library takes by name."""
+        return {
+            "folder": self.folder, "budget": self.budget, "segments": self.segments,
+            "report": self.report, "load": self.load,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +129,7 @@ class EditedScene:
         seconds: by part. ``edit``, ``source``, ``warp`` and ``tune`` are the method's own work.
         counters: counts of work, such as ``network_rows``.
         cut: the limit of the budget that ended the method; None for a whole run.
+        rounds: the views of each round, as planned; empty where a method does not tell them.
     """
 
     gaussians: Gaussians
@@ -119,6 +137,7 @@ class EditedScene:
     seconds: Mapping[str, float]
     counters: Mapping[str, float]
     cut: str | None = None
+    rounds: Sequence[Round] = ()
 
 
 @dataclass(frozen=True)
@@ -133,12 +152,14 @@ class Method:
         takes_budget: whether it can be cut short by a budget.
         edited: how many of a number of views it edits at most with these settings; None where that
             is not known.
+        needs_truth: whether it reads the true edited views.
     """
 
     settings: Callable[[str | None, dict[str, Any], int], dict[str, Any]]
     run: Callable[[Job], EditedScene]
     takes_budget: bool = False
     edited: Callable[[Mapping[str, Any], int], int] | None = None
+    needs_truth: bool = False
 
 
 def _attention_warping_settings(
@@ -163,10 +184,9 @@ def _attention_warping(job: Job) -> EditedScene:
             job.editor,
             job.instruction,
             AttentionWarpingSettings.from_dict(job.settings),
+            source=job.source,
             warps=job.warps,
-            folder=job.folder,
-            budget=job.budget,
-            segments=job.segments,
+            **job.options,
         )
     )
 
@@ -209,7 +229,9 @@ def _with_features_of(job: Job, donor: Donor) -> EditedScene:
 
 
 def _edited(result: Any) -> EditedScene:
-    return EditedScene(result.gaussians, result.edited, result.seconds, result.counters, result.cut)
+    return EditedScene(
+        result.gaussians, result.edited, result.seconds, result.counters, result.cut, result.rounds
+    )
 
 
 def _true_pictures(job: Job) -> EditedScene:
@@ -284,9 +306,7 @@ def _baseline(name: str) -> Method:
                 job.editor,
                 job.instruction,
                 methods.preset(name, **job.settings),
-                folder=job.folder,
-                budget=job.budget,
-                segments=job.segments,
+                **job.options,
             )
         )
 
@@ -300,7 +320,7 @@ EDITING_METHODS: dict[str, Method] = {
         takes_budget=True,
         edited=_warped_views,
     ),
-    "true pictures": Method(_attention_warping_settings, _true_pictures),
+    "true pictures": Method(_attention_warping_settings, _true_pictures, needs_truth=True),
     **{name: _baseline(name) for name in PRESETS if name != "attention_warping"},
 }
 """Every method by name, as in :mod:`attnwarp.methods`. ``attention_warping`` with ``a0: 0`` is the
