@@ -26,8 +26,8 @@ from attnwarp.editing.small import thread_count
 from attnwarp.methods import METHODS, Budget, Result, preset
 from attnwarp.process import core_count
 from attnwarp_eval.cost import peak_memory_mb, reset_peak_memory
-from attnwarp_eval.reproduce.manifest import Loaded, Row, load_manifest
 from attnwarp_eval.study.shared.editing_methods import with_source_words
+from attnwarp_lab.captures.manifest import Loaded, Row, load_manifest
 from benchmarks import command
 from benchmarks.gpu import TINY, Sizes, random_editor, ring
 from benchmarks.render import scene
@@ -119,7 +119,7 @@ def needs(loaded: Loaded, views: int) -> list[Need]:
     }
     seen: set[str] = set()
     found = []
-    for name, row in loaded.manifest.methods.items():
+    for name, row in loaded.manifest.variants.items():
         settings = settings_of(row, TINY.edit_pixels)
         keys = {
             repr((row.method, replace(settings, seed=seed), row.editor, row.splats))
@@ -202,7 +202,7 @@ def costs(loaded: Loaded, sizes: Sizes, editors: Sequence[str] = (*MEASURED,)) -
         names = MEASURED[guide]
         editor = random_editor("cpu", sizes, torch.float32, depth=guide == "controlnet")
         torch.set_num_threads(thread_count(editor))
-        rows = loaded.manifest.methods
+        rows = loaded.manifest.variants
         for name in (ALONE, *names, ALONE):
             alone = {"a0": 0.0} if name == ALONE else {}
             yield measure(name, rows[names[0] if alone else name], editor, sizes, **alone)

@@ -155,7 +155,7 @@ def check_out(out: Path) -> None:
 COMMANDS = {
     "attnwarp": ("fit", "edit", "render", "convert", "undistort", "edit-image"),
     "attnwarp-eval": (
-        "run", "report", "verdicts", "verify", "studies", "reproduce", "compare", "stability",
+        "run", "report", "verdicts", "verify", "studies", "captures", "compare", "stability",
         "metrics", "encoders", "doctor", "scenes", "userstudy", "cache",
     ),
 }  # fmt: skip

@@ -2,7 +2,7 @@
 
 import pytest
 
-from attnwarp_eval.reproduce.manifest import load_manifest
+from attnwarp_lab.captures.manifest import load_manifest
 from benchmarks.gpu import TINY
 from benchmarks.reproducing import costs, needs, table
 

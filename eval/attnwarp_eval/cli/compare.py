@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from attnwarp.cli.shell import fail, log, warn
-from attnwarp_eval.cli.shell import TOO_LITTLE, Regression, check_not_of_run, clear_errors
+from attnwarp_eval.cli.shell import (
+    TOO_LITTLE,
+    Regression,
+    check_not_of_run,
+    clear_errors,
+    other_run,
+)
 
 if TYPE_CHECKING:
     from attnwarp_eval.compare import Snapshot
@@ -60,10 +66,9 @@ def compare(
     from attnwarp_eval.compare.write import as_json, document
     from attnwarp_eval.document import write
     from attnwarp_eval.files import write_atomic
-    from attnwarp_eval.reproduce.seal import is_reproduction
 
-    if is_reproduction(baseline) and is_reproduction(run):
-        _side_by_side(baseline, run)
+    if (other := other_run(baseline, run)) is not None:
+        _side_by_side(other, baseline, run)
         return
     with clear_errors():
         outputs = {"--markdown": markdown, "--json": json, "--html": html}
@@ -108,15 +113,14 @@ def compare(
         raise fail(f"{run}: only what {baseline} has too was compared", TOO_LITTLE)
 
 
-def _side_by_side(one: Path, two: Path) -> None:
-    """Two people's reproductions: what differs of their inputs, and their figures."""
+def _side_by_side(other: Any, one: Path, two: Path) -> None:
+    """Two people's runs on captures: what differs of their inputs, and their figures."""
     from rich.console import Console
 
     from attnwarp_eval.document.write import terminal
-    from attnwarp_eval.reproduce.seal import side_by_side
 
     with clear_errors():
-        lines, table = side_by_side(one, two)
+        lines, table = other.side_by_side(one, two)
     for line in lines or ["same inputs, code and versions"]:
         typer.echo(line)
     Console(width=250).print(terminal(table))

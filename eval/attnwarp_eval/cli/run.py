@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from attnwarp.cli.options import options_of
 from attnwarp.cli.shell import fail, log, warn
 from attnwarp.reporting import reporter
-from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, names, resumable, scheduler_lost
+from attnwarp_eval.cli.shell import (
+    TOO_LITTLE,
+    clear_errors,
+    names,
+    other_run,
+    resumable,
+    scheduler_lost,
+    whole_numbers,
+)
 
 if TYPE_CHECKING:
     from attnwarp_eval.study.cell import Cell
@@ -22,46 +29,6 @@ if TYPE_CHECKING:
     from attnwarp_eval.study.store import Store
 
 
-@dataclass(frozen=True)
-class Capture:
-    """Options of a study's editing methods on a capture, where no truth is known."""
-
-    data: Annotated[
-        Path | None,
-        typer.Option(
-            help=(
-                "Run the study's editing methods on this capture (transforms.json, COLMAP,"
-                " BlendedMVS) instead of on scenes; --size is then the longest side."
-            )
-        ),
-    ] = None
-    ply: Annotated[Path | None, typer.Option(help="With --data: its splats.")] = None
-    instruction: Annotated[str | None, typer.Option(help="With --data: the edit.")] = None
-    target_prompt: Annotated[
-        str | None, typer.Option(help="With --data: what the edited scene shows.")
-    ] = None
-    source_prompt: Annotated[
-        str | None, typer.Option(help="With --data: what the scene shows before.")
-    ] = None
-    scale: Annotated[int, typer.Option(help="With --data: 2, 4 or 8 reads images_2 and so on.")] = 1
-    editor: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|FOLDER",
-            help="With --data: in place of the study's editors that take a picture.",
-        ),
-    ] = None
-    depth_editor: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|FOLDER|BASE,CONTROLNET",
-            help="With --data: in place of the study's editors that take depth maps.",
-        ),
-    ] = None
-    device: Annotated[str, typer.Option(help="With --data: of the editors, cpu or cuda.")] = "cpu"
-
-
-@options_of(Capture)
 def run(
     study: Annotated[
         str, typer.Argument(help="A study that ships (quick) or the path of a study's YAML.")
@@ -94,8 +61,6 @@ def run(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Count what would be measured, and plan the rest.")
     ] = False,
-    *,
-    capture: Capture,
 ) -> None:
     """Run a study and write its report.
 
@@ -106,68 +71,13 @@ def run(
     def load() -> Study:
         return load_study(study, scenes=names(scenes), seeds=drawn, size=size)
 
-    drawn = _whole_numbers(seeds, "--seeds")
+    drawn = whole_numbers(seeds, "--seeds")
     if scheduler is not None and jobs > 1:
         raise fail("--jobs starts workers here, --scheduler uses others; give one of the two")
-    with_data = [
-        f"--{field.name.replace('_', '-')}"
-        for field in fields(capture)
-        if getattr(capture, field.name) != field.default
-    ]
-    without_data = {
-        "--scenes": scenes is not None,
-        "--dry-run": dry_run,
-        "--jobs": jobs > 1,
-        "--scheduler": scheduler is not None,
-        "--fail-fast": not keep_going,
-    }
-    if with_data and capture.data is None:
-        raise fail(
-            f"{with_data[0]}: needs --data; on scenes, the study itself says what is edited, how"
-        )
-    for option in (option for option, given in without_data.items() if given and with_data):
-        raise fail(f"{option}: has no meaning with --data, a capture edited here; leave it out")
-    if capture.data is not None:
-        _run_on_capture(lambda: load_study(study, seeds=drawn), capture, capture.data, out, size)
-    elif dry_run:
+    if dry_run:
         _print_plan(load, out)
     else:
         run_study(load, out, jobs, scheduler, keep_going)
-
-
-def _run_on_capture(
-    load: Callable[[], Study], capture: Capture, data: Path, out: Path | None, size: int | None
-) -> None:
-    """Run a study's methods where no truth is known."""
-    from attnwarp.errors import InputError
-    from attnwarp.fit import load_views
-    from attnwarp.io import read_dataset, read_ply
-    from attnwarp_eval.experiments import captured
-
-    with clear_errors():
-        if capture.ply is None:
-            raise InputError(
-                f"--data {data}: needs --ply; make it with: attnwarp fit {data} --out fit"
-            )
-        if capture.instruction is None:
-            raise InputError(f"--data {data}: needs --instruction, such as 'make it snow'")
-        loaded = load()
-        editors = captured.Editors(capture.editor, capture.depth_editor, capture.device)
-        words = captured.Words(capture.instruction, capture.target_prompt, capture.source_prompt)
-        folder = out or Path("runs") / f"{loaded.name}-{data.resolve().name}"
-        try:
-            dataset = read_dataset(data, points=False, scale=capture.scale)
-        except (FileNotFoundError, ValueError) as error:
-            raise InputError(f"--data: {error}") from None
-        views = load_views(dataset, max_size=size, damaged="error")
-        with reporter(every=True) as report, resumable(lambda: "finished edits are kept"):
-            result = captured.compare(
-                loaded, views, read_ply(capture.ply), words, folder, report, editors=editors
-            )
-    for what, why in result.left_out.items():
-        typer.echo(f"left out: {what}: {why}", err=True)
-    for name in ("captured.json", "captured.md", "captured.html"):
-        typer.echo(folder / name)
 
 
 def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
@@ -259,16 +169,6 @@ def _who(cell: Cell) -> str:
     if cell.labels and cell.variant not in cell.labels:
         return f"{', '.join(cell.labels)} (in turn)"
     return " = ".join(cell.labels) or cell.variant
-
-
-def _whole_numbers(text: str | None, option: str) -> list[int] | None:
-    """Those of a comma-separated option; None if it was left out."""
-    parts = names(text)
-    if parts is None:
-        return None
-    if not parts or not all(part.isdecimal() for part in parts):
-        raise fail(f"{option}: got {text!r}, expected whole numbers such as 0,1")
-    return [int(part) for part in parts]
 
 
 def run_study(
@@ -492,13 +392,12 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
     results.jsonl is held against its checksum.
     """
     from attnwarp_eval.report import wrong_results
-    from attnwarp_eval.reproduce import seal
     from attnwarp_eval.study.run import verify
     from attnwarp_eval.study.store import Store
 
     with clear_errors():
-        if seal.is_reproduction(run):
-            problems = seal.verify(Store(run))
+        if (other := other_run(run)) is not None:
+            problems = other.verify(Store(run))
         else:
             problems = verify(Store(run))
             problems.damaged += wrong_results(Store(run))

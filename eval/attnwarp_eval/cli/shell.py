@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from attnwarp.cli import shell
 from attnwarp.cli.shell import STOPPED, fail
@@ -14,6 +16,17 @@ from attnwarp.process import stops_interrupt
 REGRESSION, TOO_LITTLE = 1, 3
 """Exit codes beside those of attnwarp. 1 is reserved for a regression. A run that measured too
 little, or with an instrument that is not calibrated, is 3."""
+
+
+OTHER_RUNS: dict[str, str] = {}
+"""Runs of no study: a file that marks their folders -> the module whose ``verify`` checks one, and
+whose ``side_by_side`` compares two. Packages with commands add theirs."""
+
+
+def other_run(*folders: Path) -> Any:
+    """The module of :data:`OTHER_RUNS` for folders of one kind; None for runs of studies."""
+    modules = [m for mark, m in OTHER_RUNS.items() if all((f / mark).is_file() for f in folders)]
+    return import_module(modules[0]) if modules else None
 
 
 class Regression(SystemExit):
@@ -87,3 +100,13 @@ def scheduler_lost(scheduler: str | None, kept: Callable[[], int]) -> Iterator[N
 def names(text: str | None) -> list[str] | None:
     """The parts of a comma-separated option; None if the option was left out."""
     return None if text is None else [part.strip() for part in text.split(",") if part.strip()]
+
+
+def whole_numbers(text: str | None, option: str) -> list[int] | None:
+    """Those of a comma-separated option; None if it was left out."""
+    parts = names(text)
+    if parts is None:
+        return None
+    if not parts or not all(part.isdecimal() for part in parts):
+        raise fail(f"{option}: got {text!r}, expected whole numbers such as 0,1")
+    return [int(part) for part in parts]

@@ -23,8 +23,8 @@ BEFORE, AFTER = "before", "render"
 """Contents of an edited scene's pictures: the view before the edit, and the edited splats."""
 
 
-CAPTURED, MOST_VIEWS = "captured.json", 8
-"""File of a run with ``--data``, and the views of it that are shown, evenly spread."""
+RESULTS, MOST_VIEWS = "results.json", 8
+"""File of a run on captures, and the views of each that are shown, evenly spread."""
 
 LEAST = 256
 """Least longest side of a picture that people see, in px."""
@@ -72,16 +72,13 @@ def _along_the_orbit(view: str) -> tuple[float, str]:
     return (float(yaw[1].replace("m", "-").replace("p", ".")) if yaw else 0.0, view)
 
 
-def read_items(
-    runs: Sequence[Path], methods: Sequence[str] | None = None, *, within: Path | None = None
-) -> list[Item]:
+def read_items(runs: Sequence[Path], methods: Sequence[str] | None = None) -> list[Item]:
     """The edited scenes of runs of which at least two methods have pictures.
 
     Args:
         runs: folders.
         methods: variants to compare, or the parts between commas of such names; all that have
             pictures if None.
-        within: folder that holds the pictures of captures; that of each run if None.
 
     Raises:
         InputError: there is none, a picture that lies elsewhere, a method that no run has, or runs
@@ -90,8 +87,8 @@ def read_items(
     items: dict[tuple[str, str, int], Item] = {}
     first: dict[tuple[str, str], tuple[str, Path]] = {}  # item and method -> how, and the run
     for run in runs:
-        captured = (run / CAPTURED).is_file()
-        for key, one, method, how in _captured(run, within or run) if captured else _edited(run):
+        captured = (run / RESULTS).is_file()
+        for key, one, method, how in _captured(run) if captured else _edited(run):
             item = items.setdefault(key, one)
             if item.content != one.content:
                 raise InputError(
@@ -172,29 +169,31 @@ def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
             )
 
 
-def _captured(run: Path, within: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
-    """The edited capture of a run with ``--data``, as :func:`_edited` gives a study's cells."""
+def _captured(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
+    """The edits of a run on captures, as :func:`_edited` gives a study's cells."""
     try:
-        data = json.loads((run / CAPTURED).read_text(encoding="utf-8"))
-        instruction, count = data["words"]["instruction"], len(data["views"])
-        rows = data["variants"].items()
-        folders = {name: run / row["folder"] for name, row in rows}
-        originals = run / data.get("originals", "originals")
-    except (ValueError, KeyError, TypeError) as error:
+        data = json.loads((run / RESULTS).read_text(encoding="utf-8"))
+        for cell in data["cells"]:
+            if cell["kind"] != "edit":
+                continue
+            key = (cell["scene"], cell["edit"], cell["seed"])
+            capture = data["captures"][cell["scene"]]
+            instruction, count = capture["edits"][cell["edit"]], len(capture["views"])
+            chosen = [k * count // MOST_VIEWS for k in range(MOST_VIEWS)]
+            views = [f"view-{k:04d}" for k in (chosen if count > MOST_VIEWS else range(count))]
+            before, after = (
+                {view: inside(run, f"{folder}/{view}.png") for view in views}
+                for folder in (capture["originals"], f"{cell['folder']}/renders")
+            )
+            content = (capture["sha256"], instruction)
+            for method in cell["variants"]:
+                item = Item(*key, instruction, content, before, {method: after})
+                yield key, item, method, cell["id"]
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(
-            f"{run / CAPTURED}: damaged ({error!r}); run the study again, finished edits are kept"
+            f"{run / RESULTS}: damaged ({error!r}); run attnwarp-eval captures again, finished"
+            " edits are kept"
         ) from None
-    views = sorted({k * count // MOST_VIEWS for k in range(MOST_VIEWS)} if count > MOST_VIEWS
-                   else range(count))  # fmt: skip
-    files = [f"view-{view:04d}.png" for view in views]
-    for folder in (originals, *folders.values()):
-        inside(within, folder.absolute())
-    before = {Path(name).stem: originals / name for name in files}
-    key = (run.resolve().name, "edit", 0)
-    for method, folder in folders.items():
-        own = {Path(name).stem: folder / "renders" / name for name in files}
-        item = Item(*key, instruction, (str(run.resolve()), instruction), before, {method: own})
-        yield key, item, method, str(folder.resolve())
 
 
 def read_picture(path: Path) -> bytes:

@@ -22,13 +22,22 @@ def test_views_of_other_names_stay_in_the_order_of_their_names():
     assert item.views == ["a", "b-10", "c_2"]
 
 
-@pytest.mark.parametrize("key", ["folder", "originals"])
-def test_a_captures_pictures_lie_in_its_folder(tmp_path, key):
-    rows = {name: {"folder": name} for name in ("a", "b")}
-    data = {"words": {"instruction": "red"}, "views": [0], "variants": rows}
-    (rows["a"] if key == "folder" else data)[key] = "../elsewhere"
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run/captured.json").write_text(json.dumps(data))
+@pytest.mark.parametrize("place", ["folder", "originals"])
+def test_a_captures_pictures_lie_in_its_folder(tmp_path, place):
+    cells = [
+        {"id": name, "kind": "edit", "scene": "bear", "edit": "red", "seed": 0, "variants": [name],
+         "folder": f"made/{name}"}
+        for name in ("a", "b")
+    ]  # fmt: skip
+    bear = {"sha256": "0", "views": ["front"], "originals": "bear", "edits": {"red": "red"}}
+    data = {"captures": {"bear": bear}, "cells": cells}
+
+    def read():
+        (tmp_path / "results.json").write_text(json.dumps(data))
+        return read_items([tmp_path])
+
+    (item,) = read()
+    assert item.methods["b"] == {"view-0000": tmp_path / "made/b/renders/view-0000.png"}
+    (cells[0] if place == "folder" else bear)[place] = "../elsewhere"
     with pytest.raises(InputError, match="leads out of"):
-        read_items([tmp_path / "run"])
-    assert read_items([tmp_path / "run"], within=tmp_path)
+        read()

@@ -218,20 +218,26 @@ def test_people_see_pictures_of_256_px_and_more(run, tmp_path):
 
 
 def captured(folder, views=20, size=320):
-    """The folder of a run on a capture, as `run --data` leaves it: a colour for each method."""
+    """The folder of a run on a capture: a colour for each variant."""
     colors = {"alone": (200, 40, 40), "warped, twice": (40, 40, 200)}
-    rows = {name: {"folder": f"variant-{k + 1}"} for k, name in enumerate(colors)}
-    folders = {"originals": (90, 90, 90)} | {
-        f"{rows[name]['folder']}/renders": color for name, color in colors.items()
+    folders = {"originals/garden": (90, 90, 90)} | {
+        f"made/{k}/renders": color for k, color in enumerate(colors.values())
     }
     for part, color in folders.items():
         (folder / part).mkdir(parents=True)
         for view in range(views):
             picture = Image.new("RGB", (size, size // 2), color)
             picture.save(folder / part / f"view-{view:04d}.png")
-    data = {"study": "mine", "words": {"instruction": "make it snow"}, "views": ["v"] * views,
-            "variants": rows, "left_out": {}}  # fmt: skip
-    (folder / "captured.json").write_text(json.dumps(data))
+    cells = [
+        {"id": str(k), "kind": "edit", "scene": "garden", "edit": "snow", "seed": 0,
+         "variants": [name], "folder": f"made/{k}"}
+        for k, name in enumerate(colors)
+    ]  # fmt: skip
+    garden = {"sha256": "0", "views": ["v"] * views, "originals": "originals/garden",
+              "edits": {"snow": "make it snow"}}  # fmt: skip
+    (folder / "results.json").write_text(
+        json.dumps({"captures": {"garden": garden}, "cells": cells})
+    )
     return colors
 
 
@@ -252,6 +258,6 @@ def test_a_run_on_a_capture_is_shown_with_eight_of_its_views(tmp_path):
 
 def test_a_damaged_file_of_a_run_on_a_capture_is_one_line(tmp_path):
     captured(tmp_path / "garden", views=1)
-    (tmp_path / "garden" / "captured.json").write_text("{}")
+    (tmp_path / "garden" / "results.json").write_text("{}")
     done = build(tmp_path / "garden", "--out", tmp_path / "page.html")
-    assert done.exit_code == 2 and "captured.json: damaged" in done.output
+    assert done.exit_code == 2 and "results.json: damaged" in done.output

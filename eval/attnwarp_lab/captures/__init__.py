@@ -1,4 +1,4 @@
-"""The paper's tables from a manifest: captures, splats, words, methods and weights of one's own.
+"""Methods on captures, by a manifest: the paper's tables, or one capture of a command line.
 
 ``manifest`` reads it, ``check`` refuses what does not fit before anything runs, ``cells`` edits and
 measures, ``estimate`` tells what that costs, ``report`` writes the tables, ``seal`` hashes it all.

@@ -7,23 +7,23 @@ import shutil
 import numpy as np
 import pytest
 import torch
-import yaml
 from PIL import Image
-from reproduction import save, write_small
+from small_manifest import save, write_small
 from tiny_editors import pix2pix, unet
 from tiny_models import save_clip, save_dino
 from typer.testing import CliRunner
 
+from attnwarp.editing.small import load_editor
 from attnwarp.errors import InputError
 from attnwarp.io import read_ply, write_ply
 from attnwarp_eval.cli.main import app
-from attnwarp_eval.reproduce.check import check, pattern
-from attnwarp_eval.reproduce.manifest import load_manifest, shipped
+from attnwarp_lab.captures.check import check, pattern
+from attnwarp_lab.captures.manifest import load_manifest, shipped
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("reproduction")
+    folder = tmp_path_factory.mktemp("captures")
     return folder, write_small(folder)
 
 
@@ -35,7 +35,7 @@ def copied(made, tmp_path):
 
 
 def told(folder, manifest):
-    return check(load_manifest(str(save(folder, manifest))), folder / "run")
+    return check(load_manifest(str(save(folder, manifest))), folder / "run", "cpu")
 
 
 def rms(values):
@@ -47,47 +47,31 @@ def test_a_right_manifest_has_no_problem_and_its_probe_values_are_the_models_own
     folder, manifest = made
     done = told(folder, manifest)
     assert done.problems == []
-    assert set(done.captures) == {"one", "two"} and done.views == {"one": 3, "two": 3}
-    pipe = pix2pix()
-    words = pipe.tokenizer(
-        "a photo of a bear", padding="max_length", max_length=24, return_tensors="pt"
-    ).input_ids
-    picture = 0.5 + 0.5 * pattern(1, 3, 32, 32).float()
+    assert {name: len(views) for name, views in done.views.items()} == {"one": 3, "two": 3}
+    pipe, editor = pix2pix(), load_editor(str(folder / "weights/pix2pix"))
+    side = 128  # a multiple of what the editor takes
+    picture = (0.5 + 0.5 * pattern(side, side, 3)).float().permute(2, 0, 1)[None]
     with torch.no_grad():
-        text = pipe.text_encoder(words)[0]
-        x = pattern(1, 8, 16, 16).float()
-        out = pipe.unet(x, torch.tensor(500), encoder_hidden_states=text).sample
-        latents = pipe.vae.encode(2 * picture - 1).latent_dist.mode()
-    assert done.weights["editors.pix2pix"][1] == pytest.approx(rms(out) + rms(latents), rel=1e-5)
+        text, plain = (
+            pipe.text_encoder(
+                pipe.tokenizer(
+                    words, padding="max_length", max_length=24, return_tensors="pt"
+                ).input_ids
+            )[0]
+            for words in ("a photo of a bear", "")
+        )
+        view = pipe.vae.encode(2 * picture - 1).latent_dist.mode()
+        x = pattern(*view.shape).float()
+        step = torch.tensor(int(editor.schedule.timesteps(2, view.shape[2:])[1]))
 
+        def noise(before, words):
+            both = torch.cat([x, before], 1)
+            return pipe.unet(both, step, encoder_hidden_states=words).sample
 
-def test_probe_values_are_written_into_the_manifest_and_hold_other_weights_off(copied):
-    """Oracle: the manifest as it was but for the values, which the check computes on its own."""
-    folder, manifest = copied
-    weights = told(folder, manifest).weights
-    path = save(folder, manifest)
-    flow = (
-        "  dino: {folder: weights/dino, shapes: {embeddings.register_tokens: [1, 4, 32]}} # ours\n"
-    )
-    start, rest = path.read_text().split("  dino:\n")
-    path.write_text(f"{start}{flow}{rest[rest.index('methods:') :]}")
-    expected = yaml.safe_load(path.read_text())
-    for place, (_, value) in weights.items():
-        part, key = place.split(".")
-        if key != "perceptual":  # left out of the manifest: the bundled one
-            expected[part][key]["probe"] = pytest.approx(value, rel=1e-5)
-    shutil.rmtree(folder / "captures")  # not needed
-
-    def call():
-        return CliRunner().invoke(app, ["reproduce", str(path), "--write-probes"])
-
-    done = call()
-    assert done.exit_code == 0, done.output
-    assert yaml.safe_load(path.read_text()) == expected and "} # ours" in path.read_text()
-    assert "has a probe value" in call().stdout
-    unet(8, seed=5).save_pretrained(folder / "weights/pix2pix/unet")
-    other = call()
-    assert other.exit_code == 2 and "editors.pix2pix.probe" in other.stderr
+        both, image, none = noise(view, text), noise(view, plain), noise(0 * view, plain)
+    guided = none + editor.image_guidance * (image - none) + editor.text_guidance * (both - image)
+    expected = rms(guided) + rms(view * pipe.vae.config.scaling_factor)
+    assert done.weights["editors.pix2pix"][1] == pytest.approx(expected, rel=1e-4)
 
 
 def two_names(folder, manifest):
@@ -146,7 +130,7 @@ def moved_splats(folder, manifest):
 
 
 def small_mask(folder, manifest):
-    Image.new("RGB", (16, 16), "white").save(folder / "captures/two/masks/1.png")
+    Image.new("RGB", (32, 16), "white").save(folder / "captures/two/masks/1.png")
 
 
 def no_folder(folder, manifest):
@@ -154,24 +138,24 @@ def no_folder(folder, manifest):
 
 
 def wrong_editor(folder, manifest):
-    manifest["methods"]["IGS2GS"]["editor"] = "controlnet"
+    manifest["variants"]["IGS2GS"]["editor"] = "controlnet"
 
 
 MISTAKES = {
     two_names: "the key 'one' stands here and on line 5; keep one",
-    other_version: "format: got 2, expected 1: the manifest is of another version",
+    other_version: "format: got 2, but input should be 1",
     outside: "captures.../../evil.[key]: got the name '../../evil', expected one that a file can have",
     no_prompt: "captures.two.edits.red.source: is missing, expected the words",
-    empty_prompt: "captures.two.edits.red.target: is empty, expected the words",
+    empty_prompt: "captures.two.edits.red.target: is missing, expected the words",
     other_checkpoint: "editors.pix2pix.probe: weights/pix2pix gives",
     other_shapes: "unet.conv_in.weight has shape [16, 4, 3, 3], expected [320, 4, 3, 3]",
     other_scheduler: "editors.pix2pix: its scheduler leaves",
     other_clip: "vision_model.embeddings.position_embedding.weight has shape [26, 32], expected [17, 32]",
     no_registers: "encoders.dino: weights/dino has no tensor embeddings.register_tokens",
-    moved_splats: "captures.two.splats.2d: renders of its splats are",
-    small_mask: "1.png is 16 x 16 px, expected 32 x 32",
+    moved_splats: "captures.two.splats.2d: ",
+    small_mask: "1.png: got 16 x 32 (height x width), expected the aspect ratio of 32 x 32",
     no_folder: "captures.two: ",
-    wrong_editor: "methods.IGS2GS: igs2gs takes an editor guided by a picture",
+    wrong_editor: "variants.IGS2GS: igs2gs takes an editor guided by a picture",
 }
 
 
@@ -189,28 +173,28 @@ def test_a_planted_mistake_is_refused_by_name_before_anything_runs(copied, mista
     if mistake is not two_names:
         save(folder, manifest)
     run = folder / "run"
-    done = CliRunner().invoke(app, ["reproduce", str(path), "--out", str(run), "--dry-run"])
+    done = CliRunner().invoke(app, ["captures", str(path), "--out", str(run), "--dry-run"])
     assert done.exit_code == 2, done.output
     assert MISTAKES[mistake] in done.stderr
     assert not (run / "cells").exists()
     with pytest.raises(InputError):
-        check(load_manifest(str(path)), run).refuse()
+        check(load_manifest(str(path)), run, "cpu").refuse()
 
 
 def test_the_shipped_manifest_has_the_published_numbers():
     """Oracle: the paper's settings, and means of its columns."""
     loaded = load_manifest("paper")
     manifest = loaded.manifest
-    assert list(shipped()) == ["paper"] and manifest.size == 512 and len(manifest.captures) == 6
-    from attnwarp_eval.reproduce.cells import settings_of
-
-    settings = settings_of(
-        loaded, manifest.methods["attention warp, ControlNet random"], 0, "a cat"
+    assert (
+        list(shipped()) == ["one", "paper"] and manifest.size == 512 and len(manifest.captures) == 6
     )
+    from attnwarp_lab.captures.cells import settings_of
+
+    settings = settings_of(loaded, manifest.variants["attention warp, ControlNet random"], 0, 512)
     assert (settings["stages"], settings["views_per_stage"], settings["iterations"]) == (3, 40, 960)
     assert settings["suffix"] == ", best quality, extremely detailed"
     assert settings["negative_prompt"].startswith("longbody, lowres")
     assert (settings["source_text_guidance"], settings["text_guidance"]) == (7.5, 12.5)
-    assert settings["source_prompt"] == "a cat"
-    ip2p = settings_of(loaded, manifest.methods["attention warp, IP2P"], 0, "")
+    assert settings["source_prompt"] == "{source}"
+    ip2p = settings_of(loaded, manifest.variants["attention warp, IP2P"], 0, 512)
     assert ip2p["guidance_drop"] == 1.5 and ip2p["start"] == [700, 980]

@@ -2,8 +2,8 @@
 
 import pytest
 
-from attnwarp_eval.reproduce.cells import _own_device
 from attnwarp_eval.study.cluster import _local_client
+from attnwarp_lab.captures.cells import _own_device
 
 
 @pytest.mark.slow

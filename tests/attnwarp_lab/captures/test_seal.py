@@ -5,10 +5,10 @@ import json
 import pytest
 
 from attnwarp_eval.canonical_json import digest, write_json
-from attnwarp_eval.reproduce.manifest import FIGURES
-from attnwarp_eval.reproduce.seal import open_seal, side_by_side, verify, write_seal
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.store import Store, StoreError
+from attnwarp_lab.captures.manifest import FIGURES
+from attnwarp_lab.captures.seal import open_seal, side_by_side, verify, write_seal
 
 CLIP = FIGURES["CLIP"]
 
@@ -19,7 +19,7 @@ def sealed(folder, figures):
     nothing = {name: {} for name in ("captures", "splats", "masks", "weights")}
     store.write_study({"inputs": nothing, "cells": []})
     cells = [
-        {"kind": "edit", "methods": ["DGE"], "scene": scene, "edit": "red", "seed": seed,
+        {"kind": "edit", "variants": ["DGE"], "scene": scene, "edit": "red", "seed": seed,
          "figures": {CLIP: value and value + sign * 0.01}, "authors": {}}
         for scene, value in figures.items()
         for seed, sign in ((0, -1), (1, 1))
@@ -31,7 +31,7 @@ def sealed(folder, figures):
 
 def test_a_seal_is_compared_before_it_is_taken_off(tmp_path):
     """Oracle: by hand, the cells that rest on each damaged file; one of another scene stays."""
-    cells = [Cell({"name": name}, name, "DGE", "reproduction", 0) for name in ("a", "b", "c")]
+    cells = [Cell({"name": name}, name, "DGE", "captures", 0) for name in ("a", "b", "c")]
     _, b, c = cells
     files = ("originals/a/view-0000.png", f"made/{b.id[:16]}/measured/x.json",
              f"made/{c.id[:16]}/renders/view-0000.png", "notes.txt")  # fmt: skip

@@ -14,8 +14,8 @@ import pytest
 from distributed import LocalCluster
 from edit_folders import files
 from PIL import Image
-from reproduction import EDIT, MANIFEST, SIZE, VIEWS, save, write
 from skimage.metrics import peak_signal_noise_ratio
+from small_manifest import EDIT, MANIFEST, SIZE, VIEWS, save, write
 from tiny_models import linear_layers, save_backbone
 from typer.testing import CliRunner
 
@@ -24,18 +24,18 @@ from attnwarp.encoders import lpips, pretrained
 from attnwarp.io import read_ply
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.reproduce.cells import settings_of
-from attnwarp_eval.reproduce.manifest import load_manifest
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.splats.export import orbit
 from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, Job
 from attnwarp_eval.truth import appearance
+from attnwarp_lab.captures.cells import settings_of
+from attnwarp_lab.captures.manifest import load_manifest
 
 pytestmark = pytest.mark.slow
 
 
 def command(folder, out, *more, manifest="manifest.yaml"):
-    arguments = ["reproduce", str(folder / manifest), "--out", str(out), *more]
+    arguments = ["captures", str(folder / manifest), "--out", str(out), *more]
     return [sys.executable, "-m", "attnwarp_eval", *arguments]
 
 
@@ -47,7 +47,7 @@ def whole(*arguments, **more):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return write(tmp_path_factory.mktemp("reproduction"))
+    return write(tmp_path_factory.mktemp("captures"))
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +60,11 @@ def records(run):
     """Cells without what was measured in seconds and bytes."""
     cells = [json.loads(p.read_bytes()) for p in sorted((run / "cells").rglob("*.json"))]
     return [{k: v for k, v in cell.items() if k not in ("cost", "sha256")} for cell in cells]
+
+
+def made(run):
+    """Files of all cells but for the pages, which tell seconds."""
+    return {k: v for k, v in files(run / "made").items() if not k.endswith("index.html")}
 
 
 def test_a_run_that_was_killed_half_way_gives_the_same_bytes(folder, run):
@@ -78,7 +83,7 @@ def test_a_run_that_was_killed_half_way_gives_the_same_bytes(folder, run):
     whole(folder, killed)
     assert (killed / "results.json").read_bytes() == (run / "results.json").read_bytes()
     assert records(killed) == records(run)
-    assert files(killed / "made") == files(run / "made")
+    assert made(killed) == made(run)
     assert (killed / "userstudy.html").read_bytes() == (run / "userstudy.html").read_bytes()
 
 
@@ -103,9 +108,9 @@ def test_the_tables_have_the_written_pictures_figures_beside_the_papers(run):
         if "DINO single-image similarity" in cell["figures"]:
             title = "DINO single-image similarity"
             assert cell["authors"][title] != pytest.approx(cell["figures"][title], abs=1e-6)
-    text = (run / "reproduction.md").read_text()
+    text = (run / "report.md").read_text()
     for part in ("22.780", "not at hand", "IGS2GS below attention warp", "## 2DGS against 3DGS",
-                 "## Variability over seeds", "## Cost by method", "can't tell"):  # fmt: skip
+                 "## Variability over seeds", "## Cost by variant", "can't tell"):  # fmt: skip
         assert part in text
     assert "data:image/jpeg" in (run / "userstudy.html").read_text()
 
@@ -113,13 +118,13 @@ def test_the_tables_have_the_written_pictures_figures_beside_the_papers(run):
 def test_an_exported_scene_gives_the_studys_edited_pictures(folder, run):
     """Oracle: the study's way to edit true pictures, which never were files, by the same splats and seed."""
     loaded = load_manifest(str(folder / "manifest.yaml"))
-    row = loaded.manifest.methods["attention warp"]
+    row = loaded.manifest.variants["attention warp"]
     scene = load_scene("spheres")
     cameras = orbit(scene, VIEWS, SIZE)
     images = [np.asarray(to_srgb(appearance(scene, c, spp=2)), np.float32) for c in cameras]
     splats = read_ply(run / "fits" / "spheres-2d" / "splats.ply")
     editor = load_editor(loaded.editor("pix2pix"))
-    settings = settings_of(loaded, row, 0, EDIT["source"])
+    settings = settings_of(loaded, row, 0, SIZE)
     job = Job(splats, cameras, images, editor, EDIT["instruction"], settings, folder / "study",
               None, {})  # fmt: skip
     study = EDITING_METHODS["attention_warping"].run(job)
@@ -127,7 +132,7 @@ def test_an_exported_scene_gives_the_studys_edited_pictures(folder, run):
     (cell,) = (
         c
         for c in results["cells"]
-        if (c["scene"], c["methods"], c["seed"]) == ("spheres", ["attention warp"], 0)
+        if (c["scene"], c["variants"], c["seed"]) == ("spheres", ["attention warp"], 0)
     )
     assert set(study.edited) == {
         int(p.stem[-4:]) for p in (run / "made" / cell["id"][:16] / "edited").iterdir()
@@ -208,12 +213,12 @@ def test_quick_runs_two_methods_on_one_scene(quick):
     told = float(lines[-1].split(", ")[-1].removesuffix(" GB of disk"))
     assert told == pytest.approx(size / 1e9, rel=0.25)
     results = json.loads((out / "results.json").read_text())
-    assert [(c["scene"], c["methods"]) for c in results["cells"] if c["kind"] == "edit"] == [
+    assert [(c["scene"], c["variants"]) for c in results["cells"] if c["kind"] == "edit"] == [
         ("spheres", ["attention warp"]),
         ("spheres", ["IGS2GS"]),
     ]
     for name in ("attention warp", "IGS2GS"):
-        (cell,) = (c for c in results["cells"] if c["methods"] == [name])
+        (cell,) = (c for c in results["cells"] if c["variants"] == [name])
         told = f"{name}: 1 cells, {cell['counts']['network_rows']} network rows, "
         assert any(line.startswith(told) for line in lines)
 
@@ -230,4 +235,4 @@ def test_two_workers_of_a_scheduler_give_the_bytes_of_one_process(folder, quick)
         address = ("--scheduler", cluster.scheduler_address)
         whole(folder, out, "--quick", *address, manifest="quick.yaml")
     assert (out / "results.json").read_bytes() == (quick[0] / "results.json").read_bytes()
-    assert files(out / "made") == files(quick[0] / "made")
+    assert made(out) == made(quick[0])

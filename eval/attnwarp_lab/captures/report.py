@@ -1,11 +1,9 @@
-"""The paper's tables with one's own figures beside the published ones."""
+"""The tables of a run on captures, with published figures beside its own where there are some."""
 
 from __future__ import annotations
 
-import json
 import math
-import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,28 +13,36 @@ import numpy as np
 from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import without_nan, write_json
 from attnwarp_eval.document import write
-from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
+from attnwarp_eval.document.model import Gallery, Grid, Picture, Report, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.files import write_atomic
-from attnwarp_eval.reproduce.cells import Made, Planned, cell_folder, made_of
-from attnwarp_eval.reproduce.manifest import FIGURES, Row, TablePart, lacking
 from attnwarp_eval.statistics.contrasts import Contrast, contrast
 from attnwarp_eval.statistics.intervals import benjamini_hochberg, interval, over_scenes
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.shared.method_run import PARTS
 from attnwarp_eval.study.store import Store
+from attnwarp_lab.captures.capture import ORIGINALS
+from attnwarp_lab.captures.cells import Made, Planned, cell_folder, made_of, picture_name
+from attnwarp_lab.captures.manifest import FIGURES, Row, TablePart, lacking
+from attnwarp_lab.userstudy.material import RESULTS
 
 NOT_AT_HAND = "not at hand"
 """Stands for a published figure that this package does not know."""
 
-RESULTS, NAME, PAGE = "results.json", "reproduction", "userstudy.html"
-"""Files of the run's folder: figures, the report without its suffix, the page that asks people."""
+NAME, ASKING = "report", "userstudy.html"
+"""Files of the run's folder: the report without its suffix, and the page that asks people."""
+
+PICTURED = 4
+"""Views of each edit side by side in the report, evenly spread; of several edits fewer, at least
+one."""
 
 Value = Callable[[Made], Mapping[str, float]]
 
+PUBLISHED = "with the encoders' published preprocessing"
+
 VERSIONS: dict[str, Value] = {
     "as the paper's authors compute them": lambda made: made.authors or {},
-    "with the encoders' published preprocessing": lambda made: made.figures,
+    PUBLISHED: lambda made: made.figures,
 }
 """Versions of the figures. Edit PSNR has one alone."""
 
@@ -57,19 +63,19 @@ class Results:
 
     @property
     def rows(self) -> Mapping[str, Row]:
-        """Rows of the manifest by name."""
-        return self.planned.loaded.manifest.methods
+        """Variants of the manifest by name."""
+        return self.planned.loaded.manifest.variants
 
-    def edits(self, method: str | None = None) -> Iterator[tuple[Cell, Any]]:
-        """Edits, of one method alone if it is named."""
+    def edits(self, variant: str | None = None) -> Iterator[tuple[Cell, Any]]:
+        """Edits, of one variant alone if it is named."""
         for cell, record in self.records:
-            if cell.spec["kind"] == "edit" and (method is None or method in cell.labels):
+            if cell.spec["kind"] == "edit" and (variant is None or variant in cell.labels):
                 yield cell, record
 
-    def values(self, method: str, title: str, value: Value) -> dict[str, dict[str, float]]:
+    def values(self, variant: str, title: str, value: Value) -> dict[str, dict[str, float]]:
         """Scene -> edit and seed -> figure."""
         found: dict[str, dict[str, float]] = {}
-        for cell, record in self.edits(method):
+        for cell, record in self.edits(variant):
             figures = (
                 {**record.extra.figures} if title == FIGURES["Edit PSNR"] else value(record.extra)
             )
@@ -77,11 +83,6 @@ class Results:
                 key = f"{cell.spec['edit']}/{cell.seed}"
                 found.setdefault(cell.scene, {})[key] = figures.get(title, math.nan)
         return found
-
-    @property
-    def missing(self) -> int:
-        """Cells without a record."""
-        return len(self.planned.cells) - len(self.records)
 
 
 def write_report(planned: Planned, store: Store) -> list[Path]:
@@ -91,77 +92,102 @@ def write_report(planned: Planned, store: Store) -> list[Path]:
     """
     results = Results(planned, store.root, list(made_of(planned, store)))
     write_json(store.root / RESULTS, without_nan(results_json(results)), sort_keys=False)
-    paths = [store.root / RESULTS, *write.write_files(report(results), store.root, NAME)]
-    page = _ask_people(results)
-    return paths if page is None else [*paths, page]
+    asking = _ask_people(results)
+    return [store.root / RESULTS, *write.write_files(report(results), store.root, NAME), *asking]
 
 
 def results_json(results: Results) -> dict[str, Any]:
     """Figures of every cell, in the order of the manifest."""
-    checked = results.planned.checked
+    checked, captures = results.planned.checked, results.planned.loaded.manifest.captures
     return {
         "title": results.planned.loaded.manifest.title,
         "weights": {k: {"sha256": sha, "probe": p} for k, (sha, p) in checked.weights.items()},
-        "captures": checked.captures,
+        "captures": {
+            name: {
+                "sha256": sha, "views": checked.views[name], "originals": f"{ORIGINALS}/{name}",
+                "edits": {title: edit.instruction for title, edit in captures[name].edits.items()},
+            }
+            for name, sha in checked.captures.items()
+        },
         "cells": [
             {
                 "id": cell.id, "kind": cell.spec["kind"], "scene": cell.scene,
-                "edit": cell.spec.get("edit"), "methods": list(cell.labels), "seed": cell.seed,
-                "figures": dict(record.extra.figures), "authors": dict(record.extra.authors),
-                "counts": dict(record.extra.counts), "files": list(record.extra.files),
+                "edit": cell.spec.get("edit"), "variants": list(cell.labels), "seed": cell.seed,
+                "folder": _folder(cell), "figures": dict(record.extra.figures),
+                "authors": dict(record.extra.authors), "counts": dict(record.extra.counts),
+                "cut": record.extra.cut, "files": list(record.extra.files),
             }
             for cell, record in results.records
         ],
     }  # fmt: skip
 
 
+def _folder(cell: Cell) -> str:
+    return cell_folder(Path(), cell.id).as_posix()
+
+
 def report(results: Results) -> Report:
     """The run as a document."""
-    m = results.planned.loaded.manifest
-    scenes = len(m.captures)
+    loaded = results.planned.loaded
+    m, edits = loaded.manifest, [*loaded.edits()]
+    size = f"{m.size} px" if m.size else "each editor's own size"
     lead = [
-        f"{scenes} scene{'s' * (scenes > 1)}, {sum(1 for _ in results.planned.loaded.edits())}"
-        f" edits, {m.size} px. Behind ± stands half of a 95 % interval over scenes; of fewer than"
-        " six scenes the lowest and the highest are shown, from which nothing follows for others."
+        f"{_count(len(m.captures), 'scene')}, {_count(len(edits), 'edit')}, {size}. Behind ± stands"
+        " half of a 95 % interval over scenes; of fewer than six scenes the lowest and the highest"
+        " are shown, from which nothing follows for others.",
+        *(f"{note[0].upper()}{note[1:]}." for note in results.planned.notes),
     ]
     ours = [
-        f"{scene} / {name}: {', '.join(edit.ours)}"
-        for scene, capture in m.captures.items()
-        for name, edit in capture.edits.items()
-        if edit.ours
+        f"{scene} / {name}: {', '.join(given)}"
+        for scene, name in edits
+        if (given := m.captures[scene].edits[name].ours)
     ]
     if ours:
         lead.append(f"Prompts that were not published and are this manifest's: {'; '.join(ours)}.")
+    for key, figure in (("target", "CLIP similarity"), ("source", "CLIP directional similarity")):
+        if any(getattr(m.captures[scene].edits[name], key) is None for scene, name in edits):
+            lead.append(f"Edits without words for `{key}` have no {figure}.")
+    if cut := sorted({n for cell, r in results.edits() if r.extra.cut for n in cell.labels}):
+        lead.append(f"**Did not finish within their budget: {', '.join(cut)}.**")
     if unknown := lacking(m):
         lead.append(
             f"**Which checkpoint {', '.join(unknown)} held was not checked**: the manifest has no"
             " probe value of the published weights, so others of the same shapes pass."
         )
-    if results.missing:
+    if missing := len(results.planned.cells) - len(results.records):
         lead.append(
-            f"**{results.missing} of {len(results.planned.cells)} cells are missing; the same"
-            " command computes them.**"
+            f"**{missing} of {len(results.planned.cells)} cells are missing; the same command"
+            " computes them.**"
         )
-    bundled = [k for k in ("clip", "dino") if ":" not in results.planned.loaded.encoder(k)]
+    bundled = [k for k in ("clip", "dino") if ":" not in loaded.encoder(k)]
     if bundled:
         lead.append(
             f"**The encoders of {' and '.join(bundled)} are bundled ones, whose figures do not"
             " compare with published ones.**"
         )
-    sections = [section for table in m.tables for section in _table(results, table)]
-    sections += [*_geometry(results), *_variability(results), _cost(results), _people(results)]
+    sections = [_table(results, table) for table in loaded.tables()]
+    sections += [_pictures(results), *_geometry(results), *_variability(results), _cost(results)]
+    if (results.root / ASKING).is_file():
+        sections.append(_people())
     return Report(m.title, lead, sections)
 
 
-def _table(results: Results, table: TablePart) -> list[Section]:
-    """A table of the paper: figures in both versions, and verdicts on its orderings."""
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
+
+
+def _table(results: Results, table: TablePart) -> Section:
+    """A table: the paper's figures in both versions, all others, and verdicts on its orderings."""
     tables: list[Table] = []
     for version, value in VERSIONS.items():
-        rows = [_row(results, name, value) for name in table.rows]
-        if any(cell != "–" for row in rows for cell in row[3::2]):
-            columns = ["method", *(c for head in FIGURES for c in (head, f"{head}, paper"))]
-            tables.append(Table(columns, rows, f"Figures {version}.", folded=bool(tables)))
-    text = ["Higher is better. Edit PSNR also rewards a scene that hardly changes."]
+        if any(value(record.extra) for _, record in results.edits()):
+            tables += _figures(results, table, f"Figures {version}.", FIGURES, value, bool(tables))
+    measured = dict.fromkeys(t for _, record in results.edits() for t in record.extra.figures)
+    others = {title: title for title in measured if title not in FIGURES.values()}
+    tables += _figures(results, table, "Other figures.", others, VERSIONS[PUBLISHED], True)
+    text = [
+        "Higher is better, but of distances. Edit PSNR also rewards a scene that hardly changes."
+    ]
     lost = [
         name for name in table.rows
         if any(math.isnan(r.extra.figures.get(FIGURES["DINO img"], math.nan))
@@ -169,7 +195,7 @@ def _table(results: Results, table: TablePart) -> list[Section]:
     ]  # fmt: skip
     if lost:
         text.append(
-            "Single-image similarities compare renders with the method's own edit of the source"
+            "Single-image similarities compare renders with the variant's own edit of the source"
             f" view. Of {', '.join(lost)} some cells have none, as the method did not edit it."
         )
     if table.against is not None and (verdicts := _verdicts(results, table)) is not None:
@@ -179,17 +205,54 @@ def _table(results: Results, table: TablePart) -> list[Section]:
             " scenes, adjusted for all rows together (Benjamini-Hochberg). Below six scenes there"
             " is no verdict."
         )
-    return [Section(table.title, text, tables)]
+    return Section(table.title, text, tables)
 
 
-def _row(results: Results, name: str, value: Value) -> list[str]:
-    cells = [name]
-    for k, title in enumerate(FIGURES.values()):
-        values = results.values(name, title, value)
-        cells.append(spread(over_scenes(values), len(values)))
-        paper = results.rows[name].paper
-        cells.append(NOT_AT_HAND if paper is None else f"{paper[k]:.3f}")
-    return cells
+def _figures(
+    results: Results, table: TablePart, caption: str, titles: Mapping[str, str], value: Value,
+    folded: bool,
+) -> Iterator[Table]:  # fmt: skip
+    """A table of figures, published ones beside them where a row has some; none without values."""
+    published = titles is FIGURES and any(results.rows[name].paper for name in table.rows)
+    rows, found = [], False
+    planned = {name for cell in results.planned.edits for name in cell.labels}
+    for name in filter(planned.__contains__, table.rows):
+        row, paper = [name], results.rows[name].paper
+        for k, title in enumerate(titles.values()):
+            values = results.values(name, title, value)
+            row.append(spread(over_scenes(values), len(values)))
+            found |= row[-1] != "–"
+            if published:
+                row.append(NOT_AT_HAND if paper is None else f"{paper[k]:.3f}")
+        rows.append(row)
+    heads = [c for head in titles for c in ([head, f"{head}, paper"] if published else [head])]
+    if found:
+        yield Table(["variant", *heads], rows, caption, folded=folded)
+
+
+def _pictures(results: Results) -> Section:
+    """Edited scenes side by side, of each edit's first seed, and where each variant's page lies."""
+    edits, checked = [*results.planned.loaded.edits()], results.planned.checked
+    grids, pages = [], []
+    for scene, title in edits:
+        names = checked.views[scene]
+        count = min(max(1, PICTURED // len(edits)), len(names))
+        views = [k * len(names) // count for k in range(count)]
+        folders = {"before": f"{ORIGINALS}/{scene}"}
+        for cell, record in results.edits():
+            label = " = ".join(cell.labels)
+            if (cell.scene, cell.spec["edit"]) == (scene, title) and label not in folders:
+                folders[label] = f"{_folder(cell)}/renders"
+                pages.append([f"{scene} / {title}", label, f"`{record.extra.page or '–'}`"])
+        rows: list[tuple[str, list[Picture | None]]] = [
+            (label, [Picture(f"{folder}/{picture_name(k)}", f"{label}, {names[k]}") for k in views])
+            for label, folder in folders.items()
+        ]
+        if len(rows) > 1:
+            grids.append(Grid(f"{scene} / {title}", [names[k] for k in views], rows))
+    table = Table(["edit", "variant", "page"], pages, "The splats, and all else of a variant.",
+                  folded=len(edits) > 1)  # fmt: skip
+    return Section("Edited scenes", ["Renders of the tuned splats."], [table], grids=grids)
 
 
 def _verdicts(results: Results, table: TablePart) -> Table | None:
@@ -237,7 +300,7 @@ def _geometry(results: Results) -> list[Section]:
         return []
     rows, pictures = [], []
     for cell, record in records:
-        folder = cell_folder(Path(), cell.id).as_posix()
+        folder = _folder(cell)
         rows.append([
             f"{cell.scene}, {cell.variant}",
             *(number(record.extra.figures.get(f"{what}, {kind}gs"))
@@ -261,32 +324,30 @@ def _geometry(results: Results) -> list[Section]:
 
 
 def _variability(results: Results) -> list[Section]:
-    """Spread between seeds."""
+    """Spread between seeds of the variants that have several."""
     rows, pictures = [], []
-    for name in results.planned.loaded.manifest.variability:
+    first = next(iter(results.planned.loaded.edits()))
+    for name in results.rows:
         seeds = {cell.seed for cell, _ in results.edits(name)}
         if len(seeds) < 2:
             continue
-        cells = [name, str(len(seeds))]
+        row = [name, str(len(seeds))]
         for title in FIGURES.values():
             value = next((v for v in VERSIONS.values() if results.values(name, title, v)), None)
             values = {} if value is None else results.values(name, title, value)
             deviations = {scene: _deviations(by_edit) for scene, by_edit in values.items()}
-            cells.append(spread(interval(deviations), len(deviations)))
-        rows.append(cells)
-        first = next(iter(results.planned.loaded.edits()))
-        row = [
-            Picture(
-                f"{cell_folder(Path(), c.id).as_posix()}/renders/view-0000.png", f"seed {c.seed}"
-            )
+            row.append(spread(interval(deviations), len(deviations)))
+        rows.append(row)
+        shown = [
+            Picture(f"{_folder(c)}/renders/{picture_name(0)}", f"seed {c.seed}")
             for c, _ in results.edits(name)
             if (c.scene, c.spec["edit"]) == first
         ]
-        pictures.append((f"**{name}, {first[0]}**", row))
+        pictures.append((f"**{name}, {first[0]}**", shown))
     if not rows:
         return []
     text = ["Standard deviation between seeds of one edit, averaged over edits, then scenes."]
-    table = Table(["method", "seeds", *FIGURES], rows)
+    table = Table(["variant", "seeds", *FIGURES], rows)
     return [Section("Variability over seeds", text, [table], gallery=Gallery(pictures))]
 
 
@@ -298,7 +359,7 @@ def _deviations(values: Mapping[str, float]) -> list[float]:
 
 
 def _cost(results: Results) -> Section:
-    """Seconds, memory and work of a method's cell, on average."""
+    """Seconds, memory and work of a variant's cell, on average."""
     rows = []
     for name in results.rows:
         records = [record for _, record in results.edits(name)]
@@ -320,71 +381,39 @@ def _cost(results: Results) -> Section:
         ])  # fmt: skip
     timed = ("seconds", "memory, GiB", "GPU, GiB")
     columns = [
-        "method", "editor", "views edited", "of views", "network rows", "iterations", *timed,
+        "variant", "editor", "views edited", "of views", "network rows", "iterations", *timed,
     ]  # fmt: skip
     text = [
-        "Means of a cell. Methods edit different numbers of views: their figures are of renders of"
+        "Means of a cell. Variants edit different numbers of views: their figures are of renders of"
         " all views, but Edit PSNR is of edited ones. Memory is the process's at most."
     ]
-    return Section("Cost by method", text, [Table(columns, rows, timed=timed)])
+    return Section("Cost by variant", text, [Table(columns, rows, timed=timed)])
 
 
 def _range(values: Sequence[int]) -> str:
     return str(values[0]) if values[0] == values[-1] else f"{values[0]} to {values[-1]}"
 
 
-def _people(results: Results) -> Section:
-    return Section(
-        "Selection frequency",
-        [
-            f"`{PAGE}` asks people which edit they prefer, and `attnwarp-eval userstudy score`"
-            " gives each method's selection frequency from the files that they save. The paper's"
-            f" frequencies are {NOT_AT_HAND}."
-        ],
+def _people() -> Section:
+    text = (
+        f"`{ASKING}` asks people which edit they prefer, and `attnwarp-eval userstudy score` gives"
+        " each variant's selection frequency from the files that they save. The paper's frequencies"
+        f" are {NOT_AT_HAND}."
     )
+    return Section("Selection frequency", [text])
 
 
-def asked_about(
-    planned: Planned, edits: Iterable[Cell]
-) -> dict[tuple[str, str, int], dict[str, Cell]]:
-    """Cells of the first table that people choose between, by row: of one capture, edit, seed."""
-    m = planned.loaded.manifest
-    named = m.tables[0].rows if m.tables else list(m.methods)
-    groups: dict[tuple[str, str, int], dict[str, Cell]] = {}
-    for cell in edits:
-        for name in set(named).intersection(cell.labels):
-            groups.setdefault((cell.scene, cell.spec["edit"], cell.seed), {})[name] = cell
-    return {key: cells for key, cells in groups.items() if len(cells) > 1}
-
-
-def _ask_people(results: Results) -> Path | None:
-    """Write the page that compares the rows of the first table; None where there is no pair."""
-    from attnwarp_lab.userstudy.material import CAPTURED, read_items
+def _ask_people(results: Results) -> list[Path]:
+    """Write the page that compares the rows of the first table, where there is a pair."""
+    from attnwarp_lab.userstudy.material import read_items
     from attnwarp_lab.userstudy.page import Design, build_page
 
-    folders = []
-    groups = asked_about(results.planned, (cell for cell, _ in results.edits()))
-    for (scene, edit, seed), cells in groups.items():
-        folder = results.root / "asked" / f"{scene}-{edit}-{seed}"
-        words = results.planned.loaded.manifest.captures[scene].edits[edit]
-        data = {
-            "words": {"instruction": words.instruction},
-            "views": list(range(results.planned.checked.views[scene])),
-            "originals": os.path.relpath(results.root / "originals" / scene, folder),
-            "variants": {
-                name: {"folder": os.path.relpath(cell_folder(results.root, cell.id), folder)}
-                for name, cell in cells.items()
-            },
-        }
-        text = json.dumps(data, indent=1) + "\n"
-        write_atomic(folder / CAPTURED, text.encode())
-        folders.append(folder)
-    if not folders:
-        return None
+    path = results.root / ASKING
+    path.unlink(missing_ok=True)
+    rows = [row for row in results.planned.loaded.tables()[0].rows if any(results.edits(row))]
     try:
-        items = read_items(folders, within=results.root)
-        text = build_page(items, Design(), "Which edit do you prefer?")
-    except InputError:  # views of different numbers
-        return None
-    write_atomic(results.root / PAGE, text.encode())
-    return results.root / PAGE
+        text = build_page(read_items([results.root], rows), Design(), "Which edit do you prefer?")
+    except InputError:  # no pair, or views of different numbers
+        return []
+    write_atomic(path, text.encode())
+    return [path]

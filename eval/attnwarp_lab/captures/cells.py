@@ -1,6 +1,6 @@
-"""Cells of a reproduction: fits, edits with their figures, and warps of the source.
+"""Cells of a run on captures: fits, edits with their figures, and warps of the source.
 
-A cell is one capture x edit x method x seed. Its id is the hash of what decides its figures; its
+A cell is one capture x edit x variant x seed. Its id is the hash of what decides its figures; its
 files lie in the run's folder, so that workers have to see that folder and the manifest's.
 """
 
@@ -16,14 +16,36 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
+from attnwarp.editing.small import guide_of, load_editor, thread_count
 from attnwarp.encoders import Kind, load_encoder
+from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
-from attnwarp.methods import Budget, Result
+from attnwarp.methods import METHODS, Budget
+from attnwarp.methods.base import workdir_of
+from attnwarp.methods.page import PAGE, show_edit
+from attnwarp.methods.pictures import enlarged_change, to_bytes
+from attnwarp.methods.scene import near_of, render_picture, to_float
 from attnwarp.reporting import SILENT, Reporter
+from attnwarp.workdir import MANIFEST
 from attnwarp_eval.canonical_json import without_nan
-from attnwarp_eval.experiments.captured import write_originals, write_pictures
 from attnwarp_eval.files import write_picture
-from attnwarp_eval.reproduce.captures import (
+from attnwarp_eval.study.cell import Cell, merged
+from attnwarp_eval.study.probe import Probe, Work, register, unregister
+from attnwarp_eval.study.record import Failure, Json, with_nan
+from attnwarp_eval.study.shared import editing_methods
+from attnwarp_eval.study.shared.editing_methods import (
+    EDITING_METHODS,
+    EditedScene,
+    needs_source_words,
+    with_source_words,
+)
+from attnwarp_eval.study.store import Store
+from attnwarp_eval.user_images import measure
+from attnwarp_lab.captures.capture import (
+    FITS,
+    MADE,
+    MARKS,
+    ORIGINALS,
     Ready,
     check_likeness,
     read_splats,
@@ -31,14 +53,8 @@ from attnwarp_eval.reproduce.captures import (
     segments,
     splats_file,
 )
-from attnwarp_eval.reproduce.check import Checked
-from attnwarp_eval.reproduce.manifest import Loaded, Manifest, Row
-from attnwarp_eval.study.cell import Cell, merged
-from attnwarp_eval.study.probe import Probe, Work, register, unregister
-from attnwarp_eval.study.record import Failure, Json, with_nan
-from attnwarp_eval.study.shared.editing_methods import with_source_words
-from attnwarp_eval.study.store import Store
-from attnwarp_eval.user_images import measure
+from attnwarp_lab.captures.check import Checked
+from attnwarp_lab.captures.manifest import Loaded, Manifest, Row
 
 PROTOCOL = 1
 """Raised whenever the same inputs would give other figures."""
@@ -58,6 +74,8 @@ class Made:
         figures: by their title, with the encoders' published preprocessing.
         authors: the same with that of the paper's authors.
         counts: counts of views, edited views, network rows, iterations and splats.
+        cut: the limit of the budget that ended the method; None for a whole run.
+        page: path of the method's page in the run's folder; None for a method that leaves none.
         seconds: seconds of the method, by part.
         gpu: GiB of a GPU at most; NaN without one.
         files: path in the run's folder, and SHA-256.
@@ -66,6 +84,8 @@ class Made:
     figures: Mapping[str, float] = field(default_factory=dict)
     authors: Mapping[str, float] = field(default_factory=dict)
     counts: Mapping[str, float] = field(default_factory=dict)
+    cut: str | None = None
+    page: str | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
     gpu: float = np.nan
     files: Sequence[Mapping[str, str]] = ()
@@ -81,15 +101,15 @@ class Made:
         """Rebuild from :meth:`to_json`."""
         cost = with_nan({"gpu": data["cost"]["gpu_gib"]})
         return cls(
-            with_nan(data["figures"]), with_nan(data["authors"]), with_nan(data["counts"]),
-            data["cost"]["method"], cost["gpu"], data["files"],
+            *(with_nan(data[key]) for key in ("figures", "authors", "counts")),
+            data["cut"], data["page"], data["cost"]["method"], cost["gpu"], data["files"],
         )  # fmt: skip
 
 
-class Reproduction(Probe[Made]):
+class Captured(Probe[Made]):
     """Probe whose cells are of captures; no study names it, so it is registered while it runs."""
 
-    name: ClassVar[str] = "reproduction"
+    name: ClassVar[str] = "captures"
     protocol: ClassVar[int] = PROTOCOL
     needs_scenes: ClassVar[bool] = False
     judges_variants: ClassVar[bool] = False
@@ -122,8 +142,8 @@ def _own_device(devices: Sequence[str]) -> str:
 
 @lru_cache(maxsize=1)
 def editor_of(name: str, device: str) -> Any:
+    """An editor; the last one that a process loaded is kept."""
     from attnwarp.devices import type_of
-    from attnwarp.editing.small import load_editor
 
     return load_editor(name, device=device, dtype=type_of("auto", device))
 
@@ -178,55 +198,64 @@ class Job:
         path.parent.mkdir(parents=True, exist_ok=True)
         start = first_splats(capture.dataset, capture.cameras, settings, self.report)
         done = fit(start.to(device=self.device), capture.views, settings, folder=path.parent)
-        check_likeness(f"captures.{self.cell.scene}: fit of {kind}gs", capture, done.gaussians)
+        place = f"captures.{self.cell.scene}: fit of {kind}gs"
+        check_likeness(place, path, capture, done.gaussians.to(device="cpu"))
         counts = {"splats": len(done.gaussians), "iterations": done.iteration}
-        return Made({}, {}, counts, {"fit": done.seconds}, _gpu(self.device), self._files(path))
+        return Made(
+            counts=counts, seconds={"fit": done.seconds}, gpu=_gpu(self.device),
+            files=self._files(path),
+        )  # fmt: skip
 
     def edit(self) -> Made:
-        """Edit a capture by a method, and measure what came out."""
+        """Edit a capture by a variant's method, and measure what came out."""
         capture, folder = self.capture, self.folder()
         _reset_gpu(self.device)
-        result, splats = self.run_method(self.editor())
-        originals = self.run / "originals" / self.cell.scene
-        images = write_originals(capture.views, originals)
-        write_pictures(capture.cameras, splats, result, images, folder)
+        result, before = self.run_method()
+        originals = self.run / ORIGINALS / self.cell.scene
+        images = [to_float(image) for image in capture.images]
+        near = near_of(capture.cameras, before)
+        for k, camera in enumerate(capture.cameras):
+            _write(originals, k, images[k])
+            _write(folder / "renders", k, render_picture(result.gaussians, camera, near, "auto"))
+        for k, pixels in result.edited.items():
+            _write(folder / "edited", k, enlarged_change(images[k], to_float(pixels)))
+        page = None
+        method = workdir_of(folder / "run")
+        if method.has(MANIFEST):  # a method from outside leaves no such folder
+            page = (method.path / PAGE).relative_to(self.run).as_posix()
+            if not method.has(PAGE):
+                show_edit(method, before, capture.cameras, images)
         counts = {
             "views": len(capture.cameras), "edited": len(result.edited),
             **{k: result.counters[k] for k in COUNTED if k in result.counters},
         }  # fmt: skip
-        files = self._files(
-            folder / "renders", folder / "edited", folder / "run" / "edited.ply", originals
-        )
+        edited = (folder / "renders", folder / "edited", folder / "run" / "edited.ply", originals)
         return Made(
-            self.figures(result, originals), self.figures(result, originals, authors=True),
-            counts, result.seconds, _gpu(self.device), files,
+            self.figures(result, originals), self.figures(result, originals, authors=True), counts,
+            result.cut, page, result.seconds, _gpu(self.device), self._files(*edited),
         )  # fmt: skip
 
-    def editor(self) -> Any:
-        """Editor of the cell's row; the last one that a process loaded is kept."""
-        row = self.loaded.manifest.methods[self.cell.variant]
-        return editor_of(self.loaded.editor(row.editor), self.device)
-
-    def run_method(self, editor: Any) -> tuple[Result, Gaussians]:
+    def run_method(self) -> tuple[EditedScene, Gaussians]:
         """The result of the cell's method, and the splats before it."""
-        from attnwarp.editing.small import thread_count
         from attnwarp.fit import compile_kernels
-        from attnwarp.methods import METHODS, preset
 
-        spec, capture, folder = self.cell.spec, self.capture, self.folder()
+        spec, capture, row = self.cell.spec, self.capture, self.row
+        editor = editor_of(self.loaded.editor(row.editor), self.device)
         torch.set_num_threads(thread_count(editor))
-        splats = self.splats(self.loaded.manifest.methods[self.cell.variant].splats)
+        splats = self.splats(row.splats)
         compile_kernels(splats.kind, self.report, self.device)
-        options: dict[str, Any] = {"budget": self.budget} if self.budget else {}
-        if spec["method"] == "attention_warping":
-            options["source"] = capture.source
-        marked = segments(self.loaded, self.cell.scene, splats, folder, self.device, self.report)
-        result = METHODS[spec["method"]](
-            splats, capture.cameras, capture.images, editor, spec["text"],
-            preset(spec["method"], **spec["settings"]), folder=folder / "run",
-            segments=marked, report=self.report, load=encoder_of, **options,
+        marked = segments(self.loaded, self.cell.scene, self.run, self.device, self.report)
+        job = editing_methods.Job(
+            splats, capture.cameras, capture.images, editor, spec["text"], spec["settings"],
+            self.folder() / "run", None, {}, self.budget or Budget.from_dict(row.budget),
+            segments=marked(splats), source=capture.source, report=self.report, load=encoder_of,
         )  # fmt: skip
-        return result, splats
+        return EDITING_METHODS[spec["method"]].run(job), splats
+
+    @property
+    def row(self) -> Row:
+        """Variant of the cell."""
+        return self.loaded.manifest.variants[self.cell.variant]
 
     def splats(self, kind: str) -> Gaussians:
         """Splats of the capture, on the device."""
@@ -239,13 +268,14 @@ class Job:
             return start.to(device=self.device)
         return read_splats(path, kind).to(device=self.device)
 
-    def figures(self, result: Result, originals: Path, authors: bool = False) -> dict[str, float]:
+    def figures(
+        self, result: EditedScene, originals: Path, authors: bool = False
+    ) -> dict[str, float]:
         """Figures by their title; those of bundled encoders have no version of the authors."""
         folder, words = self.folder(), self.cell.spec["words"]
-        source = folder / "edited" / f"view-{self.capture.source:04d}.png"
-        names: dict[Kind, str | None] = {
-            "clip": self.loaded.encoder("clip"), "dino": self.loaded.encoder("dino"),
-        }  # fmt: skip
+        source = folder / "edited" / picture_name(self.capture.source)
+        kinds: tuple[Kind, ...] = ("clip", "dino", "perceptual")
+        names: dict[Kind, str | None] = {kind: self.loaded.encoder(kind) for kind in kinds}
         if authors:
             names = {k: authors_version(str(name)) or measure.OFF for k, name in names.items()}
             if set(names.values()) == {measure.OFF}:
@@ -256,14 +286,12 @@ class Job:
             words["target"], words["source"],
         )  # fmt: skip
         done = measure.measure(
-            inputs, {**names, "perceptual": measure.OFF}, Store(folder / "measured"),
-            device=self.device, load=encoder_of,
-        )  # fmt: skip
+            inputs, names, Store(folder / "measured"), device=self.device, load=encoder_of
+        )
         return {row.title: row.value for row in done.rows if row.encoder or not authors}
 
     def warp(self) -> Made:
         """The source's picture warped into a target by both kinds of splats, with its mask."""
-        from attnwarp.methods.scene import near_of, to_float
         from attnwarp.warp import PRESETS, warp_view
         from attnwarp_eval.study.shared.pictures import carried
 
@@ -284,16 +312,25 @@ class Job:
             figures[f"apart, {kind}gs"] = float(apart.mean()) if apart.size else np.nan
             shown = np.where(mask[..., None], warped, 0.0)
             for what, picture in (("warped", warped), ("valid", shown)):
-                pixels = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
-                write_picture(folder / f"{what}-{kind}.png", pixels)
+                _write(folder, f"{what}-{kind}", picture)
         for what, picture in (("source", source), ("target", truth)):
-            write_picture(folder / f"{what}.png", np.rint(255 * picture).astype(np.uint8))
+            _write(folder, what, picture)
         return Made(figures, files=self._files(folder))
+
+
+def picture_name(view: int) -> str:
+    """File of a view's picture in each folder of them."""
+    return f"view-{view:04d}.png"
+
+
+def _write(folder: Path, what: int | str, picture: Any) -> None:
+    name = picture_name(what) if isinstance(what, int) else f"{what}.png"
+    write_picture(folder / name, to_bytes(picture))
 
 
 def cell_folder(run: Path, cell_id: str) -> Path:
     """Folder of a cell's files."""
-    return run / "made" / cell_id[:16]
+    return run / MADE / cell_id[:16]
 
 
 def rests_on(cell: Cell, name: str) -> bool:
@@ -304,7 +341,7 @@ def rests_on(cell: Cell, name: str) -> bool:
         name: path of the file in the run's folder.
     """
     part, place, *_ = (*name.split("/"), "")
-    of_scene = part in ("originals", "fits") and cell.scene in (place, place.rpartition("-")[0])
+    of_scene = part in (ORIGINALS, FITS, MARKS) and cell.scene in (place, place.rpartition("-")[0])
     return of_scene or cell.id[:16] in name
 
 
@@ -330,13 +367,15 @@ def authors_version(name: str) -> str | None:
 
 @dataclass(frozen=True)
 class Planned:
-    """Cells of a manifest in the order of their running: all of a wave may run at once."""
+    """Cells of a manifest in the order of their running: all of a wave may run at once; and notes
+    on what is left out and what is not equal."""
 
     loaded: Loaded
     checked: Checked
     fits: list[Cell]
     edits: list[Cell]
     warps: list[Cell]
+    notes: list[str]
 
     @property
     def waves(self) -> tuple[list[Cell], list[Cell]]:
@@ -359,13 +398,13 @@ def plan(loaded: Loaded, checked: Checked, run: Path, devices: Sequence[str]) ->
 
     def cell(kind: str, scene: str, variant: str, seed: int, **spec: Any) -> Cell:
         common = {
-            "probe": Reproduction.name, "protocol": PROTOCOL, "kind": kind,
+            "probe": Captured.name, "protocol": PROTOCOL, "kind": kind,
             "capture": checked.captures[scene], "seed": seed,
         }  # fmt: skip
-        return Cell({**common, **spec}, scene, variant, Reproduction.name, seed, (variant,), (),
+        return Cell({**common, **spec}, scene, variant, Captured.name, seed, (variant,), (),
                     sources)  # fmt: skip
 
-    kinds = {row.splats for row in m.methods.values()} | ({"2d", "3d"} if m.geometry else set())
+    kinds = {row.splats for row in m.variants.values()} | ({"2d", "3d"} if m.geometry else set())
     fits = [
         cell("fit", name, f"fit of {kind}gs", 0, settings=_fit_settings(m, kind))
         for name, capture in m.captures.items()
@@ -375,35 +414,48 @@ def plan(loaded: Loaded, checked: Checked, run: Path, devices: Sequence[str]) ->
     def splats_of(name: str, kind: str) -> Any:
         return checked.splats[name].get(kind) or {"fit": _fit_settings(m, kind)}
 
-    def edit(name: str, edit_name: str, method: str, row: Row, seed: int) -> Cell:
+    def edit(name: str, edit_name: str, variant: str, row: Row, seed: int) -> Cell:
         words = m.captures[name].edits[edit_name]
-        guided = editor_guide(loaded.editor(row.editor)) == "depth"
         return cell(
-            "edit", name, method, seed,
+            "edit", name, variant, seed,
             edit=edit_name,
             splats=splats_of(name, row.splats),
             mask=checked.masks.get(name),
             method=row.method,
-            settings=settings_of(loaded, row, seed, words.source),
-            text=words.controlnet if guided else words.instruction,
+            settings=with_source_words(settings[variant, seed], words.source or ""),
+            budget=row.budget,
+            text=words.text(guide_of(loaded.editor(row.editor))),
             words={"source": words.source, "target": words.target},
             editor=checked.weights[f"editors.{row.editor}"][0],
             encoders={k: v for k, (v, _) in checked.weights.items() if k.startswith("encoders.")},
         )  # fmt: skip
 
-    edits = [
-        edit(name, edit_name, method, row, seed)
-        for name, edit_name in loaded.edits()
-        for method, row in m.methods.items()
+    settings = {
+        (name, seed): settings_of(loaded, row, seed, checked.sizes[row.editor])
+        for name, row in m.variants.items()
         for seed in loaded.seeds(row)
-    ]
+    }
+    edits, notes = [], _unequal(loaded, checked, settings)
+    for name, edit_name in loaded.edits():
+        for variant, row in m.variants.items():
+            seeds = loaded.seeds(row)
+            told = m.captures[name].edits[edit_name].source is not None
+            if needs_source_words(settings[variant, seeds[0]]) and not told:
+                notes.append(
+                    f"left out: {name} / {edit_name} / {variant}: it inverts with the words for the"
+                    " scene before, which the edit lacks; give `source` (--source-prompt)"
+                )
+                continue
+            edits += [edit(name, edit_name, variant, row, seed) for seed in seeds]
+    if not edits:
+        raise InputError("; ".join(notes))
     warps = [
         cell("warp", name, f"view {target}", 0, target=target,
              splats=[splats_of(name, kind) for kind in ("2d", "3d")])
         for name in m.captures
-        for target in _targets(checked.views[name], ready(loaded, name).source, m.geometry)
+        for target in _targets(len(checked.views[name]), ready(loaded, name).source, m.geometry)
     ]  # fmt: skip
-    return Planned(loaded, checked, fits, merged(edits), warps)
+    return Planned(loaded, checked, fits, merged(edits), warps, notes)
 
 
 def _fit_settings(manifest: Manifest, kind: str) -> Json:
@@ -412,21 +464,29 @@ def _fit_settings(manifest: Manifest, kind: str) -> Json:
     return FitSettings.from_dict({**manifest.fit, "kind": kind}).to_dict()
 
 
-def editor_guide(name: str) -> str:
-    """Guide of an editor, "picture" or "depth"."""
-    from attnwarp.editing.small import guide_of
+def settings_of(loaded: Loaded, row: Row, seed: int, size: int) -> Json:
+    """All settings of a row's method; one of the library takes the manifest's size and encoder."""
+    shared = {"size": size, "perceptual_encoder": loaded.encoder("perceptual")}
+    own = {**row.options, **(shared if row.method in METHODS else {})}
+    return EDITING_METHODS[row.method].settings(row.preset, own, seed)
 
-    return guide_of(name)
 
-
-def settings_of(loaded: Loaded, row: Row, seed: int, source_words: str) -> Json:
-    """All settings of a row's method."""
-    from attnwarp.methods import preset
-
-    own = {**row.options, "seed": seed, "size": loaded.manifest.size,
-           "perceptual_encoder": loaded.encoder("perceptual")}  # fmt: skip
-    settings = preset(row.method, row.preset, **own).to_dict()
-    return with_source_words(settings, source_words)
+def _unequal(loaded: Loaded, checked: Checked, settings: Mapping[Any, Json]) -> list[str]:
+    """A note where variants edit different numbers of a capture's views, and the remedy."""
+    name, views = next(iter(checked.views.items()))
+    counts = {
+        variant: edited(settings[variant, loaded.seeds(row)[0]], len(views))
+        for variant, row in loaded.manifest.variants.items()
+        if (edited := EDITING_METHODS[row.method].edited) is not None
+    }
+    if len(set(counts.values())) < 2:
+        return []
+    listed = ", ".join(f"{variant} {count}" for variant, count in counts.items())
+    return [
+        f"of {len(views)} views of {name}, variants edit {listed}; Edit PSNR is of edited views"
+        " alone, and more edits cost more: options views_per_stage of attention_warping, and views"
+        " of methods that draw them, make the numbers equal"
+    ]
 
 
 def _targets(views: int, source: int, count: int) -> list[int]:
@@ -441,7 +501,7 @@ def todo(cells: Sequence[Cell], store: Store) -> list[Cell]:
     done = store.done()
 
     def whole(cell: Cell) -> bool:
-        read = Reproduction().read
+        read = Captured().read
         record = store.whole(cell.id, read) if cell.id in done else None
         return record is not None and not store.damaged_pictures(record.extra.files)
 
@@ -462,7 +522,7 @@ def execute(
 
     failures: list[Failure] = []
     needs = [store.root / "study.json", *planned.loaded.paths()]
-    register(Reproduction)
+    register(Captured)
     try:
         for wave in planned.waves:
             left = todo(wave, store)
@@ -473,14 +533,14 @@ def execute(
             if failures:
                 break
     finally:
-        unregister(Reproduction.name)
+        unregister(Captured.name)
     return failures
 
 
 def made_of(planned: Planned, store: Store) -> Iterator[tuple[Cell, Any]]:
     """Cells with their records, those that are there."""
     for cell in planned.cells:
-        record = store.whole(cell.id, Reproduction().read)
+        record = store.whole(cell.id, Captured().read)
         if record is not None:
             yield cell, record
 
@@ -496,7 +556,7 @@ def expected(planned: Planned) -> Json:
         },
         "cells": [
             {"id": cell.id, "title": title(cell), "scene": cell.scene, "kind": cell.spec["kind"],
-             "edit": cell.spec.get("edit"), "methods": list(cell.labels), "seed": cell.seed}
+             "edit": cell.spec.get("edit"), "variants": list(cell.labels), "seed": cell.seed}
             for cell in planned.cells
         ],
     }  # fmt: skip
@@ -506,6 +566,3 @@ def title(cell: Cell) -> str:
     """A cell in words."""
     edit = f" / {cell.spec['edit']}" if "edit" in cell.spec else ""
     return f"{cell.scene}{edit} / {cell.variant}" + (f" / seed {cell.seed}" if cell.seed else "")
-
-
-__all__ = ["Made", "Planned", "Reproduction", "execute", "expected", "made_of", "plan", "todo"]

@@ -1,4 +1,4 @@
-"""Hours, disk and memory of a reproduction, from a few measured edits of each method."""
+"""Hours, disk and memory of a run on captures, from a few measured edits of each variant."""
 
 from __future__ import annotations
 
@@ -9,29 +9,19 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import fmean
 
-from attnwarp.methods import Budget
+from attnwarp.methods import METHODS, Budget
 from attnwarp.reporting import Reporter
 from attnwarp_eval.cost import peak_memory_mb, reset_peak_memory
-from attnwarp_eval.reproduce.captures import ready
-from attnwarp_eval.reproduce.cells import Job, Made, Planned
-from attnwarp_eval.reproduce.report import asked_about
 from attnwarp_eval.study.cell import Cell
-from attnwarp_lab.userstudy.material import MOST_VIEWS, read_picture
+from attnwarp_lab.captures.capture import ready
+from attnwarp_lab.captures.cells import Job, Made, Planned
 
 STEPS = (1, 3)
 """Steps of denoising of the two pilots of a method: their difference is what a step takes."""
 
 EDITS, BRANCHES, ITERATIONS = 8, 3, 8
 """Edits of a pilot, as far as a budget for so many branches goes, and iterations of its tuning."""
-
-WARPED, BESIDE = 6, 2
-"""Pictures of a warp; and on the page that asks people, those beside the methods': the original and
-a scrambled one."""
-
-BASE64 = 4 / 3
-"""Characters of a byte on a page."""
 
 EDITING = ("source", "warp", "edit", "write")
 """Parts of a method's seconds that grow with its edits."""
@@ -48,8 +38,8 @@ class Unit:
         rows, edits, iterations, rounds: rows, edits, iterations and rounds of a whole run on this
             capture; rows through the UNet.
         views: views of the capture.
-        files, state, picture: bytes of a cell's other files, of a round's end, of an edit.
-        original, asked: bytes of a view's picture, and of one in the page that asks people.
+        files, state, picture: bytes of a cell's other files, the capture's pictures among them; of
+            a round's end; of an edit.
         memory: GiB of the process, with the features of all steps.
         gpu: GiB of a GPU; NaN without one.
     """
@@ -65,8 +55,6 @@ class Unit:
     files: float
     state: float
     picture: float
-    original: float
-    asked: float
     memory: float
     gpu: float
 
@@ -96,9 +84,10 @@ def estimate(
 
     A capture whose splats are not fitted yet is piloted with first splats.
     """
-    views = planned.checked.views
+    views = {name: len(views) for name, views in planned.checked.views.items()}
     units: dict[str, Unit] = {}
-    edits = [cell for cell in left if cell.spec["kind"] == "edit"]
+    every = [cell for cell in left if cell.spec["kind"] == "edit"]
+    edits = [cell for cell in every if cell.spec["method"] in METHODS]
     firsts = {cell.variant: cell for cell in reversed(edits)}
     with tempfile.TemporaryDirectory() as place:
         warm = True
@@ -116,7 +105,6 @@ def estimate(
         ]
     total, disk = (sum(costs) for costs in zip((0.0, 0.0), *fits, strict=True))
     hours, fitted = total / 3600, disk
-    disk += _shared_bytes(planned, left, list(units.values())) / 1e9
     for name, unit in units.items():
         own = [cell for cell in edits if cell.variant == name]
         seconds = sum(unit.seconds(views[cell.scene]) for cell in own)
@@ -133,6 +121,8 @@ def estimate(
             f"fits: {len(fits)}, {hours:.2g} hours, {fitted:.2g} GB while splats are as few as at"
             " the beginning"
         )
+    if len(edits) < len(every):
+        yield f"{len(every) - len(edits)} cells of methods from outside: not foreseen"
     count = len(devices)
     yield (
         f"to do: {len(left)} cells, {total / 3600:.3g} hours of one device"
@@ -143,7 +133,7 @@ def estimate(
 def _measured(planned: Planned, cell: Cell, folder: Path, device: str) -> Unit:
     """Costs of a cell's method from its plan and two short cells."""
     plan = _job(planned, cell, folder / "plan", device, 0)
-    rounds = plan.run_method(plan.editor())[0].rounds
+    rounds = plan.run_method()[0].rounds
     gc.collect()
     reset_peak_memory()
     (short, _, whole), (long, last, _) = (
@@ -153,6 +143,7 @@ def _measured(planned: Planned, cell: Cell, folder: Path, device: str) -> Unit:
     step = max(0.0, three - one) / (STEPS[1] - STEPS[0])
     tuned = sum(_spent(made, ("tune",)) for made in (short, long))
     steps, edits = cell.spec["settings"]["steps"], long.counts["edits"]
+    views = len(planned.checked.views[cell.scene])
     state, pictures = _bytes(last, (".pt", ".ply")), _bytes(last / "run" / "rounds", (".png",))
     features = long.counts.get("feature_bytes", 0) / STEPS[1] * steps / 2**30
     return Unit(
@@ -163,12 +154,10 @@ def _measured(planned: Planned, cell: Cell, folder: Path, device: str) -> Unit:
         sum(len(part.views) for part in rounds),
         sum(part.iterations for part in rounds),
         len(rounds),
-        planned.checked.views[cell.scene],
-        _bytes(last) - state - 3 * pictures,
+        views,
+        _bytes(last.parents[1]) - state - 3 * pictures,
         state,
         3 * pictures / edits,
-        _bytes(last.parents[1] / "originals") / planned.checked.views[cell.scene],
-        BASE64 * len(read_picture(next((last / "renders").iterdir()))),
         peak_memory_mb() / 1024 + features,
         math.nan if device == "cpu" else max(short.gpu, long.gpu),
     )
@@ -199,23 +188,6 @@ def _pilot(
 
 def _spent(made: Made, parts: Sequence[str]) -> float:
     return sum(made.seconds.get(part, 0.0) for part in parts)
-
-
-def _shared_bytes(planned: Planned, left: Sequence[Cell], units: Sequence[Unit]) -> float:
-    """Bytes beside fits and edits: the captures' pictures, warps, and the page that asks people."""
-    if not units:
-        return 0.0
-    views = planned.checked.views
-    original, asked = (
-        fmean(getattr(unit, name) for unit in units) for name in ("original", "asked")
-    )
-    pictures = sum(views[name] for name in {cell.scene for cell in left})
-    pictures += WARPED * sum(cell.spec["kind"] == "warp" for cell in left)
-    shown = sum(
-        (len(cells) + BESIDE) * min(MOST_VIEWS, views[scene])
-        for (scene, _, _), cells in asked_about(planned, planned.edits).items()
-    )
-    return original * pictures + asked * shown
 
 
 def _fit_cost(planned: Planned, cell: Cell, folder: Path, device: str) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""A reproduction's seal, its verification, and two of them side by side."""
+"""A seal of a run on captures, its verification, and two of them side by side."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from attnwarp_eval.canonical_json import digest, write_json
 from attnwarp_eval.cost import environment
 from attnwarp_eval.document.model import Table
 from attnwarp_eval.document.numbers import number
-from attnwarp_eval.reproduce.cells import rests_on
-from attnwarp_eval.reproduce.manifest import FIGURES
-from attnwarp_eval.reproduce.report import RESULTS, difference
 from attnwarp_eval.statistics.contrasts import contrast
 from attnwarp_eval.statistics.intervals import over_scenes
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.store import Problems, Store, StoreError
+from attnwarp_lab.captures.cells import rests_on
+from attnwarp_lab.captures.manifest import FIGURES
+from attnwarp_lab.captures.report import difference
+from attnwarp_lab.userstudy.material import RESULTS
 
 SEAL = "seal.json"
 """File of hashes: of the code and its packages, of what went in, and of every other file."""
@@ -35,8 +36,8 @@ Cells = dict[Key, dict[str, Any]]
 """Figures by their title, of each cell."""
 
 
-def is_reproduction(run: Path) -> bool:
-    """Return True for the folder of a reproduction that has ended."""
+def is_sealed(run: Path) -> bool:
+    """Return True for the folder of a run on captures that has ended."""
     return (run / SEAL).is_file()
 
 
@@ -122,7 +123,7 @@ def open_seal(store: Store, cells: Sequence[Cell]) -> list[str]:
     Raises:
         StoreError: the seal is damaged.
     """
-    if not is_reproduction(store.root):
+    if not is_sealed(store.root):
         return []
     broken = list(_broken(store, _read_seal(store)))
     for name in broken:
@@ -136,10 +137,10 @@ def open_seal(store: Store, cells: Sequence[Cell]) -> list[str]:
 
 
 def side_by_side(one: Path, two: Path) -> tuple[list[str], Table]:
-    """Differences of what went into two reproductions, and their figures by row.
+    """Differences of what went into two runs, and their figures by row.
 
     Raises:
-        InputError: one of the folders is no reproduction, or is damaged.
+        InputError: one of the folders is no such run, or is damaged.
     """
     (study, first), (other, second) = map(_read, (one, two))
     lines = [
@@ -166,7 +167,7 @@ def side_by_side(one: Path, two: Path) -> tuple[list[str], Table]:
                 method, head, str(apart.views), str(apart.scenes), *map(number, means),
                 difference(apart),
             ])  # fmt: skip
-    columns = ["method", "figure", "cells of both", "scenes", "first", "second", APART]
+    columns = ["variant", "figure", "cells of both", "scenes", "first", "second", APART]
     return lines, Table(columns, rows, NOTE)
 
 
@@ -187,8 +188,8 @@ def _pairs(
 
 def _read(run: Path) -> tuple[dict[str, Any], Cells]:
     """Content of ``study.json``, and figures by row, capture, edit and seed."""
-    if not is_reproduction(run):
-        raise InputError(f"{run}: has no {SEAL}; name the folder of a finished reproduction")
+    if not is_sealed(run):
+        raise InputError(f"{run}: has no {SEAL}; name the folder of a finished run on captures")
     bad = verify(Store(run))
     if not bad.ok:
         raise InputError(f"{run}: is damaged; attnwarp-eval verify {run} names what")
@@ -197,7 +198,7 @@ def _read(run: Path) -> tuple[dict[str, Any], Cells]:
         (method, cell["scene"], cell["edit"], cell["seed"]): cell["figures"] | cell["authors"]
         for cell in cells
         if cell["kind"] == "edit"
-        for method in cell["methods"]
+        for method in cell["variants"]
     }
     return Store(run).read_study(), figures
 

@@ -1,4 +1,4 @@
-"""A small reproduction: two exported scenes, random models in the published formats, a manifest."""
+"""A small run on captures: two exported scenes, random models in the published formats, a manifest."""
 
 import copy
 import shutil
@@ -51,7 +51,7 @@ MANIFEST = {
         },
         "dino": {"folder": "weights/dino", "shapes": {"embeddings.register_tokens": [1, 4, 32]}},
     },
-    "methods": {
+    "variants": {
         "IGS2GS": {
             "method": "igs2gs", "editor": "pix2pix", "paper": [21.429, 0.267, 0.149, 0.627, 0.841],
             "options": {**QUICK, "every": 4},
@@ -74,7 +74,6 @@ MANIFEST = {
         {"title": "Ablation", "rows": ["1 stage"]},
     ],
     "geometry": 1,
-    "variability": ["attention warp"],
 }  # fmt: skip
 
 
@@ -106,24 +105,28 @@ def save(folder, manifest, name="manifest.yaml"):
     return path
 
 
+def write_capture(place, turn=0.0):
+    """Three pictures that splats render, with these and a mask of each view."""
+    for part in ("images", "masks"):
+        (place / part).mkdir(parents=True)
+    splats, cameras, paths = few_splats(), [], []
+    for k, angle in enumerate((-0.4, 0.0, 0.4)):
+        eye = [3 * np.sin(angle + turn), -3 * np.cos(angle + turn), 0.5]
+        camera = Camera.look_at(eye, [0, 0, 0], width=SIZE, height=SIZE, fov_y=40)
+        color = render(splats, camera).color.clamp(0, 1).numpy()
+        paths.append(
+            write_picture(place / "images" / f"{k}.png", np.rint(255 * color).astype(np.uint8))
+        )
+        write_picture(place / "masks" / f"{k}.png", np.full((SIZE, SIZE, 3), 255, np.uint8))
+        cameras.append(camera)
+    write_transforms(place / "transforms.json", Dataset(cameras, paths))
+    write_ply(place / "scene.ply", splats)
+
+
 def write_small(folder):
-    """Two captures of pictures that splats render, with these, a mask of each view, and weights."""
+    """Two captures, weights and a manifest."""
     for name, turn in (("one", 0.0), ("two", 0.3)):
-        place = folder / "captures" / name
-        for part in ("images", "masks"):
-            (place / part).mkdir(parents=True)
-        splats, cameras, paths = few_splats(), [], []
-        for k, angle in enumerate((-0.4, 0.0, 0.4)):
-            eye = [3 * np.sin(angle + turn), -3 * np.cos(angle + turn), 0.5]
-            camera = Camera.look_at(eye, [0, 0, 0], width=SIZE, height=SIZE, fov_y=40)
-            color = render(splats, camera).color.clamp(0, 1).numpy()
-            paths.append(
-                write_picture(place / "images" / f"{k}.png", np.rint(255 * color).astype(np.uint8))
-            )
-            write_picture(place / "masks" / f"{k}.png", np.full((SIZE, SIZE, 3), 255, np.uint8))
-            cameras.append(camera)
-        write_transforms(place / "transforms.json", Dataset(cameras, paths))
-        write_ply(place / "scene.ply", splats)
+        write_capture(folder / "captures" / name, turn)
     write_weights(folder / "weights")
     small = copy.deepcopy(MANIFEST)
     small["captures"] = {
@@ -135,8 +138,8 @@ def write_small(folder):
         }
         for name in ("one", "two")
     }
-    small |= {"geometry": 0, "variability": []}
-    for row in small["methods"].values():
+    small |= {"geometry": 0}
+    for row in small["variants"].values():
         row["splats"] = few_splats().kind
     save(folder, small)
     return small

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp.cli.files import check_seen, likeness
 from attnwarp.digest import digest
 from attnwarp.errors import InputError
 from attnwarp.fit import Views, load_views
@@ -19,15 +20,15 @@ from attnwarp.io import Dataset, read_dataset, read_ply
 from attnwarp.methods.command import marked, view_of
 from attnwarp.methods.marks import Marks
 from attnwarp.methods.pictures import Segment
-from attnwarp.methods.scene import images_of, near_of, render_picture, to_float
-from attnwarp.reporting import Reporter
-from attnwarp_eval.reproduce.manifest import Loaded
-
-LOOKS, LOOK_SIZE = 6, 256
-"""Views whose renders are held against their pictures, and their longest side in px."""
+from attnwarp.methods.scene import images_of
+from attnwarp.reporting import SILENT, Reporter
+from attnwarp_lab.captures.manifest import Loaded, MaskPart
 
 LEAST_PSNR = 15.0
 """dB below which renders of splats are of something else than the pictures."""
+
+MARKS, FITS, ORIGINALS, MADE = "marks", "fits", "originals", "made"
+"""Folders of a run: masks by words, and fits by the capture's name; pictures; files of cells."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,34 +85,14 @@ def _read(
     return Ready(dataset, views, images_of(views), index, content)
 
 
-def likeness(capture: Ready, splats: Gaussians) -> float:
-    """PSNR in dB of renders of splats against the pictures of some views, pooled over them."""
-    count = len(capture.cameras)
-    chosen = dict.fromkeys(np.linspace(0, count - 1, min(LOOKS, count)).round().astype(int))
-    near, error, size = near_of(capture.cameras, splats), 0.0, 0
-    for k in chosen:
-        camera, picture = capture.cameras[k], to_float(capture.images[k])
-        factor = min(1.0, LOOK_SIZE / max(camera.width, camera.height))
-        if factor < 1:
-            import cv2
-
-            w, h = (max(1, round(factor * side)) for side in (camera.width, camera.height))
-            camera = camera.resize(w, h)
-            small = cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA)
-            picture = np.asarray(small, np.float32)
-        render = render_picture(splats, camera, near, "auto")
-        error += float(np.square(render.astype(np.float64) - picture).sum())
-        size += picture.size
-    return float(-10 * np.log10(max(error / size, 1e-12)))
-
-
-def check_likeness(place: str, capture: Ready, splats: Gaussians) -> None:
-    """Refuse splats whose renders are unlike the pictures.
+def check_likeness(place: str, path: Path, capture: Ready, splats: Gaussians) -> None:
+    """Refuse splats that no view sees, or whose renders are unlike the pictures.
 
     Raises:
         InputError: they are under :data:`LEAST_PSNR`; the message begins with ``place``.
     """
-    psnr = likeness(capture, splats)
+    check_seen(path, splats, capture.cameras, SILENT)
+    psnr, _ = likeness(splats, capture.dataset)
     if psnr < LEAST_PSNR:
         raise InputError(
             f"{place}: renders of its splats are {psnr:.1f} dB from the pictures, expected at least"
@@ -124,7 +105,7 @@ def check_likeness(place: str, capture: Ready, splats: Gaussians) -> None:
 def splats_file(loaded: Loaded, run: Path, name: str, kind: Any) -> Path:
     """File of a capture's splats: the manifest's, or that of their fit in the run's folder."""
     given = loaded.manifest.captures[name].splats.get(kind)
-    return loaded.path(given) if given else run / "fits" / f"{name}-{kind}" / "splats.ply"
+    return loaded.path(given) if given else run / FITS / f"{name}-{kind}" / "splats.ply"
 
 
 def read_splats(path: Path, kind: str) -> Gaussians:
@@ -141,18 +122,28 @@ def read_splats(path: Path, kind: str) -> Gaussians:
     return splats
 
 
-def segments(
-    loaded: Loaded, name: str, splats: Gaussians, out: Path, device: str, report: Reporter
-) -> list[Segment] | None:
-    """(H, W) shares of each view that are edited; None where a capture marks nothing."""
-    part = loaded.manifest.captures[name].mask
-    if part is None:
-        return None
-    capture = ready(loaded, name)
+def marks_of(loaded: Loaded, name: str) -> Marks:
+    """Marks of a capture.
+
+    Raises:
+        InputError: several ways at once.
+    """
+    part = loaded.manifest.captures[name].mask or MaskPart()
     folder, source = (p and loaded.path(p) for p in (part.folder, part.source))
-    marks = Marks(folder or None, source or None, words=part.words, segmenter=part.segmenter)
-    lift = marked(
-        marks, "", capture.dataset, capture.views, capture.images, capture.source, out, device,
-        report,
+    return Marks(folder or None, source or None, part.box, part.at, part.words, part.segmenter)
+
+
+def segments(
+    loaded: Loaded, name: str, run: Path, device: str, report: Reporter
+) -> Callable[[Gaussians], list[Segment] | None]:
+    """(H, W) shares of each view that are edited, as a function of the splats, None where a capture
+    marks nothing; marks are read, and words looked for, at once.
+
+    Raises:
+        InputError: marks that are missing, lie beside the picture, or find nothing.
+    """
+    capture, marks = ready(loaded, name), marks_of(loaded, name)
+    return marked(
+        marks, "", capture.dataset, capture.views, capture.images, capture.source,
+        run / MARKS / name, device, report,
     )  # fmt: skip
-    return lift(splats)

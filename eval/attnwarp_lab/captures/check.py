@@ -1,8 +1,9 @@
-"""Everything that can be wrong before a reproduction starts, refused by name."""
+"""Everything that can be wrong before a run on captures starts, refused by name."""
 
 from __future__ import annotations
 
 import gc
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -13,12 +14,21 @@ import numpy as np
 import torch
 
 from attnwarp.digest import digest
-from attnwarp.editing.schedule import stable_diffusion_alphas
+from attnwarp.editing.editor import Editor
+from attnwarp.editing.schedule import DDIM, Schedule, stable_diffusion_alphas
 from attnwarp.errors import InputError
-from attnwarp.io.images import image_size
 from attnwarp.methods.command import mask_files
-from attnwarp_eval.reproduce.captures import Ready, check_likeness, read_splats, ready, splats_file
-from attnwarp_eval.reproduce.manifest import Loaded, Weights
+from attnwarp.reporting import SILENT, Reporter
+from attnwarp_lab.captures.capture import (
+    Ready,
+    check_likeness,
+    marks_of,
+    read_splats,
+    ready,
+    segments,
+    splats_file,
+)
+from attnwarp_lab.captures.manifest import Encoders, Loaded, Weights, in_folders
 
 SCHEDULE_TOLERANCE = 1e-5
 """Largest difference of two schedules' shares of signal that is rounding."""
@@ -29,8 +39,8 @@ PROBE_TOLERANCE = 1e-3
 GUIDES = {"igs2gs": "picture", "dge": "picture", "gaussctrl": "depth"}
 """Kinds of editors that methods take; the others take both."""
 
-PROBE_WORDS, PROBE_STEP, PROBE_SIDE = "a photo of a bear", 500, 16
-"""Words, timestep, and side of the latents of a probe value."""
+PROBE_WORDS, PROBE_PIXELS = "a photo of a bear", 128
+"""Words of a probe value, and least sides of its view."""
 
 
 @dataclass
@@ -43,7 +53,8 @@ class Checked:
         captures: content's SHA-256 by the capture's name.
         splats: SHA-256 by the capture's name and the kind; fitted ones are left out.
         masks: SHA-256 of masks by the capture's name.
-        views: count of views by the capture's name.
+        views: names of the views by the capture's name.
+        sizes: longest side in px at which each editor works.
     """
 
     problems: list[str] = field(default_factory=list)
@@ -51,7 +62,8 @@ class Checked:
     captures: dict[str, str] = field(default_factory=dict)
     splats: dict[str, dict[str, str]] = field(default_factory=dict)
     masks: dict[str, str] = field(default_factory=dict)
-    views: dict[str, int] = field(default_factory=dict)
+    views: dict[str, list[str]] = field(default_factory=dict)
+    sizes: dict[str, int] = field(default_factory=dict)
 
     @contextmanager
     def asking(self, place: str = "") -> Iterator[None]:
@@ -68,106 +80,94 @@ class Checked:
             raise InputError("\n".join(self.problems))
 
 
-def check(loaded: Loaded, run: Path, device: str = "cpu") -> Checked:
+def check(loaded: Loaded, run: Path, device: str, report: Reporter = SILENT) -> Checked:
     """Check captures, splats, masks, weights, and whether methods and editors fit.
 
     Args:
+        loaded: the manifest.
+        run: the run's folder, which keeps masks by words.
         device: device of the networks while they are probed.
+        report: hears what masks mark.
     """
     done = Checked()
     for name in loaded.manifest.captures:
         with done.asking(f"captures.{name}"):
-            _check_capture(loaded, name, run, done)
-    check_weights(loaded, device, done)
-    return done
-
-
-def check_weights(loaded: Loaded, device: str, done: Checked) -> None:
-    """Check weights, and whether methods and editors fit."""
+            _check_capture(loaded, name, run, device, done, report)
     for name in loaded.manifest.editors:
         with done.asking(f"editors.{name}"):
             _check_editor(loaded, name, device, done)
-    for kind in ("clip", "dino", "perceptual"):
+    for kind in Encoders.model_fields:
         with done.asking(f"encoders.{kind}"):
             _check_encoder(loaded, kind, device, done)
+    return done
 
 
-def _check_capture(loaded: Loaded, name: str, run: Path, done: Checked) -> None:
+def _check_capture(
+    loaded: Loaded, name: str, run: Path, device: str, done: Checked, report: Reporter
+) -> None:
     capture = ready(loaded, name)
     same = [other for other, content in done.captures.items() if content == capture.content]
     if same:
         raise InputError(
             f"captures.{name}: has the pictures and cameras of {same[0]!r}; name a capture once"
         )
-    done.captures[name], done.views[name] = capture.content, len(capture.cameras)
+    done.captures[name] = capture.content
+    done.views[name] = [camera.name for camera in capture.cameras]
     done.splats[name] = {}
     for kind in loaded.manifest.captures[name].splats:
         place, path = f"captures.{name}.splats.{kind}", splats_file(loaded, run, name, kind)
         with done.asking(place):
             splats = read_splats(path, kind)
             done.splats[name][kind] = splats.digest()
-            check_likeness(place, capture, splats)
+            check_likeness(place, path, capture, splats)
     part = loaded.manifest.captures[name].mask
     if part is None:
         return
     with done.asking(f"captures.{name}.mask"):
-        files: list[Path] = []
-        if part.folder is not None:
-            folder = loaded.path(part.folder)
-            if not folder.is_dir():
-                raise InputError(f"captures.{name}.mask.folder: {folder} is no folder; name one")
-            files = mask_files(folder, capture.cameras)
-            for path, picture in zip(files, capture.pictures(), strict=True):
-                _same_size(path, picture)
-        elif part.source is not None:
-            files = [loaded.path(part.source)]
-            _same_size(files[0], capture.pictures()[capture.source])
+        segments(loaded, name, run, device, report)
+        marks = marks_of(loaded, name)
+        files = [marks.mask] if marks.mask else []
+        files += mask_files(marks.masks, capture.cameras) if marks.masks else []
         done.masks[name] = digest(part.model_dump(mode="json"), *(p.read_bytes() for p in files))
 
 
-def _same_size(mask: Path, picture: Path) -> None:
-    if not mask.is_file():
-        raise InputError(f"{mask}: no such file; name the mask's picture")
-    (w, h), (width, height) = image_size(mask), image_size(picture)
-    if (w, h) != (width, height):
-        raise InputError(
-            f"{mask} is {w} x {h} px, expected {width} x {height} as {picture}; make the mask of"
-            " that picture again"
-        )
-
-
 def _check_editor(loaded: Loaded, name: str, device: str, done: Checked) -> None:
-    from attnwarp.editing.small import load_editor
-    from attnwarp.methods import AttentionWarpingSettings, preset
+    from attnwarp.editing.small import check_words, load_editor
+    from attnwarp.methods import preset
     from attnwarp.methods.view_edits import check_editor
     from attnwarp_eval.study.shared.edits import files_digest
 
     weights, place = loaded.manifest.editors[name], f"editors.{name}"
-    editor: Any = load_editor(loaded.editor(name), device=device)
-    networks = {
-        part: network
-        for part in ("unet", "vae", "text_encoder", "controlnet")
-        if (network := getattr(editor, part, None)) is not None
+    editor: Editor = load_editor(loaded.editor(name), device=device)
+    tensors = {
+        f"{part}.{key}": value
+        for part, network in editor.parts.items()
+        if isinstance(network, torch.nn.Module)
+        for key, value in network.state_dict().items()
     }
-    tensors = {f"{part}.{k}": v for part, n in networks.items() for k, v in n.state_dict().items()}
     _check_shapes(place, weights, tensors)
-    if weights.scheduler == "stable-diffusion":
-        _check_scheduler(place, editor)
+    if weights.scheduler == "stable-diffusion" and place in in_folders(loaded.manifest):
+        _check_scheduler(place, editor.schedule)
     _note(done, place, weights, files_digest(loaded.editor(name)), _probe_editor(editor))
-    for row_name, row in loaded.manifest.methods.items():
+    for capture, edit in loaded.edits():
+        text = loaded.manifest.captures[capture].edits[edit].text(editor.guide)
+        with done.asking(f"captures.{capture}.edits.{edit}"):
+            editor.check_text(text)
+            check_words(weights.folder, text, anyway=True)
+    done.sizes[name] = loaded.manifest.size or editor.own_size
+    for row_name, row in loaded.manifest.variants.items():
         if row.editor != name:
             continue
-        with done.asking(f"methods.{row_name}"):
+        with done.asking(f"variants.{row_name}"):
             wanted = GUIDES.get(row.method, editor.guide)
             if wanted != editor.guide:
                 raise InputError(
-                    f"methods.{row_name}: {row.method} takes an editor guided by a {wanted}, and"
+                    f"variants.{row_name}: {row.method} takes an editor guided by a {wanted}, and"
                     f" {name!r} is guided by a {editor.guide}; name another editor"
                 )
-            settings = preset(row.method, row.preset, **row.options)
-            if isinstance(settings, AttentionWarpingSettings):
-                check_editor(editor, settings)
-    del editor, networks, tensors
+            if row.method == "attention_warping":
+                check_editor(editor, preset(row.method, row.preset, **row.options))
+    del editor, tensors
     gc.collect()
 
 
@@ -186,8 +186,12 @@ def _check_shapes(place: str, weights: Weights, tensors: Mapping[str, Any]) -> N
             )
 
 
-def _check_scheduler(place: str, editor: Any) -> None:
-    schedule = editor.schedule
+def _check_scheduler(place: str, schedule: Schedule) -> None:
+    if not isinstance(schedule, DDIM):
+        raise InputError(
+            f"{place}: its schedule is not Stable Diffusion's; write `scheduler: any`, which asks"
+            " for none"
+        )
     expected = stable_diffusion_alphas()
     own = schedule.alphas.double().cpu()
     if schedule.prediction != "epsilon":
@@ -208,7 +212,7 @@ def _check_encoder(loaded: Loaded, kind: Any, device: str, done: Checked) -> Non
 
     name, place = loaded.encoder(kind), f"encoders.{kind}"
     encoder: Any = load_encoder(name, kind, device=device)
-    weights = getattr(loaded.manifest.encoders, kind) or Weights(folder=name)
+    weights = getattr(loaded.manifest.encoders, kind)
     if weights.shapes:
         model = getattr(encoder, "_model", None)
         _check_shapes(place, weights, {} if model is None else model.state_dict())
@@ -246,23 +250,14 @@ def _rms(values: torch.Tensor) -> float:
 
 
 @torch.no_grad()
-def _probe_editor(editor: Any) -> float:
-    """Sum of root mean squares that each network gives for a fixed input."""
-    unet, device = editor.unet, editor.unet.device
-    words = editor.embed([PROBE_WORDS])[:1]
-    side = PROBE_SIDE * editor.factor
-    picture = (0.5 + 0.5 * pattern(1, 3, side, side)).float().to(device)
-    x = pattern(1, unet.config.in_channels, PROBE_SIDE, PROBE_SIDE).float().to(device)
-    step = torch.tensor(PROBE_STEP, device=device)
-    out = unet(x, step, encoder_hidden_states=words, return_dict=False)[0]
-    total = _rms(out) + _rms(editor.raw_latents(picture))
-    control = getattr(editor, "controlnet", None)
-    if control is not None:
-        residuals = control(
-            x, step, encoder_hidden_states=words, controlnet_cond=picture, return_dict=False
-        )
-        total += _rms(residuals[1])
-    return total
+def _probe_editor(editor: Editor) -> float:
+    """Root mean square of a prediction for fixed noise and view, plus that of the latents."""
+    side = editor.side_multiple * math.ceil(PROBE_PIXELS / editor.side_multiple)
+    picture = (0.5 + 0.5 * pattern(side, side, 3)).float().numpy()
+    task = editor.task([picture if editor.guide == "picture" else 1 + picture[..., 0]], PROBE_WORDS)
+    latents = editor.encode([picture])
+    step = editor.schedule.timesteps(2, task.shape[2:])[1]
+    return _rms(task.predict(pattern(*task.shape).to(latents), step)) + _rms(latents)
 
 
 def _probe_encoder(encoder: Any, kind: str) -> float:

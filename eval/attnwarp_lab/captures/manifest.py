@@ -1,0 +1,441 @@
+"""A manifest: captures, edits, variants and weights, in one YAML file or on a command line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    StringConstraints,
+    ValidationError,
+    field_validator,
+)
+
+from attnwarp.errors import InputError, suggest
+from attnwarp_eval.plugins import load_plugins
+from attnwarp_eval.scene import explain
+from attnwarp_eval.scene.yaml import YamlError, line_of, read_yaml
+from attnwarp_eval.study.schema import Part, Whole
+from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS
+
+SHIPPED = Path(__file__).parent / "shipped"
+"""Folder of the manifests that ship with the package."""
+
+FIGURES = {
+    "Edit PSNR": "Edit PSNR, mean of the views",
+    "CLIP": "CLIP similarity",
+    "CLIP dir": "CLIP directional similarity",
+    "DINO img": "DINO single-image similarity",
+    "CLIP img": "CLIP single-image similarity",
+}
+"""Columns of the paper's tables: their heads -> titles of :mod:`attnwarp_eval.user_images`."""
+
+KEYS = "docs/measuring/captures.md"
+"""File that says what each key means."""
+
+Words = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]
+
+
+def _file_name(name: str) -> str:
+    if name in ("", "..") or PurePath(name).name != name or not name.isprintable():
+        raise ValueError(
+            f"got the name {name!r}, expected one that a file can have, without a slash"
+        )
+    return name
+
+
+Name = Annotated[str, AfterValidator(_file_name)]
+"""Name that becomes part of the paths of files."""
+
+
+class Edit(Part):
+    """Descriptions of an edit.
+
+    ``instruction`` is what InstructPix2Pix is told, ``controlnet`` what a ControlNet is told;
+    ``source`` and ``target`` describe the scene before and after, for CLIP and for inversions.
+    ``ours`` names those that were not published.
+    """
+
+    instruction: Words
+    controlnet: Words | None = None
+    source: Words | None = None
+    target: Words | None = None
+    ours: list[Literal["instruction", "controlnet", "source", "target"]] = Field(
+        default_factory=list
+    )
+
+    def text(self, guide: str) -> str:
+        """The words that an editor of a guide, "picture" or "depth", is told."""
+        if guide == "picture":
+            return self.instruction
+        return self.controlnet or self.target or self.instruction
+
+
+class MaskPart(Part):
+    """Marks of what is edited, one of these: a folder of masks by the views' names; or of the
+    source view a mask, a box, a point, or words and the segmenter that looks for them."""
+
+    folder: str | None = None
+    source: str | None = None
+    box: tuple[float, float, float, float] | None = None
+    at: tuple[float, float] | None = None
+    words: str | None = None
+    segmenter: str = "clip-parts"
+
+
+class Capture(Part):
+    """A scene: posed pictures, splats of it, and edits.
+
+    ``data`` is a transforms.json, or a folder of one, of COLMAP or of BlendedMVS; ``splats`` are
+    files by their kind, and a kind that is left out is fitted.
+    """
+
+    data: str
+    images: str | None = None
+    scale: Whole = 1
+    source: str | None = None
+    splats: dict[Literal["2d", "3d"], str] = Field(default_factory=dict)
+    mask: MaskPart | None = None
+    edits: Annotated[dict[Words, Edit], Field(min_length=1)]
+
+
+class Weights(Part):
+    """Bundled weights, or some in a folder, and what tells them from others.
+
+    ``shapes`` are of some tensors by name; ``probe`` is the value that ``--dry-run`` prints, and
+    ``sha256`` the hash of the files. The latter two are recorded where they are left out.
+    """
+
+    folder: str
+    shapes: dict[str, list[int]] = Field(default_factory=dict)
+    probe: float | None = None
+    sha256: str | None = None
+    scheduler: Literal["stable-diffusion", "any"] = "stable-diffusion"
+
+
+AnyWeights = Annotated[
+    Weights, BeforeValidator(lambda v: {"folder": v} if isinstance(v, str) else v)
+]
+"""Weights, or their name or folder alone."""
+
+
+class Encoders(Part):
+    """Encoders of the figures, and the perceptual distance that splats are tuned with too."""
+
+    clip: AnyWeights = Weights(folder="clip-small")
+    dino: AnyWeights = Weights(folder="dino-small")
+    perceptual: AnyWeights = Weights(folder="perceptual-small")
+
+
+class Row(Part):
+    """A variant: a method with its settings, a row of a table.
+
+    ``budget`` cuts the method short; ``paper`` are its published figures in the order of
+    :data:`FIGURES`.
+    """
+
+    method: str = "attention_warping"
+    preset: str | None = None
+    options: dict[str, Any] = Field(default_factory=dict)
+    editor: str
+    splats: Literal["2d", "3d"] = "2d"
+    seeds: list[Whole] | None = None
+    budget: dict[str, Any] = Field(default_factory=dict)
+    paper: list[float] | None = None
+
+    @field_validator("paper")
+    @classmethod
+    def _all_figures(cls, value: list[float] | None) -> list[float] | None:
+        if value is not None and len(value) != len(FIGURES):
+            raise ValueError(f"got {len(value)} figures, expected {', '.join(FIGURES)}")
+        return value
+
+
+class TablePart(Part):
+    """A table: rows by name, and the row that verdicts compare the others with."""
+
+    title: str
+    rows: Annotated[list[str], Field(min_length=1)]
+    against: str | None = None
+
+
+class Manifest(Part):
+    """Everything that decides a run on captures."""
+
+    format: Literal[1]
+    title: str
+    size: Annotated[Whole, Field(ge=16, le=4096)] | None = None
+    max_size: Annotated[Whole, Field(ge=16)] | None = None
+    captures: Annotated[dict[Name, Capture], Field(min_length=1)]
+    fit: dict[str, Any] = Field(default_factory=dict)
+    seeds: Annotated[list[Whole], Field(min_length=1)] = Field(default_factory=lambda: [0])
+    editors: Annotated[dict[str, AnyWeights], Field(min_length=1)]
+    encoders: Encoders = Encoders()
+    variants: Annotated[dict[str, Row], Field(min_length=1)]
+    tables: list[TablePart] = Field(default_factory=list)
+    geometry: Annotated[Whole, Field(ge=0)] = 0
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A manifest, and the folder that its paths count from."""
+
+    manifest: Manifest
+    folder: Path
+
+    def path(self, name: str) -> Path:
+        """A path of the manifest."""
+        return self.folder / Path(name).expanduser()
+
+    def paths(self) -> list[Path]:
+        """Paths of captures, splats, masks and weights; what is bundled has none."""
+        names: list[str | None] = []
+        for c in self.manifest.captures.values():
+            mask = c.mask or MaskPart()
+            names += [c.data, c.images, *c.splats.values(), mask.folder, mask.source]
+        for weights in in_folders(self.manifest).values():
+            names += [part.strip() for part in weights.folder.split(",")]
+        return [self.path(name) for name in names if name is not None]
+
+    def editor(self, name: str) -> str:
+        """An editor of the manifest as :func:`attnwarp.editing.small.load_editor` takes it."""
+        return _from(self.folder, self.manifest.editors[name].folder)
+
+    def encoder(self, kind: Literal["clip", "dino", "perceptual"]) -> str:
+        """An encoder as :func:`attnwarp.encoders.load_encoder` takes it."""
+        from attnwarp.encoders import BUNDLED
+
+        folder = str(getattr(self.manifest.encoders, kind).folder)
+        scheme = {"clip": "clip", "dino": "dinov2", "perceptual": "lpips"}[kind]
+        return folder if folder in BUNDLED else f"{scheme}:{self.path(folder)}"
+
+    def seeds(self, row: Row) -> list[int]:
+        """Seeds of a row."""
+        return self.manifest.seeds if row.seeds is None else row.seeds
+
+    def edits(self) -> Iterator[tuple[str, str]]:
+        """Every capture with each of its edits, by name."""
+        for name, capture in self.manifest.captures.items():
+            for edit in capture.edits:
+                yield name, edit
+
+    def tables(self) -> list[TablePart]:
+        """The tables; one of all variants where none is named."""
+        m = self.manifest
+        return m.tables or [TablePart(title="Figures", rows=list(m.variants))]
+
+    def changed(self, **changes: Any) -> Loaded:
+        """A copy with other values of keys."""
+        return Loaded(self.manifest.model_copy(update=changes), self.folder)
+
+    def with_rows(self, **changes: Any) -> Loaded:
+        """A copy whose variants have other values of keys."""
+        rows = self.manifest.variants.items()
+        return self.changed(variants={k: row.model_copy(update=changes) for k, row in rows})
+
+    def only(self, names: Sequence[str]) -> Loaded:
+        """These variants alone, with their editors, and tables without the other rows.
+
+        Raises:
+            InputError: there is no such variant.
+        """
+        m = self.manifest
+        for name in names:
+            if name not in m.variants:
+                raise InputError(
+                    f"--variant: got {name!r}, expected one of {', '.join(m.variants)}"
+                    f"{suggest(name, list(m.variants))}"
+                )
+        variants = {name: m.variants[name] for name in names}
+        tables = []
+        for table in m.tables:
+            rows = [row for row in table.rows if row in variants]
+            against = table.against if table.against in rows else None
+            if rows:
+                tables.append(table.model_copy(update={"rows": rows, "against": against}))
+        used = {row.editor for row in variants.values()}
+        editors = {name: weights for name, weights in m.editors.items() if name in used}
+        return self.changed(variants=variants, tables=tables, editors=editors)
+
+    def with_editors(self, folders: Sequence[str]) -> Loaded:
+        """The variants whose editors are of the kinds of some others, which take their places.
+
+        Raises:
+            InputError: there is no such editor, or no variant takes one of its kind.
+        """
+        from attnwarp.editing.small import guide_of
+
+        m, given = self.manifest, {guide_of(folder): folder for folder in folders}
+        guides = {row.editor: guide_of(self.editor(row.editor)) for row in m.variants.values()}
+        for guide in given.keys() - set(guides.values()):
+            raise InputError(
+                f"--editor {given[guide]}: is guided by a {guide}, and no variant takes one of that"
+                " kind; leave it out"
+            )
+        editors = {
+            name: Weights(folder=_from(Path.cwd(), given[guide]), scheduler="any")
+            for name, guide in guides.items()
+            if guide in given
+        }
+        kept = [name for name, row in m.variants.items() if row.editor in editors]
+        return self.changed(editors={**m.editors, **editors}).only(kept)
+
+    def quick(self) -> Loaded:
+        """The first capture with its first edit, the first seed, and two variants: the row that
+        the first table compares with, and another of the same editor."""
+        m, table = self.manifest, self.tables()[0]
+        against = table.against or table.rows[0]
+        editor = m.variants[against].editor
+        others = sorted(
+            (r for r in table.rows if r != against), key=lambda r: m.variants[r].editor != editor
+        )
+        kept = [against, *others[:1]]
+        name, capture = next(iter(m.captures.items()))
+        first = dict([next(iter(capture.edits.items()))])
+        return self.with_rows(seeds=m.seeds[:1]).only(kept).changed(
+            captures={name: capture.model_copy(update={"edits": first})}, geometry=0,
+            tables=[TablePart(title="Quick look", rows=kept, against=against)],
+        )  # fmt: skip
+
+
+def _from(place: Path, editor: str) -> str:
+    """A bundled editor's name, or its folders from a place on."""
+    from attnwarp.editing.small import bundled
+
+    if editor in bundled():
+        return editor
+    return ",".join(str(place / Path(part.strip()).expanduser()) for part in editor.split(","))
+
+
+def shipped() -> dict[str, Path]:
+    """Manifests that ship with the package, by name.
+
+    Example:
+        >>> list(shipped())
+        ['one', 'paper']
+    """
+    return {path.stem: path for path in sorted(SHIPPED.glob("*.yaml"))}
+
+
+def load_manifest(name_or_path: str, one: Mapping[str, Any] | None = None) -> Loaded:
+    """Read a manifest by the name of a shipped one or by a file's path.
+
+    Paths in it count from the file's folder; those of a shipped one from the current folder.
+
+    Args:
+        name_or_path: name or path of the manifest.
+        one: keys that stand in place of the manifest's, such as the one capture of a command line,
+            with which no published figure is compared.
+
+    Raises:
+        InputError: no such file, no YAML, another version, a key that stands twice, is missing or
+            unknown, or a value out of range; the message names the place and what to do.
+
+    Example:
+        >>> try:
+        ...     load_manifest("papr")
+        ... except InputError as error:
+        ...     print(error)
+        papr: no such manifest; did you mean 'paper'? Or give the path of a YAML file
+    """
+    own = shipped()
+    path = own.get(name_or_path, Path(name_or_path))
+    if not path.is_file():
+        hint = suggest(name_or_path, list(own))
+        raise InputError(
+            f"{name_or_path}: no such manifest{f'{hint} Or' if hint else '; or'} give the path of"
+            " a YAML file"
+        )
+    try:
+        lines, data = read_yaml(path.read_text(encoding="utf-8"))
+    except (YamlError, UnicodeDecodeError) as error:
+        line = getattr(error, "line", None)
+        raise InputError(f"{path}{f':{line}' if line else ''}: {error}") from None
+    try:
+        manifest = Manifest.model_validate(
+            {**data, **(one or {})} if isinstance(data, dict) else data
+        )
+    except ValidationError as error:
+        raise InputError(
+            "\n".join(
+                f"{path}:{line_of(lines, problem['loc'])}: "
+                f"{explain.explain(problem, Manifest, KEYS)}"
+                for problem in error.errors(include_url=False)
+            )
+        ) from None
+    loaded = Loaded(manifest, Path() if name_or_path in own else path.parent)
+    if one is not None:
+        kinds = [kind for capture in manifest.captures.values() for kind in capture.splats]
+        loaded = loaded.with_rows(paper=None, **({"splats": kinds[0]} if kinds else {}))
+    _check_names(path, lines, loaded.manifest)
+    return loaded
+
+
+def in_folders(manifest: Manifest) -> dict[str, Weights]:
+    """Weights that are not bundled, by key."""
+    from attnwarp.editing.small import bundled
+    from attnwarp.encoders import BUNDLED
+
+    known = {*bundled(), *BUNDLED}
+    encoders = {f"encoders.{k}": getattr(manifest.encoders, k) for k in Encoders.model_fields}
+    named = {**{f"editors.{k}": w for k, w in manifest.editors.items()}, **encoders}
+    return {key: w for key, w in named.items() if w.folder not in known}
+
+
+def lacking(manifest: Manifest) -> list[str]:
+    """Keys of weights in folders that neither a probe value nor a hash tells from others."""
+    weights = in_folders(manifest).items()
+    return [key for key, w in weights if w.probe is None and w.sha256 is None]
+
+
+def _check_names(path: Path, lines: Mapping[Any, int], manifest: Manifest) -> None:
+    """Refuse names that nothing has, settings that no method takes, and prompts that published
+    figures need and an edit lacks."""
+    from attnwarp.fit import FitSettings
+    from attnwarp.methods import Budget
+
+    def known(place: str, name: str, names: list[str]) -> None:
+        if name not in names:
+            raise InputError(
+                f"{path}: {place}: got {name!r}, expected one of {', '.join(names)}"
+                f"{suggest(name, names)}"
+            )
+
+    load_plugins()
+    methods = [name for name, method in EDITING_METHODS.items() if not method.needs_truth]
+    for name, row in manifest.variants.items():
+        known(f"variants.{name}.editor", row.editor, list(manifest.editors))
+        known(f"variants.{name}.method", row.method, methods)
+        for key in ("seed", "size", "perceptual_encoder"):
+            if key in row.options:
+                raise InputError(
+                    f"{path}: variants.{name}.options.{key}: is the manifest's own; leave it out"
+                )
+        try:
+            EDITING_METHODS[row.method].settings(row.preset, row.options, 0)
+            Budget.from_dict(row.budget)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{path}: variants.{name}: {error}") from None
+    for number, table in enumerate(manifest.tables):
+        for name in [*table.rows, *([table.against] if table.against else [])]:
+            known(f"tables.{number}", name, list(manifest.variants))
+    if any(row.paper for row in manifest.variants.values()):
+        for name, capture in manifest.captures.items():
+            for title, edit in capture.edits.items():
+                place = ("captures", name, "edits", title)
+                for key in ("controlnet", "source", "target"):
+                    if getattr(edit, key) is None:
+                        raise InputError(
+                            f"{path}:{line_of(lines, place)}: {'.'.join(place)}.{key}: is missing,"
+                            " expected the words of this prompt, which figures beside the paper's"
+                            " need; where none was published, write your own"
+                        )
+    try:
+        FitSettings.from_dict(manifest.fit)
+    except ValueError as error:
+        raise InputError(f"{path}: fit: {error}") from None

@@ -1,0 +1,242 @@
+"""The command that measures methods on captures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from attnwarp.cli.options import Marking, MaxSizeOption, options_of
+from attnwarp.cli.shell import fail
+from attnwarp.errors import InputError
+from attnwarp.reporting import reporter
+from attnwarp_eval.cli.shell import (
+    TOO_LITTLE,
+    clear_errors,
+    resumable,
+    scheduler_lost,
+    whole_numbers,
+)
+
+ONE = "One capture"
+"""Panel of the help."""
+
+
+@dataclass(frozen=True)
+class One:
+    """Options that make a manifest of one capture and one edit."""
+
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DATA",
+            help="transforms.json, its folder, or one of COLMAP or BlendedMVS.",
+            rich_help_panel=ONE,
+        ),
+    ] = None
+    instruction: Annotated[
+        str | None, typer.Option(help="The edit, for editors that take pictures.",
+                                 rich_help_panel=ONE)
+    ] = None  # fmt: skip
+    target_prompt: Annotated[
+        str | None,
+        typer.Option(
+            help="What the edited scene shows, for CLIP and editors that take depth maps.",
+            rich_help_panel=ONE,
+        ),
+    ] = None
+    source_prompt: Annotated[
+        str | None,
+        typer.Option(
+            help="What it shows before, for CLIP and methods that invert.", rich_help_panel=ONE
+        ),
+    ] = None
+    ply: Annotated[
+        Path | None, typer.Option(help="Its splats; fitted if left out.", rich_help_panel=ONE)
+    ] = None
+    images: Annotated[
+        Path | None, typer.Option(help="Images of a COLMAP model.", rich_help_panel=ONE)
+    ] = None
+    scale: Annotated[
+        int, typer.Option(metavar="N", help="2, 4 or 8 reads images_N.", rich_help_panel=ONE)
+    ] = 1
+    max_size: MaxSizeOption = None
+
+    @property
+    def name(self) -> str:
+        """Name of the capture: that of its folder."""
+        path = Path(str(self.data)).resolve()
+        return path.parent.name if path.suffix == ".json" else path.name
+
+    def keys(self, marking: Marking) -> dict[str, Any] | None:
+        """Keys of a manifest; None without a capture.
+
+        Raises:
+            InputError: an option that needs another one, or marks that do not go together.
+        """
+        from attnwarp.io import read_ply
+
+        if self.data is None:
+            given = [f.name for part in (self, marking) for f in fields(part)
+                     if getattr(part, f.name) != f.default]  # fmt: skip
+            for name in given:
+                option = {"words": "where"}.get(name, name.replace("_", "-"))
+                raise InputError(f"--{option}: needs --data; a manifest says it by itself")
+            return None
+        if self.instruction is None:
+            raise InputError(f"--data {self.data}: needs --instruction, such as 'make it golden'")
+        marks = marking.marks()
+        mask = {
+            "folder": _place(marks.masks), "source": _place(marks.mask), "box": marks.box,
+            "at": marks.at, "words": marks.words, "segmenter": marks.segmenter,
+        }  # fmt: skip
+        edit = {
+            "instruction": self.instruction, "target": self.target_prompt,
+            "source": self.source_prompt,
+        }  # fmt: skip
+        capture = {
+            "data": _place(self.data), "images": _place(self.images), "scale": self.scale,
+            "source": marking.source, "mask": mask if marks.option else None,
+            "splats": {read_ply(self.ply).kind: _place(self.ply)} if self.ply else {},
+            "edits": {self.instruction: edit},
+        }  # fmt: skip
+        return {
+            "title": f"Methods on {self.name}", "captures": {self.name: capture},
+            "max_size": self.max_size, "geometry": 0,
+        }  # fmt: skip
+
+
+def _place(path: Path | None) -> str | None:
+    return None if path is None else str(path.resolve())
+
+
+@options_of(One, Marking)
+def captures(
+    manifest: Annotated[
+        str | None,
+        typer.Argument(
+            help="A manifest's YAML, or one that ships: `paper`; with --data, `one` if left out.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="The run's folder; in runs/captures if left out.")
+    ] = None,
+    variant: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Only this one of the manifest's; may be repeated."),
+    ] = None,
+    editor: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME|FOLDER|BASE,CONTROLNET",
+            help="In place of the editors of its kind, whose variants alone run; may be repeated.",
+        ),
+    ] = None,
+    seeds: Annotated[
+        str | None, typer.Option(help="Only these seeds (comma-separated whole numbers).")
+    ] = None,
+    device: Annotated[
+        str,
+        typer.Option(
+            metavar="DEVICE[,DEVICE...]",
+            help="cpu, cuda, or several such as cuda:0,cuda:1: one process each.",
+        ),
+    ] = "cpu",
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", "-j", min=1, help="Processes; one a device if left out.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS|FILE",
+            help="A dask scheduler, whose workers see this folder and the manifest's.",
+        ),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="One scene, one edit, one seed, two variants.")
+    ] = False,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", help="Check everything, tell hours, disk and memory, and run nothing."
+        ),
+    ] = False,
+    *,
+    one: One,
+    marking: Marking,
+) -> None:
+    """Edit captures by several methods, and measure what came out.
+
+    MANIFEST names captures, edits and variants; --data and --instruction make one of one capture.
+    Everything is checked before anything runs. Killed and started again, it goes on.
+    """
+    from attnwarp.devices import device_of
+    from attnwarp_eval.study.store import Store
+    from attnwarp_lab.captures import cells
+    from attnwarp_lab.captures.check import check
+    from attnwarp_lab.captures.manifest import lacking, load_manifest
+    from attnwarp_lab.captures.report import write_report
+    from attnwarp_lab.captures.seal import open_seal, write_seal
+
+    if scheduler is not None and jobs is not None:
+        raise fail("--jobs starts workers here, --scheduler uses others; give one of the two")
+    if manifest is None and one.data is None:
+        raise fail("name a manifest, such as paper, or one capture: --data DIR --instruction TEXT")
+    drawn = whole_numbers(seeds, "--seeds")
+    with clear_errors(), reporter(every=True) as report:
+        loaded = load_manifest(manifest or "one", one.keys(marking))
+        loaded = loaded.with_editors(editor) if editor else loaded
+        loaded = loaded.only(variant) if variant else loaded
+        loaded = loaded.with_rows(seeds=drawn) if drawn else loaded
+        loaded = loaded.quick() if quick else loaded
+        devices = [part.strip() for part in device.split(",")]
+        for name in devices if scheduler is None else ():
+            device_of(name)
+        named = one.name if one.data else Path(str(manifest)).stem
+        store = Store(out or Path("runs/captures") / named)
+        store.refuse_strangers()
+        report.log("checking captures and weights")
+        checked = check(loaded, store.root, devices[0] if scheduler is None else "cpu", report)
+        checked.refuse()
+        planned = cells.plan(loaded, checked, store.root, devices)
+        left = cells.todo(planned.cells, store)
+        for note in planned.notes:
+            report.log(note)
+        for name, (sha256, probe) in checked.weights.items():
+            report.log(f"{name}: probe {probe:.6g}, sha256 {sha256}")
+        if unknown := lacking(loaded.manifest):
+            report.log(
+                f"{', '.join(unknown)}: the manifest has no probe value, so another checkpoint of"
+                " the same shapes would pass too; whoever has the published weights writes the"
+                " values above into it, as `probe`"
+            )
+        done = len(planned.cells) - len(left)
+        report.log(f"{len(planned.cells)} cells, {done} done in {store.root}")
+        if dry_run:
+            from attnwarp_lab.captures.estimate import estimate
+
+            for line in estimate(planned, left, devices, report):
+                typer.echo(line)
+            return
+        with store.lock(), resumable(lambda: f"{len(store.done())} cells are kept"):
+            if broken := open_seal(store, planned.cells):
+                report.log(
+                    f"{len(broken)} sealed files are missing or changed and are made anew:"
+                    f" {', '.join(broken[:8])}{' ...' * (len(broken) > 8)}"
+                )
+            store.write_study(cells.expected(planned))
+            with scheduler_lost(scheduler, lambda: len(store.done())):
+                failures = cells.execute(
+                    planned, store, jobs=jobs or len(devices), scheduler=scheduler, report=report
+                )
+            paths = [*write_report(planned, store), write_seal(store)]
+        for path in paths:
+            typer.echo(path)
+    if failures:
+        listed = "; ".join(f"{f.title}: {f.error}" for f in failures)
+        raise fail(
+            f"{len(failures)} cells failed; the same command tries them again: {listed}", TOO_LITTLE
+        )
