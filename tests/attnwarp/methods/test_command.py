@@ -32,7 +32,7 @@ from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transfor
 from attnwarp.io.images import encode_png
 from attnwarp.methods import PRESETS
 from attnwarp.methods.command import _masks, mask_files
-from attnwarp.methods.marks import Marks, mask_by_words, read_mask, read_over_black
+from attnwarp.methods.marks import Marks, check_middle, mask_by_words, read_mask, read_over_black
 from attnwarp.methods.scene import near_of, to_float
 from attnwarp.render import render
 from attnwarp.warp import lift_masks, piece_around
@@ -491,6 +491,19 @@ def test_a_box_whose_lifted_mask_leaves_its_middle_out_is_refused(place, tmp_pat
     assert result.exit_code == 2, result.output
     assert re.search(r"--box: lifted through the splats, .* leaves \d+% of its own", result.output)
     assert not (tmp_path / "out" / "rounds").exists()
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    "marks", [Marks(box=(8, 8, 56, 56)), Marks(at=(32, 32)), Marks(words="ball"), Marks(mask=Path("a"))]
+)  # fmt: skip
+def test_each_kind_of_marks_has_a_middle_that_its_lifted_mask_keeps(marks):
+    """A disc in a view of half of its file's size, and the ring that is left of it."""
+    away = np.hypot(*np.meshgrid(np.arange(32) - 15.5, np.arange(32) - 15.5))
+    disc, ring = away < 10, (away < 10) & (away > 7)
+    check_middle(marks, disc, 0.5, disc.astype(np.float32))
+    with pytest.raises(InputError, match=f"^{marks.option}: .* leaves 100% of its own middle out"):
+        check_middle(marks, disc, 0.5, ring.astype(np.float32))
 
 
 def test_an_edit_begins_with_how_much_it_changed_inside_the_mask(place, tmp_path):
