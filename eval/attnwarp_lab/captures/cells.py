@@ -100,8 +100,9 @@ class Made:
     def from_json(cls, data: Json) -> Made:
         """Rebuild from :meth:`to_json`."""
         cost = with_nan({"gpu": data["cost"]["gpu_gib"]})
+        figures, authors, counts = (with_nan(data[key]) for key in ("figures", "authors", "counts"))
         return cls(
-            *(with_nan(data[key]) for key in ("figures", "authors", "counts")),
+            figures, authors, counts,
             data["cut"], data["page"], data["cost"]["method"], cost["gpu"], data["files"],
         )  # fmt: skip
 

@@ -19,7 +19,7 @@ from pydantic import (
 from attnwarp.errors import InputError, suggest
 from attnwarp_eval.plugins import load_plugins
 from attnwarp_eval.scene import explain
-from attnwarp_eval.scene.yaml import YamlError, line_of, read_yaml
+from attnwarp_eval.scene.yaml import Place, YamlError, line_of, read_yaml
 from attnwarp_eval.study.schema import Part, Whole
 from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS
 
@@ -393,7 +393,7 @@ def lacking(manifest: Manifest) -> list[str]:
     return [key for key, w in weights if w.probe is None and w.sha256 is None]
 
 
-def _check_names(path: Path, lines: Mapping[Any, int], manifest: Manifest) -> None:
+def _check_names(path: Path, lines: dict[Place, int], manifest: Manifest) -> None:
     """Refuse names that nothing has, settings that no method takes, and prompts that published
     figures need and an edit lacks."""
     from attnwarp.fit import FitSettings
