@@ -334,7 +334,7 @@ def warn_of_twins(views: Views, held_out: Views) -> None:
             f"held_out: {_named(again, views.cameras, held_out.cameras)}, so that their PSNR is not"
             " one of held-out views; leave them out of one of the two",
             InputWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

@@ -301,7 +301,7 @@ def _settled(
     jacobi = diags(1 / (degree + held))
     solved, failed = cg(system, held * vote, x0=vote, rtol=1e-4, maxiter=2000, M=jacobi)
     if failed:
-        warnings.warn("lift_masks: unseen splats did not settle", RuntimeWarning, stacklevel=3)
+        warnings.warn("lift_masks: unseen splats did not settle", RuntimeWarning, stacklevel=4)
     return np.clip(np.where(reached, solved, 0), 0, 1), reached
 
 

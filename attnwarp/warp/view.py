@@ -433,7 +433,7 @@ def _warn_if_empty(view: WarpedView, without_surface: str) -> None:
         " both: from world to camera, not camera-to-world; OpenCV axes (x right, y down, z"
         " forward), not OpenGL's",
         InputWarning,
-        stacklevel=3,
+        stacklevel=4,
     )
 
 
