@@ -392,7 +392,9 @@ def _cubic(image, size):
         return rows
 
     high, wide = (weights(o, n) for o, n in zip(image.shape, size, strict=False))
-    return np.einsum("ih,hwc,jw->ijc", high, image.astype(np.float64), wide).clip(0, 1)
+    return np.einsum("ih,hwc,jw->ijc", high, image.astype(np.float64), wide, optimize=True).clip(
+        0, 1
+    )
 
 
 def test_the_authors_versions_see_whole_pictures_without_antialiasing(clip_folder, tmp_path):
