@@ -27,7 +27,7 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    # On first use: scenes and probes take a while to import, which `inspect` can do without.
+    # Import on first use: scenes and probes import slowly, and `inspect` needs neither.
     if name in _MODULES:
         return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -15,13 +15,13 @@ class Cell:
     """One unit of work.
 
     Attributes:
-        spec: everything that decides the result, and nothing else: scene content, variant content,
-            seed, views, image size, protocol versions. Names that people gave are not in it.
-        scene, variant, probe, seed: labels for tables and error messages. A probe that needs no
-            scenes has the name of its own subject in ``scene``, such as a hard case.
-        labels: every variant name that leads to this same content.
-        pictures: views of which pictures are wanted.
-        sources: where the computation finds what ``spec`` names by content, such as encoders.
+        spec: all inputs that decide the result, and no others: scene content, variant content,
+            seed, views, image size, protocol versions. User-given names are left out.
+        scene, variant, probe, seed: labels for tables and error messages. For a probe that needs no
+            scenes, ``scene`` names its subject, such as a hard case.
+        labels: variant names with this content.
+        pictures: views whose pictures are saved.
+        sources: locations of inputs that ``spec`` names by content, such as encoders.
 
     Example:
         >>> from attnwarp_eval.study import Cell
@@ -59,7 +59,7 @@ class Cell:
 
 
 def merged(cells: Iterable[Cell]) -> list[Cell]:
-    """The cells in their order, those of the same content as one with the labels of all."""
+    """Cells in order; cells of the same content are merged, with the labels of all."""
     by_id: dict[str, Cell] = {}
     for cell in cells:
         first = by_id.get(cell.id)

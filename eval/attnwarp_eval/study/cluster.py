@@ -41,27 +41,26 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 ATTEMPTS = 2
-"""Workers that a cell may lose. One may die of anything; two that die at the same cell die of it.
-"""
+"""Workers that a cell may lose. The first may die of anything; the second dies of the cell."""
 
 POLL_SECONDS = 0.5
-"""Between two looks at which workers there are."""
+"""Seconds between two polls of the list of workers."""
 
 CONNECT_SECONDS = 30
-"""Until a scheduler counts as unreachable, at the start and when its connection breaks."""
+"""Seconds until a scheduler counts as unreachable, at the start or after a broken connection."""
 
 REFUSED_SECONDS = 60
-"""Time that a run waits beside workers that were all refused, as others may be starting."""
+"""Seconds that a run waits after every worker was refused, since others may be starting."""
 
 MOST_REQUESTS = 1000
-"""Tasks that ask an adaptive cluster for workers; more would only load its scheduler."""
+"""Limit of tasks that request workers of an adaptive cluster; more would load its scheduler."""
 
 Ended = tuple[Cell, Failure | None]
-"""A cell and what went wrong with it."""
+"""A cell and its failure, None if it succeeded."""
 
 
 class ClusterError(InputError):
-    """A cluster that cannot be used; the message says which and what to do."""
+    """A cluster that cannot be used; the message names it and the remedy."""
 
 
 class ClusterLost(Exception):  # noqa: N818  the field's word for it
@@ -69,26 +68,26 @@ class ClusterLost(Exception):  # noqa: N818  the field's word for it
 
 
 class Workplace(ABC):
-    """A cluster as the runner uses it: hand a cell to a worker, and take its result."""
+    """Interface of a cluster to the runner: send a cell to a worker, and receive its result."""
 
     adaptive = False
     """True if the cluster may start workers when there is work for them."""
 
     @abstractmethod
     def submit(self, client: Client, worker: str, cell: Cell) -> Future:
-        """Hand a cell to a worker."""
+        """Send a cell to a worker."""
 
     @abstractmethod
     def receive(self, cell: Cell, result: Any) -> Failure | None:
-        """Take what the worker returned; its record is stored after this."""
+        """Store the record of a worker's result."""
 
     @abstractmethod
     def forget(self, worker: str) -> None:
-        """A worker is gone; another may come under its address."""
+        """Drop the state of a lost worker; another may get its address."""
 
 
 class _Local(Workplace):
-    """Workers on this machine, which write to the run's folder themselves."""
+    """Workers on this machine, which write to the run's folder directly."""
 
     def __init__(self, root: Path, threads: int) -> None:
         self.root = str(root.resolve())
@@ -111,7 +110,7 @@ class _Local(Workplace):
         return error
 
     def forget(self, worker: str) -> None:
-        """Workers of this machine are told nothing that could be forgotten."""
+        """Local workers hold no state to drop."""
 
 
 class _Remote(Workplace):
@@ -135,7 +134,7 @@ class _Remote(Workplace):
 
     def receive(self, cell: Cell, result: Parcel | Failure) -> Failure | None:
         if isinstance(result, Failure):
-            # It may be of the files themselves: whoever tries the scene next gets them again.
+            # The files may be at fault: the scene's next worker receives them again.
             self._sent = {sent for sent in self._sent if sent[1] != cell.scene}
             return result
         return unpack(result, self.store)
@@ -150,11 +149,11 @@ def run_on_workers(
     """Compute and write cells on this machine, one process a worker.
 
     Yields:
-        Each cell as it ends, with what went wrong.
+        Each cell as it ends, with its failure.
     """
     threads = max(1, core_count() // jobs)
-    # dask has workers give freed memory back at once; image-sized arrays then cost more page faults
-    # than arithmetic.
+    # dask has workers return freed memory to the system at once; image-sized arrays then cost more
+    # page faults than arithmetic.
     memory = {
         "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 30,
         "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 30,
@@ -162,13 +161,13 @@ def run_on_workers(
     settings = {
         **memory,
         "distributed.worker.memory.terminate": False,
-        # dask looks at the worker's stack 100 times a second for a dashboard that nobody opens.
+        # dask samples the worker's stack 100 times a second for a dashboard that nobody opens.
         "distributed.worker.profile.enabled": False,
         "distributed.nanny.pre-spawn-environ.OMP_NUM_THREADS": threads,
         "distributed.nanny.pre-spawn-environ.MKL_NUM_THREADS": threads,
     }
     with contextlib.ExitStack() as stack:
-        # First, so that it ends last: a cluster that closes lets dask speak of broken connections.
+        # Entered first, so that it exits last: a closing cluster makes dask log broken connections.
         stack.enter_context(_silent())
         import dask
 
@@ -179,17 +178,17 @@ def run_on_workers(
 
 @contextlib.contextmanager
 def _local_client(jobs: int) -> Iterator[Client]:
-    """A client of new worker processes on this machine.
+    """Start worker processes on this machine, and connect a client.
 
-    A cluster starts and ends in a thread, and processes that an error or Ctrl-C leaves are killed
-    meanwhile: dask itself waits for those that start, and for cells.
+    A cluster starts and ends in a thread. Meanwhile, processes left by an error or Ctrl-C are
+    killed: dask itself waits for starting processes and for running cells.
     """
     from distributed import Client, LocalCluster
 
     with ThreadPoolExecutor(1) as thread:
         with _without_ctrl_c():
-            # No memory limit: near one dask pauses a worker for good, since a world's caches are
-            # never given back.
+            # No memory limit: near it dask pauses a worker for good, since a world's caches are
+            # never freed.
             starting = thread.submit(
                 LocalCluster,
                 n_workers=jobs,
@@ -197,14 +196,14 @@ def _local_client(jobs: int) -> Iterator[Client]:
                 threads_per_worker=1,
                 memory_limit=0,
                 silence_logs=50,
-                # Any free port: two runs on one machine would both ask for dask's usual one.
+                # Any free port: two runs on one machine would compete for dask's default port.
                 dashboard_address="127.0.0.1:0",
                 scheduler_kwargs={"dashboard": False},
             )
         try:
             try:
                 client = Client(starting.result())
-            # dask's have no file; values of its configuration end in any of them.
+            # dask's messages name no file; a configuration value may come from any of its files.
             except (OSError, RuntimeError, ValueError, TypeError, LookupError) as error:
                 text = " ".join(str(error).split()) or type(error).__name__
                 raise ClusterError(
@@ -238,18 +237,18 @@ def run_on_scheduler(
     report: CellReporter,
     needs: Sequence[Path] = (),
 ) -> Generator[Ended]:
-    """Compute cells on the workers of the user's own scheduler, and write them here.
+    """Compute cells on the workers of the user's scheduler, and write the records here.
 
     Args:
-        store: the run's folder, which no worker needs to see unless ``needs`` has it.
-        scenes: by the names that cells give them.
-        scheduler: its address, such as ``tcp://host:8786``, or its scheduler file.
-        report: receives each cell as it is handed out, and a line about a worker that is refused
-            or lost.
-        needs: paths that a worker has to see.
+        store: the run's folder; workers read it only if ``needs`` lists it.
+        scenes: scenes by their names in cells.
+        scheduler: address, such as ``tcp://host:8786``, or scheduler file.
+        report: callback for each cell handed out, and for a line about each refused or lost
+            worker.
+        needs: paths that every worker must be able to read.
 
     Yields:
-        Each cell as it ends, with what went wrong.
+        Each cell as it ends, with its failure.
 
     Raises:
         ClusterError: the scheduler cannot be reached, or every worker is refused.
@@ -279,7 +278,7 @@ def _connect(scheduler: str) -> Client:
 
 
 def _address_in(file: Path) -> str:
-    """The address that a scheduler has written to its file."""
+    """Read the scheduler's address from its file."""
     try:
         return str(json.loads(file.read_bytes())["address"])
     except (OSError, ValueError, LookupError, TypeError):
@@ -291,10 +290,10 @@ def _address_in(file: Path) -> str:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """Keep dask's log away from the command's lines: what matters of it ends in one of these.
+    """Keep dask's log out of the command's output: its relevant failures become output lines.
 
     Raises:
-        ClusterError: dask cannot read its own configuration, of files or of variables.
+        ClusterError: dask cannot read its configuration files or environment variables.
     """
     try:
         import distributed  # makes its loggers
@@ -320,8 +319,8 @@ def _silent() -> Iterator[None]:
 def _closed(resource: Any) -> Iterator[Any]:
     """Close a client or a cluster at the end.
 
-    What its closing raises is no result: every record is on disk by then, and the error would hide
-    the interrupt that ended the run.
+    Errors at closing are dropped: every record is on disk by then, and such an error would
+    hide the interrupt that ended the run.
     """
     try:
         yield resource
@@ -332,11 +331,11 @@ def _closed(resource: Any) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Threads that start inside, and their worker processes, never see Ctrl-C: the main thread
+    """Shield threads started inside, and their worker processes, from Ctrl-C: the main thread
     receives it and ends them.
     """
-    # Threads and processes inherit what is blocked. multiprocessing's tracker, started by the first
-    # process, would unblock it.
+    # Threads and processes inherit blocked signals. multiprocessing's tracker, started by the first
+    # process, would unblock SIGINT.
     resource_tracker.ensure_running()
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -346,16 +345,16 @@ def _without_ctrl_c() -> Iterator[None]:
 
 
 class _Runner:
-    """Hands cells to the workers of a cluster, one at a time to each.
+    """Scheduler of cells on a cluster: each worker computes one cell at a time.
 
-    A cell is bound to the worker that it is handed to. So a worker stays with the scene whose truth
-    it has computed, a refused one gets nothing, and a worker that is lost takes its own cell alone.
+    A cell is bound to its worker. So a worker stays with the scene whose truth it has computed, a
+    refused worker gets no cell, and a lost worker takes only its current cell with it.
 
     Args:
-        place: how a cell travels.
-        report: receives each cell as it is handed out, and lines about workers.
-        code: that a worker must have; workers are not asked if None.
-        needs: paths that a worker has to see.
+        place: transport of cells to the workers.
+        report: callback for each cell handed out, and for lines about workers.
+        code: code that a worker must have; None skips the check.
+        needs: paths that every worker must be able to read.
     """
 
     def __init__(
@@ -384,7 +383,7 @@ class _Runner:
         self.requests: list[Future] = []
 
     def run(self) -> Iterator[Ended]:
-        """Every cell as it ends."""
+        """Yield every cell as it ends."""
         looked = -POLL_SECONDS
         waiting_since = time.monotonic()
         while self.cells or self.running:
@@ -405,7 +404,7 @@ class _Runner:
                     yield from self._end(self.ended.get_nowait())
 
     def _look_at_workers(self) -> Iterator[Ended]:
-        """Take in new workers, and give up those that are gone."""
+        """Add new workers, and give up lost ones."""
         addresses = self._addresses()
         for worker in addresses - self.accepted - self.refused.keys() - self.asked.keys():
             if self.code is None:
@@ -419,7 +418,7 @@ class _Runner:
             yield from self._give_up(worker)
 
     def _addresses(self) -> set[str]:
-        """Addresses of the workers that the scheduler has."""
+        """Addresses of the scheduler's workers."""
         try:
             if self.client.status != "running":
                 raise ClusterLost
@@ -428,7 +427,7 @@ class _Runner:
             raise ClusterLost from None
 
     def _give_up(self, worker: str) -> Iterator[Ended]:
-        """A worker that the scheduler no longer has; the cell that it was at is tried once more."""
+        """Give up a lost worker; its current cell is tried once more."""
         self.refused.pop(worker, None)
         self.asked.pop(worker, None)
         self.accepted.discard(worker)
@@ -451,7 +450,7 @@ class _Runner:
             yield cell, failure(cell, error)
 
     def _hand_out(self) -> None:
-        """A cell for each worker that has none."""
+        """Send a cell to each idle worker."""
         for worker in sorted(self.accepted - self.running.keys()):
             busy = {cell.probe for _, cell in self.running.values()}
             cell = self.cells.take(self.scene.get(worker), busy)
@@ -465,10 +464,10 @@ class _Runner:
             self._request_workers()
 
     def _request_workers(self) -> None:
-        """Tell an adaptive cluster how many cells wait.
+        """Request as many workers of an adaptive cluster as cells wait.
 
-        Cells that wait here are unknown to the scheduler. So as many tasks wait there, for a
-        resource that no worker has.
+        The scheduler does not know the cells that wait here. So as many tasks wait there, for a
+        resource that no worker offers.
         """
         wanted = min(len(self.cells), MOST_REQUESTS)
         missing = wanted - len(self.requests)
@@ -480,7 +479,7 @@ class _Runner:
                 resources={"attnwarp: only counted": 1},
                 pure=False,
             )
-        elif -missing > wanted // 10:  # seldom, as each time waits for the scheduler
+        elif -missing > wanted // 10:  # seldom, since each change waits for the scheduler
             self.client.cancel(self.requests[wanted:])
             del self.requests[wanted:]
 
@@ -490,7 +489,7 @@ class _Runner:
         return future
 
     def _end(self, future: Future) -> Iterator[Ended]:
-        """Outcome of a future that is done: a cell's result, or a worker's code."""
+        """Process a finished future: a cell's result, or a worker's code."""
         from distributed.scheduler import KilledWorker
 
         worker = self.workers.pop(future.key)
@@ -505,7 +504,7 @@ class _Runner:
             result = self._result(worker, future)
         except ClusterLost:
             raise
-        except KilledWorker:  # of a scheduler that gives a task up at the first lost worker
+        except KilledWorker:  # from a scheduler that gives up a task at the first lost worker
             yield from self._give_up(worker)
             return
         except Exception as error:
@@ -517,9 +516,9 @@ class _Runner:
             yield cell, self.place.receive(cell, result[0])
 
     def _result(self, worker: str, future: Future) -> tuple[Any] | None:
-        """Result that a future holds; None where its worker is lost before it could be fetched.
+        """Result of a future; None if its worker is lost before the result is fetched.
 
-        A result stays on its worker until then, and goes with it.
+        Until then the result is only on its worker.
         """
         while True:
             if future.status == "cancelled":
@@ -533,7 +532,7 @@ class _Runner:
                     return None
 
     def _judge(self, worker: str, future: Future) -> None:
-        """Accept a worker that has this code and sees what it needs, refuse any other."""
+        """Accept a worker that has this code and can read the needed paths, refuse any other."""
         assert self.code is not None
         try:
             result = self._result(worker, future)
@@ -557,8 +556,8 @@ class _Runner:
 
 
 class _Queue:
-    """Cells by scene. A worker stays with the scene whose truth it has computed, then helps where
-    most is left.
+    """Cells by scene. A worker stays with the scene whose truth it has computed, then helps with
+    the scene that has most left.
     """
 
     def __init__(self, cells: list[Cell]) -> None:
@@ -572,7 +571,7 @@ class _Queue:
         return self.count
 
     def put_back(self, cell: Cell) -> None:
-        """Put a cell first among those of its scene."""
+        """Put a cell back as the first of its scene."""
         self.scenes.setdefault(cell.scene, deque()).appendleft(cell)
         self.count += 1
 
@@ -581,8 +580,8 @@ class _Queue:
 
         Args:
             scene: scene of the cell that the worker computed last; None if it is its first.
-            busy: probes of the cells at work. A first cell is of another probe if there is one:
-                kernels that one worker compiles are on disk when the other needs them.
+            busy: probes of the running cells. A first cell is of another probe if possible: kernels
+                that one worker compiles are then on disk when the other needs them.
         """
         if not self.count:
             return None

@@ -1,4 +1,4 @@
-"""Scenes that a study names by a population: each as the file that it is drawn into."""
+"""Scenes that a study names by a population, as files of drawn scenes."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from attnwarp_eval.drawn.population import population
 def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
     """A study's data with the files of its population under ``scenes``.
 
-    Data that has been through here before names files, perhaps of another machine's cache: they are
-    found, or drawn, again. An entry of ``editing.edits`` for the population's word, such as
-    ``drawn``, is one for each of its scenes.
+    Data expanded before names files, perhaps in another machine's cache: they are found, or drawn,
+    again. An entry of ``editing.edits`` for the population's name, such as ``drawn``, becomes one
+    entry for each of its scenes.
 
     Args:
-        data: data of a study; ``scenes`` is a mapping, or ``population`` says what the files are.
+        data: data of a study; ``scenes`` is a mapping, or ``population`` names their population.
 
     Raises:
         InputError: there is no such population.
@@ -44,10 +44,10 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
         try:
             files = {path.stem: path for path in wanted.files()}
         except InputError:
-            return result  # the folder of meshes is elsewhere, and only the figures are wanted
+            return result  # the folder of meshes is elsewhere, and only the figures are read
         named = [Path(str(name)) for name in scenes]
         if not all(_is_one_of(path, files) for path in named):
-            # Other scenes beside them are no sample of anything.
+            # With further scenes, the set is no sample of a population.
             result["population"] = None
             return result
         result["scenes"] = [str(files[path.stem]) for path in named]
@@ -65,6 +65,6 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_one_of(path: Path, files: Mapping[str, Path]) -> bool:
-    """Return True if a file, where there is one, is what the population has under its name."""
+    """Return True if a file is missing, or equals the population's scene of its name."""
     own = files.get(path.stem)
     return own is not None and (not path.is_file() or path.read_bytes() == own.read_bytes())

@@ -1,7 +1,7 @@
-"""Definition of a probe: everything that a study, its runner and its store ask of one; and the
-probes by name.
+"""Definition of a probe: the interface that studies, the runner and the store use; and the probes
+by name.
 
-How a report shows one is in :mod:`attnwarp_eval.study.probe_report`.
+Reports of probes are defined in :mod:`attnwarp_eval.study.probe_report`.
 
 >>> [probe.name for probe in probes()]
 ['audit', 'calibration', 'carry', 'depth', 'editing', 'fit', 'ideal', 'labels', 'masks',
@@ -42,7 +42,7 @@ E = TypeVar("E", bound=Extra)
 K = TypeVar("K", bound="type[Probe[Any]]")
 
 PROBES = "attnwarp_eval.study.probes"
-"""Package of the probes that ship."""
+"""Package of the bundled probes."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class InTurn:
     Attributes:
         names: names of the contestants; the first is the baseline.
         seconds: stage -> contestant -> round; the baseline's second run comes last.
-        rounds, threads: how they were taken.
-        of: task of each contestant, in words.
+        rounds, threads: number of rounds and of threads.
+        of: description of each contestant's task.
     """
 
     names: tuple[str, ...]
@@ -64,14 +64,14 @@ class InTurn:
 
 
 class Carried(Protocol):
-    """Labels that the tokens of a grid take along a warp."""
+    """Labels of a grid's tokens, carried along a warp."""
 
     @property
     def kind(self) -> npt.NDArray[np.int64]:
         """(h, w) index into :attr:`TokenLabels.legend`, -1 for its last entry."""
 
     def text(self, row: int, column: int) -> str:
-        """Words for what happens at a token."""
+        """Description of the label at a token."""
 
 
 class TokenLabels(Protocol):
@@ -83,15 +83,15 @@ class TokenLabels(Protocol):
 
     @property
     def legend(self) -> Sequence[tuple[str, str]]:
-        """Text and colour of each kind of token; the last is of all others."""
+        """Text and colour of each kind of token; the last entry is for all others."""
 
     def carried(self, layer: FeatureWarp, target: str, truth: TwoView) -> Carried:
-        """Labels that the tokens of a target take along the warp of their grid."""
+        """Labels of a target's tokens, carried along the warp of their grid."""
 
 
 @dataclass
 class Work:
-    """One cell at work: what a probe computes with, and where its figures go.
+    """State of a cell during computation: a probe's inputs, and its results.
 
     Attributes:
         cell: cell to compute.
@@ -111,7 +111,7 @@ class Work:
 
     @property
     def world(self) -> World:
-        """World of the scene. LookupError: the probe needs no scenes, so it has none."""
+        """World of the scene. LookupError: the probe has no scene."""
         if self.scene_world is None:
             raise LookupError(f"probe {self.cell.probe!r} needs no scenes, so it has no world")
         return self.scene_world
@@ -127,12 +127,12 @@ class Work:
         metrics: Mapping[str, float],
         draw: Callable[[], Mapping[str, bytes]] | None = None,
     ) -> None:
-        """Add the figures of a view, and its pictures where the study wants them.
+        """Add the figures of a view, and its pictures if the study saves them.
 
         Args:
-            view: name of the target; an edit or another task may stand before it and a slash.
+            view: name of the target, or ``task/target``, where the task may be an edit.
             metrics: figures by name; NaN or infinite where undefined.
-            draw: the pictures as JPEG files, by what they show.
+            draw: function that returns JPEG files by content.
         """
         yaw = self.world.yaw[view.rpartition("/")[2]]
         self.views.append(View(view, yaw, dict(metrics)))
@@ -140,7 +140,7 @@ class Work:
             self.draw(view, draw)
 
     def draw(self, view: str, draw: Callable[[], Mapping[str, bytes]]) -> None:
-        """Save the pictures of a view, of the source too, where the study wants them.
+        """Save the pictures of a view, or of the source, if the study saves them.
 
         Args:
             view: as in :meth:`add`.
@@ -157,24 +157,24 @@ class Work:
 
 
 class Probe(ABC, Generic[E]):
-    """One kind of measurement, from a study's YAML to its records.
+    """Kind of measurement, from a study's YAML to its records.
 
     A probe is a class that :func:`register` decorates: in a module of :data:`PROBES`, in
-    ``measure.py`` of a folder there, or in a module of a plugin. Nothing else names it. It knows no
-    table: a :class:`~attnwarp_eval.study.probe_report.ProbeReport` shows it.
+    ``measure.py`` of a folder there, or in a module of a plugin. No other code names it. A
+    :class:`~attnwarp_eval.study.probe_report.ProbeReport` makes its tables.
 
     Attributes:
-        name: in a study's ``probes`` and in every record.
-        protocol: raise it when the figures change meaning; all cells then get new ids.
+        name: name in a study's ``probes`` and in every record.
+        protocol: version; raised when the figures change meaning, which gives all cells new ids.
         study_part: keys of a study's YAML that only this probe reads.
         variant_part: keys of a variant that only this probe reads.
         metrics: specification of every figure of its records.
-        needs_scenes: whether its cells are of scenes; else ``cells`` names subjects of its own.
+        needs_scenes: whether its cells have scenes; else ``cells`` names other subjects.
         judges_variants: whether it has cells for each variant.
-        always: whether every run has its cells, with or without the study's asking.
-        main: whether tables of a report speak of it where they name no probe.
-        times_in_turn: stages of the :class:`InTurn` that its records may have.
-        edits: whether it measures methods that edit, whose presets are their own.
+        always: whether every run has its cells, even if the study does not list it.
+        main: whether a report's tables default to it.
+        times_in_turn: stages of :class:`InTurn` that its records may have.
+        edits: whether it measures editing methods, which have separate presets.
     """
 
     name: ClassVar[str]
@@ -191,41 +191,41 @@ class Probe(ABC, Generic[E]):
 
     @property
     def tabled(self) -> bool:
-        """True if a table of variants can be made of its figures."""
+        """True if its figures allow a table of variants."""
         return self.judges_variants and bool(self.metrics)
 
     # From a study to cells
 
     def check(self, study: Study) -> None:
-        """Raise ValueError if the study asks for what this probe cannot measure.
+        """Raise ValueError if this probe cannot measure the study.
 
         Called for every study, with or without this probe; the message begins with the YAML's key.
         """
 
     def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
-        """Raise StudyError if the study names what none of its scenes has.
+        """Raise StudyError if the study names something that none of its scenes has.
 
         Called before a run of any study, with or without this probe.
         """
 
     def check_variant(self, study: Study, variant: Variant) -> None:
-        """Raise ValueError if a variant cannot be measured; its name is put before the message."""
+        """Raise ValueError if a variant cannot be measured; the caller prepends its name."""
 
     def measured(self, study: Study) -> Set[str]:
-        """Variants of a study that decide cells of this probe."""
+        """Variants of a study on which cells of this probe depend."""
         return set(study.probes.get(self.name, ()))
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
-        """The cells of a study: here, one for each scene, variant and seed.
+        """Cells of a study: by default, one for each scene, variant and seed.
 
         Args:
-            names: names of the variants that the study names for it.
-            scenes: by the names that the study gives them.
+            names: names of the study's variants for this probe.
+            scenes: scenes by their names in the study.
 
         Raises:
-            StudyError: the study and a scene do not fit.
+            StudyError: the study does not fit a scene.
         """
         for name, scene in scenes.items():
             for label in names:
@@ -239,7 +239,7 @@ class Probe(ABC, Generic[E]):
                     yield Cell(spec, name, label, self.name, seed, (label,), pictures)
 
     def common_spec(self, study: Study, scene: Scene, seed: int) -> Json:
-        """Entries that the spec of every cell of this probe has."""
+        """Entries in the spec of every cell of this probe."""
         return {
             "probe": self.name,
             "protocol": self.protocol,
@@ -250,7 +250,7 @@ class Probe(ABC, Generic[E]):
         }
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """Entries of a study and a variant that decide the figures of this probe, and nothing else:
+        """Entries of a study and a variant that decide the figures of this probe, and no others:
         two variants that differ elsewhere share a cell.
         """
         return {}
@@ -260,16 +260,16 @@ class Probe(ABC, Generic[E]):
         return variant.settings(), variant.geometry, study.splats_of(variant)
 
     def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:
-        """Return True if a variant is of the kind of ``wanted``, for a claim about kinds.
+        """Return True if a variant is of the same kind as ``wanted``, for a claim about kinds.
 
-        A probe of methods leaves a method's own settings out, but for those that ``wanted`` names.
+        A probe of methods ignores a method's settings, except those that ``wanted`` names.
         """
         return self.meaning(study, variant) == self.meaning(study, wanted)
 
     def token_labels(
         self, study: Study, world: World, targets: Sequence[str]
     ) -> TokenLabels | None:
-        """Labels of tokens that ``inspect`` shows of a run; None where it follows none."""
+        """Labels of tokens that ``inspect`` shows for a run; None for a probe without any."""
         return None
 
     # From a cell to its record
@@ -279,25 +279,25 @@ class Probe(ABC, Generic[E]):
         """Compute a cell: figures and pictures go to ``work.add``, the rest is returned."""
 
     def read_extra(self, data: Json) -> E:
-        """The extra of a record, from the record's JSON."""
+        """Read the extra of a record from the record's JSON."""
         return NoExtra()  # type: ignore[return-value]
 
     def read(self, data: Json) -> Record[E]:
-        """A record of this probe from its JSON."""
+        """Read a record of this probe from its JSON."""
         return Record.from_json(data, self.read_extra(data))
 
     def metric(self, key: str) -> Metric:
-        """The specification of a figure. KeyError: this probe gives no such figure."""
+        """Specification of a figure. KeyError: this probe has no such figure."""
         return self.metrics[key]
 
     def repeatable(self, record: Record[E]) -> bool:
-        """Return True if another machine gives the same figures; else no comparison of runs reads
-        them.
+        """Return True if another machine gives the same figures; comparisons of runs skip other
+        records.
         """
         return True
 
     def in_turn(self, cell: Outcome, record: Record[E]) -> InTurn | None:
-        """Seconds of contestants, where this probe times them."""
+        """Seconds of contestants, if this probe times them."""
         return None
 
 
@@ -328,7 +328,7 @@ def unregister(name: str) -> None:
 
 
 def import_probes(package: str) -> None:
-    """Import the modules of a package of probes, of a folder its ``measure.py``."""
+    """Import the modules of a package of probes; of a folder, its ``measure.py``."""
     folder = importlib.import_module(package).__path__
     for module in sorted(pkgutil.iter_modules(folder), key=lambda module: module.name):
         importlib.import_module(f"{package}.{module.name}{'.measure' if module.ispkg else ''}")
@@ -347,6 +347,6 @@ def probes() -> list[Probe[Any]]:
 
 
 def probe(name: str) -> Probe[Any]:
-    """The probe of a name. KeyError: there is none."""
+    """Look up a probe by name. KeyError: no such probe."""
     _discover()
     return _registered[name]

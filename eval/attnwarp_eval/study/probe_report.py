@@ -1,4 +1,4 @@
-"""Report of a probe: columns, contrasts and sections of what it measured.
+"""Report of a probe: columns, contrasts and sections on its records.
 
 >>> report_of("depth").columns["AbsRel"]
 'depth.abs_rel'
@@ -26,19 +26,19 @@ K = TypeVar("K", bound="type[ProbeReport]")
 
 
 class Place(IntEnum):
-    """Place of a probe's section in the report; probes of one place stand in their order."""
+    """Place of a probe's section in the report; probes of one place keep their order."""
 
     ANSWER = -1
-    """Before everything else; the first words of a report whose study asks nothing itself."""
+    """First of all: the opening of a report whose study has no question."""
 
     INSTRUMENT = 0
-    """Before the tables of variants: whether the instrument can be trusted."""
+    """Before the tables of variants: checks of the instrument."""
 
     RESULT = 1
     """After the tables of variants."""
 
     APPENDIX = 2
-    """After everything that was measured."""
+    """After all measurements."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Layout:
 
     Attributes:
         root: the run's folder; figures go below it.
-        timings: whether anything measured in seconds or bytes of memory is shown.
+        timings: whether measured seconds and memory are shown.
     """
 
     root: Path
@@ -61,22 +61,22 @@ class Layout:
 class ProbeReport:
     """Presentation of a probe's records in a report.
 
-    It stands in the probe's module, or in ``report.py`` beside the probe's ``measure.py``, and
-    :func:`register_report` decorates it. It measures nothing.
+    It is defined in the probe's module, or in ``report.py`` next to the probe's ``measure.py``,
+    and decorated by :func:`register_report`. It measures nothing.
 
     Attributes:
         name: name of the probe.
         columns: columns of the table of variants, title -> metric; ``{layer}`` stands for a feature
-            grid. Every metric of the probe under its own name where there are none. Metrics with a
-            ``column`` in the registry stand behind them.
-        tabulates_all: whether its own section has every variant, in a study's tables or not.
+            grid. Without any, every metric of the probe under its name. Metrics with a ``column``
+            in the registry follow them.
+        tabulates_all: whether its section has every variant, also those in no table of the study.
         contrasts: metrics in which a variant is tested against a baseline.
-        stage: stage of :class:`~attnwarp_eval.study.probe.InTurn`, the one whose seconds its
-            figures cost.
-        cost, cost_of, cost_text: stage of a cell's seconds that its figures cost where nothing was
-            taken in turn, what they are seconds of, and what is in them.
-        measures: measured quantity, for the first sentence of a report; its name if empty.
-        picture_label: title of its pictures; the variant's name if empty.
+        stage: stage of :class:`~attnwarp_eval.study.probe.InTurn` that gives the cost of its
+            figures.
+        cost, cost_of, cost_text: fallback without timings in turn: stage of a cell's seconds, what
+            is timed, and what the seconds include.
+        measures: measured quantity, for the first sentence of a report; the probe's name if empty.
+        picture_label: title of the pictures; the variant's name if empty.
     """
 
     name: str = ""
@@ -113,15 +113,15 @@ class ProbeReport:
         }
 
     def problems(self, results: Results) -> list[str]:
-        """Faults of the instrument by this probe's records, one line each."""
+        """Faults of the instrument found in this probe's records, one line each."""
         return []
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """Sections of the report; none where the run has no record of this probe."""
+        """Sections of the report; none if the run has no record of this probe."""
         return iter(())
 
     def gallery(self, results: Results) -> Section | None:
-        """A section of its own for its pictures; None where they stand with those of others."""
+        """A separate section for its pictures; None if the shared gallery shows them."""
         return None
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
@@ -134,12 +134,12 @@ class ProbeReport:
 
 
 class PlainReport(ProbeReport):
-    """Report of a probe that has none of its own: a table of its metrics."""
+    """Default report of a probe: a table of its metrics."""
 
     tabulates_all = True
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """The table, where the probe gives figures."""
+        """The table, if the probe has figures."""
         columns = self.columns_at(results.layer)
         measured = dict.fromkeys(
             v for cell, _ in results.finished(self.name) for v in cell.variants
@@ -162,7 +162,7 @@ def register_report(kind: K) -> K:
 
 
 def report_of(name: str) -> ProbeReport:
-    """The report of a probe; a plain one where it has none. KeyError: no probe of that name."""
+    """Report of a probe, by default a plain one. KeyError: no probe of that name."""
     own = probe(name)
     _discover(type(own).__module__)
     return _registered.get(name, PlainReport)(own)
@@ -170,7 +170,7 @@ def report_of(name: str) -> ProbeReport:
 
 @cache
 def _discover(module: str) -> None:
-    """Import ``report.py`` beside a probe's ``measure.py``."""
+    """Import ``report.py`` next to a probe's ``measure.py``."""
     folder, _, last = module.rpartition(".")
     if last == "measure" and find_spec(f"{folder}.report"):
         importlib.import_module(f"{folder}.report")
@@ -182,12 +182,11 @@ def reports() -> list[ProbeReport]:
 
 
 def in_degrees(names: Iterable[str], views: Iterable[View]) -> list[str]:
-    """Heads of columns of views: each one's degrees from the source, or its name where that says
-    more: it has none, or not the same in all records, or another view has as many.
-
+    """Heads of columns of views: each view's degrees from the source, or its name if it has no yaw,
+    a yaw that differs between records, or the yaw of another view.
     Args:
-        names: views, without a task before them.
-        views: records' figures of them.
+        names: names of views, without the task.
+        views: figures of the views, from records.
 
     Example:
         >>> views = [View("near", 12.2, {}), View("left", 30, {}), View("right", 30, {})]
@@ -218,13 +217,13 @@ def side_by_side(
     caption: str,
     first: Mapping[str, str],
 ) -> Grid | None:
-    """Pictures of variants in the views of one scene; None where the run has none.
+    """Pictures of variants in the views of one scene; None if the run has none.
 
     Args:
         probe, variants: probe and variants of the pictures; variants are the rows.
         content: content of the pictures.
-        scene: scene of the pictures; the first one that has some where this has none.
-        first: label of a row before them -> what it shows, the same for all variants.
+        scene: scene of the pictures; the first one with pictures if this has none.
+        first: label of a leading row -> its content, the same for all variants.
     """
     found: dict[str, dict[str, dict[tuple[str, str], str]]] = {}
     records: dict[str, list[Record[Any]]] = {}
@@ -265,7 +264,7 @@ def scenes_side_by_side(
 
 
 def mean_values(results: Results, probe: str, name: str, metrics: Iterable[str]) -> list[str]:
-    """Cells of a table: the means over scenes of a variant's metrics, with their intervals. A mean
+    """Cells of a table: means over scenes of a variant's metrics, with intervals. A mean
     squared error is shown in decibels, as a pooled PSNR.
     """
     scenes, metrics_of = len(results.study.scenes), report_of(probe).probe.metrics

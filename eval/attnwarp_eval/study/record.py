@@ -1,4 +1,4 @@
-"""Result of a cell, typed from the probe to the report. JSON appears only in ``to_json`` and
+"""Result of a cell, typed from probe to report. JSON appears only in ``to_json`` and
 ``from_json``.
 """
 
@@ -19,7 +19,7 @@ class Extra(Protocol):
     """Entries that the records of one probe hold beside figures."""
 
     def to_json(self) -> Json:
-        """Entries of the record; those of the key ``cost`` go into the record's own cost."""
+        """Entries of the record; entries under ``cost`` go into the record's cost."""
         ...
 
 
@@ -40,8 +40,8 @@ class View:
     """Figures of one target view.
 
     Attributes:
-        name: the target's; an edit or another task may stand before it, as ``task/target``.
-        yaw: degrees from the source, in [0, 180]; 0 where nothing is seen by a camera.
+        name: target name, or ``task/target``, where the task may be an edit.
+        yaw: degrees from the source, in [0, 180]; 0 if the figures involve no camera.
         metrics: figures by name; NaN where undefined.
     """
 
@@ -64,7 +64,7 @@ class PictureFile:
     """A picture of one view in the run's folder.
 
     Attributes:
-        view: its name.
+        view: name of the view.
         content: content, such as ``mask``.
         path: relative to the run's folder.
         sha256: sha256 of the file.
@@ -95,10 +95,10 @@ class Cost:
     """Cost of a cell.
 
     Attributes:
-        seconds: by stage; None where there was nothing to time.
+        seconds: seconds by stage; None for an empty stage.
         counters: counts of work, such as pixels or pairs.
-        peak_memory_mb: peak memory of the process while it computed the cell, MiB, with what it
-            held before; of the process so far where the system cannot count anew (not Linux).
+        peak_memory_mb: peak memory of the process during the cell, MiB, including memory it held
+            before; of the whole process so far if the system cannot reset the peak (not Linux).
         threads: threads of the renderer.
     """
 
@@ -118,12 +118,12 @@ class Cost:
 
     @classmethod
     def from_json(cls, data: Json) -> Cost:
-        """Rebuild from :meth:`to_json`; entries of a probe's own beside it are left alone."""
+        """Rebuild from :meth:`to_json`; ignores further entries of the probe."""
         return cls(data["seconds"], data["counters"], data["peak_memory_mb"], data["threads"])
 
 
 _environments: dict[tuple[Any, ...], Environment] = {}
-"""Those that were read. A run's records share a few; apart they would fill most of the memory."""
+"""Environments read so far. A run's records share a few; copies would fill most of the memory."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ class Environment:
     def same_code(self, other: Environment) -> bool:
         """Return True if both were computed by the same state of the source and the same packages.
 
-        The hash of the source decides: revisions that differ in documents alone are the same code.
+        The hash of the source decides: revisions that differ only in documents are the same code.
         """
         return (self.versions, self.source) == (other.versions, other.source)
 
@@ -177,10 +177,10 @@ class Record(Generic[E]):
 
     Attributes:
         id, spec: id and spec of the cell; see :class:`attnwarp_eval.study.cell.Cell`.
-        views: figures by view.
-        pictures: files of the run's folder.
-        cost, environment: cost, and the machine.
-        extra: entries that only this probe's records hold.
+        views: views with their figures.
+        pictures: picture files in the run's folder.
+        cost, environment: cost and environment of the computation.
+        extra: entries specific to this probe.
     """
 
     id: str
@@ -193,7 +193,7 @@ class Record(Generic[E]):
 
     @property
     def comparable(self) -> bool:
-        """False where the source's edit was not done: the figures say nothing of a method."""
+        """False if the source's edit failed: the figures then say nothing about the method."""
         return bool(getattr(self.extra, "comparable", True))
 
     def to_json(self) -> Json:
@@ -212,7 +212,7 @@ class Record(Generic[E]):
 
     @classmethod
     def from_json(cls, data: Json, extra: E) -> Record[E]:
-        """Rebuild from :meth:`to_json`, with the extra that its probe has read."""
+        """Rebuild from :meth:`to_json`, with the extra that its probe read."""
         return cls(
             data["id"],
             data["spec"],
@@ -244,12 +244,12 @@ class Failure:
 
 
 def finite(figures: Mapping[str, float]) -> dict[str, float | int | None]:
-    """Numbers that JSON has: null for NaN and infinities."""
+    """Figures as JSON numbers: null for NaN and infinities."""
     return dict(without_nan(figures))
 
 
 def with_nan(figures: Mapping[str, float | int | None]) -> dict[str, float]:
-    """The figures of :func:`finite` again: NaN for null. The records of a run share the names."""
+    """Inverse of :func:`finite`: NaN for null. The records of a run share the name strings."""
     return {
         sys.intern(name): math.nan if value is None else value for name, value in figures.items()
     }

@@ -27,13 +27,13 @@ from attnwarp_eval.study.work import compute, failure
 
 @dataclass(frozen=True)
 class Code:
-    """Code that a process computes with.
+    """Code that a process runs.
 
     Attributes:
         source: SHA-256 of the source files of both packages and of the plugins.
         versions: versions of Python (major and minor) and of the packages that results depend on.
-        worker: its name in the cluster; empty outside one.
-        unseen: paths that a cell needs and the worker cannot read.
+        worker: name of the worker in the cluster; empty outside one.
+        unseen: needed paths that the worker cannot read.
     """
 
     source: str
@@ -42,7 +42,7 @@ class Code:
     unseen: Sequence[str] = ()
 
     def difference(self, expected: Code) -> str:
-        """Difference of a worker from the expected one; empty where its cells would be the same."""
+        """Difference from the expected code in words; empty if cells would be the same."""
         names = sorted(self.versions.keys() | expected.versions.keys())
         parts = [
             f"{name} {self.versions.get(name, 'missing')}, expected"
@@ -59,7 +59,7 @@ class Code:
 
 def this_code() -> Code:
     """The code of this process."""
-    with suppress(InputError):  # a worker without a plugin has other code
+    with suppress(InputError):  # a worker that lacks a plugin has other code
         load_plugins()
     versions = dict(environment()["versions"])
     versions["python"] = "{}.{}".format(*sys.version_info[:2])
@@ -67,11 +67,11 @@ def this_code() -> Code:
 
 
 def code_of_worker(request: int = 0, needs: Sequence[str] = ()) -> Code:
-    """The code of the worker that this runs on.
+    """Code of the worker that executes this call.
 
     Args:
-        request: tells calls apart.
-        needs: paths that it has to see.
+        request: number that makes each call distinct.
+        needs: paths that the worker must be able to read.
     """
     from distributed import get_worker
 
@@ -84,8 +84,8 @@ class SceneFiles:
     """A scene's file and its meshes.
 
     Attributes:
-        entry: the scene's file among them.
-        files: contents by path, all below one folder.
+        entry: path of the scene's file in ``files``.
+        files: file contents by path, all below one folder.
     """
 
     entry: str
@@ -93,9 +93,9 @@ class SceneFiles:
 
 
 def files_of_scene(scene: Scene) -> SceneFiles | None:
-    """The files that a scene is read from; None for one made in code.
+    """Files that a scene is read from; None for a scene made in code.
 
-    A mesh that the scene names by an absolute path stays away: workers must see it there.
+    A mesh at an absolute path is not sent: workers must be able to read that path.
     """
     if scene.path is None:
         return None
@@ -113,17 +113,17 @@ def files_of_scene(scene: Scene) -> SceneFiles | None:
 
 
 def _absolute(path: Path) -> Path:
-    """A path without ``..``; links stay, as the files keep their places beside one another."""
+    """Remove ``..`` from a path; links stay, so that the files keep their relative places."""
     return Path(os.path.abspath(path))  # noqa: PTH100
 
 
 @dataclass(frozen=True)
 class Parcel:
-    """Parcel that a worker sends back of a cell.
+    """Results of a cell that a worker sends back.
 
     Attributes:
-        record: as :meth:`attnwarp_eval.study.store.Store.write` takes it.
-        pictures: contents by path, relative to the run's folder.
+        record: argument of :meth:`attnwarp_eval.study.store.Store.write`.
+        pictures: file contents by path relative to the run's folder.
     """
 
     record: Json
@@ -131,16 +131,16 @@ class Parcel:
 
 
 _scenes: dict[str, Path] = {}
-"""Files of the scenes that this worker was sent, by the scene's content."""
+"""Scene files received by this worker, by the scene's content."""
 
 
 def compute_and_send(probe: Probe[Any], cell: Cell, scene: SceneFiles | None) -> Parcel | Failure:
-    """Compute one cell on a worker and return what belongs into the run's folder.
+    """Compute one cell on a worker and return its files for the run's folder.
 
-    Fits stay on the worker, where later cells want them again.
+    Fits stay on the worker for later cells.
 
     Args:
-        scene: its files; None where this worker has them, or needs none.
+        scene: files of the scene; None if this worker has them or needs none.
     """
     from distributed import get_worker
 
@@ -169,10 +169,10 @@ def _unpack_scene(scene: SceneFiles, folder: Path) -> Path:
 
 
 def unpack(parcel: Parcel, store: Store) -> Failure | None:
-    """Write a cell that came back into the run's folder: its pictures first, then its record."""
+    """Write a received cell into the run's folder: its pictures first, then its record."""
     for name, content in parcel.pictures.items():
         write_atomic(inside(store.root, name), content)
-    # The worker's source is this one's, byte for byte; its copy need not know the revision.
+    # The worker's source is this one's, byte for byte; its installed copy may lack the revision.
     here = environment()
     own = {**parcel.record["environment"], "git": here["git"], "source": here["source"]}
     store.write({**parcel.record, "environment": own})

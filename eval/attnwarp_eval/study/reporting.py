@@ -1,4 +1,4 @@
-"""Reports of a run's cells, and of the time left that they tell."""
+"""Progress of a run's cells, with an estimate of the time left."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.record import Failure
 
 LEFT_SECONDS = 0.1
-"""Least time between two workings of the time left: cells may take less, and have many kinds."""
+"""Least seconds between two estimates of the time left: cells may be faster, and of many kinds."""
 
 
 class CellReporter:
-    """Reports cells as they begin and end.
+    """Reporter of cells as they begin and end.
 
-    A cell that is left takes the mean seconds of finished ones of its probe and variant. Where
-    there is none yet, it takes the mean of its probe, else of all. The time left is not told while
-    most cells that are left are of probes of which none has finished.
+    The estimate for a cell to do is the mean seconds of finished cells of its probe and variant,
+    else of its probe, else of all cells. The time left is unknown while most cells to do are of
+    probes without a finished cell.
 
     Args:
         todo: cells to compute.
         done: cells that an earlier run finished.
-        report: receives a step for each beginning and end, and lines.
+        report: callback for a step at each beginning and end, and for lines.
     """
 
     def __init__(self, todo: Sequence[Cell], done: int, report: Reporter) -> None:
@@ -37,7 +37,7 @@ class CellReporter:
         self._told = -math.inf, math.nan
 
     def start(self, cell: Cell) -> None:
-        """Report that a cell begins, or begins once more."""
+        """Report that a cell begins, or begins again."""
         if cell.id not in self._working:
             self._waiting[_kind(cell)] -= 1
         self._working[cell.id] = _kind(cell), time.perf_counter()
@@ -45,7 +45,7 @@ class CellReporter:
         self._step(cell)
 
     def end(self, cell: Cell, failure: Failure | None) -> None:
-        """Report that a cell ended, and what went wrong."""
+        """Report that a cell ended, with its failure."""
         kind, since = self._working.pop(cell.id)
         seconds = time.perf_counter() - since
         for group in _groups(kind):
@@ -60,7 +60,7 @@ class CellReporter:
         self.report.step(self.done, self.total, cell.title, self.left())
 
     def left(self) -> float:
-        """Seconds; NaN while they cannot be told."""
+        """Seconds left; NaN while they are unknown."""
         now = time.perf_counter()
         if now - self._told[0] >= LEFT_SECONDS or self.done == self.total:
             self._told = now, self._left(now)
@@ -90,5 +90,5 @@ def _kind(cell: Cell) -> Kind:
 
 
 def _groups(kind: Kind) -> tuple[Hashable, ...]:
-    """Groups that a cell's seconds belong to, the narrowest first."""
+    """Groups of a cell for the means of seconds, the narrowest first."""
     return kind, kind[0], None

@@ -21,8 +21,8 @@ class Outcome:
 
     Attributes:
         id, title, scene, probe, seed: id, title, scene, probe and seed of the cell.
-        variants: every name that the study gives to its content.
-        record: None where the cell is not done.
+        variants: all names of its content in the study.
+        record: record; None if the cell is not done.
     """
 
     id: str
@@ -44,13 +44,13 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Shared:
-    """A metric of several variants over the views that all of them have.
+    """Metric of several variants over their shared views.
 
     Attributes:
-        tables: variant -> scene -> view (and seed) -> value, none of them NaN.
-        apart: variants that have too few views, so that their tables are over their own.
-        views: how many views the others share.
-        of: how many views there are.
+        tables: variant -> scene -> view (and seed) -> value, without NaN.
+        apart: variants with too few views, whose tables are over all of their views.
+        views: number of views that the others share.
+        of: number of all views.
     """
 
     tables: dict[str, dict[str, dict[str, float]]]
@@ -59,13 +59,13 @@ class Shared:
     of: int
 
     def mean(self, variant: str, scenes: Collection[str] | None = None) -> Interval:
-        """Over ``scenes``, all by default, of the means over the views."""
+        """Mean over ``scenes``, by default all, of the means over the views."""
         table = self.tables[variant]
         chosen = table if scenes is None else [scene for scene in scenes if scene in table]
         return over_scenes({scene: table[scene] for scene in chosen})
 
     def text(self, title: str) -> list[str]:
-        """A paragraph that says what the means are over; none where that is every view."""
+        """Paragraph on the views of the means; none if these are all views."""
         if self.views == self.of and not self.apart:
             return []
         text = f"{title}: over the {self.views} of {self.of} views in which all have a value."
@@ -78,7 +78,7 @@ class Shared:
 
 
 def _value(figures: Mapping[str, float], metric: str) -> float:
-    """A figure of a view, NaN without one."""
+    """A figure of a view, NaN if absent."""
     return figures.get(metric, math.nan)
 
 
@@ -97,9 +97,9 @@ class Results:
 
     Attributes:
         study: the resolved study.
-        cells: one entry an expected cell, in the study's order.
+        cells: one entry for each expected cell, in the study's order.
         failures: the table of failed cells.
-        notices: by scene, what a person should know of it.
+        notices: notices to the reader, by scene.
     """
 
     study: Study
@@ -109,8 +109,8 @@ class Results:
 
     @property
     def layer(self) -> int:
-        """The feature grid that tables show: an eighth of the image, as in a diffusion UNet, or the
-        next smaller one.
+        """The feature grid shown in tables: an eighth of the image, as in a diffusion UNet, or the
+        next smaller grid.
         """
         size, sizes = self.study.size, self.study.feature_sizes
         return (
@@ -146,8 +146,8 @@ class Results:
 
     @cached_property
     def _by_variant(self) -> dict[tuple[str, str], list[tuple[str, int, Record[Any]]]]:
-        """A table asks for every variant in turn: a search through all cells each time would take
-        their number squared.
+        """Index of the records: a search through all cells for every variant of a table would take
+        the number of cells squared.
         """
         table: dict[tuple[str, str], list[tuple[str, int, Record[Any]]]] = {}
         for name, cells in self._by_probe.items():
@@ -161,12 +161,12 @@ class Results:
         self, probe: str, variant: str, metric: str, yaw: tuple[float, float] | None = None
     ) -> dict[str, dict[str, float]]:
         """Scene -> view (and seed) -> value; NaN where undefined, as is every figure of an edit
-        whose source was not done: such an edit takes part in no comparison. A figure of cost stands
-        once a cell, at its first view, done or not.
+        whose source edit failed: comparisons skip such edits. A figure of cost appears once a cell,
+        at its first view, whether or not the edit succeeded.
 
         Args:
             probe, variant: probe and variant of the records.
-            yaw: closed range of degrees that a view's yaw from the source must lie in; any if None.
+            yaw: closed range of views' yaws from the source, in degrees; any if None.
         """
         table: dict[str, dict[str, float]] = {}
         for scene, seed, record in self.records(probe, variant):
@@ -186,10 +186,10 @@ class Results:
         return over_scenes(self.views(probe, variant, metric))
 
     def shared(self, probe: str, variants: Sequence[str], metric: str) -> Shared:
-        """A metric of several variants over the views that all of them have.
+        """Collect a metric of several variants over their shared views.
 
-        A variant with values in fewer than half of the views of the one with most would leave too
-        little: it stays apart, over its own views.
+        A variant with values in fewer than half of the views of the largest variant would leave too
+        few views: it is set apart, over all of its views.
         """
         tables = {name: self.views(probe, name, metric) for name in variants}
         own = {name: common([table])[0] for name, table in tables.items()}
@@ -215,8 +215,8 @@ class Results:
         return {scene: sum(v) / len(v) for scene, v in by_scene.items()}
 
     def usual_seconds(self, probe: str, variant: str, stage: str) -> float:
-        """Median over scenes of a stage's seconds, NaN without any. No mean: the first cell of a
-        process compiles kernels, which takes a hundred times as long as an edit.
+        """Median over scenes of a stage's seconds, NaN without any. The first cell of a
+        process compiles kernels, a hundred times as long as an edit; hence no mean.
         """
         taken = self.seconds(probe, variant, stage).values()
         return median(taken) if taken else math.nan

@@ -1,4 +1,4 @@
-"""Run a study's cells, and verify a run. Every finished cell is on disk."""
+"""Run a study's cells, and verify a run. Every finished cell is on disk at once."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from attnwarp_eval.truth.plan import open_bounces
 
 @dataclass
 class Plan:
-    """A resolved study and what of it is still to do.
+    """A resolved study and its cells to do.
 
     Attributes:
         study, scenes, cells: study, scenes and cells of a complete run.
         todo: cells without a record.
-        other_code: how many records were computed by other code than this.
-        notices: by scene, what a person should know of it; scenes without any are left out.
+        other_code: number of records computed by different code.
+        notices: notices to the user, by scene; scenes without any are left out.
     """
 
     study: Study
@@ -52,7 +52,7 @@ class Plan:
 
     @property
     def reused(self) -> int:
-        """Cells that an earlier run already finished."""
+        """Number of cells that an earlier run finished."""
         return len(self.cells) - len(self.todo)
 
 
@@ -73,23 +73,23 @@ class Summary:
 
 
 def plan(study: Study, store: Store) -> Plan:
-    """Load the scenes, list the cells, and look which of them ``store`` already has.
+    """Load the scenes, list the cells, and find those that ``store`` already has.
 
     Raises:
-        InputError: something the study names cannot be used, or is of none of its scenes.
+        InputError: something that the study names cannot be used, or is in none of its scenes.
     """
-    silence_notices()  # the plan has them below
+    silence_notices()  # the plan collects them below
     scenes = _scenes(study)
     cells = cells_of(study, scenes)
     _check_names(study, list(scenes.values()), cells)
     done = store.done()
-    load_plugins()  # whose source is part of the code
+    load_plugins()  # plugins' source is part of the code
     this = Environment.from_json(environment())
     todo: list[Cell] = []
     other_code = 0
     for cell in cells:
         record = store.whole(cell.id, probe(cell.probe).read) if cell.id in done else None
-        # Pictures are no part of a cell's id: those that the study wants may be others.
+        # Pictures are not part of a cell's id: the study may now save other pictures.
         if record is None or not set(cell.pictures) <= {p.view for p in record.pictures}:
             todo.append(cell)
         else:
@@ -114,15 +114,15 @@ def _scenes(study: Study) -> dict[str, Scene]:
 
 
 def _check_names(study: Study, scenes: list[Scene], cells: list[Cell]) -> None:
-    """Check that views to be pictured, and what probes name, are of some scene of the study.
+    """Check that views to be pictured, and names in probes, are of some scene of the study.
 
-    A misspelt name would else change the study in silence. What is of no chosen scene may be of one
-    that was left out; only then are those loaded.
+    A misspelt name would otherwise change the study silently. A name found in no chosen scene may
+    be of a scene left out; only then are those scenes loaded.
 
     Raises:
-        StudyError: a name is of none.
+        StudyError: a name is in no scene.
     """
-    # Fits measure views of their own.
+    # Fits measure held-out views.
     own = {view for cell in cells for view in cell.spec.get("views", ())}
 
     def check(scenes: list[Scene]) -> None:
@@ -145,11 +145,11 @@ def _check_names(study: Study, scenes: list[Scene], cells: list[Cell]) -> None:
 
 
 def verify(store: Store) -> Problems:
-    """Recompute the hashes of a run's cells and pictures, and the list of expected cells from its
-    study.
+    """Recompute the hashes of a run's cells and pictures, and list its expected cells again from
+    its study.
 
     Raises:
-        InputError: the folder is no run.
+        InputError: the folder is not a run.
     """
     silence_notices()
     stored = store.read_study()
@@ -175,9 +175,9 @@ class Stored:
     """Contents of ``study.json`` of a run.
 
     Attributes:
-        study: resolved.
-        cells: those that a complete run has.
-        notices: as in :class:`Plan`.
+        study: resolved study.
+        cells: cells of a complete run.
+        notices: notices of :class:`Plan`.
     """
 
     study: Study
@@ -186,10 +186,10 @@ class Stored:
 
 
 def stored_study(store: Store) -> Stored:
-    """The study of a run, and its expected cells, as ``study.json`` has them.
+    """Read a run's study and its expected cells from ``study.json``.
 
     Raises:
-        StoreError: the folder is no run, or its study cannot be read.
+        StoreError: the folder is not a run, or its study cannot be read.
 
     Example:
         >>> from attnwarp_eval.study.run import expected, plan, stored_study
@@ -223,11 +223,11 @@ def stored_study(store: Store) -> Stored:
 
 
 def _check_plugins(store: Store, stored: dict[str, Any]) -> None:
-    """Import the plugins; where the run's are not here, say so before anything fails of it.
+    """Import the plugins; report the run's missing plugins before anything else fails.
 
     Raises:
-        StoreError: some are not named here, and the study cannot be read without them.
-        InputError: one cannot be imported.
+        StoreError: plugins of the run are missing, and the study cannot be read without them.
+        InputError: a plugin cannot be imported.
     """
     load_plugins()
     missing = sorted(set(stored.get("plugins", ())) - set(plugin_modules()))
@@ -251,7 +251,7 @@ def _remedy(store: Store) -> str:
 
 
 def expected(plan: Plan) -> dict[str, Any]:
-    """The content of ``study.json``: the resolved study and the cells that a complete run has."""
+    """Content of ``study.json``: the resolved study and the cells of a complete run."""
     return {
         "study": plan.study.model_dump(mode="json"),
         "scenes": {
@@ -288,18 +288,18 @@ def execute(
     keep_going: bool = True,
     report: Reporter = SILENT,
 ) -> Summary:
-    """Compute the cells that are still to do, writing each as soon as it is finished.
+    """Compute the cells to do, and write each as soon as it is finished.
 
     Args:
-        jobs: worker processes, at most one a cell and a core; 1 stays in this process. The
-            numbers do not depend on it.
-        scheduler: address or file of a dask scheduler, whose workers compute instead.
-        keep_going: go on after a failed cell; else stop at the first.
-        report: receives every beginning and end of a cell, and lines about failures and workers.
+        jobs: worker processes, at most one for each cell and core; 1 computes in this process. The
+            figures do not depend on it.
+        scheduler: address or file of a dask scheduler, whose workers compute the cells.
+        keep_going: whether to continue after a failed cell.
+        report: callback for each beginning and end of a cell, and lines on failures and workers.
 
     Raises:
         ClusterError: the scheduler cannot be reached, or every worker is refused.
-        ClusterLost: the connection to the scheduler broke; what had ended is stored.
+        ClusterLost: the connection to the scheduler broke; finished cells are stored.
     """
     start = time.perf_counter()
     store.write_study(expected(plan))
@@ -324,16 +324,16 @@ def compute_cells(
     needs: Sequence[Path] = (),
     keep_going: bool = True,
 ) -> list[Failure]:
-    """Compute cells, in this process or on workers, and return what failed.
+    """Compute cells, in this process or on workers, and return the failures.
 
     Args:
         cells: cells of registered probes.
-        store: the run's folder, which gets every record and failure.
-        jobs: worker processes, at most one a cell; 1 stays in this process.
-        scheduler: see :func:`execute`.
-        scenes: by the names that cells give them.
-        needs: paths that a scheduler's workers have to see.
-        keep_going: see :func:`execute`.
+        store: the run's folder, destination of every record and failure.
+        jobs: worker processes, at most one for each cell; 1 computes in this process.
+        scheduler: address or file, as for :func:`execute`.
+        scenes: scenes by their names in cells.
+        needs: paths that a scheduler's workers must be able to read.
+        keep_going: as for :func:`execute`.
 
     Raises:
         ClusterError, ClusterLost: see :func:`execute`.
@@ -346,7 +346,7 @@ def compute_cells(
     else:
         work = _in_this_process(cells, store, report)
     failures = []
-    # Closed here and now: an interrupt must end the workers before the command ends.
+    # Close at once: an interrupt must end the workers before the command ends.
     with contextlib.closing(work):
         for cell, failure in work:
             if failure is not None:

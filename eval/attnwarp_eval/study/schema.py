@@ -1,6 +1,6 @@
 """The parts of a study's YAML that every probe shares.
 
-What only one probe reads stands in that probe's file; :mod:`attnwarp_eval.study.study` joins them.
+Keys of a single probe are defined with that probe; :mod:`attnwarp_eval.study.study` joins them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ P = TypeVar("P", bound="Part")
 
 
 class StudyError(InputError):
-    """A study that cannot be run; the message names the file, what came and what to do.
+    """A study that cannot be run; the message names the file, the value and the remedy.
 
     Example:
         >>> from attnwarp_eval.study import StudyError, load_study
@@ -60,10 +60,10 @@ class Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     def part(self, kind: type[P]) -> P:
-        """Cast the object to one of the parts that it was joined from.
+        """Cast the object to one of its parts.
 
         Raises:
-            TypeError: it was not; only a study that was read through
+            TypeError: the object lacks that part; only a study read through
                 :mod:`attnwarp_eval.study.study` has the parts of every probe.
         """
         if not isinstance(self, kind):
@@ -86,10 +86,10 @@ class Splats(Part):
 
 
 class Variant(Part):
-    """One row of a table: where depth comes from, and how the warp is made.
+    """One row of a table: the source of depth, and the settings of the warp.
 
-    ``preset`` is one of the warp's, "corrected" where it is left out. Of a variant that is edited
-    it is one of its method's.
+    ``preset`` is a preset of the warp, by default "corrected". For an editing variant it is a
+    preset of its method.
     """
 
     preset: str | None = None
@@ -98,7 +98,7 @@ class Variant(Part):
     splats: dict[str, Any] = Field(default_factory=dict)
 
     def settings(self) -> WarpSettings:
-        """The preset with this variant's own fields."""
+        """Settings of the preset, overridden by this variant's fields."""
         name = "corrected" if self.preset is None else self.preset
         check.one_of(name, list(PRESETS), "preset")
         return WarpSettings.from_dict({**PRESETS[name].to_dict(), **self.set})
@@ -115,7 +115,7 @@ class UnmeasuredError(ValueError):
 class Ablation(Part):
     """A table of the report: variants against a baseline, paired on scene and view.
 
-    ``probe`` is empty until the study fills in the main probe.
+    ``probe`` is empty until the study sets the main probe.
     """
 
     title: str
@@ -128,8 +128,8 @@ class Ablation(Part):
 class Front(Part):
     """A figure of the report: a metric (lower is better) against the seconds of the method.
 
-    Seconds taken in turn are used where a probe has them for all variants, else those of the cells
-    themselves. ``probe`` is empty until the study fills in the main probe.
+    Seconds taken in turn are used if a probe has them for all variants, else seconds of the cells.
+    ``probe`` is empty until the study sets the main probe.
     """
 
     title: str
@@ -145,7 +145,7 @@ FIGURE = re.compile(r"\{([^{}|]+)\|([^{}|]+)\}")
 class AnswerColumn(Part):
     """A column of an answer's table: a metric, over targets within a range of yaws, in degrees.
 
-    ``probe`` is empty until the study fills in the main probe.
+    ``probe`` is empty until the study sets the main probe.
     """
 
     metric: str
@@ -157,12 +157,12 @@ class AnswerPictures(Part):
     """Pictures of an answer, side by side: columns are views, rows the variants.
 
     Args:
-        caption: above them.
-        probe: that draws them; the main probe if left out.
-        scene: scene of the pictures; the first one that has some where this has none.
-        first: label of a row before those of the variants -> what it shows, the same for all.
+        caption: text above the pictures.
+        probe: probe that draws the pictures, by default the main probe.
+        scene: scene of the pictures; the first one with pictures if this has none.
+        first: label of a leading row -> its content, the same for all variants.
         content: content of the variants' rows.
-        variants: the rows.
+        variants: variants, one for each row.
     """
 
     caption: str
@@ -174,11 +174,11 @@ class AnswerPictures(Part):
 
 
 class Answer(Part):
-    """First words of a report: a question, sentences, pictures, one table.
+    """Opening of a report: a question, sentences, pictures, one table.
 
-    A sentence holds figures as ``{column|variant}``; one with a figure that this run did not
-    measure is left out. ``variants`` are the table's rows, each with what it is in words;
-    ``columns`` are titles with their metrics, ``figures`` further ones, of sentences alone.
+    A sentence holds figures as ``{column|variant}``; a sentence with a figure that this run lacks
+    is left out. ``variants`` are the table's rows, each with a description;
+    ``columns`` are titles with their metrics, ``figures`` further columns for sentences only.
     ``decides`` is the column by which a variant is recommended.
     """
 
@@ -192,14 +192,14 @@ class Answer(Part):
 
 
 class Pictures(Part):
-    """Variants and views of which pictures are saved."""
+    """Variants and views whose pictures are saved."""
 
     variants: list[str] = Field(default_factory=list)
     views: list[str] = Field(default_factory=list)
 
 
 class Study(Part):
-    """Scenes x variants x seeds x probes, and what the report shows of them.
+    """Scenes x variants x seeds x probes, and the contents of the report.
 
     Example:
         >>> from attnwarp_eval.study import load_study
@@ -240,7 +240,7 @@ class Study(Part):
 
     @property
     def scene_names(self) -> list[str]:
-        """Names of the scenes in cells and reports: two files of one name by their paths."""
+        """Names of the scenes in cells and reports: files that share a name are named by path."""
         names = [scene_name(where) for where in self.scenes]
         return [
             where if names.count(name) > 1 else name
@@ -249,7 +249,7 @@ class Study(Part):
 
     @property
     def sampled(self) -> str:
-        """The population that the scenes are a sample of, in words; empty if of none."""
+        """Description of the population that the scenes sample; empty without one."""
         if self.population is None:
             return ""
         count, words = len(self.scenes), self.population.words
@@ -262,7 +262,7 @@ class Study(Part):
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Scenes of the study's file that were not chosen; other keys may name them."""
+        """Scenes of the study's file that are not chosen; other keys may name them."""
         return self._left_out
 
     @model_validator(mode="before")
@@ -291,10 +291,10 @@ class Study(Part):
         return self
 
     def check_scenes(self, names: Iterable[str], key: str, scenes: Iterable[Scene]) -> None:
-        """Refuse names that are those of no scene, of the chosen ones or of those left out.
+        """Refuse names of unknown scenes; scenes left out are known.
 
         Raises:
-            StudyError: a name that is no scene's.
+            StudyError: a name of an unknown scene.
         """
         known = [*(scene.name for scene in scenes), *map(scene_name, self.left_out)]
         for name in names:
@@ -304,7 +304,7 @@ class Study(Part):
                 )
 
     def check_variants(self, names: Iterable[str], key: str, probe: str = "") -> None:
-        """Raise ValueError unless every name is a variant's, and ``probe`` measures it.
+        """Raise ValueError unless every name is a variant that ``probe`` measures.
 
         Args:
             key: key of the YAML, for the message.
@@ -314,16 +314,16 @@ class Study(Part):
             if name not in self.variants:
                 near = did_you_mean(name, self.variants)
                 raise UnmeasuredError(key, f"no variant {name!r}{near}")
-            # A row that is never measured would be missing from its table without a word.
+            # A variant that is never measured would silently be missing from its table.
             if probe and name not in self.probes.get(probe, []):
                 raise UnmeasuredError(key, f"{name!r} is not measured; add it to probes.{probe}")
 
     def splats_of(self, variant: Variant) -> Splats:
-        """The study's splats with the variant's own fields."""
+        """The study's splats, overridden by the variant's fields."""
         return Splats.model_validate({**self.splats.model_dump(), **variant.splats})
 
     def views_of(self, scene: Scene) -> list[str]:
-        """Names of the scene's targets that the study measures, in the scene's order.
+        """Names of the measured targets of a scene, in the scene's order.
 
         Raises:
             StudyError: the study names a view that the scene lacks.
@@ -338,10 +338,10 @@ class Study(Part):
         return [name for name in available if not self.views or name in self.views]
 
     def pictures_of(self, views: Iterable[str], variant: str | None = None) -> tuple[str, ...]:
-        """Those of the views that the study wants pictures of, in its own order.
+        """Views whose pictures the study saves, in the order of ``views``.
 
         Args:
-            variant: variant of the cell; None where it has none, as in the calibration.
+            variant: variant of the cell; None without one, as in the calibration.
         """
         if variant is not None and variant not in self.pictures.variants:
             return ()

@@ -1,7 +1,7 @@
-"""A run's folder: one JSON file a cell, written beside its name, flushed to disk, then renamed.
+"""A run's folder: one JSON file a cell, written to a temporary name, flushed to disk, then renamed.
 
-Cells lie in folders by the first two digits of their ids, as file systems list folders of 100,000
-files slowly.
+Cells are in folders by the first two digits of their ids, since file systems list folders of
+100,000 files slowly.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from attnwarp.io.lock import locked
 from attnwarp_eval.canonical_json import digest, write_json
 
 FORMAT = 2
-"""Version of all files of a run; a reader refuses others."""
+"""Version of all files of a run; readers refuse other versions."""
 
 OLDER = "made by an older version; run it again"
 
@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 
 class StoreError(InputError):
-    """A run's folder that cannot be used; the message says which and what to do."""
+    """A run's folder that cannot be used; the message names it and the remedy."""
 
 
 @dataclass
@@ -70,10 +70,10 @@ class Store:
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the folder against a second run that would write to it.
+        """Lock the folder against a second run.
 
         Raises:
-            StoreError: another run holds it, or it cannot be a run's.
+            StoreError: another run holds the lock, or the folder cannot be a run's.
         """
         if self.root.exists() and not self.root.is_dir():
             raise StoreError(
@@ -93,14 +93,14 @@ class Store:
             yield
 
     def refuse_strangers(self) -> None:
-        """Check that a run writes over nothing that no run wrote.
+        """Check that a run would overwrite only files of runs.
 
         Raises:
-            StoreError: the folder has files of a run's names and no study.json, or is the current
-                folder with other things in it, as an empty path is.
+            StoreError: the folder has files with a run's names and no study.json, or is the current
+                folder with other files in it, as an empty path gives.
         """
         if (self.root / "study.json").exists() or self.cells.is_dir():
-            return  # the cells of a run whose study.json is lost are taken up
+            return  # the cells of a run whose study.json is lost are reused
         own = ("report.md", "report.html", "results.jsonl")
         there = [self.root / name for name in own if (self.root / name).exists()]
         if there:
@@ -124,15 +124,15 @@ class Store:
         """Write the resolved study and its expected cells with their checksum. Cells of another
         study stay.
         """
-        # In the study's own order: seconds are taken on a scene's first edit.
+        # Keep the study's order: seconds are taken on a scene's first edit.
         write_json(self.root / "study.json", _sealed(study), sort_keys=False)
 
     def read_study(self) -> dict[str, Any]:
         """The content of ``study.json``.
 
         Raises:
-            StoreError: the folder is not a run, an older version made it, or the file was changed
-                since it was written.
+            StoreError: the folder is not a run, an older version wrote it, or the file was changed
+                after it was written.
         """
         path = self.root / "study.json"
         if not path.is_file():
@@ -164,16 +164,16 @@ class Store:
         return {path.stem for path in self.cells.glob("??/*.json")}
 
     def write(self, record: dict[str, Any]) -> None:
-        """Write the record of a finished cell, and remove a former failure of it.
+        """Write the record of a finished cell, and remove its earlier failure.
 
         Args:
-            record: with at least ``id`` and ``spec``.
+            record: record with at least ``id`` and ``spec``.
         """
         write_json(self.path(record["id"]), _sealed(record), durable=_flush_is_due())
         (self.failed / f"{record['id']}.json").unlink(missing_ok=True)
 
     def write_failure(self, cell_id: str, failure: dict[str, Any]) -> None:
-        """Write why a cell failed; the next run tries it again."""
+        """Write the failure of a cell; the next run tries the cell again."""
         write_json(self.failed / f"{cell_id}.json", {**failure, "id": cell_id})
 
     def failures(self) -> list[dict[str, Any]]:
@@ -191,7 +191,7 @@ class Store:
         """The record of a finished cell.
 
         Raises:
-            StoreError: the file is missing, damaged, or made by an older version.
+            StoreError: the file is missing, damaged, or written by an older version.
         """
         path = self.path(cell_id)
         try:
@@ -212,7 +212,7 @@ class Store:
         return record
 
     def _path_problem(self, record: Mapping[str, Any]) -> str | None:
-        """Fault of the files that a record names, which may come from elsewhere, or None."""
+        """Fault of a record's file paths, which may come from another machine, or None."""
         try:
             for entry in (*record.get("pictures", ()), *record.get("files", ())):
                 inside(self.root, entry["path"])
@@ -224,7 +224,7 @@ class Store:
         """Apply ``read`` to the record of a finished cell.
 
         Raises:
-            StoreError: as :meth:`read`, or the record is not one that ``read`` takes.
+            StoreError: as :meth:`read`, or ``read`` refuses the record.
         """
         record = self.read(cell_id)
         try:
@@ -246,8 +246,8 @@ class Store:
         return None
 
     def keep_picture(self, path: Path, **about: str) -> dict[str, str]:
-        """Entry of a record for a picture that was written below the folder: ``about``, its path
-        and its SHA-256.
+        """Entry of a record for a picture written below the folder: ``about``, the path and the
+        SHA-256.
         """
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         return {**about, "path": path.relative_to(self.root).as_posix(), "sha256": sha256}
@@ -276,10 +276,10 @@ class Store:
         return problems
 
     def damaged_pictures(self, pictures: Iterable[Mapping[str, Any]]) -> list[str]:
-        """A line for each picture that is not the one that was written.
+        """One line for each picture that differs from its checksum.
 
         Args:
-            pictures: with ``path`` and ``sha256``, as a record has them.
+            pictures: entries of a record, with ``path`` and ``sha256``.
         """
         remedy = f"run again with --out {self.root}, which makes it anew"
         bad = []
@@ -293,10 +293,10 @@ class Store:
 
 
 FLUSH_SECONDS = 1.0
-"""Least time between two flushes of cells to disk by one process.
+"""Least seconds between two flushes of cells to disk by one process.
 
-A flush takes longer than a cell that costs nothing. Without it the system writes the file half a
-minute later; a record that a power cut damages fails its checksum and is computed again.
+A flush takes longer than a cheap cell. Between flushes the system writes the file within half a
+minute; a record that a power cut damages fails its checksum and is computed again.
 """
 
 _flushed = -FLUSH_SECONDS
@@ -316,7 +316,7 @@ def _read_object(path: Path) -> dict[str, Any]:
     """The JSON object in a file.
 
     Raises:
-        ValueError: it is not JSON or no object, in one line.
+        ValueError: the file is not JSON, or not an object; a one-line message.
     """
     value = json.loads(path.read_bytes())
     if not isinstance(value, dict):
@@ -341,7 +341,7 @@ def _seal_problem(content: dict[str, Any]) -> str | None:
 
 
 def _digest(value: Any) -> str | None:
-    """:func:`digest`, None for a value that has none: numbers such as 1e999 are infinite."""
+    """:func:`digest`, None for a value without one: numbers such as 1e999 are infinite."""
     try:
         return digest(value)
     except ValueError:

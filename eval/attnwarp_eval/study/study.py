@@ -1,4 +1,4 @@
-"""Way from a study's YAML to its cells: the shared parts joined with those of every probe."""
+"""Conversion of a study's YAML to its cells: the shared parts joined with every probe's."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from attnwarp_eval.study.schema import (
 )
 
 KEYS = "study/shipped/quick.yaml"
-"""File of this package that shows the keys of a study, for messages."""
+"""Bundled file that shows the keys of a study, for messages."""
 
 
 _Lines = dict[Place, tuple[Path, int]]
-"""File and line (from 1) of every place of a study."""
+"""File and line (from 1) of every key path of a study."""
 
 
 class _PlacedError(ValueError):
@@ -150,7 +150,7 @@ class _Joined(Study):
 
     def _check_each_variant(self) -> None:
         for name, variant in self.variants.items():
-            # Seconds are of whatever else is measured of a variant.
+            # Timing applies to whatever else is measured of a variant.
             measuring = [p for p in probes() if name in p.measured(self) and not p.times_in_turn]
             try:
                 if not measuring or not all(p.edits for p in measuring):
@@ -189,7 +189,7 @@ def _check_metric(front: Front, front_probe: Probe[Any], key: str) -> None:
 
 
 def parse_study(data: Any) -> Study:
-    """A study from plain data, with the parts of every probe.
+    """Parse a study from plain data, with the parts of every probe.
 
     Raises:
         ValidationError: an unknown key or a value out of range.
@@ -205,7 +205,7 @@ def parse_study(data: Any) -> Study:
 
 
 def parse_variant(data: Any) -> Variant:
-    """A variant from plain data, with the parts of every probe.
+    """Parse a variant from plain data, with the parts of every probe.
 
     Raises:
         ValidationError: an unknown key or a value out of range.
@@ -215,7 +215,7 @@ def parse_variant(data: Any) -> Variant:
 
 @cache
 def _models(joined: tuple[Probe[Any], ...]) -> tuple[type[Study], type[Variant]]:
-    """The models of a study and of a variant, with the parts of these probes."""
+    """The models of a study and of a variant, with the parts of ``joined``."""
     variant_parts = [p.variant_part for p in joined if p.variant_part is not None]
     study_parts = [p.study_part for p in joined if p.study_part is not None]
     variant: Any = create_model("Variant", __base__=(Variant, *variant_parts))
@@ -228,10 +228,10 @@ def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:
     """Every cell of a study, scene by scene; variants of the same content share one.
 
     Args:
-        scenes: the loaded scenes by the names that the study gives them.
+        scenes: the loaded scenes by their names in the study.
 
     Raises:
-        StudyError: the study and a scene do not fit, such as a view that the scene lacks.
+        StudyError: the study does not fit a scene, such as a view that the scene lacks.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -258,12 +258,12 @@ def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:
         for cell in cells
     ]
     place = {name: i for i, name in enumerate(ordered)}
-    # What has no scene comes last, in its own order.
+    # Cells without a scene come last, in their order.
     return merged(sorted(cells, key=lambda cell: place.get(cell.scene, len(place))))
 
 
 def shipped_studies() -> dict[str, Path]:
-    """Studies that come with the package or in the folder ``studies`` of a plugin's, by name."""
+    """Studies that come with the package or in a plugin's folder ``studies``, by name."""
     own = Path(str(resources.files("attnwarp_eval.study") / "shipped"))
     files = [p for folder in (own, *plugin_folders("studies")) for p in folder.glob("*.yaml")]
     return {p.stem: p for p in sorted(files, key=lambda p: p.stem)}
@@ -272,16 +272,16 @@ def shipped_studies() -> dict[str, Path]:
 def load_study(name_or_path: str, **overrides: Any) -> Study:
     """Read a study by the name of a shipped one or by the path of a YAML file.
 
-    Relative paths in the file count from the file's folder; those of ``overrides`` from the current
-    one.
+    Relative paths in the file start at the file's folder; those of ``overrides`` at the current
+    folder.
 
     Args:
-        name_or_path: such as ``quick`` or ``my/study.yaml``.
+        name_or_path: name or path, such as ``quick`` or ``my/study.yaml``.
         overrides: fields to replace, such as ``size`` or ``scenes``; None leaves a field as it is.
 
     Raises:
-        StudyError: no such study, not YAML, an unknown key, a value out of range, a variant that no
-            probe measures, or studies that extend each other in a circle.
+        StudyError: no such study, invalid YAML, an unknown key, a value out of range, a variant
+            that no probe measures, or studies that extend each other in a circle.
 
     Example:
         >>> study = load_study("quick", scenes=["spheres"])
@@ -309,7 +309,7 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         # Reports call a scene of the file by its name.
         data["scenes"] = [files.get(name, name) for name in data["scenes"]]
     if isinstance(data.get("scenes"), list):
-        # The run is reported and inspected from other folders than this one.
+        # Absolute paths: the run is reported and inspected from other folders.
         data["scenes"] = [
             str(Path(name).expanduser().absolute()) if is_scene_file(name) else name
             for name in data["scenes"]
@@ -333,7 +333,7 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
                     f"{file}:{line}: variants.{name}: no probe measures it; name it under probes,"
                     " or leave it out"
                 )
-        # Those of an extended study, of which this one measures fewer.
+        # Tables of an extended study, of which this study measures fewer variants.
         kept = {name: value for name, value in data["variants"].items() if name not in idle}
         shown = data.get("pictures", {})
         rows = [name for name in shown.get("variants", ()) if name not in idle]
@@ -345,11 +345,11 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
 
 
 def _parsed(data: dict[str, Any], inherited: Callable[[str], bool]) -> tuple[Study, dict[str, Any]]:
-    """A study, and its data without inherited tables of variants that it does not measure.
+    """Parse a study; also return its data without inherited tables of unmeasured variants.
 
     Args:
         data: data of the study.
-        inherited: True of a key that comes from an extended study.
+        inherited: predicate of keys that come from an extended study.
     """
     try:
         return parse_study(data), data
@@ -365,10 +365,10 @@ def _parsed(data: dict[str, Any], inherited: Callable[[str], bool]) -> tuple[Stu
 
 
 def _read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], _Lines]:
-    """A study's data joined with what it extends, and where each of its places is written.
+    """A study's data joined with its extended studies', and file and line of each key path.
 
     Args:
-        above: files that extend this one, the first of them first.
+        above: files that extend this one, outermost first.
     """
     try:
         read, data = read_yaml(read_text(path))
@@ -408,10 +408,10 @@ def _read(path: Path, above: tuple[Path, ...] = ()) -> tuple[dict[str, Any], _Li
 def _extended(
     base: dict[str, Any], base_lines: _Lines, own: dict[str, Any], own_lines: _Lines
 ) -> tuple[dict[str, Any], _Lines]:
-    """A study's own data over that of the one it extends.
+    """Merge a study's data over the data of the study that it extends.
 
-    Mappings are merged, all else is replaced; null takes away a key that the other has. Scenes of
-    meshes replace drawn ones, and the reverse, since they have other keys.
+    Mappings are merged, all else is replaced; null removes an inherited key. Scenes of meshes
+    replace drawn ones, and the reverse, since they have different keys.
     """
     replaced: list[Place] = []
 
@@ -441,16 +441,16 @@ def _extended(
 
 
 def _place(problem: Any) -> tuple[int | str, ...]:
-    """The place of a problem in the file; empty where the problem is of no single place."""
+    """Key path of a problem in the file; empty for a problem without a single place."""
     own = problem.get("ctx", {}).get("error")
     return own.place if isinstance(own, _PlacedError) else problem["loc"]
 
 
 def _beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """A study's data with its relative paths taken from the folder of its file.
+    """Resolve the relative paths in a study's data from the folder of its file.
 
     Paths are scenes such as ``my/scene.yaml`` and encoders such as ``clip:my/folder``. Values of
-    another type stay as they are, for the error that comes later.
+    another type stay as they are, for a later error message.
     """
 
     def beside(text: Any) -> Any:
@@ -476,11 +476,11 @@ def _beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def explain_errors(error: ValidationError, model: type[BaseModel] | None = None) -> str:
-    """Pydantic's errors in one readable text: each key, what came, and what was expected.
+    """Pydantic's errors in one readable text: each key, the given value, and the expected value.
 
     Args:
-        error: error of a study, or
-        model: model of this part.
+        error: validation error of a study or of a part.
+        model: model of the part.
     """
     model = model or _models(tuple(probes()))[0]
     problems = error.errors(include_url=False)

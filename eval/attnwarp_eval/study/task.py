@@ -1,4 +1,4 @@
-"""Work that no study names, stored and resumed as a study's cells are."""
+"""Work outside studies, stored and resumed like a study's cells."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Task(Generic[T]):
-    """A unit of work whose record is a cell of a folder.
+    """Unit of work whose record is a cell of a folder.
 
     Attributes:
-        title: for the display of progress.
-        spec: everything that decides the result, and nothing else.
-        compute: makes the rest of the record, as JSON.
-        read: makes the result of a record; a record that it cannot read is computed again.
+        title: title for the progress display.
+        spec: all inputs that decide the result, and no others.
+        compute: function that computes the rest of the record, as JSON.
+        read: function from record to result; a record that it refuses is computed again.
     """
 
     title: str
@@ -34,12 +34,12 @@ class Task(Generic[T]):
 def results(
     store: Store, tasks: Iterable[Task[T]], total: int, report: Reporter = SILENT
 ) -> Iterator[T]:
-    """The results of tasks, in their order. After an interruption only missing ones are computed.
+    """Compute the results of tasks, in order. After an interruption only missing ones are computed.
 
     Args:
-        store: store of the folder, which is locked meanwhile.
-        tasks: taken one by one, so that what one of them holds can be freed.
-        report: receives each task, and what is at work in it.
+        store: store of the folder, locked during the call.
+        tasks: tasks, consumed one by one, so that each can be freed.
+        report: callback for each task and its progress.
 
     Raises:
         StoreError: another run is writing to the folder.

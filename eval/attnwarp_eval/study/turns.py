@@ -17,7 +17,7 @@ class Timed:
     """Seconds of one stage of contestants that ran in turn.
 
     Attributes:
-        turns: one for each cell that timed the stage.
+        turns: timings, one for each cell that timed the stage.
         stage: stage of :class:`InTurn`.
     """
 
@@ -26,12 +26,12 @@ class Timed:
 
     @property
     def baseline(self) -> str:
-        """The contestant that all ratios are to."""
+        """The contestant that is the denominator of all ratios."""
         return self.turns[0].names[0]
 
     def rounds(self, name: str | None) -> list[list[float]]:
-        """Seconds of a contestant: a list of rounds for each cell that has it; the baseline's
-        second run for None.
+        """Seconds of a contestant: a list of rounds for each cell with the contestant; None gives
+        the baseline's second run.
         """
         return [
             turn.seconds[self.stage][-1 if name is None else turn.names.index(name)]
@@ -40,7 +40,7 @@ class Timed:
         ]
 
     def of(self, stage: str) -> Timed:
-        """The seconds of another stage."""
+        """Timings of another stage."""
         return Timed(self.turns, stage)
 
     @property
@@ -55,7 +55,7 @@ class Timed:
 
     @property
     def noise(self) -> Ratio:
-        """The baseline against itself: what the machine's noise alone does."""
+        """Ratio of the baseline to itself: the machine's noise."""
         return time_ratio(self.rounds(None), self.rounds(self.baseline))
 
     def ratio(self, name: str) -> Ratio:
@@ -64,14 +64,14 @@ class Timed:
         return time_ratio(self.rounds(name), Timed(both, self.stage).rounds(self.baseline))
 
     def seconds(self, name: str) -> Interval:
-        """The baseline's times the ratio, so that a slow moment of the machine falls out."""
+        """The baseline's seconds times the ratio, which cancels slow moments of the machine."""
         ratio, base, nan = self.ratio(name), self.base, float("nan")
         low, high = base * ratio.low, base * ratio.high
         return Interval(base * ratio.ratio, low, high, 1, 1, 0, nan, nan)
 
     def resampled(self, name: str, draws: int) -> FloatArray:
-        """(draws,) :meth:`seconds` of rounds drawn with replacement in each cell, the same rounds
-        for every contestant of a cell; apart from any draw of a plain seed.
+        """(draws,) :meth:`seconds` of rounds resampled with replacement in each cell, the same
+        rounds for every contestant of a cell; independent of other draws with the same seed.
         """
         medians = []
         for index, turn in enumerate(self.turns):
@@ -86,8 +86,8 @@ class Timed:
         return seconds
 
     def judge(self, ratio: Ratio) -> str:
-        """Faster or slower only outside the band that the baseline against itself spans, and from
-        so many rounds on that there is one.
+        """Verdict "faster" or "slower" only outside the band of the baseline against itself, and
+        from enough rounds for a band.
         """
         noise = self.noise
         if not (noise.bounded and ratio.bounded):
@@ -101,7 +101,7 @@ class Timed:
 
 
 def timed_in_turn(results: Results, stage: str) -> Timed | None:
-    """The seconds of a stage that cells of a run took in turn; None where none did."""
+    """The seconds of a stage that cells of a run took in turn; None if none did."""
     turns = [
         turn
         for cell in results.cells

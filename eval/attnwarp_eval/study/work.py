@@ -1,4 +1,4 @@
-"""Compute one cell, in whatever process."""
+"""Computation of one cell, in any process."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = Non
     """Compute a cell.
 
     Args:
-        root: the run's folder; the cell's pictures go below it.
-        threads: threads of the renderer; every core this process may use, if left out.
+        root: the run's folder; pictures are saved below it.
+        threads: threads of the renderer; by default every core available to this process.
 
     Raises:
         InputError: the scene's file has changed since the cell was planned.
     """
-    load_plugins()  # a worker has only what came with the cell
-    silence_notices()  # the run's plan has them
-    # Image-sized tensor operations gain little from threads and lose much when other processes want
-    # the cores; the renderer's own threads are counted apart.
+    load_plugins()  # a worker has only the data sent with the cell
+    silence_notices()  # the run's plan reports them
+    # Image-sized tensor operations gain little from threads and slow down when other processes need
+    # the cores; the renderer's threads are set separately.
     torch.set_num_threads(1)
     set_thread_count(threads or core_count())
     meter = Meter()
@@ -64,7 +64,7 @@ def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = Non
 
 
 def _check_metrics(probe: Probe[Any], work: Work) -> None:
-    """A figure without a specification could not be reported."""
+    """Require a specification of every figure, which reports need."""
     for view in work.views:
         for key in view.metrics:
             try:
@@ -78,10 +78,10 @@ def _check_metrics(probe: Probe[Any], work: Work) -> None:
 def compute_and_write(
     probe: Probe[Any], cell: Cell, root: str, threads: int | None = None
 ) -> Failure | None:
-    """Compute one cell and write its record; return what went wrong, or None.
+    """Compute one cell and write its record; return its failure, or None.
 
-    The cell is written where it was computed, so a lost connection cannot lose a result. Every kind
-    of error is turned into a row of the table of failed cells: one bad cell must not cost the
+    The cell is written where it is computed, so a lost connection loses no result. Every error
+    becomes a row of the table of failed cells: one bad cell must not cost the
     others.
     """
     try:
@@ -94,7 +94,7 @@ def compute_and_write(
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
-    """Return True if an error began as Ctrl-C: native code that it lands in raises one of its own,
+    """Return True if an error began as Ctrl-C: native code interrupted by it raises its own error,
     such as "returned a result with an exception set".
     """
     seen: set[int] = set()
@@ -107,7 +107,7 @@ def _is_interrupt(error: BaseException | None) -> bool:
 
 
 def failure(cell: Cell, error: BaseException) -> Failure:
-    """An exception as the row of the table of failed cells."""
+    """Convert an exception to a row of the table of failed cells."""
     return Failure(
         cell.scene,
         cell.variant,

@@ -1,7 +1,7 @@
-"""Budgets of methods: a study's YAML, seconds that another variant takes, and what came of them.
+"""Budgets of methods: a study's YAML, limits from another variant's seconds, and their outcome.
 
-A budget in seconds makes a cell's result depend on the machine and on what else runs there. Records
-of such cells say so, and no comparison of runs reads their figures.
+A budget in seconds makes a cell's result depend on the machine and its load. Records of such cells
+say so, and comparisons of runs skip their figures.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from attnwarp_eval.study.schema import Part
 
 
 class BudgetPart(Part):
-    """Limits of a variant's method: no edit and no iteration of tuning begins beyond them.
+    """Limits of a variant's method: no edit or tuning iteration begins beyond them.
 
-    ``seconds_of`` names a variant whose own seconds in the same process are the limit;
+    ``seconds_of`` names a variant whose seconds in the same process are the limit;
     ``network_rows`` counts rows through the editor's network, and does not depend on the machine.
     """
 
@@ -42,10 +42,10 @@ class Spent:
     """Outcome of a budget.
 
     Attributes:
-        seconds: that the method was given; None for no limit.
-        seconds_of: the variant that took them; None for a number of the study.
-        network_rows: that the method was given; None for no limit.
-        cut: the limit that ended the method; None where it finished.
+        seconds: limit in seconds; None for no limit.
+        seconds_of: variant that gave the limit; None if the study states a number.
+        network_rows: limit in rows; None for no limit.
+        cut: limit that ended the method; None if it finished.
     """
 
     seconds: float | None
@@ -55,7 +55,7 @@ class Spent:
 
 
 def timed(spec: Mapping[str, Any]) -> bool:
-    """Return True if a cell's result depends on how fast the machine is.
+    """Return True if a cell's result depends on the machine's speed.
 
     >>> timed({}), timed({"budget": {"network_rows": 9}}), timed({"budget": {"seconds": 2.0}})
     (False, False, True)
@@ -64,9 +64,9 @@ def timed(spec: Mapping[str, Any]) -> bool:
 
 
 class Stopwatch:
-    """Seconds of methods in this process, by what they compute.
+    """Seconds of methods in this process, by spec.
 
-    A method's first run in a process pays for compilation; it is not taken.
+    A method's first run in a process pays for compilation; it is skipped.
     """
 
     def __init__(self) -> None:
@@ -74,14 +74,14 @@ class Stopwatch:
         self._warm: set[str] = set()
 
     def note(self, spec: Json, seconds: float) -> None:
-        """Take the seconds of a run."""
+        """Record the seconds of a run."""
         kind = digest([spec["method"], spec["editor"], spec["size"]])
         if kind in self._warm:
             self._seconds.setdefault(digest(spec), seconds)
         self._warm.add(kind)
 
     def seconds(self, spec: Json, run: Callable[[], float]) -> float:
-        """Seconds of a run; those taken before, else it is run."""
+        """Recorded seconds of a run; ``run`` is called if there are none."""
         while (taken := self._seconds.get(digest(spec))) is None:
             self.note(spec, run())
         return taken

@@ -1,7 +1,7 @@
-"""Controls of studies of edits: features that a method cannot be right with, and other noise.
+"""Controls of studies of edits: features from a wrong source, and other noise.
 
-A study that does not tell the method from wrong features is blind to where features come from,
-whatever it says of two methods. One that tells it from itself with another seed tells too much.
+If a metric does not separate a method from wrong features, the study cannot judge where features
+come from. A metric that separates two seeds of one method is too sensitive.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ OTHER_SCENE: Control = "another scene"
 """Control whose features are those of the next scene's source, edited under the same words."""
 
 OTHER_SEED: Control = "another seed"
-"""Negative control: the same variant with other noise and other stages."""
+"""Negative control: the same variant with another seed for noise and stages."""
 
 SEED_STEP, SCENE_STEP = 1_000_003, 1009
-"""Difference of the seed of :data:`OTHER_SEED` from the study's, and of a drawn scene's from
-that of the scene before it."""
+"""Offset of the seed of :data:`OTHER_SEED` from the study's, and of a drawn scene's seed from the
+previous scene's."""
 
 DISPLACEMENT = 1 / 8
-"""Share of the source's width by which ``displaced`` moves what is taken."""
+"""Share of the source's width by which ``displaced`` shifts the sampled features."""
 
 
 def moved(xy: Tensor, width: int, control: Control, share: float = DISPLACEMENT) -> Tensor:
-    """(H, W, 2) positions in a source of some width, mirrored left to right or displaced to the
-    right by a share of it; what leaves the picture enters it on the other side.
+    """(H, W, 2) positions in a source of the given width, mirrored left to right or displaced to
+    the right by a share of the width; positions wrap around at the border.
 
     Example:
         >>> xy = torch.tensor([[[0.5, 0.5], [7.5, 0.5]]])
@@ -58,14 +58,14 @@ class MovedView(WarpedView):
 
     @classmethod
     def of(cls, view: WarpedView, control: Control, share: float = DISPLACEMENT) -> MovedView:
-        """The wrong warp of a right one."""
+        """Make the control's warp from a correct one."""
         own = {f.name: getattr(view, f.name) for f in fields(view) if f.init}
         return cls(**own, control=control, share=share)
 
     def at(
         self, size: tuple[int, int], *, source_size: tuple[int, int] | None = None
     ) -> FeatureWarp:
-        """The warp of an (h, w) grid of the target, from the wrong place of the source's."""
+        """Warp of an (h, w) grid of the target, from the wrong place in the source."""
         key = (*size, *(source_size or ()))
         if key not in self._moved:
             layer = super().at(size, source_size=source_size)

@@ -1,4 +1,4 @@
-"""The true pictures of one edit in all views of a cell, and which answer an edited view shows."""
+"""True pictures of one edit in all views of a cell, and the nearest answer of edited views."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 ONLY = "edited"
-"""Name of the answer of an edit that has one alone."""
+"""Name of the answer of an edit with a single answer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class EditTruth:
 
     Attributes:
         originals: (H, W, 3) sRGB in [0, 1] by view, before the edit.
-        answers: the same after the edit, by answer and view.
+        answers: the same pictures after the edit, by answer and view.
         masks: (H, W) bool by answer and view, the edited object; all True for an edit of the light.
         union: by view, the union of the answers' masks.
     """
@@ -45,7 +45,7 @@ class EditTruth:
 
     @property
     def ambiguous(self) -> bool:
-        """True if there is more than one right answer."""
+        """True if several answers are right."""
         return len(self.answers) > 1
 
     def of(self, views: Sequence[str]) -> EditTruth:
@@ -58,7 +58,7 @@ class EditTruth:
         )
 
     def judge(self, pictures: Mapping[str, Any]) -> Judgement:
-        """Judge whether pictures of some views show an edit that was done, and which answer.
+        """Judge whether pictures of some views show the edit, and which answer.
 
         Args:
             pictures: (H, W, 3) sRGB in [0, 1] by view.
@@ -79,10 +79,10 @@ class Judgement:
     """Judgement of edited views.
 
     Attributes:
-        answer: the nearest; None where nothing of the object is in the pictures.
+        answer: nearest answer; None if none of the object is visible.
         done: whether the pictures are nearer to it than to the unedited ones, and than those are.
-        psnr: dB to it inside the edited object, pooled over the views.
-        unedited: dB of the unedited pictures to it.
+        psnr: dB to the answer inside the edited object, pooled over the views.
+        unedited: dB of the unedited pictures to the answer.
         unchanged: dB of the pictures to the unedited ones.
     """
 
@@ -94,17 +94,17 @@ class Judgement:
 
 
 def answers_of(scene: Scene, edit: str) -> list[tuple[str, str | None]]:
-    """(name, answer as the scene has it) of an edit's right answers.
+    """(name, answer in the scene's notation) of an edit's right answers.
 
     Args:
-        edit: its name, or ``name=answer`` for one answer of an ambiguous edit alone.
+        edit: name of the edit, or ``name=answer`` for a single answer of an ambiguous edit.
 
     Raises:
-        ValueError: there is no such answer.
+        ValueError: no such answer.
     """
     title, _, answer = edit.partition("=")
     if answer:
-        pick(scene.edit(title), answer)  # refuses an answer that is not there
+        pick(scene.edit(title), answer)  # refuses an unknown answer
         return [(answer, answer)]
     answers = scene.edit(title).answers
     return [(one.name, one.name) for one in answers] or [(ONLY, None)]
@@ -127,12 +127,12 @@ def edit_truth(
 
     Args:
         scene, size: arguments of :func:`attnwarp_eval.world.world`.
-        edit: as for :func:`answers_of`.
-        views: names, the source among them.
-        planned: the answers for which the cell was planned; whatever the file says if None.
+        edit: name of the edit, as for :func:`answers_of`.
+        views: names, including the source.
+        planned: answers of the planned cell; None accepts those of the file.
 
     Raises:
-        InputError: the answers are not those ``planned``.
+        InputError: the answers differ from ``planned``.
     """
     of = world(scene, size)
     title = edit.partition("=")[0]
@@ -146,7 +146,7 @@ def planned_truth(cell: Cell, views: Sequence[str]) -> EditTruth:
     """The truth of the edit that a cell was planned for.
 
     Raises:
-        InputError: the scene's file has another edit by now.
+        InputError: the edit in the scene's file has changed.
     """
     spec = cell.spec
     edit = spec["edit"]
@@ -170,7 +170,7 @@ def _edit_truth(
     edit: str,
     views: tuple[str, ...],
 ) -> EditTruth:
-    """``content`` and ``hashes``: what the scene's file says now, before the edit and after it."""
+    """``content`` and ``hashes``: scene content in the file, before and after the edit."""
     of = world(scene, size)
     answers = answers_of(of.scene, edit)
     title = edit.partition("=")[0]
@@ -194,8 +194,8 @@ def _edit_truth(
 
 
 def neighbours(of: World, views: Sequence[str]) -> dict[str, str]:
-    """Neighbour of each target: the nearest by yaw of the source and of the targets that are nearer
-    to it.
+    """Neighbour of each target: the nearest by yaw among the source and the targets that are nearer
+    to the source.
     """
     yaw = {of.source.name: 0.0, **of.signed_yaw}
     ordered = [of.source.name, *sorted(views, key=lambda view: of.yaw[view])]
@@ -203,7 +203,7 @@ def neighbours(of: World, views: Sequence[str]) -> dict[str, str]:
     def apart(first: str, second: str) -> float:
         return abs((yaw[first] - yaw[second] + 180) % 360 - 180)
 
-    # Of several equally near ones the last counts.
+    # Of equally near views the last counts.
     return {
         view: min(reversed(ordered[:k]), key=partial(apart, view))
         for k, view in enumerate(ordered)

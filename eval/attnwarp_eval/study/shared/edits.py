@@ -1,4 +1,4 @@
-"""Edits of scenes by methods: the keys of a study that several probes read, and a cell's spec."""
+"""Edits of scenes by methods: study keys shared by several probes, and entries of a cell's spec."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from attnwarp_eval.study.shared.splats import splats_meaning, splats_spec
 E = TypeVar("E", bound=Extra)
 
 LEAST_PIXELS = 16
-"""Agreement is undefined where fewer pixels of a view are compared, the area of one cell of the
-bundled editors' latents. Views count alike in a mean, so a single pixel would weigh as much as a
-whole view."""
+"""Least compared pixels for agreement to be defined: the area of one latent cell of the bundled
+editors. Views have equal weight in a mean, so a single pixel would weigh as much as a whole
+view."""
 
 
 class IdealPart(Part):
     """The ideal editor (docs/measuring/ideal-editor.md).
 
-    ``parts`` of the thing, each in one of ``colors``; ``settled``: mean share of the steps before
-    an answer holds; ``cross``: what cross-attention gives.
+    ``parts`` of the thing, each in one of ``colors``; ``settled``: mean share of the steps until
+    an answer holds; ``cross``: output of cross-attention.
     """
 
     parts: Annotated[Whole, Field(ge=1, le=1000)] = 12
@@ -51,9 +51,9 @@ class IdealPart(Part):
 class EditorPart(Part):
     """An editor of single views.
 
-    ``name`` is bundled or a folder in diffusers' format. Guidance left out is the editor's own.
-    ``draws: false`` takes from a bundled editor what lets the noise's mean choose an answer.
-    ``ideal`` takes the ideal editor in place of these, for the probe ``ideal``.
+    ``name`` is a bundled editor or a folder in diffusers' format. Guidance defaults to the
+    editor's. ``draws: false`` removes a bundled editor's choice of answer by the noise's mean.
+    ``ideal`` selects the ideal editor instead, for the probe ``ideal``.
     """
 
     name: str = "small-plain"
@@ -66,9 +66,9 @@ class EditorPart(Part):
 class Editing(Part):
     """Settings that all variants share.
 
-    ``edits``: by scene, an edit's name, or ``edit=answer`` for one of its answers alone, with the
-    words that the editor is given; the edit's own words where they are null. Scenes that are left
-    out have all their edits. ``by_yaw``: variants whose figures the report shows by yaw.
+    ``edits``: by scene, an edit's name, or ``edit=answer`` for a single answer, with the words for
+    the editor; null for the edit's words. Scenes that are left out have all their edits.
+    ``by_yaw``: variants whose figures the report shows by yaw.
     """
 
     editor: EditorPart = EditorPart()
@@ -83,19 +83,19 @@ class Editing(Part):
 
 
 class EditingPart(Part):
-    """Keys of a study: what is edited, and by which editor."""
+    """Keys of a study: the edits and the editor."""
 
     editing: Editing = Editing()
 
 
 class VariantPart(Part):
-    """Keys of a variant: the method, and what limits it.
+    """Keys of a variant: the method and its limits.
 
-    ``options`` are fields of the method's settings, over the study's; ``preset`` among them goes
-    before the variant's. ``{source}`` in ``source_prompt`` stands for the edit's
+    ``options`` are fields of the method's settings that override the study's; a ``preset`` among
+    them is applied before the variant's. ``{source}`` in ``source_prompt`` stands for the edit's
     ``source`` words. ``mask: truth`` injects where the source truly sees the
-    surface, ``geometry: truth`` warps by exact depth. ``budget`` cuts the method short.
-    ``control`` takes features from the wrong place or scene, or another seed
+    surface, ``geometry: truth`` warps by exact depth. ``budget`` limits the method.
+    ``control`` takes features from the wrong place or scene, or uses another seed
     (:mod:`attnwarp_eval.study.shared.controls`).
     """
 
@@ -108,14 +108,14 @@ class VariantPart(Part):
 
 
 class MethodProbe(Probe[E]):
-    """Base of probes that run a variant's method of editing."""
+    """Base of probes that run a variant's editing method."""
 
     edits = True
     whole = False
-    """True where methods run whole: ``budget`` decides nothing."""
+    """True if methods run to their end: ``budget`` has no effect."""
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """The method with all its settings, the editor, and where splats and warps come from."""
+        """The method with its settings, the editor, and the sources of splats and warps."""
         own = variant.part(VariantPart)
         settings = settings_of(study, variant, seed + SEED_STEP * (own.control == OTHER_SEED))
         limits: Json = {} if self.whole else self._budget_spec(study, variant, seed)
@@ -134,10 +134,10 @@ class MethodProbe(Probe[E]):
     def other_scene(
         self, study: Study, variant: Variant, scene: str, scenes: Mapping[str, Scene]
     ) -> tuple[Json, dict[str, str]]:
-        """Entries of a cell's spec and of its sources for features of another scene: the next one.
+        """Entries of a cell's spec and sources for features of the next scene.
 
         Raises:
-            StudyError: there is no other scene.
+            StudyError: the study has no other scene.
         """
         if variant.part(VariantPart).control != OTHER_SCENE:
             return {}, {}
@@ -157,7 +157,7 @@ class MethodProbe(Probe[E]):
         return {}
 
     def _budget_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """Limits of the method; for the seconds of another variant, all that decides its run."""
+        """Limits of the method; for another variant's seconds, the full spec of its run."""
         part = variant.part(VariantPart).budget
         if part is None:
             return {}
@@ -169,7 +169,7 @@ class MethodProbe(Probe[E]):
         return {"budget": budget}
 
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
-        """Everything that decides a cell but for its seed."""
+        """Everything that decides a cell except its seed."""
         own = variant.part(VariantPart)
         settings = settings_of(study, variant, 0)
         return (
@@ -178,11 +178,11 @@ class MethodProbe(Probe[E]):
         )  # fmt: skip
 
     def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:
-        """Return True if method, editor, splats, warp and budget are the same. Of the method's
-        other settings, only those count that ``wanted`` names.
+        """Return True if method, editor, splats, warp and budget are equal, and those of the
+        method's other settings that ``wanted`` names.
         """
         if variant.part(VariantPart).method != wanted.part(VariantPart).method:
-            return False  # the study's options need not fit the other method
+            return False  # the study's options may not fit the other method
         counts = {"warp", *wanted.part(VariantPart).options}
 
         def kind(of: Variant) -> list[Any]:
@@ -193,23 +193,23 @@ class MethodProbe(Probe[E]):
 
         try:
             asked = kind(wanted)
-        except ValueError:  # what is asked does not go with the study's options
+        except ValueError:  # ``wanted`` conflicts with the study's options
             return False
         return kind(variant) == asked
 
 
 def scene_seed(study: Study, scene: str, seed: int) -> int:
-    """Seed of a scene's noise: the study's own, and on drawn scenes another for each.
+    """Seed of a scene's noise: the study's seed, offset for each drawn scene.
 
-    An open instruction's answer follows from the noise's mean, so that with one seed most scenes
-    get the same answer. Scenes of a sample have to be independent.
+    An open instruction's answer follows from the noise's mean, so one seed would give most scenes
+    the same answer. Scenes of a sample must be independent.
     """
     sample = study.population.names if study.population else []
     return seed + SCENE_STEP * sample.index(scene) if scene in sample else seed
 
 
 def settings_of(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
-    """The settings of a variant's method: a preset, the study's fields, the variant's, and the
+    """Settings of a variant's method: a preset, the study's fields, the variant's, and the
     fields of its warp.
 
     Raises:
@@ -232,15 +232,15 @@ def reference_of(variant: Variant) -> str | None:
 
 
 def editor_of(study: Study, variant: Variant) -> EditorPart:
-    """The variant's own editor, else the study's."""
+    """The variant's editor, else the study's."""
     return variant.part(VariantPart).editor or study.part(EditingPart).editing.editor
 
 
 def editor_identity(editor: EditorPart) -> Json:
-    """Parts of an editor that decide its pictures: its files and its guidance, not its folder.
+    """Entries that decide an editor's pictures: its files and guidance, not its folder.
 
     Raises:
-        StudyError: there is none of that name, or it has no draw to leave out.
+        StudyError: no editor of that name, or no draw to leave out.
     """
     from attnwarp.editing.small import guide_of
 
@@ -260,7 +260,7 @@ def files_digest(name: str) -> str:
     """SHA-256 of an editor's files.
 
     Raises:
-        StudyError: there is none of that name.
+        StudyError: no editor of that name.
     """
     from attnwarp.editing.small import SUMS, folders_of
 
@@ -270,7 +270,7 @@ def files_digest(name: str) -> str:
         raise StudyError(str(error)) from None
     files = {path.relative_to(folder): path for path in folder.rglob("*")}
     if control is not None and control != folder / "controlnet":
-        # As if it stood there; a ControlNet that does is not read.
+        # Name it as if in the folder; a ControlNet in the folder is not read.
         files = {place: path for place, path in files.items() if place.parts[0] != "controlnet"}
         files |= {"controlnet" / path.relative_to(control): path for path in control.rglob("*")}
     sums = [

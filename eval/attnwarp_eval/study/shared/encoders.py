@@ -1,4 +1,4 @@
-"""Encoders of pictures and words that several probes measure with."""
+"""Encoders of pictures and words shared by several probes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def encoder_sources(part: EncodersPart) -> dict[str, str]:
 
 
 def encoder_identities(part: EncodersPart) -> dict[str, dict[str, Any]]:
-    """Encoders by their weights: other weights give other cells, another folder does not."""
+    """Identities of encoders: different weights give different cells, another folder does not."""
     identities = {}
     for kind, name in part.encoders.items():
         try:
@@ -48,7 +48,7 @@ def encoder_identities(part: EncodersPart) -> dict[str, dict[str, Any]]:
 
 
 def identity(name: str, kind: Kind) -> dict[str, Any]:
-    """Parts of an encoder that decide its figures: its weights and its preprocessing, not its path.
+    """Entries that decide an encoder's figures: weights and preprocessing, not the path.
 
     Raises:
         InputError: see :func:`attnwarp.encoders.load_encoder`.
@@ -57,7 +57,7 @@ def identity(name: str, kind: Kind) -> dict[str, Any]:
 
 
 def identity_of(encoder: Any) -> dict[str, Any]:
-    """:func:`identity` of an encoder that is loaded."""
+    """Identity of a loaded encoder, as :func:`identity` gives it."""
     about = encoder.about.to_dict()
     return {key: about[key] for key in ("kind", "weights_sha256", "preprocessing", "size", "dim")}
 
@@ -66,11 +66,11 @@ def loaded(names: Mapping[str, str], expected: Mapping[str, Mapping[str, Any]]) 
     """Encoders by kind.
 
     Args:
-        names: by kind, as :func:`attnwarp.encoders.load_encoder` takes them.
-        expected: by kind, the :func:`identity` that they had when the run was planned.
+        names: names for :func:`attnwarp.encoders.load_encoder`, by kind.
+        expected: :func:`identity` of each at planning, by kind.
 
     Raises:
-        InputError: one cannot be loaded, or is another one by now.
+        InputError: an encoder cannot be loaded, or has changed.
     """
     encoders = {}
     for kind, planned in expected.items():
@@ -84,7 +84,7 @@ def loaded(names: Mapping[str, str], expected: Mapping[str, Mapping[str, Any]]) 
 
 
 def encoders_named(study: Study, spec: Mapping[str, Any]) -> str:
-    """A sentence with the encoders of a cell and the first digits of their weights' SHA-256."""
+    """Sentence on the encoders of a cell, with the first digits of their weights' SHA-256."""
     names = study.part(EncodersPart).encoders
     encoders = [
         f"{kind} `{names[kind]}` ({identity['weights_sha256'][:12]})"

@@ -1,4 +1,4 @@
-"""Fits of splats that several probes measure: the keys of a study, and the fit of a cell."""
+"""Fits of splats shared by several probes: study keys, and the fit of a cell."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from attnwarp_eval.study.schema import Part, Study, Variant
 
 
 class Fits(Part):
-    """Views and first points of every fit, and fields of :class:`attnwarp.fit.FitSettings`."""
+    """Views and initial points of every fit, and fields of :class:`attnwarp.fit.FitSettings`."""
 
     views: Annotated[int, Field(ge=9, le=10_000)] = 64
     points: Annotated[int, Field(ge=10, le=5_000_000)] = 5000
@@ -36,7 +36,7 @@ class StudyPart(Part):
 
 
 class VariantPart(Part):
-    """Keys of a variant: its own fields of the fit's settings; ``fitted`` has the other probes take
+    """Keys of a variant: its fields of the fit's settings; ``fitted`` makes the other probes use
     fitted splats in place of sampled ones.
     """
 
@@ -45,7 +45,7 @@ class VariantPart(Part):
 
 
 def settings_of(study: Study, variant: Variant, seed: int) -> FitSettings:
-    """The study's fit settings with the variant's own fields."""
+    """The study's fit settings, overridden by the variant's fields."""
     shared, own = study.part(StudyPart).fit.settings, variant.part(VariantPart).fit
     if "seed" in {**shared, **own}:
         raise ValueError("fit.seed: the seeds are the study's own; set seeds there")
@@ -59,15 +59,15 @@ def fit_spec(study: Study, variant: Variant, seed: int) -> Json:
 
 
 def fit_of(work: Work, spec: Mapping[str, Any] | None = None) -> attnwarp.fit.Fit:
-    """The fit that a cell's spec, or ``spec`` in its place, names under ``fit``.
+    """Run or load the fit under ``fit`` in a cell's spec, or in ``spec``.
 
-    It lies below the run's folder, named by what decides it: cells that want the same fit share
-    it, and one that was cut short is resumed.
+    The fit is saved below the run's folder under a name from its spec: cells with the same fit
+    share it, and an interrupted fit is resumed.
     """
     spec, world = work.spec if spec is None else spec, work.world
     data, folder = spec["fit"], folder_of(work.root, spec)
     folder.mkdir(parents=True, exist_ok=True)
-    # Where two workers want one fit, the second reads what the first has done.
+    # If two workers need one fit, the second reads the first's result.
     with locked(folder / ".lock", wait=True):
         return fitted.fit_scene(
             world.scene,
@@ -83,6 +83,6 @@ def fit_of(work: Work, spec: Mapping[str, Any] | None = None) -> attnwarp.fit.Fi
 
 
 def folder_of(root: Path, spec: Mapping[str, Any]) -> Path:
-    """The folder of the fit that a cell's spec names under ``fit``, below a run's folder."""
+    """Folder, below a run's folder, of the fit under ``fit`` in a cell's spec."""
     keys = ("scene", "size", "spp", "seed")
     return root / "fits" / digest({**spec["fit"], **{key: spec[key] for key in keys}})[:16]

@@ -1,4 +1,4 @@
-"""Run of a method that edits a scene, as a cell's spec names it."""
+"""Run of an editing method, as a cell's spec describes it."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
     from attnwarp.methods import Budget
 
 EDITING_PARTS = ("source", "warp", "edit")
-"""Parts of a method's seconds that are neither tuning nor for people."""
+"""Parts of a method's seconds except tuning and display."""
 
 PARTS = (*EDITING_PARTS, "tune")
-"""Parts of a method's seconds that are its own; renders and files are for people."""
+"""Parts of a method's seconds except display: renders and files are for people."""
 
 WHOLE = "whole"
 """Stage of :class:`~attnwarp_eval.study.probe.InTurn`: all parts of an edit together."""
 
 FLOOR = "by_view"
-"""The method of a comparison that does so."""
+"""Name of the method that edits each view alone."""
 
 
 def run_method(
@@ -58,15 +58,15 @@ def run_method(
     donor: Donor | None = None,
     segments: Sequence[npt.NDArray[np.bool_]] | None = None,
 ) -> EditedScene:
-    """Edit a scene by the method of a cell; its seconds go to the work's meter.
+    """Edit a scene by the method of a cell; its seconds are added to the work's meter.
 
     Args:
         work: work of the cell, whose spec has ``method``, ``settings``, ``editor`` and ``edit``.
         names: names of the views, the source first.
-        editor: in place of the one that the spec names.
-        donor: donor of the control's features; the other scene's source with the same editor if
-            left out.
-        segments: (H, W) bool of each view, outside which nothing changes.
+        editor: replacement of the spec's editor.
+        donor: source of the control's features; by default the other scene's source with the same
+            editor.
+        segments: (H, W) bool of each view, the only pixels that may change.
     """
     spec, world = work.spec, work.world
     with work.meter.stage("setup"):
@@ -97,10 +97,10 @@ def run_method(
 
 
 def other_world(work: Work) -> World | None:
-    """World of the scene whose features a cell's control takes; None for another control.
+    """World of the other scene for a cell's control; None for other controls.
 
     Raises:
-        InputError: its file has changed since the cell was planned.
+        InputError: the scene's file has changed since the cell was planned.
     """
     other = work.spec.get("other")
     if other is None:
@@ -117,7 +117,7 @@ def _other_world(scene: str, size: int, content: str) -> World:
 
 
 def own_seconds(result: EditedScene) -> float:
-    """Seconds of a method's own parts together."""
+    """Total seconds of a method, without display."""
     return sum(result.seconds.get(part, 0.0) for part in PARTS)
 
 
@@ -132,7 +132,7 @@ def _loaded(name: str, guidance: tuple[tuple[str, float], ...], draws: bool, dev
 
 
 def load(name: str, planned: Json, device: str = "cpu") -> Editor:
-    """An editor whose identity is the planned one.
+    """Load an editor with the planned identity.
 
     Raises:
         StudyError: its files have changed since the run was planned.
@@ -149,10 +149,10 @@ def load(name: str, planned: Json, device: str = "cpu") -> Editor:
 
 
 def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
-    """Warps by exact depth, with the exact mask, or wrong ones; None for the method's own."""
+    """Warps by exact depth, with the exact mask, or of a control; None for the method's warps."""
     spec, world = work.spec, work.world
     control = spec.get("control")
-    if control == OTHER_SCENE:  # the right warp of wrong features
+    if control == OTHER_SCENE:  # the correct warp of wrong features
         control = None
     if spec["geometry"] == "splats" and spec["mask"] == "rules" and control is None:
         return None
@@ -177,8 +177,6 @@ def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
 
 
 def is_alone(spec: Mapping[str, Any]) -> bool:
-    """Return True if a variant's spec says that it edits each view by itself, and as long as it
-    likes.
-    """
+    """Return True if a variant's spec edits each view alone and without a budget."""
     itself = spec["method"] == FLOOR or spec["settings"].get("a0") == 0
     return itself and "budget" not in spec

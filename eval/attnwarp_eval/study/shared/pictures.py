@@ -1,4 +1,4 @@
-"""Pictures of one cell and view, for people; no number is taken from them."""
+"""Pictures of one cell and view, for display only."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CLASSES: dict[str, tuple[str, str]] = {
     "visible, rejected": ("#1f78b4", "lost"),
     "ambiguous, not scored": ("#d9d06b", "either"),
 }
-"""Colours of a mask against truth, and what each class means."""
+"""Colours of a mask against truth, with the meaning of each class."""
 
 EPE_RANGE = (1e-2, 10.0)
 """Pixels from the dark to the bright end of an endpoint error map, on a logarithmic scale."""
@@ -39,10 +39,10 @@ DEPTH_RANGE = 0.02
 
 
 ORDER = ("warped", "mask", "endpoint-error", "render", "depth-error")
-"""Order of pictures side by side in a row; others follow."""
+"""Order of pictures in a row; other pictures follow."""
 
 SHARED = ("source", "target")
-"""Pictures that are the same for every variant, and stand once above their rows."""
+"""Pictures that are the same for every variant, shown once above the variants' rows."""
 
 
 def of_warp(
@@ -73,12 +73,12 @@ def of_depth(surface: Surface, hits: Hits) -> dict[str, bytes]:
 
 
 def of_fit(surface: Surface, hits: Hits, image: npt.NDArray[np.uint8]) -> dict[str, bytes]:
-    """JPEG files of a view held out from a fit.
+    """JPEG files of a fit's held-out view.
 
     Args:
         surface: rendered surface of the splats, with its image.
         hits: truth of the view.
-        image: (H, W, 3) sRGB, its true picture.
+        image: (H, W, 3) sRGB, true picture of the view.
     """
     return _jpegs(
         {
@@ -104,7 +104,7 @@ def of_mask(
 
     Args:
         marked: (H, W) bool, the mask.
-        thing: (H, W) bool, the exact one.
+        thing: (H, W) bool, the exact mask.
     """
     target = world.image(name, spp)
     classes = (marked & thing, ~marked & thing, marked & ~thing)
@@ -122,7 +122,7 @@ def _jpegs(images: dict[str, Image]) -> dict[str, bytes]:
 def jpeg(image: Image) -> bytes:
     """An sRGB image in [0, 1], reduced to :data:`WIDTH`, as JPEG without chroma subsampling.
 
-    As PNG a report of them has three times the size.
+    A report with PNG pictures would be three times as large.
     """
     import cv2
 
@@ -151,13 +151,13 @@ def checkered(shape: tuple[int, int]) -> Image:
 
 
 def carried(source: Image, view: WarpedView) -> Image:
-    """(H, W, 3) the source image warped to the target, whatever the mask says."""
+    """(H, W, 3) the source image warped to the target, ignoring the mask."""
     planes = torch.from_numpy(np.ascontiguousarray(source.transpose(2, 0, 1)))
     return sample(planes, view.correspondence)[0].permute(1, 2, 0).numpy()
 
 
 def warped(source: Image, view: WarpedView) -> Image:
-    """(H, W, 3) the source image warped to the target; squares where the mask rejects."""
+    """(H, W, 3) the source image warped to the target; a checkerboard where the mask rejects."""
     height, width = view.mask.shape
     return np.where(view.mask.numpy()[..., None], carried(source, view), checkered((height, width)))
 

@@ -22,20 +22,20 @@ def splats_spec(study: Study, variant: Variant, seed: int) -> Json:
 
 
 def surface_spec(study: Study, variant: Variant, seed: int) -> Json:
-    """Source of a variant's depth: the truth, or splats."""
+    """Spec of a variant's depth: the truth, or splats."""
     if variant.geometry == "truth":
         return {"geometry": "truth"}
     if variant.part(fits.VariantPart).fitted:
-        # A fit depends on the samples of the pictures that it sees.
+        # A fit depends on the samples a pixel of its pictures.
         return {"spp": study.spp, **splats_spec(study, variant, seed)}
     return splats_spec(study, variant, seed)
 
 
 def check_splats(study: Study, probe: str, what: str) -> None:
-    """Raise ValueError if a probe of renders measures a variant that renders nothing.
+    """Raise ValueError if a rendering probe measures a variant without splats.
 
     Args:
-        study: with or without the probe.
+        study: study, with or without the probe.
         what: measured part of a render.
     """
     for name in study.probes.get(probe, []):
@@ -46,27 +46,27 @@ def check_splats(study: Study, probe: str, what: str) -> None:
 
 
 def splats_meaning(study: Study, variant: Variant) -> str:
-    """Key that variants of the same splats share, for claims."""
+    """Key shared by variants with the same splats, for claims."""
     return canonical_json(splats_spec(study, variant, 0))
 
 
 def surface_meaning(study: Study, variant: Variant) -> tuple[Any, ...]:
-    """Key that variants of the same depth and rules share, for claims."""
+    """Key shared by variants with the same depth and rules, for claims."""
     return variant.settings(), variant.geometry, splats_meaning(study, variant)
 
 
 def is_fitted(spec: Mapping[str, Any]) -> bool:
-    """Return True if a cell's splats are fitted: the seconds of that are the fit's own, in no
+    """Return True if a cell's splats are fitted: a fit's seconds are in the fit's folder, in no
     cell.
     """
     return "fit" in spec
 
 
 def splats_of(work: Work, spec: Mapping[str, Any] | None = None) -> Gaussians:
-    """The splats that a cell's spec names.
+    """Splats of a cell's spec.
 
     Args:
-        spec: in place of the cell's own.
+        spec: replacement of the cell's spec.
     """
     spec = work.spec if spec is None else spec
     if is_fitted(spec):

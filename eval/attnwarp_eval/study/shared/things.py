@@ -1,4 +1,4 @@
-"""The thing of a scene: the objects whose parts are told apart."""
+"""The thing of a scene: the objects with distinct parts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from attnwarp_eval.study.schema import Part, Study, StudyError, did_you_mean
 class ThingsPart(Part):
     """Keys of a study: by scene, the names of the objects that make up the thing.
 
-    A scene that is left out has the objects of its first edit that several answers are right for.
+    The default is the objects of the scene's first edit with several right answers.
     """
 
     things: dict[str, list[str]] = Field(default_factory=dict)
@@ -21,8 +21,8 @@ def thing_of(study: Study, scene: Scene) -> list[str]:
     """Names of the objects that make up a scene's thing.
 
     Raises:
-        StudyError: an object that the scene lacks, or a scene that names neither objects nor such
-            an edit.
+        StudyError: an object that the scene lacks, or a scene without both objects and such an
+            edit.
     """
     named = study.part(ThingsPart).things.get(scene.name)
     if named is None:

@@ -1,4 +1,4 @@
-"""The warps of a variant's cell, view by view, and their figures against truth."""
+"""Warps of a variant's cell, view by view, and their figures against truth."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class WarpProbe(Probe[NoExtra]):
     """Base of probes that judge a variant's warp."""
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """Depth and rules."""
+        """Entries for depth and rules."""
         return {
             **surface_spec(study, variant, seed),
             "spp": study.spp,
@@ -41,16 +41,16 @@ class WarpProbe(Probe[NoExtra]):
         }
 
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
-        """Splats may be fitted."""
+        """Key of the depth and the rules."""
         return surface_meaning(study, variant)
 
 
 def warped_views(work: Work, grids: Sequence[int]) -> Iterator[tuple[str, TwoView, WarpedView]]:
-    """Each target of a cell with its truth and its warp, which counts as the cell's work.
+    """Warp each target of a cell; yields its name, truth and warp, with the time measured.
 
     Args:
         work: work of the cell, whose spec has ``settings`` and the source of depth.
-        grids: sides of the feature grids that are warped too.
+        grids: sides of the feature grids to warp.
     """
     spec, world, meter = work.spec, work.world, work.meter
     size, spp = spec["size"], spec["spp"]
@@ -59,7 +59,7 @@ def warped_views(work: Work, grids: Sequence[int]) -> Iterator[tuple[str, TwoVie
     if spec.get("geometry") != "truth":
         with meter.stage("splats"):
             model = splats_of(work)
-        # One source serves every target, so its render is no part of what a target costs.
+        # One source serves every target, so its render is not part of a target's cost.
         with meter.stage("source"):
             source_surface = render_surface(model, world.source, settings)
         meter.count(source_pairs=source_surface.counters["pairs"])
@@ -92,7 +92,7 @@ def warped_views(work: Work, grids: Sequence[int]) -> Iterator[tuple[str, TwoVie
 
 
 def warp_truth(world: World, truth: TwoView, settings: WarpSettings, **images: Any) -> WarpedView:
-    """Warp by the truth's own depth.
+    """Warp by the true depth.
 
     Args:
         truth: truth of the pair, (H, W).
@@ -114,7 +114,7 @@ def warp_figures(work: Work, name: str, view: WarpedView) -> dict[str, float]:
     """Endpoint error, feature error and mask scores, at image size and at every feature size.
 
     Args:
-        work: the cell; its spec names the feature sizes, their channels and their seed.
+        work: work of the cell, whose spec has the feature sizes, channels and seed.
     """
     spec, world, meter = work.spec, work.world, work.meter
     size = spec["size"]

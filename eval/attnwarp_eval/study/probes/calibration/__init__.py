@@ -1,1 +1,1 @@
-"""The instrument judged by itself."""
+"""Calibration of the instrument."""

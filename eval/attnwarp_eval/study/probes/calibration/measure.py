@@ -1,7 +1,7 @@
-"""The instrument judged by itself, before it judges anything.
+"""Calibration of the instrument, before any measurement.
 
-The truth's own depth goes through the same warp, the exact mask is scored against itself, and
-Mitsuba must find the points that the ray caster finds.
+The truth's depth goes through the same warp, the exact mask is scored against itself, and Mitsuba
+must find the points that the ray caster finds.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ exact to about 1e-6 of that.
 EXACT = dataclasses.replace(
     PRESETS["corrected"], depth_relative=EXACT_DEPTH_TOLERANCE, depth_spread=TAP_SPREAD
 )
-"""The corrected rules with the tolerances for exact depth."""
+"""Corrected rules with the tolerances for exact depth."""
 
 
 @dataclass(frozen=True)
 class Transport:
-    """The light transport that a scene calls for, and the plan of its pictures.
+    """Light transport that a scene needs, and the plan of its pictures.
 
     Attributes:
-        needed: effects that are simulated -> the words of the scene's file that call for them.
-        not_simulated: effects that are not -> the same.
+        needed: simulated effects -> the words of the scene's file that need them.
+        not_simulated: effects that are not simulated -> the same.
         plan: plan of the rendering, as JSON.
         everything_on: the integrator that would simulate everything.
-        variant: variant of Mitsuba, which draws the pictures' noise.
+        variant: variant of Mitsuba, which decides the pictures' noise.
     """
 
     needed: Mapping[str, str]
@@ -63,7 +63,7 @@ class Transport:
 
 @dataclass(frozen=True)
 class Extra:
-    """The transport of the cell's scene."""
+    """Transport of the cell's scene."""
 
     transport: Transport
 
@@ -74,7 +74,7 @@ class Extra:
 
 @register
 class Calibration(Probe[Extra]):
-    """The error of the instrument itself, in every run."""
+    """Error of the instrument, in every run."""
 
     name = "calibration"
     metrics = metrics_of("calibration.", "warp.", "occlusion.")
@@ -97,7 +97,7 @@ class Calibration(Probe[Extra]):
             yield Cell(spec, name, self.name, self.name, seed, (self.name,), pictures)
 
     def compute(self, work: Work) -> Extra:
-        """Warp the truth's own depth by the exact rules, view by view."""
+        """Warp the truth's depth by the exact rules, view by view."""
         spec, size = work.spec, work.spec["size"]
         for name in spec["views"]:
             with work.meter.stage("truth"):
@@ -122,7 +122,7 @@ class Calibration(Probe[Extra]):
 
 
 def transport_of(scene: Scene) -> Transport:
-    """The effects that a scene's file calls for, each with the reason, and the plan."""
+    """Effects that a scene's file needs, each with the reason, and the plan."""
     reasons = called_for(scene.spec)
     return Transport(
         {name: text for name, text in reasons.items() if name not in NOT_SIMULATED},
@@ -134,8 +134,8 @@ def transport_of(scene: Scene) -> Transport:
 
 
 def _mitsuba_agrees(world: World, truth: TwoView) -> float:
-    """Share of a view's pixels where Mitsuba's own ray tracer finds the same surface point, or none
-    where there is none.
+    """Share of a view's pixels where Mitsuba's ray tracer finds the same surface point as the ray
+    caster, or both find none.
     """
     position, _ = position_and_shape(world.scene, truth.target)
     error = np.linalg.norm(position - truth.hits.point, axis=-1)

@@ -1,4 +1,4 @@
-"""Report of the instrument itself: whether it is calibrated, and what its scenes' light needs."""
+"""Report of the instrument: its calibration, and the light transport that its scenes need."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
 
 SMALL = 256
-"""Pixels: in smaller pictures, depth changes from pixel to pixel by more than the rules for exact
-depth let its taps spread. They then reject much that is visible, and their F1 says little.
+"""Pixels. In smaller pictures, depth changes from pixel to pixel by more than the rules for exact
+depth let their taps spread. They then reject much of the visible surface, and F1 says little.
 """
 
 LARGEST_EPE = 1e-3
-"""Pixels: the largest median endpoint error of the truth's own depth through the warp."""
+"""Pixels: the largest median endpoint error of the truth's depth through the warp."""
 
 SMALLEST_SHARE = 0.99
-"""Least share of pixels whose surface point Mitsuba must find where the ray caster does. Rays on
-outlines may fall either way.
+"""Least share of pixels where Mitsuba must find the surface point of the ray caster. Rays on
+outlines may fall on either side.
 """
 
 
 @register_report
 class CalibrationReport(ProbeReport):
-    """The error of the instrument, in every report."""
+    """Error of the instrument, in every report."""
 
     name = "calibration"
     measures = "the error of the instrument itself"
@@ -66,7 +66,7 @@ class CalibrationReport(ProbeReport):
         return lines
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """The calibration, and the light transport of the scenes."""
+        """Sections on the calibration, and on the light transport of the scenes."""
         if not results.study.scenes:
             return
         yield Place.INSTRUMENT, self._calibration(results)

@@ -1,1 +1,1 @@
-"""An edit carried to other views beside the same views edited alone, without true pictures."""
+"""An edit carried to other views against the same views edited alone, without true pictures."""

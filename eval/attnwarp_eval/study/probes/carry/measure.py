@@ -1,7 +1,7 @@
 """An edit of a thing in some views, judged by the views' agreement alone.
 
-True pictures of an edit cost more than the edit. This probe needs none: it shows a person what a
-method does. Nothing changes outside the thing's exact mask, and splats are not tuned.
+True pictures of an edit cost more than the edit, and this probe needs none: it shows a method's
+result to a person. Nothing changes outside the thing's exact mask, and splats are not tuned.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from attnwarp_eval.study.shared.things import thing_of
 Image = npt.NDArray[np.float32]
 
 LEAST_CHANGE = 5.0
-"""dE00 by which the source must change inside the thing: else there is no edit to carry."""
+"""dE00 by which the source must change inside the thing: otherwise there is no edit to carry."""
 
 
 class Carry(Part):
-    """Scenes that are edited, each with the words for its thing, and the views.
+    """Edited scenes, each with the words for its thing, and the views.
 
     Args:
         edits: scene -> words.
         views: targets by name; the study's if empty.
-        size: side of the pictures in px, at most the study's, which it is if left out.
+        size: side of the pictures in px, at most the study's, which is the default.
     """
 
     edits: dict[str, str] = Field(default_factory=dict)
@@ -66,7 +66,7 @@ class CarryProbe(MethodProbe[NoExtra]):
     metrics = Registry({"multiview.delta_e": METRICS["multiview.delta_e"]})
 
     def check(self, study: Study) -> None:
-        """Require an edit, variants that edit, and an editor that follows words."""
+        """Require an edit, editing variants, and an editor that takes instructions."""
         if self.name not in study.probes:
             return
         if not study.part(StudyPart).carry.edits:
@@ -79,13 +79,13 @@ class CarryProbe(MethodProbe[NoExtra]):
                 )
 
     def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
-        """Refuse words for a scene that the study lacks: they would be tried nowhere."""
+        """Refuse words for a scene that the study lacks: they would be unused."""
         study.check_scenes(study.part(StudyPart).carry.edits, "carry.edits", scenes)
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
-        """One for each scene that has words, variant and seed."""
+        """Cells: one for each scene with words, variant and seed."""
         part = study.part(StudyPart).carry
         size = min(part.size or study.size, study.size)
         for name, scene in scenes.items():
@@ -101,7 +101,7 @@ class CarryProbe(MethodProbe[NoExtra]):
                         "size": size,
                         "views": views,
                         "thing": thing_of(study, scene),
-                        # A description of the result, if a method asks for one, is the words.
+                        # The words also describe the result, for a method that needs a description.
                         "edit": {
                             "instruction": part.edits[scene.name],
                             "target": part.edits[scene.name],
@@ -121,7 +121,7 @@ class CarryProbe(MethodProbe[NoExtra]):
                     )
 
     def compute(self, work: Work) -> NoExtra:
-        """Edit the views, and hold each against the source at exact correspondences."""
+        """Edit the views, and compare each with the source at exact correspondences."""
         spec, world, meter = work.spec, work.world, work.meter
         source, names = world.source.name, [world.source.name, *spec["views"]]
         objects = [world.scene.object_names.index(name) for name in spec["thing"]]

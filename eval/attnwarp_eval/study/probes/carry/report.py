@@ -33,7 +33,7 @@ class CarryReport(ProbeReport):
     cost_text = "Seconds are those of the source's edit, the warps and the views' edits."
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """A table: the difference of each view from the source's."""
+        """Table of each view's difference from the source."""
         rows, views = [], dict[str, None]()
         for cell, record in results.finished(self.name):
             values = {view.name: view.metrics["multiview.delta_e"] for view in record.views}

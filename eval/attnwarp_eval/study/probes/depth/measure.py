@@ -27,11 +27,11 @@ class Depth(Probe[NoExtra]):
     metrics = metrics_of("depth.")
 
     def check(self, study: Study) -> None:
-        """A variant without splats renders nothing."""
+        """Refuse variants without splats: they render nothing."""
         check_splats(study, self.name, "depth to measure")
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """Splats, and how depth is read off them."""
+        """Splats, and the rule that reads depth off them."""
         settings = variant.settings()
         return {
             **surface_spec(study, variant, seed),
@@ -40,7 +40,7 @@ class Depth(Probe[NoExtra]):
         }
 
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
-        """Splats may be fitted."""
+        """Key of the splats, sampled or fitted, and of the depth."""
         return surface_meaning(study, variant)
 
     def compute(self, work: Work) -> NoExtra:

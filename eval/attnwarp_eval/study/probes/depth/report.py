@@ -23,7 +23,7 @@ PLACES = (
     "depth.delta_1_25",
     "depth.normal_median",
 )
-"""Metrics with a table of their own for the inside of surfaces and for edges."""
+"""Metrics with separate tables for the inside of surfaces and for edges."""
 
 
 @register_report
@@ -50,8 +50,8 @@ class DepthReport(ProbeReport):
     stage = "render"
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """Views without depth, whose figures are dashes, which do not say why; none where every
-        view has a depth.
+        """Section on views without depth, whose figures are unexplained dashes; none if every view
+        has a depth.
         """
         empty, views, places = 0, 0, []
         for cell, record in results.finished(self.name):
@@ -68,7 +68,7 @@ class DepthReport(ProbeReport):
             yield Place.RESULT, Section("Views without depth", [text])
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
-        """Inside surfaces and at edges apart."""
+        """Tables for the inside of surfaces and for edges."""
         regions = {"inside surfaces": "interior", "at edges": "edge"}
         columns = ["variant", "where", *(metric.removeprefix("depth.") for metric in PLACES)]
         rows = [

@@ -1,8 +1,8 @@
 """A scene edited by a method, against the true pictures of the edit.
 
 Views of a record are named ``edit/view``. Figures end in ``.edit`` for the edited views and in
-``.render`` for renders of the edited splats. Where the editor did not do the edit in the source
-view, figures of agreement between views are undefined: there was nothing to carry.
+``.render`` for renders of the edited splats. If the editor failed at the edit in the source view,
+figures of agreement between views are undefined: there is no edit to carry.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from attnwarp.methods import Budget
 
 STOPWATCH = Stopwatch()
-"""Seconds of the methods that this process has run."""
+"""Seconds of the methods run by this process."""
 
 
 @register
@@ -67,7 +67,7 @@ class EditingProbe(MethodProbe[EditResult]):
     # From a study to cells
 
     def check(self, study: Study) -> None:
-        """Figures by yaw need their variants measured."""
+        """Require that the variants of figures by yaw are measured."""
         part = study.part(EditingPart).editing
         for name in sorted(self.measured(study) & study.variants.keys()):
             if editor_of(study, study.variants[name]).ideal is not None:
@@ -91,11 +91,11 @@ class EditingProbe(MethodProbe[EditResult]):
                 )
 
     def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
-        """A scene without an entry has all of its edits measured, so a misspelt one matters."""
+        """Refuse unknown scene names: a scene without an entry has all edits measured."""
         study.check_scenes(study.part(EditingPart).editing.edits, "editing.edits", scenes)
 
     def check_variant(self, study: Study, variant: Variant) -> None:
-        """Settings are refused even where nothing is edited."""
+        """Refuse invalid settings even if nothing is edited."""
         own = variant.part(VariantPart)
         check.one_of(own.method, list(EDITING_METHODS), "method")
         if own.budget is not None and not EDITING_METHODS[own.method].takes_budget:
@@ -126,7 +126,7 @@ class EditingProbe(MethodProbe[EditResult]):
             )
 
     def measured(self, study: Study) -> Set[str]:
-        """Variants whose seconds limit others are run too."""
+        """Measured variants, with those whose seconds limit others."""
         names = study.variants.keys() & super().measured(study)
         references = {reference_of(study.variants[name]) for name in names}
         return names | {name for name in references if name is not None}
@@ -134,7 +134,7 @@ class EditingProbe(MethodProbe[EditResult]):
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
-        """One for each scene, edit, variant and seed."""
+        """Cells: one for each scene, edit, variant and seed."""
         wanted = study.part(EncodersPart)
         encoders = encoder_identities(wanted)
         sources = encoder_sources(wanted)
@@ -190,7 +190,7 @@ class EditingProbe(MethodProbe[EditResult]):
         return replace(extra, budget=Spent(budget.seconds, given, budget.network_rows, result.cut))
 
     def _budget(self, work: Work, truth: EditTruth, names: Sequence[str]) -> Budget | None:
-        """Limits of the work's method; a variant whose seconds are the limit is run if need be."""
+        """Limits of the work's method; runs the variant whose seconds are the limit if needed."""
         from attnwarp.methods import Budget
 
         given = work.spec.get("budget")
@@ -222,7 +222,7 @@ class EditingProbe(MethodProbe[EditResult]):
 
 @cache
 def _compile(kind: Literal["2d", "3d"]) -> None:
-    """Compile what renders, tunes and warps, so that a first edit's seconds do not hold it."""
+    """Compile rendering, tuning and warping, so that a first edit's seconds exclude compilation."""
     compile_kernels(kind)
     axes = 3 if kind == "3d" else 2
     one = torch.ones(1, 1, 3, dtype=torch.float32)
@@ -240,5 +240,5 @@ _SHARED = ("probe", "protocol", "scene", "size", "views", "seed", "edit", "encod
 
 
 def _decisive(spec: Json) -> Json:
-    """Entries of a cell's spec that decide its method's run; the encoders measure it afterwards."""
+    """Entries of a cell's spec that decide its method's run; encoders only measure the result."""
     return {key: value for key, value in spec.items() if key != "encoders"}

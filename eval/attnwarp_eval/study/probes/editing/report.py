@@ -1,5 +1,5 @@
-"""Report of edited scenes: what the editor can do, agreement by yaw and by scene, seconds by part,
-and which variant to choose for a given time.
+"""Report of edited scenes: the editor's abilities, agreement by yaw and by scene, seconds by part,
+and the best variant for a given time.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ BY_YAW = {
     "multiview.delta_e_above.edit_inside": "disagreement with the source above its floor, dE00",
     "fidelity.psnr.edit_inside": "PSNR to the true edit inside the object, dB",
 }
-"""Figures that are shown by yaw, with what they are."""
+"""Figures that are shown by yaw, with descriptions."""
 
 BY_SCENE = {
     "multiview.same_answer.edit_seen": "Views with the source's answer where the source saw it",
@@ -53,11 +53,11 @@ BY_SCENE = {
 DISAGREEMENT = "multiview.delta_e_above.edit_inside"
 
 ONE_SOURCE = frozenset({"attention_warping", "true pictures"})
-"""Methods whose source view is edited alike, whatever happens to the others."""
+"""Methods that edit the source view in the same way and differ in the others."""
 
 
 CHOSEN_BY = ("multiview.delta_e_above.edit_inside", "fidelity.mse.edit_inside")
-"""Figures that choose the variant for a given time; less is better."""
+"""Figures by which the variant for a given time is chosen; lower is better."""
 
 
 @register_report
@@ -128,7 +128,7 @@ class EditingReport(ProbeReport):
 
 
 def abilities(results: Results, probe: str) -> Section:
-    """Section on what the editor does in the source view, and in every view by itself."""
+    """Section on the editor's success in the source view, and in every view alone."""
     names = controls(results, probe)
     section = Section("What the editor can do")
     section.text = [
@@ -177,8 +177,8 @@ def abilities(results: Results, probe: str) -> Section:
 
 
 def _done_by_method(results: Results, probe: str) -> list[Table]:
-    """Tables of the source edits that each variant of a comparison does; none for a study of one
-    method.
+    """Tables of the source edits that succeeded, by variant of a comparison; none for a study of
+    one method.
     """
     records = {
         name: [record for _, _, record in results.records(probe, name)]
@@ -196,8 +196,8 @@ def _done_by_method(results: Results, probe: str) -> list[Table]:
 
 
 def controls(results: Results, probe: str) -> list[str]:
-    """The measured variants that edit each view by itself, as long as they like; the first measured
-    one without any.
+    """Measured variants that edit each view alone without a budget; without any, the first measured
+    variant.
     """
     measured = [
         (name, records[0][2].spec)
@@ -301,7 +301,7 @@ def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
 
 
 def _injected(results: Results, probe: str, names: Sequence[str]) -> list[Table]:
-    """Variants that inject features, by scenes; none where no variant does."""
+    """Shares of injected features: variants by scenes; none if no variant injects."""
     scenes = results.study.scene_names
     rows = []
     for name in names:
@@ -316,7 +316,7 @@ def _injected(results: Results, probe: str, names: Sequence[str]) -> list[Table]
 
 
 def _ratios(results: Results, probe: str, names: Sequence[str]) -> Table:
-    """Disagreement above its floor as a part of the control's with the same editor."""
+    """Ratio of disagreement above the floor to the control's with the same editor."""
     control = {
         results.records(probe, name)[0][2].spec["editor"]["sha256"]: name
         for name in reversed(controls(results, probe))
@@ -344,7 +344,7 @@ def _part(
 
     Args:
         names: names of the variant and its control.
-        shared: values of both in the views that they share, by scene.
+        shared: values of both in their shared views, by scene.
     """
     if scene in shared[0]:
         own, control = (sum(table[scene].values()) for table in shared)
@@ -357,14 +357,14 @@ def _part(
 
 
 SOURCE = "source's edit"
-"""Column of what each method made of the source."""
+"""Column of each method's edit of the source."""
 
 UNDONE = "**source edit failed**"
-"""Stands behind a method's name whose edit of the source was not done."""
+"""Suffix of a method's name if its edit of the source failed."""
 
 
 def side_by_side(results: Results, probe: str) -> Section | None:
-    """A grid for each edit: columns are views, rows the view before, each method, and the truth."""
+    """A grid for each edit: columns are views, rows the unedited view, methods, and truth."""
     edits: dict[tuple[str, str], dict[str, Record[EditResult]]] = {}
     for cell, record in results.finished(probe):
         if record.pictures:
@@ -511,7 +511,7 @@ def choice(results: Results, probe: str, names: Sequence[str], metrics: Sequence
 
 
 def budgets(results: Results, probe: str) -> Section | None:
-    """Section on what methods with a budget did with it; None where no method has one."""
+    """Section on the use of budgets; None if no method has one."""
     columns = [
         "variant",
         "budget, s",
@@ -574,7 +574,7 @@ def budgets(results: Results, probe: str) -> Section | None:
 
 
 def _limit(cells: Sequence[tuple[str, Any]], name: str) -> float:
-    """Mean over scenes of one limit of the cells' budgets, NaN without any."""
+    """Mean over scenes of one limit of the cells' budgets, NaN without limits."""
     limits = [(scene, getattr(record.extra.budget, name)) for scene, record in cells]
     return _over_scenes((scene, limit) for scene, limit in limits if limit is not None)
 
@@ -590,7 +590,7 @@ def _seconds(results: Results, probe: str, name: str) -> dict[tuple[Any, ...], d
 
 
 def _over_scenes(values: Iterable[tuple[str, float]]) -> float:
-    """Mean over scenes of the means over their cells: (scene, value) each."""
+    """Mean over scenes of the means over their cells, from (scene, value) pairs."""
     by_scene: dict[str, list[float]] = {}
     for scene, value in values:
         by_scene.setdefault(scene, []).append(value)

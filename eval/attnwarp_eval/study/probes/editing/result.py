@@ -30,25 +30,25 @@ if TYPE_CHECKING:
 Image = npt.NDArray[np.float32]
 
 FIDELITY = ("psnr", "mse", "ssim")
-"""Figures of :func:`attnwarp_eval.metrics.fidelity` that a record has, of the whole picture and
-inside the edited object."""
+"""Figures of :func:`attnwarp_eval.metrics.fidelity` in a record, of the whole picture and inside
+the edited object."""
 
 
 @dataclass(frozen=True)
 class EditResult:
-    """Entries of a cell's record beside the figures of its views.
+    """Entries of a cell's record besides the figures of its views.
 
     Attributes:
         name, instruction: name and instruction of the edit.
-        source: content of the source's edit.
-        alone: content of all edited views together, the source's included.
-        answers: by "edit" and "render": by view, the nearest answer; None where nothing of the
-            object shows.
-        overall: by "edit" and "render", the answer nearest to all views together.
-        edit_psnr: dB, edited views against renders, pooled, where a surface shows.
+        source: content description of the source's edit.
+        alone: the same for all edited views together, the source included.
+        answers: nearest answer by "edit" or "render", then by view; None if none of the object is
+            visible.
+        overall: by "edit" and "render", the nearest answer to all views together.
+        edit_psnr: dB, edited views against renders, pooled over pixels with a surface.
         edited: number of edited views.
-        injected: mean share of the targets' pixels that got features; 0 without a warp.
-        budget: budget of the method; None for none.
+        injected: mean share of the targets' pixels with injected features; 0 without a warp.
+        budget: budget of the method, None without one.
     """
 
     name: str
@@ -64,7 +64,7 @@ class EditResult:
 
     @property
     def comparable(self) -> bool:
-        """True where the source's edit was done; no other edit takes part in a comparison."""
+        """True if the source's edit succeeded; comparisons use no other edits."""
         return self.source.done
 
     def to_json(self) -> Json:
@@ -120,14 +120,14 @@ class Measurement:
             )
         edited = {names[k]: _full(truth.originals[names[k]], v) for k, v in result.edited.items()}
         self.pictures = {"edit": edited, "render": self._renders(result.gaussians)}
-        # A method that was cut short may not have edited the source: it shows no edit then.
+        # A method cut short may have left the source unedited: it then shows no edit.
         image = edited.get(self.source, truth.originals[self.source])
         self.judged = truth.judge({self.source: image})
         self.nearest = {k: self._nearest(pictures) for k, pictures in self.pictures.items()}
         self.neighbours = neighbours(work.world, work.spec["views"])
 
     def record(self) -> EditResult:
-        """Add the figures of every target to the work; return the rest."""
+        """Add the figures of every target to the work; return the record's extra."""
         work, truth = self.work, self.truth
         figures: dict[str, dict[str, float]] = {name: {} for name in self.names[1:]}
         overall: dict[str, str | None] = {}
@@ -189,8 +189,8 @@ class Measurement:
         }
 
     def _agreement(self, kind: str, name: str, answer: str | None) -> dict[str, float]:
-        """Agreement of a target with the source, and with its neighbour; NaN where it was not
-        edited or the source's edit is not one.
+        """Agreement of a target with the source, and with its neighbour; NaN if the target was not
+        edited or the source's edit failed.
         """
         keys = ("same_answer", "delta_e", "delta_e_floor", "delta_e_above")
         row = dict.fromkeys(
@@ -227,7 +227,7 @@ class Measurement:
     def _above(
         self, images: Mapping[str, Image], answer: str, first: str, second: str, mask: Any
     ) -> dict[str, float]:
-        """Disagreement of two views above its floor; NaN where fewer than :data:`LEAST_PIXELS` are
+        """Disagreement of two views above its floor; NaN if fewer than :data:`LEAST_PIXELS` are
         compared.
         """
         true = self.truth.answers[answer]
@@ -282,7 +282,7 @@ class Measurement:
         return {name: self._render(model, name) for name in self.names}
 
     def _render(self, model: Gaussians, name: str, least: int = 1) -> Image:
-        """(H, W, 3) of a view of splats, at a whole multiple of its size and at least so wide."""
+        """(H, W, 3) of a view of splats, at a multiple of its size, at least ``least`` wide."""
         from attnwarp.methods.scene import near_of, render_picture
 
         cameras = {own: self.work.world.camera(own) for own in self.names}
@@ -292,7 +292,7 @@ class Measurement:
         return render_picture(model, larger, near, "auto")
 
     def _draw(self, name: str) -> dict[str, bytes]:
-        """JPEG files of a view: before, the source's edit, the edited view, its render, and the
+        """JPEG files of a view: unedited, the source's edit, the edited view, its render, and the
         truth of the source's answer."""
         answer = self.judged.answer
         images = {

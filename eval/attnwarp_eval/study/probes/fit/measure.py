@@ -25,11 +25,11 @@ class Point:
 
     Attributes:
         iteration: iterations done.
-        seconds, cpu_seconds: spent on them, without evaluations and files.
-        splats: their number.
+        seconds, cpu_seconds: time of the iterations, without evaluations and files.
+        splats: number of splats.
         loss: loss of the last iterations, smoothed.
-        psnr, psnr_pooled: mean over the views held out, and of their mean squared error; dB.
-        measures: further figures over the views held out.
+        psnr, psnr_pooled: mean PSNR over the held-out views, and PSNR of their mean MSE; dB.
+        measures: further figures over the held-out views.
     """
 
     iteration: int
@@ -76,19 +76,19 @@ class Fit(Probe[Curve]):
     metrics = metrics_of("fit.", "depth.")
 
     def check_variant(self, study: Study, variant: Variant) -> None:
-        """Fit settings are refused even where nothing is fitted."""
+        """Refuse invalid fit settings even if nothing is fitted."""
         own = variant.part(fits.VariantPart).fit
         if self.name in study.probes or own or study.part(fits.StudyPart).fit.settings:
             fits.settings_of(study, variant, 0)
 
     def common_spec(self, study: Study, scene: Scene, seed: int) -> Json:
-        """The views are those held out, not the scene's targets."""
+        """Entries with the held-out views in place of the scene's targets."""
         study.views_of(scene)
         views = export.held_out_names(study.part(fits.StudyPart).fit.views)
         return {**super().common_spec(study, scene, seed), "views": views}
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """The fit, and how depth is read off it."""
+        """The fit, and the rule that reads depth off it."""
         settings = variant.settings()
         return {
             "spp": study.spp,
@@ -98,14 +98,14 @@ class Fit(Probe[Curve]):
         }
 
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
-        """Splats are fitted here, so those of the study's surfaces play no part."""
+        """Key without the study's sampled splats, since splats are fitted here."""
         return variant.settings(), variant.geometry, variant.part(fits.VariantPart).fit
 
     def compute(self, work: Work) -> Curve:
-        """Fit, then measure on every view held out.
+        """Fit, then measure on every held-out view.
 
-        The fit lies below the run's folder, named by what decides it: cells that measure the same
-        fit in other ways share it, and one that was cut short is resumed.
+        The fit is saved below the run's folder under a name from its spec: cells that measure the
+        same fit in other ways share it, and an interrupted fit is resumed.
         """
         spec, world, meter = work.spec, work.world, work.meter
         with meter.stage("truth"):
@@ -116,7 +116,7 @@ class Fit(Probe[Curve]):
             }
         for camera in cameras.values():
             world.add(camera)
-        # The fit's seconds go into the curve, which holds them for earlier sittings as well.
+        # The fit's seconds go into the curve, which also holds those of earlier runs.
         result = fits.fit_of(work)
         meter.count(iterations=result.iteration, splats=len(result.gaussians))
         settings = WarpSettings(depth=spec["depth"], depth_statistic=spec["depth_statistic"])

@@ -19,7 +19,7 @@ from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.shared.fits import StudyPart
 
 GOOD_PSNR = 28.0
-"""dB: a fit counts as good from here on."""
+"""dB from which a fit counts as good."""
 
 
 Pick = Callable[[Point], float]
@@ -63,7 +63,7 @@ class FitReport(ProbeReport):
         """Sections on the result of each fit, and its curves."""
         by_content: dict[str, str] = {}
         for cell, record in results.finished(self.name):
-            # Variants that read one fit in different ways share its curve; the first names it.
+            # Variants that read one fit's depth differently share its curve, named by the first.
             content = canonical_json({**record.spec["fit"], "seed": cell.seed})
             by_content.setdefault(content, cell.variants[0])
         names = list(dict.fromkeys(by_content.values()))
@@ -140,7 +140,7 @@ class FitReport(ProbeReport):
         return Picture("figures/fits.svg", "Accuracy against time as the fits proceed.")
 
     def _curve(self, results: Results, name: str, pick: Pick) -> tuple[list[float], list[Interval]]:
-        """CPU seconds and values at the evaluations that every scene and seed has, without the one
+        """CPU seconds and values at the evaluations that every scene and seed has, except the one
         before the first iteration.
         """
         curves: list[tuple[str, dict[int, Point]]] = [

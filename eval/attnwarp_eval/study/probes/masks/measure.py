@@ -1,4 +1,4 @@
-"""Masks of a thing in one or a few views, lifted through splats, against exact ones in others."""
+"""Masks of a thing in one or a few views, lifted through splats, against exact masks in others."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ Mask = npt.NDArray[np.bool_]
 
 
 class Lifted(Part):
-    """Masks that are lifted.
+    """Masks to lift.
 
-    ``masks``: so many, of views evenly around the scene; the source is the first. ``by``: the exact
-    masks ("truth"), or grabCut's from the box of each ("box").
+    ``masks``: number of masks, from views evenly around the scene, the source first. ``by``: exact
+    masks ("truth"), or grabCut's from the bounding box of each ("box").
     """
 
     masks: Annotated[Whole, Field(ge=1, le=64)] = 1
@@ -63,17 +63,17 @@ class Masks(Probe[NoExtra]):
     metrics = metrics_of("masks.")
 
     def check(self, study: Study) -> None:
-        """A variant without splats has nothing to lift through."""
+        """Refuse variants without splats: masks are lifted through splats."""
         check_splats(study, self.name, "mask to lift")
 
     def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
-        """A thing of a scene that is not there would be measured nowhere."""
+        """Refuse things of unknown scenes: they would be unused."""
         study.check_scenes(study.part(ThingsPart).things, "things", scenes)
 
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
-        """One for each scene, variant and seed."""
+        """Cells: one for each scene, variant and seed."""
         things = {name: thing_of(study, scene) for name, scene in scenes.items()}
         for cell in super().cells(study, names, scenes):
             yield replace(cell, spec={**cell.spec, "thing": things[cell.scene]})
@@ -87,7 +87,7 @@ class Masks(Probe[NoExtra]):
         }
 
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
-        """Splats may be fitted."""
+        """Key of the splats, sampled or fitted, and of the masks."""
         return splats_meaning(study, variant), variant.part(VariantPart).lifted
 
     def compute(self, work: Work) -> NoExtra:
@@ -136,7 +136,7 @@ def _thing(world: World, camera: Camera, objects: Sequence[int]) -> Mask:
 
 
 def _by_box(world: World, camera: Camera, thing: Mask, spp: int) -> Mask:
-    """(H, W) bool: what grabCut cuts out of the box of a thing; nothing where it finds nothing."""
+    """(H, W) bool: grabCut's segment in the bounding box of a thing; empty if it finds none."""
     if not thing.any():
         return thing
     rows, columns = np.flatnonzero(thing.any(1)), np.flatnonzero(thing.any(0))

@@ -84,7 +84,7 @@ class MasksReport(ProbeReport):
 
 
 def _median(values: list[float]) -> str:
-    """Median with the lowest value; how many are defined, where some are not."""
+    """Median with the lowest value, and the number of defined values if some are undefined."""
     defined = [value for value in values if math.isfinite(value)]
     if not defined:
         return "–"

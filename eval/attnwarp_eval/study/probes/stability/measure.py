@@ -18,7 +18,7 @@ from attnwarp_eval.study.schema import Part, Study
 
 
 class Sweep(Part):
-    """Hard cases that a study sweeps."""
+    """Hard cases of a study."""
 
     cases: list[str] = Field(default_factory=list, description="by name; all of them if empty")
     levels: Literal["all", "quick"] = "all"
@@ -33,7 +33,7 @@ class StudyPart(Part):
 
 @dataclass(frozen=True)
 class Extra:
-    """The error messages of the levels that were refused."""
+    """Error messages of the refused levels."""
 
     refusals: Mapping[str, str]
 
@@ -44,11 +44,11 @@ class Extra:
 
 @dataclass(frozen=True)
 class Swept:
-    """One way of one case, as it was measured.
+    """Measured outcomes of one way of one case.
 
     Attributes:
         case, way: case, and the swept input.
-        outcomes: the easiest level first.
+        outcomes: outcomes by level, the easiest first.
     """
 
     case: Case
@@ -57,7 +57,7 @@ class Swept:
 
     @property
     def end(self) -> Outcome | None:
-        """The first level that breaks or is refused; None where all hold."""
+        """The first level that breaks or is refused; None if all hold."""
         return next((o for o in self.outcomes if o.verdict != "holds"), None)
 
 
@@ -72,7 +72,7 @@ class Stability(Probe[Extra]):
     judges_variants = False
 
     def check(self, study: Study) -> None:
-        """Cases have names; variants change none of them."""
+        """Require known names of cases, and no variants, since no case depends on one."""
         sweep = study.part(StudyPart).stability
         if study.probes.get(self.name):
             raise ValueError(
@@ -87,7 +87,7 @@ class Stability(Probe[Extra]):
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
-        """One for each way of each case."""
+        """Cells: one for each way of each case."""
         sweep = study.part(StudyPart).stability or Sweep()
         for hard in [hard_case(name) for name in sweep.cases] or hard_cases().values():
             levels = hard.levels if sweep.levels == "all" else hard.quick
@@ -126,7 +126,7 @@ class Stability(Probe[Extra]):
         return Extra(data["refusals"])
 
     def read(self, data: Json) -> Record[Extra]:
-        """A record from its JSON. ValueError: today's cases have no such case or level."""
+        """Read a record from its JSON. ValueError: the present cases have no such case or level."""
         _definition(data["spec"])
         return super().read(data)
 
@@ -142,12 +142,12 @@ def _definition(spec: Json) -> tuple[Case, Way, list[float]]:
 
 
 def read_sweeps(results: Results) -> list[Swept]:
-    """The sweeps of a run, as its records hold them, in the order of the cases."""
+    """Sweeps from a run's records, in the order of the cases."""
     swept = []
     for _, record in results.finished(Stability.name):
         hard, way, levels = _definition(record.spec)
         refusals = record.extra.refusals
-        # JSON has no infinity: an error that was infinite is NaN in a record.
+        # JSON has no infinity: an infinite error is NaN in a record.
         outcomes = [
             hard.judge(level, way, view.metrics["stability.error"], refusals.get(view.name, ""))
             for level, view in zip(levels, record.views, strict=True)

@@ -33,7 +33,7 @@ class StabilityReport(ProbeReport):
 
 
 def verdict_lines(swept: Sequence[Swept]) -> list[str]:
-    """A line for each level that had to hold and does not."""
+    """A line for each level that must hold and does not."""
     return [
         f"{sweep.case.name} / {sweep.way.name}: {_what_failed(sweep, outcome)}"
         for sweep in swept
@@ -61,7 +61,7 @@ def _tolerance(bound: Bound, tolerance: float) -> str:
 
 
 def _grouped(swept: Sequence[Swept], directions: bool) -> list[list[Swept]]:
-    """Sweeps of one case, and of one direction where these are told apart."""
+    """Sweeps of one case, and of one direction if directions are shown separately."""
     parts: dict[tuple[str, str], list[Swept]] = {}
     for sweep in swept:
         key = sweep.case.name, sweep.way.direction if directions else ""
@@ -86,7 +86,7 @@ def _verdicts(swept: Sequence[Swept]) -> Section:
             else "Every required level holds."
         ),
     ]
-    # Those that end somewhere come first.
+    # Sweeps with a level that does not hold come first.
     parts = sorted(_grouped(swept, directions=True), key=lambda part: not any(s.end for s in part))
     table = Table(list(COLUMNS), [_row(part) for part in parts])
     return Section("Where hard inputs break the numerics", text, [table])

@@ -1,7 +1,7 @@
-"""Seconds of variants taken in turn in one process, for accuracy against time: of whole edits where
+"""Seconds of variants taken in turn in one process, for accuracy against time: of whole edits if
 the study's probe ``editing`` measures the variants too, else of warps.
 
-Seconds of separate cells come from other times of a machine whose speed drifts.
+Seconds of separate cells are taken at different times, and a machine's speed drifts.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ OF_A_WARP = ("render", "pair")
 OF_AN_EDIT = (WHOLE, *PARTS)
 
 COUNTERS = ("network_rows", "iterations")
-"""Work of an edit, which no machine changes."""
+"""Counters of an edit's work, which are the same on every machine."""
 
 
 class StudyPart(Part):
-    """Keys of a study that only this probe reads; ``timing_rounds`` are those of every timing."""
+    """Keys of a study that only this probe reads; ``timing_rounds`` applies to every timing."""
 
     timed_scenes: Annotated[Whole, Field(ge=1)] | None = Field(
         default=None, description="how many scenes are timed, from the first on; all if left out"
@@ -62,20 +62,20 @@ class Rounds:
 
 
 def _edited(study: Study) -> Sequence[str]:
-    """Variants that are timed as whole edits."""
+    """Variants timed as whole edits."""
     return study.probes.get("editing", ())
 
 
 @register
 class Timing(Probe[Rounds]):
-    """One cell for all contestants: seconds of separate cells cannot be compared."""
+    """Timing of all contestants in one cell: seconds of separate cells cannot be compared."""
 
     name = "timing"
     study_part = StudyPart
     times_in_turn = (*OF_A_WARP, *OF_AN_EDIT)
 
     def check(self, study: Study) -> None:
-        """Every contestant renders, edits, and runs to its end by what it sees itself."""
+        """Require contestants that render and edit, without a time budget or the exact truth."""
         check_splats(study, self.name, "time to take")
         for name in study.probes.get(self.name, []):
             own = study.variants[name].part(VariantPart)
@@ -92,7 +92,7 @@ class Timing(Probe[Rounds]):
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
-        """One for each scene and seed, of the view in the middle; of edits one for each scene, of
+        """Cells: one for each scene and seed, of the middle view; of edits one for each scene, of
         its first edit and the first seed.
         """
         edited = [name for name in names if name in _edited(study)]
@@ -148,7 +148,7 @@ class Timing(Probe[Rounds]):
         return Rounds(seconds, [dict(row) for row in cost.get("work", ())])
 
     def in_turn(self, cell: Outcome, record: Record[Rounds]) -> InTurn:
-        """The seconds of a cell."""
+        """Seconds of a cell, by stage and contestant."""
         spec = record.spec
         of = (
             f"the edit {spec['edit']['name']} of {cell.scene}"
@@ -190,7 +190,7 @@ def _warps(work: Work) -> Rounds:
 
 
 def _edits(work: Work) -> Rounds:
-    """Seconds of whole edits: of the method's own parts, without files and renders for people."""
+    """Seconds of whole edits: of the method's parts, without files and renders for display."""
     spec, world = work.spec, work.world
     names = [world.source.name, *spec["views"]]
     with work.meter.stage("truth"):
@@ -211,7 +211,7 @@ def _edits(work: Work) -> Rounds:
     parts = {WHOLE: PARTS, **{part: (part,) for part in PARTS}}
     seconds = {
         stage: [
-            # The first round compiles.
+            # The first round includes compilation.
             [sum(row.get(part, 0.0) for part in own) for row in taken[1:]]
             for taken in rows
         ]

@@ -17,7 +17,7 @@ from attnwarp_eval.study.turns import Timed, timed_in_turn
 
 @register_report
 class TimingReport(ProbeReport):
-    """Seconds of whole edits by variant; those of warps stand beside the fronts."""
+    """Seconds of whole edits by variant; seconds of warps are shown with the fronts."""
 
     name = "timing"
 

@@ -35,7 +35,7 @@ class Warp(WarpProbe):
     main = True
 
     def check(self, study: Study) -> None:
-        """Masks by yaw need their variants measured."""
+        """Require that the variants of masks by yaw are measured."""
         names = study.part(StudyPart).yaw.variants
         study.check_variants(names, "yaw.variants", self.name)
 

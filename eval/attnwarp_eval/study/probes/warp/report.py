@@ -23,7 +23,7 @@ from attnwarp_eval.study.probes.warp.measure import StudyPart
 from attnwarp_eval.study.results import Results
 
 YAW_EDGES = (0, 15, 45, 75, 105, 135, 165, 180)
-"""Bins around the yaws 30, 60, ... 150 that studies like to take, with the ends apart."""
+"""Bins around the yaws 30, 60, ... 150 that studies often use, with separate bins at the ends."""
 
 RATES = {
     "occlusion.false_positive_rate": (
@@ -82,7 +82,7 @@ class WarpReport(ProbeReport):
         return [Table(["variant", "over", *map(str, sizes)], rows, caption, folded=True)]
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """Masks by yaw, where the study asks for them."""
+        """Section on masks by yaw, if the study asks for them."""
         wanted = results.study.part(StudyPart).yaw.variants
         names = [name for name in wanted if results.records(self.name, name)]
         if names:
@@ -165,7 +165,7 @@ class WarpReport(ProbeReport):
     def _curve(
         self, results: Results, variant: str, metric: str
     ) -> tuple[list[float], list[Interval]]:
-        """The yaws of a variant's views, and its means over scenes there."""
+        """The yaws of a variant's views, and its means over scenes at each."""
         yaws = sorted(
             {
                 view.yaw
