@@ -1,4 +1,4 @@
-"""Methods that edit a scene: attention warping, and those that it is compared with.
+"""Methods that edit a scene: attention warping, and the baselines it is compared with.
 
 All have the same arguments, ``method(gaussians, cameras, images, editor, instruction, settings,
 folder=..., budget=..., report=...)``, and return a :class:`Result`.
@@ -31,7 +31,7 @@ from attnwarp.workdir import Budget
 METHODS: Named[Callable[..., Result]] = Named(
     {name: getattr(import_module(f"{__name__}.{name}"), name) for name in PRESETS}
 )
-"""The methods by name: for each that has presets, the function of its module."""
+"""Methods by name; each method with presets maps to the function of its module."""
 
 __all__ = [
     "METHODS",

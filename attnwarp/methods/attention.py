@@ -9,10 +9,10 @@ from typing import Any
 from torch import Tensor
 
 Attend = Callable[[Tensor, Tensor | None], Tensor]
-"""A layer's own attention: (B, L, C) tokens look at (B, M, C) others, or at themselves for None."""
+"""Original attention of a layer: (B, L, C) tokens attend to (B, M, C), to themselves for None."""
 
 Rule = Callable[[str, Tensor, Attend], Tensor]
-"""(B, L, C) output of a layer by its name, its input tokens and its own attention."""
+"""(B, L, C) output of a layer, from the layer's name, input tokens and original attention."""
 
 
 @contextmanager
@@ -21,7 +21,7 @@ def self_attention(network: Any, rule: Rule) -> Iterator[None]:
 
     Args:
         network: a diffusers UNet or ControlNet.
-        rule: gets the layer's name, such as
+        rule: function of the layer's arguments; the first is the layer's name, such as
             ``up_blocks.3.attentions.2.transformer_blocks.0.attn1``.
     """
     before = dict(network.attn_processors)
@@ -39,7 +39,7 @@ def self_attention(network: Any, rule: Rule) -> Iterator[None]:
 
 
 class _Ruled:
-    """An attention processor that leaves the projections and the softmax to the one it replaces."""
+    """Attention processor that delegates projections and softmax to the processor it replaces."""
 
     def __init__(self, name: str, processor: Any, rule: Rule) -> None:
         self.name, self.processor, self.rule = name, processor, rule
@@ -66,11 +66,11 @@ class _Ruled:
 
 
 def joint(tokens: Tensor, branches: int) -> Tensor:
-    """(branches V, V L, C): for each picture the tokens of all pictures of its branch.
+    """Return (branches V, V L, C): for each picture the tokens of all pictures of its branch.
 
     Args:
         tokens: (branches V, L, C), branch by branch.
-        branches: branches of guidance.
+        branches: number of guidance branches.
 
     Example:
         >>> import torch
@@ -84,15 +84,15 @@ def joint(tokens: Tensor, branches: int) -> Tensor:
 
 
 def aligned(references: int, self_share: float, branches: int) -> Rule:
-    """GaussCtrl's attention: a share of the view's own, the rest a mean over reference views.
+    """GaussCtrl's attention: self-attention of the view blended with attention to references.
 
-    s attn(q, k, v) + (1 - s) / R sum_r attn(q, k_r, v_r), of whose pictures in the batch the first
-    R of each branch are the references.
+    The output is s attn(q, k, v) + (1 - s) / R sum_r attn(q, k_r, v_r). The first R pictures of
+    each branch in the batch are the references.
 
     Args:
-        references: R.
-        self_share: s in [0, 1].
-        branches: branches of guidance.
+        references: R, the number of reference views.
+        self_share: s in [0, 1], the weight of the view's self-attention.
+        branches: number of guidance branches.
     """
 
     def rule(name: str, tokens: Tensor, attend: Attend) -> Tensor:
@@ -101,8 +101,8 @@ def aligned(references: int, self_share: float, branches: int) -> Rule:
         total = self_share * attend(tokens, None) if self_share else 0.0
         for reference in range(references):
             others = by_branch[:, reference : reference + 1].expand_as(by_branch)
-            # The projection after the attention is affine and the shares add to 1, so that it makes
-            # no difference whether outputs or heads are averaged.
+            # The projection after the attention is affine and the shares add to 1, so averaging
+            # outputs equals averaging heads.
             output = attend(tokens, others.reshape(tokens.shape))
             total = total + (1 - self_share) / references * output
         return total  # type: ignore[return-value]

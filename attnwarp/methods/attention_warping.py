@@ -1,7 +1,7 @@
-"""Attention warping: an edit of one view is carried into the others, and the splats are tuned.
+"""Attention warping: carry the edit of one view into the other views, then tune the splats.
 
 :meth:`AttentionWarping.run` is Algorithm 1 of "Diffusion-Based Attention Warping for Consistent 3D
-Scene Editing"; the numbers in comments are those of its lines.
+Scene Editing"; numbers in comments are line numbers of Algorithm 1.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from attnwarp.methods.view_edits import RecordedSource, ViewEdits
 from attnwarp.methods.work import Work, chunks
 
 CORRECTED = AttentionWarpingSettings()
-"""Settings of who names none."""
+"""Settings used when the caller passes none."""
 
 
 def attention_warping(
@@ -49,19 +49,19 @@ def attention_warping(
     store: Literal["device", "cpu", "disk"] = "cpu",
     **options: Unpack[Options],
 ) -> Result:
-    """Edit one view of a scene, carry the edit into others, and tune the splats on all of them.
+    """Edit one view of a scene, carry the edit into other views, and tune the splats on all views.
 
     Args:
         gaussians, cameras, images, editor, instruction, options: see :func:`by_view`.
         settings: every choice of the method; ``corrected`` if left out.
         source: number of the source view.
-        source_picture: (h, w, 3) the source view edited elsewhere, such as by hand, of a type that
-            ``images`` may have and the view's aspect ratio. Its features are recorded while its own
-            noise is replayed (edit-friendly inversion).
-        warps: the warp from the source to a target, by their numbers, such as one from exact depth;
-            used in place of those from the splats' depth.
-        store: store of the recorded features: on the editor's "device", in main memory ("cpu"), or
-            in the folder ("disk") until the edit is done.
+        source_picture: (h, w, 3) edit of the source view made elsewhere, such as by hand. Its type
+            is any that ``images`` accepts, and its aspect ratio is the view's. Its features are
+            recorded while its inverted noise is replayed (edit-friendly inversion).
+        warps: function of a source's and a target's number that returns their warp, such as one
+            from exact depth; replaces the warps from the splats' depth.
+        store: place of the recorded features until the edit ends: the editor's "device", main
+            memory ("cpu"), or the folder ("disk").
 
     Raises:
         ValueError, InputError, RuntimeError: see :func:`by_view`.
@@ -141,11 +141,11 @@ def blend(warp: TokenWarp, F_src: Tensor, F_new: Tensor, a: float) -> Tensor:
 
 
 inject = partial(injection.inject, weight=a_t, blend=blend)
-"""Injection as Algorithm 1 has it: :func:`attnwarp.editing.injection.inject`."""
+"""Injection of Algorithm 1: :func:`attnwarp.editing.injection.inject` with its weight and blend."""
 
 
 class AttentionWarping(Method):
-    """Algorithm 1, with the choices of the settings."""
+    """Algorithm 1, as configured by the settings."""
 
     def __init__(
         self,
@@ -171,21 +171,21 @@ class AttentionWarping(Method):
             self.psnr_leaves_out = self.stages[-1]
 
     def run(self, loop: Loop) -> None:
-        """Algorithm 1."""
+        """Run Algorithm 1."""
         s, edited = self.settings, [*self.sources]
-        # (1) Edit the source and record its features; further sources, if any, take them.
+        # (1) Edit the source and record its features; further sources, if any, receive them.
         for number, view in enumerate(self.sources):
             rows = self.views.rows_of_source(number)
             loop.edit(0, (view,), partial(self.edit_source, number), rows=rows)
         # (2) For each stage:
         for stage, views in enumerate(self.stages):
-            # (3) choose views, at random among those not edited: see draw_stages;
+            # (3) choose views at random among the unedited ones (see draw_stages);
             for _, same in groupby(views, key=lambda view: self.work.sizes[view]):
                 for batch in chunks(list(same), s.batch):
-                    # (4) warp the source's features to them, (5) edit them with these injected;
+                    # (4) warp the source's features to these views, (5) edit with them injected;
                     rows = self.views.rows(len(batch), s.guidance(stage), stage)
                     loop.edit(stage, batch, partial(self.edit_targets, stage, batch), rows=rows)
-            # (6) tune the splats on edited views.
+            # (6) tune the splats on the edited views.
             edited += [view for view in views if view not in edited]
             own = [*(self.sources[1:] if stage == 0 else ()), *views]
             if s.training == "all" or not views:
@@ -198,7 +198,7 @@ class AttentionWarping(Method):
     def edit_source(
         self, number: int, model: Gaussians, step: Callable[[], None]
     ) -> list[ViewEdit]:
-        """Edit a source, by its place among them, and record its features on the way (line 1)."""
+        """Edit the source of a given index and record its features meanwhile (line 1)."""
         work, views, view = self.work, self.views, self.sources[number]
         before = views.recorded(number)
         sights = [views.sight(number, view, work.frozen)]
@@ -211,7 +211,7 @@ class AttentionWarping(Method):
             self._inject(stack, before, sights)
             recording = None
             if views.features.layers:
-                # After the injection: what the next source gets is what this one went on with.
+                # Record after the injection: the next source gets the features this source used.
                 plan = views.features.plan(view, views.latent_size(view), further=number > 0)
                 recording = stack.enter_context(record(work.editor, plan))
             pictures, estimates = views.denoise(start, sights, step)
@@ -221,7 +221,7 @@ class AttentionWarping(Method):
     def edit_targets(
         self, stage: int, batch: Sequence[int], model: Gaussians, step: Callable[[], None]
     ) -> list[ViewEdit]:
-        """Warp the sources' features to views of one size, and edit these (lines 4 and 5)."""
+        """Warp the sources' features to views of one size and edit the views (lines 4 and 5)."""
         work, views, count = self.work, self.views, len(self.sources)
         recorded = views.recorded(count)
         with work.folder.seconds.part("warp"):
@@ -238,7 +238,7 @@ class AttentionWarping(Method):
     def _inject(
         self, stack: ExitStack, recorded: Sequence[RecordedSource], sights: Sequence[Sight | None]
     ) -> None:
-        """Blend recorded features into the editor's; no pixel takes those of two sources."""
+        """Blend recorded features into the editor's; each pixel takes at most one source."""
         weight = partial(a_t, s=self.settings)
         for number, source in enumerate(recorded):
             if source.recording is None:
@@ -253,7 +253,7 @@ class AttentionWarping(Method):
         self.views.clear()
 
     def counters(self, records: dict[int, dict[str, Any]]) -> dict[str, float]:
-        """Sources, bytes of their features, mean weight of the warp over targets, before a_t."""
+        """Count sources and bytes of features; average the warps' weights, before a_t."""
         shares = [about["injected"] for view, about in records.items() if view != self.sources[0]]
         return {
             "sources": len(self.sources),

@@ -1,14 +1,14 @@
-"""Loop of a method: its edits and its tuning, resumed after a kill, within a budget.
+"""Loop of a method: edits and tuning, resumable after a kill, within a budget.
 
 manifest.json         method, settings, rounds, hashes of the inputs
-rounds/N/NAME.png     each edited view of a round; NAME.json: its record
-rounds/N.pt  N.ply    the splats after the round's tuning, with their optimiser and without
-masks/  features/     where features were injected, and the features as colours (attention warping)
-segments/             what is edited of each view, where segments are given
-views/NAME.png        the last edit of each view
-renders/before/ after/  the scene from every view
-sheet.png             both and the edits, side by side
-cut.json              the budget's limit that ended the run, and its place; absent if none did
+rounds/N/NAME.png     edited view of a round; NAME.json: its record
+rounds/N.pt  N.ply    splats after the round's tuning, with and without their optimiser
+masks/  features/     pixels that took injected features; features as colours (attention warping)
+segments/             edited region of each view, if segments are given
+views/NAME.png        last edit of each view
+renders/before/ after/  renders of the scene from every view
+sheet.png             renders before, edits and renders after, side by side
+cut.json              budget limit that ended the run, and its round; absent if no limit did
 edited.ply  result.json  times.json  the edited splats; change, counters, Edit PSNR; seconds by part
 """
 
@@ -60,36 +60,36 @@ from attnwarp.workdir import Budget, CheckpointClock, Workdir, results_in
 FOLDERS = ("rounds", "masks", "features", "segments", "views", "renders/before", "renders/after")
 
 VIEWER_PLY = "edited-3dgs.ply"
-"""Edited 2D splats as thin 3D ones, for viewers of 3DGS; the command writes it."""
+"""Edited 2D splats as thin 3D splats, for viewers of 3DGS; the command writes this file."""
 
 RESULTS = ("edited.ply", VIEWER_PLY, "result.json", "sheet.png")
-"""Files beside the manifest."""
+"""Result files in the manifest's folder."""
 
 BUDGETED = ("warp", "edit", "tune")
-"""Parts of the seconds that a budget limits; files and renders are for people."""
+"""Timed parts that count toward a budget; writing files and renders does not."""
 
 SHEET_VIEWS = 8
-"""Views on the sheet, evenly spread."""
+"""Number of views on the sheet, evenly spread."""
 
 
 class Options(TypedDict, total=False):
     """Options that every method takes by name.
 
     Args:
-        folder: path of all results, created if need be; one that another run writes to is refused.
-            A killed run resumes from it. All files but ``times.json`` then get the bytes of an
-            uninterrupted run, on one machine, with the same number of threads and without a budget
-            in seconds.
-        budget: limits of the run, :class:`Budget`; None for a whole run.
+        folder: path of all results, created if missing; a folder that another run is writing to is
+            refused. A killed run resumes from it. All files but ``times.json`` then get the bytes
+            of an uninterrupted run, on one machine, with the same number of threads and without a
+            budget in seconds.
+        budget: limits of the run, :class:`Budget`; None for a complete run.
         segments: masks of the edited parts: (H, W) masks of the views, bool or soft in [0, 1], or a
-            function of a view's number and picture. The original stays outside.
-        tune_outside: tune all splats alike (False). Else each takes the share of a step that it
-            belongs to what the segments mark, so that the rest stays.
-        checkpoint_seconds: between two checkpoints of tuning (30); more where one takes long.
-        backend: name of :func:`attnwarp.render.render` ("auto").
-        report: receives how the run stands, :class:`attnwarp.reporting.Reporter`.
-        load: loads the perceptual distance, :func:`attnwarp.encoders.load_encoder`. One that keeps
-            what it loaded serves several runs.
+            function of a view's number and picture. Pixels outside keep the original.
+        tune_outside: True tunes all splats alike. False (default) scales each splat's steps by its
+            membership in the segments, so that the rest stays.
+        checkpoint_seconds: time between checkpoints of tuning (30); longer if writing one is slow.
+        backend: renderer name, as for :func:`attnwarp.render.render` ("auto").
+        report: receiver of progress, :class:`attnwarp.reporting.Reporter`.
+        load: loader of the perceptual distance, :func:`attnwarp.encoders.load_encoder`. A caching
+            loader can serve several runs.
 
     Example:
         >>> from attnwarp.methods import Budget, Options
@@ -109,13 +109,13 @@ class Options(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Round:
-    """A round: views are edited, and the splats are tuned on edited views.
+    """Round of a method: edit views, then tune the splats on edited views.
 
     Attributes:
-        views: numbers of the views that it edits, in the order of editing.
-        training: numbers of the views that it tunes on.
+        views: numbers of the views the round edits, in the order of editing.
+        training: numbers of the views the round tunes on.
         iterations: iterations of tuning.
-        rows: through the UNet that its edits take.
+        rows: rows through the UNet for the round's edits.
 
     Example:
         >>> from attnwarp.methods import Round
@@ -131,21 +131,22 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """The result of a method.
+    """Result of a method.
 
     Attributes:
-        method: its name.
+        method: name of the method.
         gaussians: the edited splats, float32, outside autograd.
-        edited: (h, w, 3) uint8 sRGB by the view's number, in the order of editing: its last edit,
-            at the size of the editor's work.
-        rounds: the views of each round, as planned.
+        edited: last edit of each view, (h, w, 3) uint8 sRGB at the editor's working size, by the
+            view's number in the order of editing.
+        rounds: planned views of each round.
         edit_psnr: dB: "pooled" (of the mean squared error over views), "mean" (of the views'
-            PSNRs), and "views", the names that were counted.
+            PSNRs), and "views", the names of the counted views.
         counters: "network_rows" (rows through the UNet), "edits", "views" (edited at least once),
-            "rounds" (begun), "iterations" of tuning, "splats", and the method's own.
-        seconds: by part, over all sittings.
-        cut: "seconds" or "network_rows" where that limit of the budget ended the run; None for a
-            whole run.
+            "rounds" (begun), "iterations" of tuning, "splats", and the method's additional
+            counters.
+        seconds: time by part, summed over all processes of the run.
+        cut: budget limit that ended the run, "seconds" or "network_rows"; None for a complete
+            run.
         change: dE00 inside the mask: of the "scene", from renders before to renders after, and of
             the "source view", or of the "edited views" by a method without a source.
 
@@ -173,12 +174,12 @@ class Result:
 
 @dataclass(frozen=True, eq=False)
 class ViewEdit:
-    """An edited view.
+    """Edited view with its record.
 
     Attributes:
         picture: (h, w, 3) in [0, 1].
         about: description of the edit, for its record.
-        pictures: (H, W, 3) uint8 for people, by the folder that they go to.
+        pictures: (H, W, 3) uint8 pictures for inspection, by their target folder.
     """
 
     picture: Image
@@ -187,20 +188,20 @@ class ViewEdit:
 
 
 Edit = Callable[[Gaussians, Callable[[], None]], list[ViewEdit]]
-"""Edits views, given the splats as they stand and what to call after each step of denoising."""
+"""Function that edits views, from the current splats and a callback for each denoising step."""
 
 
 class Loop(Protocol):
-    """Steps of a method, one after another, in the order that its ``run`` gives."""
+    """Steps of a method, executed in the order in which its ``run`` calls them."""
 
     def edit(self, number: int, views: Sequence[int], edit: Edit, *, rows: int) -> None:
         """Edit views together.
 
         Args:
             number: number of the round, from 0.
-            views: their numbers.
-            edit: does it; not called where the folder has the edits.
-            rows: through the UNet that it takes.
+            views: numbers of the views.
+            edit: function that makes the edits; not called for edits already in the folder.
+            rows: rows through the UNet for the edit.
         """
         ...
 
@@ -211,8 +212,8 @@ class Loop(Protocol):
 
         Args:
             number: number of the round, from 0.
-            views: numbers of views; those without an edit are left out.
-            iterations: one view each.
+            views: numbers of the views to tune on; views without an edit are left out.
+            iterations: number of iterations, one view each.
             order: see :meth:`attnwarp.methods.tuning.Tuning.advance`.
         """
         ...
@@ -222,10 +223,10 @@ class Method(ABC):
     """A method of editing a scene.
 
     Attributes:
-        about: further JSON of the run's manifest.
-        inputs: SHA-256 of further inputs, by name.
-        notes: lines that a person is told at the beginning.
-        psnr_leaves_out: numbers of views that Edit PSNR does not count.
+        about: additional JSON of the run's manifest.
+        inputs: SHA-256 of additional inputs, by name.
+        notes: lines reported to the user at the start.
+        psnr_leaves_out: numbers of the views that Edit PSNR excludes.
     """
 
     about: dict[str, Any] = {}  # noqa: RUF012  (never written to)
@@ -235,24 +236,24 @@ class Method(ABC):
 
     @abstractmethod
     def run(self, loop: Loop) -> None:
-        """Make all edits and all tuning, by way of the loop. It is called twice, first to learn the
-        plan; a run whose calls differ from it is ended by RuntimeError.
+        """Make all edits and all tuning through the loop. ``run`` is called twice, first to record
+        the plan; if the second run's calls differ from the plan, RuntimeError ends the run.
         """
 
     def clear(self) -> None:  # noqa: B027  (most have nothing)
-        """Remove files that only a sitting needs; called as it begins and ends."""
+        """Remove temporary files of one process; called at its start and end."""
 
     def counters(self, records: dict[int, dict[str, Any]]) -> dict[str, float]:
-        """Further counters, of the edits' records by view."""
+        """Compute additional counters from the edits' records by view."""
         return {}
 
 
 class Plan:
-    """A loop that does nothing but note what a method would do.
+    """Loop that records a method's calls without executing them.
 
     Attributes:
         rounds: number of rounds of the method.
-        calls: each edit and tuning with its round, views, and rows or iterations.
+        calls: list of edits and tunings, each with its round, views, and rows or iterations.
     """
 
     def __init__(self, method: Method) -> None:
@@ -294,12 +295,12 @@ def run(
     settings: MethodSettings | None,
     **options: Unpack[Options],
 ) -> Result:
-    """Run a method; the other arguments as of :func:`attnwarp.methods.by_view`.
+    """Run a method; the other arguments are those of :func:`attnwarp.methods.by_view`.
 
     Args:
         name: name of the method.
-        make: the method, of the work and its settings.
-        kind: kind of the settings.
+        make: constructor of the method, from the work and the settings.
+        kind: class of the settings.
     """
     for option in options:
         check.one_of(option, list(Options.__annotations__), "option")
@@ -327,17 +328,17 @@ def run(
 
 
 def workdir_of(path: Path) -> Workdir:
-    """The folder of a method's run."""
+    """Open the folder of a method's run."""
     return Workdir(path, "an edit", FOLDERS, RESULTS)
 
 
 def edit_file(number: int, name: str) -> str:
-    """The file of a view's edit in a round from 0, in the run's folder."""
+    """Path in the run's folder of a view's edit; rounds count from 0."""
     return f"rounds/{number + 1}/{name}.png"
 
 
 class _Run:
-    """A run in progress: the loop that does the work, or finds it done."""
+    """Run in progress: the loop that executes each step or skips a finished one."""
 
     def __init__(self, name: str, method: Method, work: Work, options: Options) -> None:
         self.name, self.method, self.work, self.folder = name, method, work, work.folder
@@ -357,8 +358,8 @@ class _Run:
         tuned = sorted({view for part in self.rounds for view in part.training})
         self.tuning.check_sizes([work.scene.cameras[view] for view in tuned])
         self.done, self.rows, self.edits = 0, 0, 0
-        self.latest: dict[int, int] = {}  # by the view: the round of its last edit
-        self.places = [0] * len(self.rounds)  # groups of each round so far
+        self.latest: dict[int, int] = {}  # round of each view's last edit
+        self.places = [0] * len(self.rounds)  # groups edited so far in each round
         self.total = sum(
             len(part.views) * work.settings.steps + part.iterations for part in self.rounds
         )
@@ -391,7 +392,7 @@ class _Run:
         )
 
     def go(self) -> Result:
-        # After the claim: in the folder of another run nothing of this one is true.
+        # Only after the claim: the folder of another run says nothing about this run.
         for line in self.method.notes:
             self.work.report.log(line)
         self._write_segments()
@@ -407,7 +408,7 @@ class _Run:
         return result
 
     def _follow(self, call: tuple[str, int, tuple[int, ...], int] | None) -> None:
-        """Raise RuntimeError unless a call is the plan's next; None is the end."""
+        """Raise RuntimeError unless a call is the plan's next; None stands for the end."""
         planned = next(self.planned, None)
         if call != planned:
             raise RuntimeError(
@@ -419,12 +420,12 @@ class _Run:
 
     @property
     def cut(self) -> dict[str, Any] | None:
-        """Limit that ended the run, and its round; it stands in the folder, so that no later
-        sitting goes beyond."""
+        """Limit that ended the run, and its round; kept in the folder, so a resumed run does not
+        exceed it."""
         return self.folder.read_json("cut.json") if self.folder.has("cut.json") else None
 
     def _cut(self, limit: str, number: int, groups: int) -> None:
-        """End the run in a round, of which so many groups are edited."""
+        """End the run in a round after a given number of edited groups."""
         self.folder.write_json("cut.json", {"limit": limit, "round": number, "groups": groups})
 
     def _out_of_seconds(self) -> bool:
@@ -432,7 +433,7 @@ class _Run:
         return limit is not None and sum(seconds.get(part, 0.0) for part in BUDGETED) >= limit
 
     def _limit(self, rows: int) -> str | None:
-        """The limit that forbids an edit of so many rows through the network."""
+        """Find the budget limit that forbids an edit of ``rows`` rows through the network."""
         if self._out_of_seconds():
             return "seconds"
         limit = self.budget.network_rows
@@ -441,7 +442,7 @@ class _Run:
     # --- editing
 
     def edit(self, number: int, views: Sequence[int], edit: Edit, *, rows: int) -> None:
-        """Edit views together, as :class:`Loop` tells."""
+        """Edit views together, as :class:`Loop` specifies."""
         self._follow(("edit", number, tuple(views), rows))
         place = self.places[number]
         self.places[number] += 1
@@ -451,7 +452,7 @@ class _Run:
             limit = None if self.cut else self._limit(rows)
             if limit is not None:
                 self._cut(limit, number, place)
-            # A run that was cut edits no further, but for files that were removed since.
+            # A run that hit its budget only re-edits files that were removed since.
             if self.cut is not None and (number, place) >= (self.cut["round"], self.cut["groups"]):
                 return
             self._edit_now(number, views, edit)
@@ -465,7 +466,7 @@ class _Run:
             f"round {number + 1} of {len(self.rounds)}: editing view {first + 1} of"
             f" {len(self.rounds[number].views)}"
         )
-        # Rounds before are tuned by now: this is the current model.
+        # Earlier rounds are tuned by now, so this is the current model.
         model = self.tuning.gaussians()
         with self.seconds.part("edit"):
             edits = edit(model, lambda: self._tell(text, len(views)))
@@ -477,7 +478,7 @@ class _Run:
     def _write_edit(self, number: int, view: int, edit: ViewEdit) -> None:
         file = self._picture(number, view)
         pixels = to_bytes(self.work.composite(view, edit.picture))
-        self.folder.check_same(file, pixels)  # before anything is drawn anew beside it
+        self.folder.check_same(file, pixels)  # before any other file is redrawn
         pictures = {f"{part}/{self.names[view]}.png": p for part, p in edit.pictures.items()}
         for name, picture in pictures.items():
             self.folder.write_picture(name, picture)
@@ -488,7 +489,7 @@ class _Run:
         return edit_file(number, self.names[view])
 
     def _edited(self, view: int) -> Bytes:
-        """The last edit of a view."""
+        """Read the last edit of a view."""
         return self.folder.read_picture(self._picture(self.latest[view], view))
 
     # --- tuning
@@ -496,10 +497,10 @@ class _Run:
     def tune(
         self, number: int, views: Sequence[int], iterations: int, order: Order | None = None
     ) -> None:
-        """Tune the splats, as :class:`Loop` tells."""
+        """Tune the splats, as :class:`Loop` specifies."""
         self._follow(("tune", number, tuple(views), iterations))
         cut = self.cut
-        # A round without an edit would tune on those before once more.
+        # A round without an edit would tune on earlier edits once more.
         edited = number in self.latest.values() or not self.rounds[number].views
         if (cut is not None and cut["round"] < number) or not edited:
             return
@@ -514,7 +515,7 @@ class _Run:
             return
         if not finished:
             self._tune_now(number, training, begin, end, state, order)
-        # Each time, since nothing tells whether one that is there is whole.
+        # Written each time, since an existing file may be incomplete.
         write_ply(self.folder.path / f"rounds/{number + 1}.ply", self.tuning.gaussians())
         self.seconds.write()
 
@@ -528,7 +529,7 @@ class _Run:
         order: Order | None,
     ) -> None:
         if self.work.backend in ("auto", "cpu"):
-            # Not within the budget's seconds.
+            # Excluded from the budget's seconds.
             compile_kernels(self.work.frozen.kind, device=self.tuning.model.device)
         views = DrawnViews([partial(self._training, view) for view in training])
         text = f"round {number + 1} of {len(self.rounds)}: tuning"
@@ -596,7 +597,7 @@ class _Run:
         )
 
     def _edit_psnr(self, final: Gaussians) -> dict[str, Any]:
-        """PSNR of renders against the edits; the mean is of MSE, and of the finite PSNRs."""
+        """PSNR of renders against edits: pooled from the mean MSE, and mean of finite PSNRs."""
         views = [view for view in self.latest if view not in self.method.psnr_leaves_out]
         errors = []
         for view in views:
@@ -619,7 +620,7 @@ class _Run:
                 self.folder.write_picture(path, to_bytes(share))
 
     def _sheet(self) -> Bytes:
-        """Rows: before, the edits (black where none), the edited scene. Columns: views."""
+        """Draw rows: renders before, edits (black if missing), renders after. Columns: views."""
         count = len(self.names)
         views = (
             [k * count // SHEET_VIEWS for k in range(SHEET_VIEWS)]

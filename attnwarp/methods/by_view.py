@@ -1,4 +1,4 @@
-"""View by view: each view is edited alone. What every other method has to beat."""
+"""View by view: edit each view alone. The baseline that every other method has to beat."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ def by_view(
         gaussians: the scene before the edit, N splats of either kind.
         cameras: V views, at least one.
         images: V pictures (H, W, 3), sRGB, uint8, uint16 or floating in [0, 1]: the views before
-            the edit. None takes renders of ``gaussians``.
+            the edit. None uses renders of ``gaussians``.
         editor: editor of either kind, see :mod:`attnwarp.editing`.
-        instruction: an instruction or a prompt, as the editor takes it.
-        settings: :class:`ByViewSettings`, its defaults if left out.
-        options: see :class:`Options`.
+        instruction: instruction or prompt, depending on the editor.
+        settings: :class:`ByViewSettings`; the defaults if omitted.
+        options: keyword options, see :class:`Options`.
 
     Raises:
-        ValueError: an argument of another size or type; the message names it.
-        InputError: the folder holds a run of other settings or inputs; the message names them.
-        RuntimeError: tuning diverged; the last checkpoint stays.
+        ValueError: an argument has the wrong size or type; the message names the argument.
+        InputError: the folder holds a run of different settings or inputs; the message lists them.
+        RuntimeError: tuning diverged; the last checkpoint is kept.
 
     Example:
         >>> import torch
@@ -64,7 +64,7 @@ def by_view(
 
 
 class ByView(Method):
-    """Every view is edited alone, and the splats are tuned on all of them."""
+    """Method that edits every view alone and tunes the splats on all views."""
 
     def __init__(self, work: Work, settings: ByViewSettings) -> None:
         if settings.start is not None:
@@ -72,10 +72,10 @@ class ByView(Method):
         self.work, self.settings = work, settings
 
     def run(self, loop: Loop) -> None:
-        """Edit all views, a batch after the other, then tune."""
+        """Edit all views, batch by batch, then tune."""
         work, s = self.work, self.settings
         views = range(len(work.sizes))
-        # Each edit with a timestep of its own goes through the network alone.
+        # Edits with separately drawn timesteps go through the network one at a time.
         alone = s.start is not None and s.noise == "fresh"
         for _, same in groupby(views, key=lambda view: work.sizes[view]):
             for batch in chunks(list(same), 1 if alone else s.batch):
@@ -86,7 +86,7 @@ class ByView(Method):
     def edit(
         self, batch: Sequence[int], model: Gaussians, step: Callable[[], None]
     ) -> list[ViewEdit]:
-        """Edit views by their guides alone."""
+        """Edit views from their guides alone."""
         work, s = self.work, self.settings
         start = None if s.start is None else work.timestep(0, batch[0], s.start)
         with work.guided(s.text_guidance):

@@ -1,4 +1,4 @@
-"""Ideas beyond the paper that are carried along with features: clean estimates, and noise that
+"""Extensions beyond the paper, warped along with features: clean estimates, and noise that
 sticks to the surface (the preset ``extended``).
 """
 
@@ -17,14 +17,14 @@ from attnwarp.methods.sight import Sight, Size, SourceWarp
 
 
 class Estimates:
-    """The sources' estimates of their clean latents, which targets take along the warp.
+    """Sources' estimates of their clean latents, warped to the targets.
 
     Args:
         editor: the model.
-        settings: weight, its end, and whether latents or pictures are warped.
+        settings: settings with the weight, its end, and the choice of latents or pictures.
 
     Attributes:
-        sources: sources of each source, (C, h, w) at each step.
+        sources: estimates of each source, (C, h, w) at each step.
     """
 
     def __init__(self, editor: Any, settings: AttentionWarpingSettings) -> None:
@@ -35,13 +35,13 @@ class Estimates:
     def change(
         self, sights: Sequence[Sight | None], sources: int, keep: list[Tensor] | None = None
     ) -> Callable[[int, Tensor], Tensor] | None:
-        """A function of a step and the predicted (B, C, h, w), which gives what to take instead;
-        None where nothing is.
+        """Return a function of a step and the predicted (B, C, h, w) that returns their
+        replacement; None if nothing is replaced.
 
         Args:
-            sights: sights of the views.
-            sources: how many are taken.
-            keep: gets the result of a lone view at each step.
+            sights: visibility of each view from the sources.
+            sources: number of sources to take estimates from.
+            keep: callback that receives the result of a lone view at each step.
         """
         s = self.settings
         if s.estimate == 0:
@@ -69,12 +69,12 @@ class Estimates:
         return change
 
     def weight(self, number: int) -> float:
-        """Weight of a source's estimate at a step, from 0; not above 0 where it is not taken."""
+        """Weight of a source's estimate at a step, counted from 0; 0 or less means unused."""
         s = self.settings
         return s.estimate * (1 - number / max(1, s.estimate_until * s.steps))
 
     def memory(self, sizes: Sequence[Size]) -> str | None:
-        """A line on the memory of the sources' pictures of (h, w); None where none is kept."""
+        """Describe the memory of the sources' (h, w) pictures; None if no picture is kept."""
         s = self.settings
         if s.estimate_in != "picture" or s.estimate == 0:
             return None
@@ -86,7 +86,7 @@ class Estimates:
         )
 
     def _picture(self, source: int, number: int, like: Tensor) -> Tensor:
-        """(3, H, W) of a source's estimate at a step."""
+        """Decode a source's estimate at a step, (3, H, W)."""
         key = source, number
         if key not in self._pictures:
             latents = self.sources[source][number].to(like)
@@ -96,11 +96,11 @@ class Estimates:
     def _carry_picture(
         self, own: Tensor, pictures: Sequence[Tensor], warps: Sequence[SourceWarp], weight: float
     ) -> Tensor:
-        """(C, h, w) latents of a target whose picture takes the sources' (3, H, W), warped."""
+        """Encode a target's picture after warping the sources' (3, H, W) into it, (C, h, w)."""
         before = self.editor.pixels(own[None])
         after = _carry(before[0], pictures, warps, weight)[None]
-        # What an autoencoder loses of a picture is lost in both, so that nothing changes where
-        # nothing is carried.
+        # The autoencoder's loss of detail affects both pictures alike, so pixels without a warped
+        # source do not change.
         change = self.editor.latents(after) - self.editor.latents(before)
         return own + change[0].to(own)
 
@@ -108,13 +108,13 @@ class Estimates:
 def _carry(
     own: Tensor, maps: Sequence[Tensor], warps: Sequence[SourceWarp], weight: float
 ) -> Tensor:
-    """(C, h, w) of a target that takes the sources' (C, h', w') maps, warped.
+    """Blend the sources' warped (C, h', w') maps into a target's (C, h, w) map.
 
     Args:
-        own: (C, h, w) the target's.
+        own: (C, h, w) map of the target.
         maps: maps of the sources.
-        warps: from the sources.
-        weight: weight of the sources', in [0, 1].
+        warps: warps from the sources.
+        weight: weight of the sources' maps, in [0, 1].
     """
     tokens = own.flatten(1).T[None].contiguous()
     for warp, map_ in zip(warps, maps, strict=False):
@@ -126,14 +126,14 @@ def _carry(
 
 
 class Noise:
-    """Noise that views start from: one for all of a size, one of each view's own, or one that
-    sticks to the surface.
+    """Initial noise of views: shared by all views of a size, fresh for each view, or attached to
+    the surface.
 
     Args:
-        settings: which, and the seed.
+        settings: settings with the kind of noise and the seed.
 
     Attributes:
-        orders: orders of each source, (h, w) order of its noise where noise sticks to the surface.
+        orders: (h, w) order of each source's noise, if noise sticks to the surface.
     """
 
     def __init__(self, settings: AttentionWarpingSettings) -> None:
@@ -143,7 +143,7 @@ class Noise:
     def of(
         self, views: Sequence[int], shape: tuple[int, int, int], sights: Sequence[Sight | None]
     ) -> Tensor:
-        """(B, C, h, w) noise of views whose latents have (C, h, w)."""
+        """Draw (B, C, h, w) noise for views whose latents are (C, h, w)."""
         s = self.settings
         if s.noise == "fresh":
             return torch.cat(
@@ -159,7 +159,7 @@ class Noise:
         return torch.stack(rows)
 
     def order(self, sight: Sight | None, size: tuple[int, ...]) -> Tensor:
-        """(h, w) int64: the order of a view's noise; sources of another size have none to give."""
+        """Compute the (h, w) int64 order of a view's noise; sources of another size are ignored."""
         h, w = size
         if sight is None:
             return unmoved((h, w))

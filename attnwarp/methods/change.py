@@ -1,4 +1,4 @@
-"""Change that an edit made, and advice where that is hardly anything."""
+"""Measured change of an edit, and advice if the change is negligible."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from attnwarp.methods.work import Work
 
 LITTLE = 3.0
 """dE00 inside the mask below which an edit is hardly seen. Two pictures side by side differ visibly
-from about 1; rounding, tuning and a source that stays as it was make up to 2."""
+from about 1; rounding, tuning and an unchanged source account for up to 2."""
 
 MOST_PIXELS = 20_000
-"""Pixels of a view that are compared, evenly spread; more change no digit that is shown."""
+"""Compared pixels per view, evenly spread; more pixels would change no displayed digit."""
 
 Change = Mapping[str, float | None]
-"""Mean CIEDE2000 of "scene" and of "source view", or of "edited views" where a method has no
-source; None where there is no pixel."""
+"""Mean CIEDE2000 of "scene" and of "source view", or of "edited views" for a method without a
+source; None if no pixel counts."""
 
 
 def change_of(
     work: Work, names: Sequence[str], source: str | None, edited: Mapping[int, Bytes]
 ) -> Change:
-    """Change inside the mask of an edit whose renders are written.
+    """Measure the change inside the mask of an edit whose renders are written.
 
     Args:
         work: the scene before the edit, and the folder of its renders.
         names: file names of the views.
-        source: name of the source view, which the scene's change leaves out; None for no source.
+        source: name of the source view, excluded from the scene's change; None for no source.
         edited: edited views by their numbers.
 
     Returns:
@@ -53,7 +53,7 @@ def change_of(
         )  # fmt: skip
 
     def edit(view: int) -> tuple[Bytes, Bytes, Mask | None]:
-        size = edited[view].shape[:2]  # a method may answer at another size than it was asked
+        size = edited[view].shape[:2]  # a method may return another size than requested
         before = resized(work.scene.picture(view), size)
         return to_bytes(before), edited[view], mask(view, size)
 
@@ -67,14 +67,14 @@ def change_of(
 
 
 def mean_change(pictures: Iterable[tuple[Bytes, Bytes, Mask | None]]) -> float | None:
-    """Mean CIEDE2000 of pictures before and after, over all pixels of all views.
+    """Average CIEDE2000 between pictures before and after, over all pixels of all views.
 
     Args:
-        pictures: (h, w, 3) uint8 of a view before, after, and (h, w) bool of the pixels that count,
+        pictures: (h, w, 3) uint8 of a view before, after, and (h, w) bool of the counted pixels,
             None for all.
 
-    Returns:
-        dE00; None where no pixel counts.
+        rns:
+        dE00; None if no pixel counts.
 
     Example:
         >>> import numpy as np
@@ -96,7 +96,7 @@ def mean_change(pictures: Iterable[tuple[Bytes, Bytes, Mask | None]]) -> float |
 
 
 def say_change(change: Change, masked: bool) -> str:
-    """The first line of an edit's page and of its command.
+    """Write the first line of an edit's page and of its command's output.
 
     Example:
         >>> say_change({"scene": 9.04, "source view": 20.5}, masked=True)
@@ -108,7 +108,7 @@ def say_change(change: Change, masked: bool) -> str:
 
 
 def say_little(change: Change) -> str | None:
-    """Advice where next to nothing changed; None where something did.
+    """Return advice if the change is negligible, else None.
 
     Example:
         >>> say_little({"scene": 0.4, "source view": 20.5})

@@ -1,4 +1,4 @@
-"""The work of the command attnwarp edit: from photographs to an edited scene."""
+"""Implementation of the command attnwarp edit: from photographs to an edited scene."""
 
 from __future__ import annotations
 
@@ -57,18 +57,18 @@ from attnwarp.workdir import FORMAT, Budget
 FIT_FOLDER = "fit"
 
 MOST_NAMES = 5
-"""Names of views in one line."""
+"""Largest number of view names in one line."""
 
 
 @dataclass(frozen=True)
 class FitPlan:
-    """Settings of the fit before an edit. ``reports/editing/time.md`` has what the defaults take,
-    and what half and twice as much time buys.
+    """Settings of the fit before an edit. ``reports/editing/time.md`` has the defaults' duration,
+    and the gain from half and twice as much time.
 
     Args:
         iterations: iterations of the fit.
         kind: "2d" or "3d".
-        max_splats: no more than these.
+        max_splats: largest number of splats.
     """
 
     iterations: int = 3_000
@@ -82,16 +82,16 @@ class EditOptions:
 
     Args:
         marks: marks of the edited parts.
-        tune_outside: tune splats that are not marked, too.
-        source: name or number of the source view, which marks are of; the first if None, of the
-            split "train" where there is one.
-        max_size: larger pictures are averaged down to it.
+        tune_outside: True also tunes splats that are not marked.
+        source: name or number of the marked source view; None takes the first view, of the split
+            "train" if the dataset has one.
+        max_size: longest side in px; larger pictures are averaged down to it.
         device: device of the editor and the splats, "auto", "cpu" or "cuda".
         dtype: dtype of the editor; see :func:`attnwarp.devices.type_of`.
         low_memory: see :func:`attnwarp.editing.memory.save_memory`.
         threads: threads of the editor; see :func:`attnwarp.editing.small.thread_count`.
-        control: also edit the page's views each alone; None does so with a bundled editor.
-        turntable: file of the scene's turn, GIF or MP4.
+        control: True also edits each of the page's views alone; None does so with a bundled editor.
+        turntable: file of the turntable film, GIF or MP4.
     """
 
     marks: Marks
@@ -122,29 +122,29 @@ def edit_dataset(
     report: Reporter,
     **own: Any,
 ) -> tuple[Result, Path]:
-    """Fit where no splats are given, edit, and write the page.
+    """Fit splats if none are given, edit them, and write the page.
 
     Args:
-        method: see :data:`attnwarp.methods.METHODS`.
+        method: key of :data:`attnwarp.methods.METHODS`.
         dataset: cameras and pictures.
-        splats: the scene before the edit; None fits them first.
-        editor_name: see :func:`attnwarp.editing.small.load_editor`.
-        instruction: in words.
-        settings: settings of the method. Without a size, the editor's own is taken.
-        out: folder of all results, with a PLY for other viewers too.
+        splats: the scene before the edit; None fits it first.
+        editor_name: name or path, see :func:`attnwarp.editing.small.load_editor`.
+        instruction: instruction in words.
+        settings: settings of the method. A missing size becomes the editor's default.
+        out: folder of all results, including a PLY for other viewers.
         options: options of the edit.
-        fit_plan: plan of the fit, where splats are None.
+        fit_plan: plan of the fit, if splats are None.
         source_picture: file of the source view edited elsewhere, for attention warping.
         note: warning about the inputs, for the page.
-        report: receives how the work stands.
-        own: further options of the method, such as "budget".
+        report: receiver of progress.
+        own: additional options of the method, such as "budget".
 
     Returns:
-        The edit and the path of its page.
+        Result of the edit, and the path of its page.
 
     Raises:
-        InputError: no such view, mask, editor or segmenter; marks where nothing is found; files of
-            something else where results go; a film of another format.
+        InputError: an unknown view, mask, editor or segmenter; marks that select nothing; foreign
+            files in the results' folder; an unsupported film format.
     """
     index = view_of(dataset, options.source)
     device = choose(options.device, report)
@@ -163,7 +163,7 @@ def edit_dataset(
     )
     if splats is None:
         assert fit_plan is not None
-        # Settings that the editor or the tuning cannot use are refused before it.
+        # Refuse settings that the editor or the tuning cannot use before the fit.
         if isinstance(settings, AttentionWarpingSettings):
             check_editor(editor, settings)
             Features(editor, settings, "cpu")
@@ -187,9 +187,9 @@ def edit_dataset(
     )
     _report_memory(device, report)
     if result.gaussians.kind == "2d":
-        # Other programs take no splats of two scales.
+        # Other programs cannot read splats of two scales.
         write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
-    # Views are edited alone too where a bundled editor takes seconds.
+    # A bundled editor takes seconds, so it also edits the views alone.
     control = editor_name in bundled() if options.control is None else options.control
     page = show_edit(
         workdir_of(out), splats, views.cameras, images, turntable=options.turntable, report=report,
@@ -201,21 +201,21 @@ def edit_dataset(
 def _by_hand(
     source_picture: Path | None, dataset: Dataset, views: Views, index: int
 ) -> npt.NDArray[np.float32] | None:
-    """(h, w, 3) of the source view edited elsewhere, if it was."""
+    """Read the edit of the source view made elsewhere, (h, w, 3), if given."""
     if source_picture is None:
         return None
-    # Views are the cameras with a picture.
+    # Only cameras with a picture are views.
     pictures = [path for path in dataset.image_paths if path is not None]
     pixels, top = read_over_black(source_picture, beside=pictures[index])
     by_hand = (pixels / top).astype(np.float32)
     h, w, _ = by_hand.shape
-    # Again in the edit, but here before an editor is loaded and a fit spends its minutes.
+    # The edit checks again; here the check precedes loading an editor and minutes of fitting.
     check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
     return by_hand
 
 
 def _editor(name: str, device: str, options: EditOptions, report: Reporter) -> Any:
-    """The editor; on a GPU with a line about the memory of its weights."""
+    """Load the editor; on a GPU, report the memory of its weights."""
     editor = load_editor(
         name, device=device, dtype=type_of(options.dtype, device), low_memory=options.low_memory
     )
@@ -229,7 +229,7 @@ def _editor(name: str, device: str, options: EditOptions, report: Reporter) -> A
 
 
 def _report_memory(device: str, report: Reporter) -> None:
-    """Say how much of a GPU's memory was taken."""
+    """Report the peak memory of a GPU."""
     if peak := peak_memory(device):
         report.log(f"edited{peak}")
 
@@ -245,7 +245,7 @@ def marked(
     device: str,
     report: Reporter,
 ) -> Callable[[Gaussians], list[Segment] | None]:
-    """Segments of all views as a function of the splats; what is marked is read at once."""
+    """Read the marks now and return a function from splats to the segments of all views."""
     pictures = [path for path in dataset.image_paths if path is not None]
     if marks.masks is not None:
         given = _masks(marks.masks, views.cameras, pictures, report)
@@ -281,7 +281,7 @@ def _fitted(
     device: str,
     report: Reporter,
 ) -> Gaussians:
-    """Splats fitted to all views; a fit in the folder is resumed."""
+    """Fit splats to all views, resuming a fit in the folder."""
     settings = FitSettings.from_dict(
         {
             "kind": plan.kind,
@@ -308,22 +308,22 @@ def check_asked(
     out: Path,
     options: EditOptions,
 ) -> None:
-    """Refuse what needs no capture to be refused, before one is rendered or read.
+    """Refuse invalid arguments before a capture is rendered or read.
 
     Args:
         method, instruction, settings, out, options: see :func:`edit_dataset`.
         budget: budget of the method.
 
     Raises:
-        InputError: no such device, precision or segmenter; a film of another format; an edit of
-            other settings in the folder, or files of something else where results go.
+        InputError: an unknown device, precision or segmenter; an unsupported film format; an edit
+            of other settings in the folder, or foreign files in the results' folder.
     """
     check_film(options.turntable)
     type_of(options.dtype, "cpu" if options.device == "auto" else str(device_of(options.device)))
     if options.marks.words is not None:
         segmenter_folders(options.marks.segmenter)
     known = settings.to_dict()
-    if settings.size is None:  # the editor's own, which it tells once it is loaded
+    if settings.size is None:  # the editor's default, known once the editor is loaded
         del known["size"]
     workdir_of(out).check_claimed(
         {
@@ -337,10 +337,10 @@ def check_asked(
 
 
 def check_marked(options: EditOptions, dataset: Dataset) -> None:
-    """Refuse a source view that is not there, and marks beside its picture.
+    """Refuse an unknown source view, and marks outside its picture.
 
     Raises:
-        InputError: it is one of these.
+        InputError: the source view is unknown, or a mark lies outside its picture.
     """
     index, marks = view_of(dataset, options.source), options.marks
     camera = _with_picture(dataset)[index]
@@ -353,8 +353,8 @@ def _with_picture(dataset: Dataset) -> list[Camera]:
 
 
 def view_of(dataset: Dataset, name: str | None) -> int:
-    """The number of a view among those with a picture; see :func:`number_of`. The first that splats
-    were fitted to, for no name."""
+    """Find a view's number by its name among views with a picture; see :func:`number_of`. No name
+    means the first training view."""
     if name is None:
         posed = zip(dataset.splits, dataset.image_paths, strict=True)
         splits = [split for split, image in posed if image is not None]
@@ -365,15 +365,15 @@ def view_of(dataset: Dataset, name: str | None) -> int:
 
 
 def number_of(names: Sequence[str], name: str, left_out: Sequence[str] = ()) -> int:
-    """The number of a view by its name, its file's name with or without suffix, or its number.
+    """Find the number of a view by its name, its file's name (suffix optional), or its number.
 
     Args:
         names: names of the views.
-        name: as typed.
+        name: name as typed.
         left_out: names of views whose picture is missing.
 
     Raises:
-        InputError: no such view.
+        InputError: no view has this name.
 
     Example:
         >>> number_of(["left/a.png", "left/b.png"], "b"), number_of(["a", "b", "c"], "2")
@@ -397,14 +397,14 @@ def number_of(names: Sequence[str], name: str, left_out: Sequence[str] = ()) -> 
 
 
 def _spellings(names: Sequence[str]) -> list[list[str]]:
-    """The names, their files' names with suffix, and without."""
+    """List the names, their files' names with suffix, and without."""
     return [[*names], [Path(name).name for name in names], [Path(name).stem for name in names]]
 
 
 def _masks(
     folder: Path, cameras: Any, pictures: Sequence[Path], report: Reporter
 ) -> list[npt.NDArray[np.bool_]]:
-    """(H, W) bool of each view from NAME.png: white is edited."""
+    """Read the mask of each view from NAME.png, (H, W) bool: white is edited."""
     if not folder.is_dir():
         raise InputError(f"--masks: {folder} is no folder; name one with a PNG for each view")
     paths = mask_files(folder, cameras)
@@ -427,8 +427,8 @@ def _masks(
 
 
 def mask_files(folder: Path, cameras: Any) -> list[Path]:
-    """The file of each view's mask: by the view's name and folders, or by its name alone where no
-    other view has it, or numbered as an edit writes it."""
+    """Find each view's mask file: by the view's name with folders, by its bare name if unique, or
+    numbered as an edit writes it."""
     names = [Path(*(p for p in PurePath(c.name).parts if p not in ("..", "/"))) for c in cameras]
     plain = [name.parent / name.stem for name in names]
     counts, stems = Counter(plain), Counter(name.stem for name in names)

@@ -1,4 +1,4 @@
-"""Direct Gaussian Editor (Chen et al. 2024): views are edited together, as frames of a film whose
+"""Direct Gaussian Editor (Chen et al. 2024): edit views together, as frames of a film whose
 tokens are matched along epipolar lines.
 """
 
@@ -33,22 +33,22 @@ def dge(
     settings: DGESettings | None = None,
     **options: Unpack[Options],
 ) -> Result:
-    """Edit views together through key views, tune the splats on them, and begin again with others.
+    """Edit views together through key views, tune the splats on them, and repeat with other views.
 
     The views of a round are sorted by their angle and cut into batches. At every step one view of
-    each batch is drawn as key view. The key views look at each other's tokens; every view then
-    takes the attention's output of the key tokens that match its own, near the epipolar line. Each
-    round noises renders of the current splats and is guided by renders of those before the edit.
+    each batch is drawn as key view. The key views attend to each other's tokens; every view then
+    takes the attention output of the key tokens that match its tokens near the epipolar line. Each
+    round noises renders of the current splats and is guided by renders of the original splats.
 
-    The authors' code also grows the splats; their number stays here.
+    The authors' code also densifies the splats; here their number stays constant.
 
     Args:
-        gaussians, cameras, instruction, options: see :func:`by_view`. The views' edits have one
+        gaussians, cameras, instruction, options: see :func:`by_view`. All views' edits have one
             size.
-        images: see :func:`by_view`; they serve the segments and the detail that an edit at a
+        images: see :func:`by_view`; used for the segments and for the detail that an edit at a
             smaller size lacks. Guides are renders.
         editor: an InstructPix2Pix.
-        settings: :class:`DGESettings`, its defaults if left out.
+        settings: :class:`DGESettings`; the defaults if omitted.
 
     Raises:
         ValueError, InputError, RuntimeError: see :func:`by_view`.
@@ -74,7 +74,7 @@ def dge(
 
 
 class DGE(Method):
-    """Views of a round are edited together, through key views."""
+    """Method that edits the views of a round together, through key views."""
 
     def __init__(self, work: Work, settings: DGESettings) -> None:
         work.takes("dge", "picture", InstructPix2Pix)
@@ -84,7 +84,7 @@ class DGE(Method):
         work.starts_at(min(self._start(number) for number in rounds), "starts")
 
     def run(self, loop: Loop) -> None:
-        """Draw views, edit them together, tune on them, and begin again with others."""
+        """Draw views, edit them together, tune on them, and repeat with other views."""
         work, s = self.work, self.settings
         for number, iterations in enumerate(parts_of(s.iterations, s.every)):
             order = torch.randperm(len(work.sizes), generator=work.generator(VIEWS, number))
@@ -97,7 +97,7 @@ class DGE(Method):
     def edit(
         self, number: int, group: Sequence[int], model: Gaussians, step: Callable[[], None]
     ) -> list[ViewEdit]:
-        """Edit the views of a round, from their noised renders."""
+        """Edit the views of a round from their noised renders."""
         work, s = self.work, self.settings
         editor: Any = work.editor
         timesteps = editor.schedule.published(self._start(number), s.steps, s.grid)
@@ -141,25 +141,25 @@ class DGE(Method):
         return [ViewEdit(picture, about) for picture in pictures]
 
     def _start(self, number: int) -> int:
-        """Stable Diffusion's timestep that a round starts from."""
+        """Stable Diffusion timestep at which a round starts."""
         starts = self.settings.starts
         return starts[min(number, len(starts) - 1)]
 
     def _with_keys(self, number: int) -> list[bool]:
-        """Flags of a round's steps, True where views take the outputs of key views there."""
+        """Flags of a round's steps: True if views take the key views' outputs at the step."""
         s = self.settings
         published = published_steps(self._start(number), s.steps, s.grid)
         return [timestep >= s.plain_below for timestep in published]
 
 
 def by_angle(cameras: Sequence[Camera], views: Sequence[int]) -> list[int]:
-    """Views by the angle of their direction from that of the leftmost camera (the smallest x).
+    """Sort views by the angle of their direction to the leftmost camera's (smallest x).
 
-    Angles go all round, toward that camera's nearest neighbour.
+    Angles cover the full circle and increase toward that camera's nearest neighbour.
 
     Args:
-        cameras: all of them.
-        views: numbers of those to sort.
+        cameras: all cameras.
+        views: numbers of the views to sort.
 
     Example:
         >>> import math
@@ -194,7 +194,7 @@ def _drawn(batch: Sequence[int], generator: torch.Generator) -> int:
 
 
 def _part(task: Any, views: Sequence[int]) -> Any:
-    """The edit of some of the views of an InstructPix2Pix task."""
+    """Restrict an InstructPix2Pix task to some of its views."""
     rows = [branch * task.views + view for branch in range(len(task.branches)) for view in views]
     region = None if task.region is None else task.region[list(views)]
     return replace(

@@ -11,12 +11,12 @@ from attnwarp.methods.pictures import Size
 
 
 def line_distances(view: Camera, key: Camera, size: Size) -> Tensor | None:
-    """(L, L) float32 distances of each cell of ``key`` from the epipolar line of each cell of
-    ``view``, in cells; None where the centres of projection coincide and there is no line.
+    """Compute (L, L) float32 distances, in cells, of each cell of ``key`` from the epipolar line of
+    each cell of ``view``; None if both cameras share one centre, so that no line exists.
 
     Args:
         view, key: cameras.
-        size: (h, w) of both grids, L = h w. A cell's centre is at +0.5.
+        size: (h, w) of both grids, L = h w. Cell centres are at +0.5.
 
     Example:
         >>> from attnwarp import Camera
@@ -33,7 +33,7 @@ def line_distances(view: Camera, key: Camera, size: Size) -> Tensor | None:
     x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
     cells = np.stack([x.ravel(), y.ravel(), np.ones(h * w)], axis=1)
     lines = cells @ matrix.T
-    # At the epipole there is no line; 0 excludes nothing.
+    # The epipole has no line; a distance of 0 excludes nothing.
     length = np.hypot(lines[:, 0], lines[:, 1])[:, None]
     lines = np.divide(lines, length, out=np.zeros_like(lines), where=length > 0)
     return torch.from_numpy(np.abs(lines @ cells.T).astype(np.float32))

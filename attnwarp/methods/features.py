@@ -1,4 +1,4 @@
-"""Recorded features of an edit: which layers and guidance branches, and the memory they take."""
+"""Recorded features of an edit: their layers, guidance branches and memory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from attnwarp.methods.sight import Size
 
 
 class Features:
-    """The choice of what is recorded.
+    """Selection of the features to record.
 
     Args:
         editor: the model.
@@ -23,10 +23,10 @@ class Features:
         store: "device", "cpu", or a folder.
 
     Attributes:
-        layers: to record; none where their weight is 0.
+        layers: layers to record; empty if the features' weight is 0.
 
     Raises:
-        ValueError: layers or branches that the editor lacks.
+        ValueError: the editor lacks a layer or branch.
     """
 
     def __init__(
@@ -41,18 +41,18 @@ class Features:
             self._check_branches()
 
     def source_guidance(self, *, further: bool) -> float | None:
-        """Text guidance of a source; None for the editor's own. Further ones have stage 0's."""
+        """Text guidance of a source; None for the editor's default. Further sources use stage 0."""
         s = self.settings
         own = None if further else s.source_text_guidance
         return s.guidance(0) if own is None else own
 
     def plan(self, view: int, size: Size, *, further: bool) -> RecordingPlan:
-        """The recording of a source.
+        """Plan the recording of a source.
 
         Args:
-            view: its number.
-            size: (h, w) of its latents.
-            further: for a source after the first.
+            view: number of the source view.
+            size: (h, w) of the view's latents.
+            further: True for a source after the first.
         """
         s = self.settings
         branches = self.branches(self.source_guidance(further=further))
@@ -67,17 +67,17 @@ class Features:
         )
 
     def _stored(self) -> torch.dtype:
-        """Precision of what is recorded: no wider than the editor's own, which loses nothing."""
+        """Precision of recorded features; at most the editor's precision, which is lossless."""
         own, chosen = self.editor.network.dtype, getattr(torch, self.settings.feature_type)
         return own if own.itemsize < chosen.itemsize else chosen
 
     def branches(self, guidance: float | None) -> tuple[str, ...]:
-        """Guidance branches of a batch with a text guidance."""
+        """Guidance branches of a batch, given its text guidance."""
         with guided(self.editor, text_guidance=guidance):
             return self.editor.branches
 
     def _kept(self, branches: tuple[str, ...]) -> tuple[str, ...]:
-        """Branches to record, of a source that has these."""
+        """Select the branches to record from a source's branches."""
         if self.settings.branches is not None:
             return self.settings.branches
         return tuple(branch for branch in self.editor.carries if branch in branches)
@@ -96,15 +96,15 @@ class Features:
                 )
 
     def check_batches(self, stages: Sequence[int], *, further: bool) -> None:
-        """Refuse, before any work, branches of the source that a later batch does not have.
+        """Refuse, before any work, source branches that a later batch lacks.
 
         Args:
             stages: numbers of the stages that edit views, from 0.
-            further: for several sources.
+            further: True if there are several sources.
 
-        Raises:
-            ValueError: a batch takes none of the recorded branches, or cannot record all that the
-                settings name.
+            es:
+            ValueError: a batch uses none of the recorded branches, or cannot record all branches
+                named by the settings.
         """
         if not self.layers:
             return
@@ -117,7 +117,7 @@ class Features:
         guidances |= {f"stage {number + 1}": s.guidance(number) for number in stages}
         for name, guidance in guidances.items():
             branches = self.branches(guidance)
-            # A further source records what the settings name, too.
+            # A further source also records the branches named by the settings.
             needs_all = name == "a further source" and s.branches is not None
             for keep in recorded:
                 shared = set(keep) & set(branches)

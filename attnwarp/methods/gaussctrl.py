@@ -1,4 +1,4 @@
-"""GaussCtrl (Wu et al. 2024): views by their depth, with attention to reference views, from the
+"""GaussCtrl (Wu et al. 2024): edit views by depth, with attention to reference views, from the
 inverted noise of their renders.
 """
 
@@ -34,19 +34,20 @@ def gaussctrl(
     settings: GaussCtrlSettings | None = None,
     **options: Unpack[Options],
 ) -> Result:
-    """Edit views by their depth with attention to reference views, then tune the splats on them.
+    """Edit views by depth with attention to reference views, then tune the splats on the edits.
 
     Each edit starts from the DDIM inversion of the view's render, without guidance, or from random
     latents. The reference views go through the network with every batch.
 
     Args:
-        gaussians, cameras, images, options: see :func:`by_view`. ``images`` serve the segments and
-            the detail that an edit at a smaller size lacks; guides are of the splats.
-        editor: a :class:`~attnwarp.editing.editors.controlnet.DepthControlNet`. Where its network
-            predicts the picture, which says nothing of a clean picture's noise, inversion begins at
-            the lowest timestep, to which all views are noised alike.
-        instruction: a prompt.
-        settings: :class:`GaussCtrlSettings`, its defaults if left out.
+        gaussians, cameras, images, options: see :func:`by_view`. ``images`` are used for the
+            segments and for the detail that an edit at a smaller size lacks; guides come from the
+            splats.
+        editor: a :class:`~attnwarp.editing.editors.controlnet.DepthControlNet`. If its network
+            predicts the picture, a clean picture's noise is undefined, so inversion begins at the
+            lowest timestep, to which all views are noised alike.
+        instruction: prompt of the edit.
+        settings: :class:`GaussCtrlSettings`; the defaults if omitted.
 
     Raises:
         ValueError, InputError, RuntimeError: see :func:`by_view`.
@@ -73,7 +74,7 @@ def gaussctrl(
 
 
 class GaussCtrl(Method):
-    """Views are edited with attention to reference views."""
+    """Method that edits views with attention to reference views."""
 
     def __init__(self, work: Work, settings: GaussCtrlSettings) -> None:
         work.takes("gaussctrl", "depth", DepthControlNet)
@@ -86,7 +87,7 @@ class GaussCtrl(Method):
         self._latents: dict[int, Tensor] = {}
 
     def run(self, loop: Loop) -> None:
-        """Edit all drawn views, a batch after the other, then tune."""
+        """Edit all drawn views, batch by batch, then tune."""
         inverted: set[int] = set()
         for batch in chunks(self.views, self.settings.batch):
             together = {*self.references, *batch}
@@ -96,7 +97,7 @@ class GaussCtrl(Method):
         loop.tune(0, self.views, self.settings.iterations)
 
     def _rows(self, views: int, inversions: int) -> int:
-        """Rows through the network for a batch, of which so many views are inverted first."""
+        """Rows through the network for a batch whose first ``inversions`` views are inverted."""
         s = self.settings
         edits = (len(self.references) + views) * s.steps * self.work.branches()
         if s.latents == "random":
@@ -132,7 +133,7 @@ class GaussCtrl(Method):
         return [ViewEdit(picture, about) for picture in result.images[count:]]
 
     def latents(self, view: int, depth: Guide) -> Tensor:
-        """(1, C, h, w) that the edit of a view starts from, computed once a sitting."""
+        """Initial latents (1, C, h, w) of a view's edit, computed once per process."""
         work, s = self.work, self.settings
         if s.latents == "random":
             return work.noise(0, [view])
@@ -146,13 +147,13 @@ class GaussCtrl(Method):
 
 
 def _quarters(views: Sequence[int], count: int) -> list[list[int]]:
-    """Contiguous parts of views, as equal as can be; fewer where there are fewer views."""
+    """Split views into contiguous, nearly equal parts; fewer parts if there are fewer views."""
     count = min(count, len(views))
     return [list(part) for part in np.array_split(np.asarray(views), count)]
 
 
 def _choice(views: Sequence[int], count: int, generator: torch.Generator) -> list[int]:
-    """Draw so many different views at random, in their order."""
+    """Draw ``count`` different views at random and keep their order."""
     order = torch.randperm(len(views), generator=generator)[:count].tolist()
     return [int(views[k]) for k in sorted(order)]
 
@@ -160,7 +161,7 @@ def _choice(views: Sequence[int], count: int, generator: torch.Generator) -> lis
 def _spread_draw(
     views: Sequence[int], parts: int, most: int, generator: torch.Generator
 ) -> list[int]:
-    """Draw at most so many views: an equal share of each contiguous part, at random."""
+    """Draw at most ``count`` views at random: an equal share of each contiguous part."""
     if len(views) <= most:
         return list(views)
     shares = [len(part) for part in np.array_split(np.arange(most), min(parts, len(views)))]

@@ -1,4 +1,4 @@
-"""Geometry of an edit: the warps between its views, and which views are its sources."""
+"""Geometry of an edit: the warps between its views, and the choice of source views."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from attnwarp.methods.work import Work
 from attnwarp.warp import Surface, WarpedView, parts_read, render_surface, warp_view
 
 CHAIN_COVERAGE = 0.5
-"""Share of its surface that the sources so far must see of the next one."""
+"""Share of the next source's surface that the sources so far must see."""
 
 Warps = Callable[[int, int], WarpedView]
-"""The warp from a source view to a target view, by their numbers."""
+"""Function that returns the warp from a source view to a target view, by their numbers."""
 
 
 class Geometry:
@@ -29,8 +29,8 @@ class Geometry:
 
     Args:
         work: the scene.
-        settings: settings of its edit.
-        warps: from outside, such as along exact depth; None for those along the splats' depth.
+        settings: settings of the scene's edit.
+        warps: external warps, such as from exact depth; None uses the splats' depth.
     """
 
     def __init__(self, work: Work, settings: AttentionWarpingSettings, warps: Warps | None) -> None:
@@ -38,7 +38,7 @@ class Geometry:
         self._frozen: dict[int, Surface] = {}
 
     def sight(self, sources: Sequence[int], view: int, model: Gaussians) -> Sight:
-        """The sources' warps to a view, and which of them each pixel takes."""
+        """Compute the visibility of a view: the sources' warps and the source of each pixel."""
         s = self.settings
         warps = [self.warp(source, view, model) for source in sources]
         scales = [self._edit_share(source) / self._edit_share(view) for source in sources]
@@ -47,7 +47,7 @@ class Geometry:
         return Sight(warps, s.confidence, scales, margins, zeros)
 
     def warp(self, source: int, target: int, model: Gaussians) -> WarpedView:
-        """The warp from one view to another along the model before the edit, or the current one."""
+        """Compute the warp from one view to another by depth of the original or current model."""
         s, scene = self.settings, self.work.scene
         if self.outside is not None:
             return self._masked(self.outside(source, target))
@@ -88,22 +88,22 @@ class Geometry:
         return surface
 
     def _margin(self, source: int) -> int:
-        """Pixels of a source's depth map at a depth edge whose picture is not warped."""
+        """Width in px of the unwarped band at depth edges of a source's depth map."""
         camera = self.work.scene.cameras[source]
         return round(self.settings.estimate_margin * min(camera.height, camera.width))
 
     def _edit_share(self, view: int) -> float:
-        """Pixels of a view's edit for each of its picture."""
+        """Pixels of a view's edit per pixel of its picture."""
         camera, (h, w) = self.work.scene.cameras[view], self.work.sizes[view]
         return h * w / (camera.height * camera.width)
 
     def digest(self, sources: Sequence[int], targets: Sequence[int]) -> str:
-        """SHA-256 of the warps from outside between views: a function has no other identity."""
+        """Hash the external warps between views (SHA-256): a function has no other identity."""
         outside, cameras = self.outside, self.work.scene.cameras
         assert outside is not None
 
         def parts() -> Iterator[npt.NDArray[Any]]:
-            # A warp is large, so none is kept; its mask is a hundredth of it.
+            # Warps are large, so none is kept; a mask is a hundredth of a warp.
             masks = []
             for source in sources:
                 for target in targets:
@@ -119,7 +119,7 @@ class Geometry:
         return digest_each(parts())
 
     def chain(self, source: int) -> tuple[int, ...]:
-        """Further sources by the settings' number; see :func:`choose_chain`."""
+        """Choose further sources, as many as the settings ask; see :func:`choose_chain`."""
         s, scene = self.settings, self.work.scene
 
         def seen(first: int, target: int) -> tuple[Mask, Mask]:
@@ -139,19 +139,19 @@ def choose_chain(
     coverage: float,
     seen: Callable[[int, int], tuple[Mask, Mask]],
 ) -> tuple[int, ...]:
-    """Further sources, outward from the first.
+    """Choose further sources, outward from the first.
 
-    The next source is the least covered view among those with a share of at least ``coverage``. The
-    share is that of the view's surface that the sources so far see. If there is no such view, it is
-    the most covered one. Of equal views it is the first.
+    A view's share is the part of its surface that the sources so far see. The next source is the
+    view of the smallest share among those with a share of at least ``coverage``. If no view has
+    that share, the view of the largest share is next. The first of equal views is chosen.
 
     Args:
-        views: their number.
+        views: number of views.
         source: number of the first source.
         count: number of sources, the first included; fewer if there are fewer views.
-        coverage: share of a cell that its mask must cover.
-        seen: (H, W) bool of two views, a source and a target: pixels of the target that the source
-            sees, and those that show surface.
+        coverage: least share of the surface that the sources so far must see.
+        seen: function of a source and a target that returns two (H, W) bool masks: target pixels
+            that the source sees, and target pixels that show surface.
 
     Example:
         >>> import numpy as np

@@ -1,4 +1,4 @@
-"""Instruct-GS2GS (Vachha and Haque 2024): all views are edited again and again while the splats
+"""Instruct-GS2GS (Vachha and Haque 2024): edit all views repeatedly while the splats
 are tuned on them, the iterative dataset update of Instruct-NeRF2NeRF.
 """
 
@@ -27,17 +27,17 @@ def igs2gs(
     settings: IGS2GSSettings | None = None,
     **options: Unpack[Options],
 ) -> Result:
-    """Edit every view from its noised render, tune the splats, and begin again.
+    """Edit every view from its noised render, tune the splats, and repeat.
 
-    Each edit draws a timestep T of Stable Diffusion. It noises the view's render by the current
-    splats to the share of signal that T stands for. It then denoises it under the guidance of the
-    original picture. Views of a round see the splats as they were at its beginning; the authors'
-    code also takes one step of tuning between two edits.
+    Each edit draws a timestep T of Stable Diffusion, noises the view's render by the current splats
+    to the signal level of T, and denoises the result under the guidance of the original picture.
+    All edits of a round use the splats from the beginning of the round; the authors' code instead
+    takes one step of tuning between two edits.
 
     Args:
         gaussians, cameras, images, instruction, options: see :func:`by_view`.
         editor: an InstructPix2Pix.
-        settings: :class:`IGS2GSSettings`, its defaults if left out.
+        settings: :class:`IGS2GSSettings`; the defaults if omitted.
 
     Raises:
         ValueError, InputError, RuntimeError: see :func:`by_view`.
@@ -63,7 +63,7 @@ def igs2gs(
 
 
 class IGS2GS(Method):
-    """All views are edited again every so many iterations of tuning."""
+    """Method that edits all views again after a fixed number of tuning iterations."""
 
     def __init__(self, work: Work, settings: IGS2GSSettings) -> None:
         work.takes("igs2gs", "picture")
@@ -71,7 +71,7 @@ class IGS2GS(Method):
         self.work, self.settings = work, settings
 
     def run(self, loop: Loop) -> None:
-        """Edit each view from its render, tune on all, and begin again."""
+        """Edit each view from its render, tune on all views, and repeat."""
         work, s = self.work, self.settings
         views = range(len(work.sizes))
         for number, iterations in enumerate(parts_of(s.iterations, s.every)):

@@ -1,4 +1,4 @@
-"""Marks of what is edited: a person makes them in the source view, splats lift them into all."""
+"""Marks of the edited part: set by a person in the source view, lifted by splats into all views."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from attnwarp.warp import lift_masks, piece_around
 from attnwarp.workdir import Workdir
 
 COLORED = 0.1
-"""Spread of a pixel's channels that no grey picture has: a photograph, or a mask of two colours,
-named as a mask by mistake."""
+"""Least spread of a pixel's channels in a coloured picture: a photograph, or a mask of two colours,
+given as a mask by mistake."""
 
 HOW = "--at X,Y, --box X0,Y0,X1,Y1, --mask FILE or --where WORDS"
-"""Options that mark what is edited, for messages."""
+"""Options that mark the edited part, for messages."""
 
 POOR = 0.8
-"""Overlap of a mask and of itself, lifted, below which the splats do not follow it."""
+"""Overlap of a mask with its lifted mask below which the splats do not follow the mask."""
 
 KEPT = 0.1
-"""Share of the middle of what is marked that its lifted mask must keep."""
+"""Share of the middle of a mark that the lifted mask must keep."""
 
 CLICKED = 2.0
 """Radius of the middle of a click, px."""
@@ -44,18 +44,18 @@ CLICKED = 2.0
 
 @dataclass(frozen=True)
 class Marks:
-    """One way to say what is edited; none edits everything.
+    """One way to mark the edited part; no mark edits everything.
 
     Args:
-        masks: folder with a mask picture for each view.
-        mask: file of a mask of the source view; white is edited.
-        box: x0, y0, x1, y1 in px of the source's picture, around the thing.
-        at: x, y in px of a point on the thing.
-        words: names of the thing.
-        segmenter: looks for them; see :func:`attnwarp.editing.segment.load_segmenter`.
+        masks: folder with one mask picture per view.
+        mask: mask file of the source view; white is edited.
+        box: x0, y0, x1, y1 around the object, in px of the source's picture.
+        at: x, y of a point on the object, in px of the source's picture.
+        words: words that name the object.
+        segmenter: finder of the words, see :func:`attnwarp.editing.segment.load_segmenter`.
 
     Raises:
-        InputError: several of them, or words without a letter.
+        InputError: several marks are given, or the words have no letter.
 
     Example:
         >>> from attnwarp.methods.marks import Marks
@@ -87,25 +87,25 @@ class Marks:
 
     @property
     def option(self) -> str:
-        """Option that was given; empty for none."""
+        """Name of the given option; empty for none."""
         return "".join(self._given)
 
     @property
     def of_source(self) -> bool:
-        """True if the source view alone is marked, so that its mask is lifted."""
+        """True if only the source view is marked, so that its mask must be lifted."""
         return self.option not in ("", "--masks")
 
 
 def numbers(text: str | None, names: str, option: str) -> tuple[float, ...] | None:
-    """Numbers of an option such as ``--at 64,68``.
+    """Parse the numbers of an option such as ``--at 64,68``.
 
     Args:
-        text: as it was typed, or None.
+        text: text as typed, or None.
         names: names of the numbers, "X,Y".
-        option: for the error.
+        option: name of the option, for the error.
 
     Raises:
-        InputError: another count, or no numbers.
+        InputError: the text has a different count of numbers, or none.
 
     Example:
         >>> from attnwarp.methods.marks import numbers
@@ -124,7 +124,7 @@ def numbers(text: str | None, names: str, option: str) -> tuple[float, ...] | No
 
 
 def say_unmarked(editor: str, report: Reporter) -> None:
-    """Say that an editor paints more than what the words name, and how to mark it."""
+    """Report that an editor paints beyond the named object, and how to mark the object."""
     report.log(
         f"{editor} does not tell things apart: it may paint what lies near, too; mark the thing"
         f" with {HOW}"
@@ -132,18 +132,18 @@ def say_unmarked(editor: str, report: Reporter) -> None:
 
 
 def picture_mask(marks: Marks, image: npt.NDArray[Any], size: tuple[int, int]) -> Mask:
-    """(H, W) bool of a picture by box or point.
+    """Segment a picture by a box or a point, (H, W) bool.
 
     Args:
-        marks: with ``box`` or ``at``.
+        marks: marks with ``box`` or ``at``.
         image: (H, W, 3) sRGB.
-        size: width and height of the file, px, that the marks are of.
+        size: width and height, in px, of the file that the marks refer to.
 
     Raises:
-        InputError: they lie beside it, a box without area, or nothing found.
+        InputError: a mark lies outside the picture, a box has no area, or nothing is found.
     """
     check_marks(*size, box=marks.box, at=marks.at)
-    # Shrunk sides are rounded: a mark on the border must not leave the picture.
+    # Shrunk sides are rounded, so a mark on the border could leave the picture.
     scales = [(side / full, side) for side, full in zip(image.shape[1::-1], size, strict=True)]
 
     def shrunk(numbers: tuple[float, ...] | None) -> list[float] | None:
@@ -164,20 +164,20 @@ def source_mask(
     device: str,
     report: Reporter,
 ) -> Mask:
-    """(H, W) bool of the source view, as it is marked.
+    """Compute the mask of the marked source view, (H, W) bool.
 
     Args:
         marks: marks of the source.
         camera: camera of the source view.
-        image: (H, W, 3) of it.
-        picture: its file.
-        size: width and height of the file, px, that coordinates are of.
-        out: folder of the edit, which keeps masks by words.
+        image: (H, W, 3) picture of the source view.
+        picture: file of the picture.
+        size: width and height, in px, of the file that coordinates refer to.
+        out: folder of the edit, which stores masks found by words.
         device: device of a segmenter.
-        report: hears what was found.
+        report: receiver of the result.
 
     Raises:
-        InputError: nothing is marked, or nothing was found.
+        InputError: the marks select nothing, or nothing was found.
     """
     if marks.mask is not None:
         mask = read_mask(marks.mask, camera, beside=picture, option="--mask")
@@ -194,18 +194,18 @@ def source_mask(
 def mask_by_words(
     marks: Marks, camera: Camera, image: npt.NDArray[Any], out: Path, device: str
 ) -> Mask:
-    """(H, W) bool of a view, kept in a folder ``words``, since a network may take a minute and a
-    GPU need not give the same bits again. Other words, segmenters and pictures have other files.
+    """Mask a view by words, (H, W) bool, cached in the folder ``words``, since a network may take a
+    minute and GPUs may differ in bits. Words, segmenter and picture determine the cache file.
 
     Args:
-        marks: with ``words``.
+        marks: marks with ``words``.
         camera: camera of the view.
-        image: (H, W, 3) of it.
+        image: (H, W, 3) picture of the view.
         out: folder of the edit.
         device: device of a segmenter.
 
     Raises:
-        NoDetectionError: the view shows nothing that the words name.
+        NoDetectionError: the view shows no object named by the words.
     """
     assert marks.words is not None
     plain = re.sub(r"[^a-z0-9]+", "-", marks.words.lower()).strip("-")[:24] or "mask"
@@ -227,10 +227,10 @@ def lifted_segments(
     report: Reporter,
     at: Sequence[float] | None = None,
 ) -> list[Segment]:
-    """(H, W) of each view in [0, 1]: the source's mask, lifted through splats.
+    """Lift the source's mask through splats into all views, (H, W) in [0, 1] each.
 
-    Values are whole 255ths, as the pictures of masks have them. A mask of a point ``at``, in px of
-    the source view, is held to the surface around it.
+    Values are multiples of 1/255, as in mask pictures. The mask of a point ``at``, in px of the
+    source view, is restricted to the surface around the point.
     """
     if at is not None:
         mask = mask & piece_around(splats, cameras[source], at)
@@ -250,22 +250,22 @@ def lifted_segments(
             InputWarning,
             stacklevel=2,
         )
-    # The soft edge lies inside, so that nothing changes where less than half of a pixel is marked.
+    # The soft edge lies inside, so that pixels marked less than half do not change.
     soft = (np.clip(4 * lifted.render(camera) - 2, 0, 1) for camera in cameras)
     return [np.rint(255 * share).astype(np.float32) / np.float32(255) for share in soft]
 
 
 def check_middle(marks: Marks, mask: Mask, scale: float, lifted: Segment) -> None:
-    """Refuse a lifted mask that leaves out the middle of what the source's marks are of.
+    """Refuse a lifted mask that leaves out the middle of the object marked in the source.
 
     Args:
         marks: marks of the source.
-        mask: (H, W) of the source view, as it is marked.
-        scale: px of the view for each px of its file, which the marks are in.
-        lifted: (H, W) in [0, 1] of the source view.
+        mask: (H, W) mask of the marked source view.
+        scale: px of the view per px of its file, the unit of the marks.
+        lifted: (H, W) lifted mask of the source view, in [0, 1].
 
     Raises:
-        InputError: it leaves the middle out: of a box, of a click, or of the mask's widest part.
+        InputError: the lifted mask lacks the middle of a box, a click, or the mask's widest part.
     """
     import cv2
 
@@ -291,17 +291,17 @@ def check_middle(marks: Marks, mask: Mask, scale: float, lifted: Segment) -> Non
 def read_mask(
     path: Path, camera: Camera, beside: Path | None = None, option: str = "--masks"
 ) -> npt.NDArray[np.bool_]:
-    """(H, W) bool of a picture: what is white and opaque.
+    """Read a mask, (H, W) bool: True for white and opaque pixels.
 
     Args:
         path: path of the mask.
-        camera: camera of its view.
-        beside: the view's picture; see :func:`attnwarp.io.read_upright`.
-        option: that named it, for errors.
+        camera: camera of the mask's view.
+        beside: picture of the view; see :func:`attnwarp.io.read_upright`.
+        option: name of the option, for errors.
 
     Raises:
-        InputError: it is coloured.
-        ValueError: another aspect ratio than the camera's.
+        InputError: the mask is coloured.
+        ValueError: the aspect ratio differs from the camera's.
     """
     import cv2
 
@@ -314,10 +314,10 @@ def read_mask(
 
 
 def bright_of(path: Path, beside: Path | None, option: str) -> npt.NDArray[Any]:
-    """(H, W) in [0, 1]: brightness of a grey picture, black where it is transparent.
+    """Read the brightness of a grey picture, (H, W) in [0, 1]; transparent pixels are black.
 
     Raises:
-        InputError: it is coloured, or its white is 1 of 255.
+        InputError: the picture is coloured, or its white is 1 of 255.
     """
     pixels, top = read_over_black(path, beside)
     if np.ptp(pixels, axis=-1).max() > COLORED * top:
@@ -333,9 +333,9 @@ def bright_of(path: Path, beside: Path | None, option: str) -> npt.NDArray[Any]:
 
 
 def read_over_black(path: Path, beside: Path | None = None) -> tuple[npt.NDArray[Any], int]:
-    """(H, W, 3) of a picture over black where it is transparent, and the value of white.
+    """Read a picture (H, W, 3), composited over black, and the value of white.
 
-    It is turned as its EXIF tag asks; see :func:`attnwarp.io.read_upright` for ``beside``.
+    The EXIF orientation is applied; see :func:`attnwarp.io.read_upright` for ``beside``.
     """
     pixels = read_upright(path, beside=beside)
     top = int(np.iinfo(pixels.dtype).max)

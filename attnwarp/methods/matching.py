@@ -1,5 +1,5 @@
-"""DGE's attention: key views look at each other, other views take the output of the key views'
-tokens that match theirs (Chen et al. 2024).
+"""DGE's attention: key views attend to each other, other views take the output of the key views'
+tokens that match their tokens (Chen et al. 2024).
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from attnwarp.methods.epipolar import line_distances
 from attnwarp.methods.pictures import Size
 
 MATCHED = "image"
-"""Branch whose tokens are matched: that of the original picture."""
+"""Branch whose tokens are matched: the branch of the original picture."""
 
 
 def matches(tokens: Tensor, key_tokens: Tensor, excluded: Tensor | None = None) -> Tensor:
-    """(L,) index of the key token with the largest cosine to each token.
+    """Find the key token with the largest cosine to each token, (L,) indices.
 
     Args:
         tokens: (L, C).
         key_tokens: (M, C).
-        excluded: (L, M) bool of pairs that do not count. A token all of whose pairs are excluded
-            is matched among all.
+        excluded: (L, M) bool of the excluded pairs. A token with all pairs excluded is matched
+            among all key tokens.
 
     Example:
         >>> import torch
@@ -48,14 +48,14 @@ def matches(tokens: Tensor, key_tokens: Tensor, excluded: Tensor | None = None) 
 
 
 def nearest_keys(view: Camera, keys: Sequence[Camera], count: int) -> list[tuple[int, float]]:
-    """The nearest key cameras and the weights of their tokens, at most two.
+    """Find the nearest key cameras and the weights of their tokens, at most two.
 
-    Of two at distances d1 <= d2 the first weighs sigmoid(d2 / (d1 + d2)), and the other the rest.
+    Of cameras at distances d1 <= d2 the first weighs sigmoid(d2 / (d1 + d2)), the other the rest.
 
     Args:
-        view: camera.
-        keys: cameras, at least one.
-        count: 1 or 2.
+        view: camera of the view.
+        keys: key cameras, at least one.
+        count: number of key cameras, 1 or 2.
 
     Example:
         >>> from attnwarp import Camera
@@ -76,11 +76,11 @@ def nearest_keys(view: Camera, keys: Sequence[Camera], count: int) -> list[tuple
 
 @dataclass(eq=False)
 class KeyViews:
-    """Tokens of the key views at one step, by layer, and how other views take them.
+    """Tokens of the key views at one step, by layer, and their use by other views.
 
     Args:
-        branches: branches of guidance, in the order of the batch.
-        layers: layers of self-attention: (h, w) by name.
+        branches: guidance branches, in the order of the batch.
+        layers: (h, w) of each self-attention layer, by name.
         epipolar: distance in cells beyond which a match is excluded; None excludes none.
     """
 
@@ -93,7 +93,7 @@ class KeyViews:
 
     @contextmanager
     def key_pass(self) -> Iterator[None]:
-        """The network gets the key views, whose tokens are stored, while the block runs."""
+        """Store the tokens of the key views passed through the network while the block runs."""
         self._tokens.clear()
         self._outputs.clear()
         self._pass = _KeyPass()
@@ -106,12 +106,12 @@ class KeyViews:
     def view_pass(
         self, views: Sequence[Camera], keys: Sequence[Camera], nearest: int
     ) -> Iterator[None]:
-        """The network gets views that take the key views' tokens while the block runs.
+        """Let views passed through the network use the key views' tokens while the block runs.
 
         Args:
             views: cameras of the pictures of the batch.
             keys: cameras of the key pass.
-            nearest: key views that each view takes tokens of, 1 or 2.
+            nearest: number of key views that each view takes tokens from, 1 or 2.
         """
         self._pass = _ViewPass(
             list(views), list(keys), [nearest_keys(view, keys, nearest) for view in views]
@@ -122,7 +122,7 @@ class KeyViews:
             self._pass = None
 
     def rule(self, name: str, tokens: Tensor, attend: Attend) -> Tensor:
-        """The output of a layer: see :data:`attnwarp.methods.attention.Rule`."""
+        """Compute the output of a layer: see :data:`attnwarp.methods.attention.Rule`."""
         if self._pass is None:
             return attend(tokens, None)
         if isinstance(self._pass, _KeyPass):
@@ -169,8 +169,8 @@ class _ViewPass:
     views: list[Camera]
     keys: list[Camera]
     nearest: list[list[tuple[int, float]]]
-    # By view, key and size: layers of one size share what is as large as their attention. Kept for
-    # one pass, since those of all views at once would fill the memory.
+    # By view, key and size: layers of one size share data as large as their attention. Kept for one
+    # pass, since the data of all views at once would fill the memory.
     excluded: dict[tuple[int, int, Size], Tensor | None] = field(default_factory=dict)
 
 
@@ -178,14 +178,14 @@ class _ViewPass:
 def key_views(
     unet: Any, branches: tuple[str, ...], latent_size: Size, epipolar: float | None
 ) -> Iterator[KeyViews]:
-    """Replace a UNet's self-attention while the block runs; outside of the two kinds of passes it
-    is as before.
+    """Replace a UNet's self-attention while the block runs; outside of key passes and view passes
+    it is unchanged.
 
     Args:
         unet: a diffusers UNet.
-        branches: branches of guidance, in the order of the batch.
-        latent_size: (h, w).
-        epipolar: see :class:`KeyViews`.
+        branches: guidance branches, in the order of the batch.
+        latent_size: (h, w) of the latents.
+        epipolar: distance limit of matches, see :class:`KeyViews`.
     """
     layers = {layer.name: layer.size(latent_size) for layer in all_layers(unet)}
     keys = KeyViews(branches, layers, epipolar)
@@ -194,6 +194,6 @@ def key_views(
 
 
 def _unit(tokens: Tensor) -> Tensor:
-    # Half precision would decide between close matches by its rounding.
+    # Rounding in half precision would decide between close matches.
     tokens = tokens.to(torch.promote_types(tokens.dtype, torch.float32))
     return tokens / tokens.norm(dim=-1, keepdim=True).clamp_min(1e-12)

@@ -1,10 +1,10 @@
-"""Noise that sticks to the surface: a point has the same noise in every view that shows it.
+"""Noise that sticks to the surface: a surface point has the same noise in every view.
 
-The noise of a view is that of all views with its pixels in another order. A pixel takes the value
-of the nearest pixel of its source; values that no pixel takes go to those without a source. The
-order follows from the geometry alone, so a view's noise is exactly as white as the one it is drawn
-from, with the same mean. (Interpolated noise is not: its variance falls and neighbours correlate.
-Chang et al., "How I Warped Your Noise", ICLR 2024, subdivide pixels and sum the parts instead.)
+All views share the same noise values in different orders. A pixel takes the value of the nearest
+pixel of its source; unused values go to pixels without a source. The order follows from the
+geometry alone, so a view's noise is exactly as white as the initial draw, with the same mean.
+(Interpolated noise is not white: its variance falls and neighbours correlate. Chang et al., "How I
+Warped Your Noise", ICLR 2024, subdivide pixels and sum the parts instead.)
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from torch import Tensor
 from attnwarp import check
 
 FRESH = 4
-"""Purpose of the draw of a view's own noise, beside the purposes of
+"""Purpose of drawing a view's separate noise, in addition to the purposes of
 :mod:`attnwarp.methods.work`.
 """
 
 
 def own_seed(*numbers: int) -> int:
-    """A seed of several numbers, such as a run's seed, a purpose and a view.
+    """Hash several numbers into one seed, such as a run's seed, a purpose and a view.
 
-    No other numbers have it, of the same count and each in [0, 2^32): all are hashed together. (0
-    at the end counts as nothing there, and a larger number as two.)
+    Other numbers of the same count, each in [0, 2^32), give another seed. (A final 0 counts as
+    absent, and a larger number as two.)
 
     Example:
         >>> own_seed(0, FRESH, 1) != own_seed(1, FRESH, 0)  # as their sums would be
@@ -38,7 +38,7 @@ def own_seed(*numbers: int) -> int:
 
 
 def unmoved(size: tuple[int, int]) -> Tensor:
-    """(h, w) int64: the order of a first source, each pixel with its own value.
+    """Return the order of a first source, (h, w) int64: the pixels' numbers in turn.
 
     Example:
         >>> unmoved((2, 3)).tolist()
@@ -48,16 +48,16 @@ def unmoved(size: tuple[int, int]) -> Tensor:
 
 
 def carried(sources: Sequence[Tensor], positions: Sequence[Tensor], choice: Tensor) -> Tensor:
-    """The order of a target's noise.
+    """Compute the order of a target's noise.
 
-    Of pixels that would take the same value, the one nearest to the value's pixel gets it, the
-    first of equally near ones. Of the others, those whose own value is free take that one, and the
-    rest the free values in their order.
+    Of several pixels that claim one value, the pixel nearest to the value's source pixel gets it,
+    the first of equally near ones. Each remaining pixel takes the value of its number in order if
+    free; the rest take the free values in order.
 
     Args:
-        sources: (h, w) int64 orders: pixel p of the source has value number ``order[p]``.
-        positions: (h, w, 2) px of each source's grid (centres at +0.5).
-        choice: (h, w) number of the source that a pixel takes, -1 for none.
+        sources: (h, w) int64 order of each source: its pixel p has value number ``order[p]``.
+        positions: (h, w, 2) positions in px of each source's grid (centres at +0.5).
+        choice: (h, w) number of each pixel's source, -1 for none.
 
     Returns:
         (h, w) int64, a permutation of the h w numbers.
@@ -76,7 +76,7 @@ def carried(sources: Sequence[Tensor], positions: Sequence[Tensor], choice: Tens
     for number, (order, xy) in enumerate(zip(sources, positions, strict=True)):
         check.shape(order, (h, w), "sources")
         check.shape(xy, (h, w, 2), "positions")
-        inside = (xy >= 0).all(dim=-1) & (xy[..., 0] <= w) & (xy[..., 1] <= h)  # not for NaN
+        inside = (xy >= 0).all(dim=-1) & (xy[..., 0] <= w) & (xy[..., 1] <= h)  # False for NaN
         wanted = ((choice == number) & inside).flatten()
         place = xy.reshape(-1, 2)[wanted]
         column, row = place[:, 0].floor().clamp(max=w - 1), place[:, 1].floor().clamp(max=h - 1)

@@ -20,12 +20,12 @@ Image = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 Segment = npt.NDArray[Any]
-"""(H, W) bool, or float32 in [0, 1] where a mask has soft edges: above 1/2 is inside."""
+"""(H, W) bool, or float32 in [0, 1] for a mask with soft edges: values above 1/2 are inside."""
 Size = tuple[int, int]
 
 
 def edit_size(height: int, width: int, longest: int | None, multiple: int) -> Size:
-    """(h, w) at which a picture is edited: its longest side, with sides that are multiples.
+    """Compute the (h, w) of a picture's edit: a longest side, both sides multiples of a number.
 
     Example:
         >>> edit_size(1080, 1920, 512, 32)
@@ -39,20 +39,20 @@ def edit_size(height: int, width: int, longest: int | None, multiple: int) -> Si
 
 
 MULTIPLES = (8, 16, 32, 64)
-"""Editors round the sides of a picture to multiples of these."""
+"""Multiples to which editors round the sides of a picture."""
 
 
 def check_view_aspect(size: Size, camera: Camera, name: str) -> None:
-    """Refuse a picture or mask of a view that would be stretched to the view's shape.
+    """Refuse a picture or mask whose aspect ratio differs from its view's.
 
     Args:
-        size: (h, w) of the picture: the view's aspect ratio, or what an editor makes of it by
-            rounding its sides to multiples.
+        size: (h, w) of the picture: the view's aspect ratio, up to an editor's rounding of the
+            sides to multiples.
         camera: camera of the view.
         name: name of the argument.
 
     Raises:
-        ValueError: another aspect ratio.
+        ValueError: the aspect ratio differs.
     """
     full = (camera.height, camera.width)
     if all(edit_size(*full, max(size), multiple) != size for multiple in MULTIPLES):
@@ -60,7 +60,7 @@ def check_view_aspect(size: Size, camera: Camera, name: str) -> None:
 
 
 def resized(image: Image, size: Size) -> Image:
-    """(h, w, 3) of an (H, W, 3) picture in [0, 1]: averaged where it shrinks, cubic elsewhere."""
+    """Resize an (H, W, 3) picture in [0, 1]: shrinking averages, enlarging is cubic."""
     import cv2
 
     if image.shape[:2] == size:
@@ -72,9 +72,9 @@ def resized(image: Image, size: Size) -> Image:
 
 
 def enlarged_change(original: Image, edited: Image) -> Image:
-    """The full-size picture plus the change of an edit of another size.
+    """Add the change of an edit of another size to the full-size picture.
 
-    The change is enlarged linearly; that of an edit larger than the picture is averaged.
+    The change is enlarged linearly, or averaged if the edit is larger than the picture.
 
     Args:
         original: (H, W, 3) in [0, 1].
@@ -92,7 +92,7 @@ def enlarged_change(original: Image, edited: Image) -> Image:
     if edited.shape[:2] == (h, w):
         return edited
     change = edited - resized(original, (edited.shape[0], edited.shape[1]))
-    # Linear weights read 2 x 2 px of a change, however many fall on one pixel.
+    # Linear weights read only 2 x 2 px of a change, even if more fall on one pixel.
     shrinks = edited.shape[0] >= h and edited.shape[1] >= w
     how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
     fitted = cv2.resize(change, (w, h), interpolation=how)
@@ -100,13 +100,13 @@ def enlarged_change(original: Image, edited: Image) -> Image:
 
 
 def composite(edited: Image, original: Image, segment: Segment, how: str, blur: float) -> Image:
-    """The edit inside a segment; the original or black outside.
+    """Compose the edit inside a segment with the original or black outside.
 
     Args:
-        edited, original: (h, w, 3) in [0, 1].
+        edited, original: (h, w, 3) pictures in [0, 1].
         segment: (H, W) bool or in [0, 1], at any size.
         how: "none", "black" or "original".
-        blur: sigma in px of the edit's picture.
+        blur: sigma of the segment's blur, in px of the edit.
     """
     if how == "none":
         return edited
@@ -126,15 +126,15 @@ def composite(edited: Image, original: Image, segment: Segment, how: str, blur: 
 def full_size(
     original: Image, edited: Image, segment: Segment | None, how: str, blur: float
 ) -> Image:
-    """:func:`enlarged_change` of an edit that was composited, held to its segment.
+    """Apply :func:`enlarged_change` to a composited edit, restricted to its segment.
 
-    An enlarged change reaches beyond the pixels of the edit that it comes from, and brings back the
-    original's detail where :func:`composite` left black.
+    An enlarged change reaches beyond the pixels of its edit and brings back the original's detail
+    in pixels that :func:`composite` left black.
 
     Args:
         original: (H, W, 3) in [0, 1].
-        edited: (h, w, 3) in [0, 1], of :func:`composite`.
-        segment: (H, W) bool or in [0, 1]; None where all is edited.
+        edited: (h, w, 3) in [0, 1], from :func:`composite`.
+        segment: (H, W) bool or in [0, 1]; None if all is edited.
         how, blur: arguments of :func:`composite`.
     """
     picture = enlarged_change(original, edited)
@@ -151,12 +151,12 @@ def full_size(
 
 
 def to_bytes(image: npt.NDArray[Any]) -> Bytes:
-    """(H, W, 3) uint8 of a picture in [0, 1]."""
+    """Convert a picture in [0, 1] to (H, W, 3) uint8."""
     return np.asarray(np.rint(255 * np.clip(image, 0, 1)), dtype=np.uint8)
 
 
 def mask_picture(mask: Tensor) -> Bytes:
-    """(H, W, 3) uint8: white where the mask is True."""
+    """Draw a mask, (H, W, 3) uint8: True is white."""
     pixels = 255 * mask.to(torch.uint8).cpu().numpy()
     return np.repeat(pixels[..., None], 3, axis=2)
 
@@ -164,12 +164,12 @@ def mask_picture(mask: Tensor) -> Bytes:
 SOURCE_COLORS = (
     (255, 255, 255), (240, 180, 60), (80, 170, 240), (90, 200, 110), (220, 110, 190), (200, 90, 70),
 )  # fmt: skip
-"""Colours of the sources in a picture of masks, the first white; they repeat."""
+"""Colours of the sources in a picture of masks, the first white; the colours repeat."""
 
 
 def sight_picture(sight: Sight) -> Bytes:
-    """(H, W, 3) uint8: the colour of the source that a pixel takes, times the weight of its
-    features; black where there is none.
+    """Draw visibility, (H, W, 3) uint8: the colour of each pixel's source times the weight of its
+    features; black without a source.
     """
     choice = sight.choice((sight.mask.shape[0], sight.mask.shape[1]))
     colors = torch.tensor(SOURCE_COLORS, dtype=torch.float64)
@@ -181,8 +181,8 @@ class Principal:
     """Three principal components of a source's feature map, as colours.
 
     Args:
-        features: (N, C) of the source; the basis and the range of the colours come from them, so
-            that equal features of other views have equal colours.
+        features: (N, C) features of the source, which define the basis and the range of the
+            colours, so that equal features of other views have equal colours.
 
     Example:
         >>> import torch
@@ -206,12 +206,12 @@ class Principal:
         self.low, self.high = projected.quantile(0.01, dim=0), projected.quantile(0.99, dim=0)
 
     def colors(self, features: Tensor) -> Tensor:
-        """(N, 3) float64 in [0, 1] of (N, C) features."""
+        """Map (N, C) features to colours, (N, 3) float64 in [0, 1]."""
         projected = (features.detach().cpu().double() - self.mean) @ self.basis
         return ((projected - self.low) / (self.high - self.low).clamp_min(1e-12)).clamp(0, 1)
 
     def picture(self, features: Tensor, size: Size, mask: Tensor | None = None) -> Bytes:
-        """(h, w, 3) uint8 of (h w, C) features; black where the mask is False."""
+        """Draw (h w, C) features, (h, w, 3) uint8; black outside the mask."""
         colors = self.colors(features)
         if mask is not None:
             colors = torch.where(mask.reshape(-1, 1).cpu(), colors, 0.0)
@@ -219,17 +219,17 @@ class Principal:
 
 
 class FeaturePictures:
-    """Recorded features as colours: those of one layer, half-way through the recorded steps.
+    """Recorded features of one layer as colours, half-way through the recorded steps.
 
     Args:
-        first: the recording of the first source, which the colours come from.
+        first: recording of the first source, which defines the colours.
     """
 
     def __init__(self, first: Recording) -> None:
         self._principal = Principal(self._of(first)[1])
 
     def of_source(self, recording: Recording, shape: tuple[int, ...]) -> Bytes:
-        """(H, W, 3) uint8 of a source's features, at the size of its view."""
+        """Draw a source's features at the size of its view, (H, W, 3) uint8."""
         layer, features = self._of(recording)
         size = layer.size(recording.plan.latent_size)
         return enlarged(self._principal.picture(features, size), (shape[0], shape[1]))
@@ -241,7 +241,7 @@ class FeaturePictures:
         latent_size: Size,
         shape: tuple[int, ...],
     ) -> Bytes:
-        """(H, W, 3) uint8 of the sources' features, warped to a target; black where none are."""
+        """Draw sources' features warped to a target, (H, W, 3) uint8; black without a source."""
         parts = []
         for number, recording in enumerate(recordings):
             layer, features = self._of(recording)
@@ -250,11 +250,11 @@ class FeaturePictures:
             grid = sight.warp(number).at(size, source_size=source_size)
             warped = grid.warp_tokens(features[None].cpu())[0]
             parts.append(self._principal.picture(warped, size, grid.mask))
-        # A pixel takes one source at most, and is black in the others' pictures.
+        # A pixel takes at most one source and is black in the other sources' pictures.
         return enlarged(np.maximum.reduce(parts), (shape[0], shape[1]))
 
     def _of(self, recording: Recording) -> tuple[Layer, Tensor]:
-        """The layer that is shown, and its (h w, C) features."""
+        """Select the displayed layer and its (h w, C) features."""
         plan = recording.plan
         layer = min(plan.layers, key=lambda layer: (layer.level, layer.kind != "self"))
         numbers = sorted(plan.recorded)
@@ -263,7 +263,7 @@ class FeaturePictures:
 
 
 def enlarged(pixels: Bytes, size: Size) -> Bytes:
-    """Each pixel as a block, for looking at."""
+    """Enlarge each pixel to a block, for viewing."""
     import cv2
 
     blocks = cv2.resize(pixels, size[::-1], interpolation=cv2.INTER_NEAREST)

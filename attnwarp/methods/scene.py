@@ -23,7 +23,7 @@ from attnwarp.methods.pictures import Image, Segment
 from attnwarp.render import render
 
 Segments: TypeAlias = Sequence[npt.NDArray[Any]] | Callable[[int, Image], npt.NDArray[Any]]
-"""(H, W) masks of what is edited, bool or soft in [0, 1]: one for each view, or a function of a
+"""(H, W) masks of the edited part, bool or soft in [0, 1]: one for each view, or a function of a
 view's number and its picture."""
 
 
@@ -32,10 +32,10 @@ class Scene:
     """Views before the edit.
 
     Attributes:
-        cameras: one for each view.
+        cameras: cameras, one for each view.
         images: (H, W, 3) sRGB, uint8, uint16 or float32 in [0, 1]. Photographs keep their type in
             memory; :meth:`picture` converts one.
-        segments: (H, W) bool, or float32 in [0, 1] with soft edges; None where all is edited.
+        segments: (H, W) bool, or float32 in [0, 1] with soft edges; None if everything is edited.
     """
 
     cameras: list[Camera]
@@ -49,11 +49,11 @@ class Scene:
         images: Sequence[npt.NDArray[Any]],
         segments: Segments | None,
     ) -> Scene:
-        """Validate what came from outside.
+        """Validate external inputs.
 
         Raises:
             ValueError: lists of different lengths, a picture or segment of another size or type, or
-                segments that are all empty; the message names it.
+                segments that are all empty; the message names the argument.
         """
         if len(images) != len(cameras):
             raise ValueError(f"images: got {len(images)}, expected {len(cameras)}, as cameras")
@@ -86,11 +86,11 @@ class Scene:
         return cls(list(cameras), stored, masks)
 
     def picture(self, view: int) -> Image:
-        """(H, W, 3) float32 in [0, 1] of a view."""
+        """Convert a view's picture to (H, W, 3) float32 in [0, 1]."""
         return to_float(self.images[view])
 
     def digest(self) -> dict[str, str | None]:
-        """SHA-256 of cameras, pictures and segments."""
+        """Hash cameras, pictures and segments (SHA-256)."""
         cameras = [{**camera.to_dict(), "name": camera.name} for camera in self.cameras]
         return {
             "cameras": digest(cameras),
@@ -100,10 +100,10 @@ class Scene:
 
 
 def checked_image(image: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
-    """A picture of 8 or 16 bits as it is, one of floating values as float32.
+    """Check a picture: 8 or 16 bits stay unchanged, floating values become float32.
 
     Raises:
-        ValueError: another type, or values beyond [0, 1]; the message has the name.
+        ValueError: unsupported type, or values beyond [0, 1]; the message has the name.
     """
     array = np.asarray(image)
     if array.dtype in (np.uint8, np.uint16):
@@ -113,19 +113,19 @@ def checked_image(image: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
     check.finite(array, name)
     if array.min() < 0 or array.max() > 1:
         raise ValueError(f"{name}: got values in [{array.min()}, {array.max()}], expected [0, 1]")
-    # What is float32 already is not copied, unless torch could not share it.
+    # A float32 picture is copied only if torch cannot share its memory.
     return np.require(array, np.float32, ["C", "W"])
 
 
 def to_float(image: npt.NDArray[Any]) -> Image:
-    """(H, W, 3) float32 in [0, 1] of a checked image."""
+    """Convert a checked image to (H, W, 3) float32 in [0, 1]."""
     if image.dtype.kind == "f":
         return image
     return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
 
 
 def images_of(views: Views) -> list[npt.NDArray[Any]]:
-    """(H, W, 3) of each view as it is stored; transparent ones over black, as float32."""
+    """List each view's stored picture (H, W, 3); transparent pictures over black, as float32."""
     return [
         image if image.shape[2] == 3 else views.target(k, np.zeros(3)).numpy()
         for k, image in enumerate(views.images)
@@ -133,11 +133,11 @@ def images_of(views: Views) -> list[npt.NDArray[Any]]:
 
 
 def check_cameras(cameras: Any) -> list[Camera]:
-    """The cameras as a list.
+    """Return the cameras as a list.
 
     Raises:
-        TypeError: something else than cameras one after another.
-        ValueError: there are none.
+        TypeError: the argument is no sequence of cameras.
+        ValueError: the sequence is empty.
     """
     if isinstance(cameras, Camera) or not isinstance(cameras, Iterable):
         raise TypeError(f"cameras: got {type(cameras).__name__}, expected a list of cameras")
@@ -159,15 +159,15 @@ def check_loaded(editor: Any) -> None:
 
 
 def near_of(cameras: Sequence[Camera], gaussians: Gaussians) -> float:
-    """Nothing nearer is drawn, as in the tuning of these splats."""
+    """Near-plane depth, equal to the one used in the tuning of these splats."""
     return FitSettings().near * extent_of(cameras, gaussians.world_means())
 
 
 def render_picture(gaussians: Gaussians, camera: Camera, near: float, backend: str) -> Image:
-    """(H, W, 3) float32 in [0, 1], over black.
+    """Render a view over black, (H, W, 3) float32 in [0, 1].
 
     Raises:
-        RuntimeError: splats render as NaN, as they do after a tuning that diverged.
+        RuntimeError: the render has NaN, as after a diverged tuning.
     """
     with torch.no_grad():
         color = render(gaussians, camera, backend=backend, near=near).color
@@ -177,8 +177,8 @@ def render_picture(gaussians: Gaussians, camera: Camera, near: float, backend: s
 
 
 def editor_digest(editor: Editor) -> str:
-    """SHA-256 of an editor's networks, layers, schedule, options, and what it makes tokens of."""
-    # One list: numbers one after another could be read as others, 1.5 and 12 as 1.51 and 2.
+    """Hash an editor's networks, layers, schedule, options and tokenizer (SHA-256)."""
+    # One list, since concatenated numbers are ambiguous: 1.5 and 12 read as 1.51 and 2.
     values = [type(editor).__name__, {name: getattr(editor, name) for name in editor.options}]
     values += [*map(repr, editor.layers()), *_identity(editor.schedule)]
     parts: list[Any] = [values]
@@ -193,7 +193,7 @@ def editor_digest(editor: Editor) -> str:
 
 
 def _identity(schedule: Schedule) -> list[Any]:
-    """Fields of a schedule. How it spaces its steps shows in a few numbers of them."""
+    """List the fields of a schedule; a few step numbers identify its spacing of steps."""
     fields = {k: v for k, v in sorted(vars(schedule).items()) if not callable(v)}
     numbers = {k: v.tolist() if isinstance(v, torch.Tensor) else v for k, v in fields.items()}
     spacing = [list(schedule.timesteps(n, (64, 64))) for n in (1, 2, 7)]
@@ -201,20 +201,20 @@ def _identity(schedule: Schedule) -> list[Any]:
 
 
 def _configuration(network: Any) -> list[tuple[str, str]]:
-    """Entries of a network's configuration, without its origin and its writer."""
+    """List a network's configuration, without its path and library version."""
     config = getattr(network, "config", {})
-    # transformers' configurations have hundreds of defaults, which its versions change.
+    # transformers' configurations have hundreds of defaults, which change between versions.
     said = config.to_diff_dict() if hasattr(config, "to_diff_dict") else dict(config)
     about = ("architectures", "dtype", "torch_dtype", "transformers_version")
     return sorted((k, repr(v)) for k, v in said.items() if k not in about and k[0] != "_")
 
 
 def _tokens(tokenizer: Any) -> Any:
-    """Identity of a tokenizer: vocabulary, merges, rules, padding, and length."""
+    """Identify a tokenizer: vocabulary, merges, rules, padding, and length."""
     padding = [tokenizer.pad_token_id, tokenizer.model_max_length]
     backend = getattr(tokenizer, "backend_tokenizer", None)
     if backend is None:
         return [padding, sorted(tokenizer.get_vocab().items())]
     said = json.loads(backend.to_str())
-    # What its last call padded and cut to stands there too.
+    # The serialised tokenizer also contains the padding and truncation of its last call.
     return [padding, {k: v for k, v in said.items() if k not in ("padding", "truncation")}]

@@ -1,4 +1,4 @@
-"""Choices that each method is made of, and presets: what was published, what measures right."""
+"""Settings of each method, and presets: the published settings and the recommended ones."""
 
 from __future__ import annotations
 
@@ -22,39 +22,38 @@ Composite = Literal["none", "black", "original"]
 Steps = Annotated[int, Range(1, 1000)]
 
 MOST_VIEWS = 40
-"""Views of a stage in the paper."""
+"""Number of views per stage in the paper."""
 
 
 @dataclass(frozen=True)
 class MethodSettings(Settings):
-    """Settings that all methods share. Each method has a class of its own with its published
-    numbers.
+    """Settings shared by all methods. Each method has a subclass with its published numbers.
 
-    Timesteps are Stable Diffusion's, in [0, 999]. On the editor's own schedule each becomes the
-    step that leaves as much of the picture
+    Timesteps are Stable Diffusion's, in [0, 999]. On the editor's schedule each timestep becomes
+    the step that leaves the same share of the picture
     (:meth:`attnwarp.editing.schedule.Schedule.published`).
 
     Args:
-        seed: seed of everything random.
-        size: longest side in px at which the editor works; None for the cameras' own. Sides are
-            rounded to what the editor takes.
-        steps: number of steps of denoising.
+        seed: seed of all random numbers.
+        size: longest side in px at which the editor works; None for the cameras' size. Sides are
+            rounded to multiples that the editor takes.
+        steps: number of denoising steps.
         noise: "fresh" for each edit, as published, or "shared" by all edits of a run. Shared noise
-            comes with one timestep to start from for all views of a round.
+            implies one starting timestep for all views of a round.
         text_guidance: s_T of InstructPix2Pix, or the guidance of a ControlNet; None for the
-            editor's own.
-        image_guidance: s_I of InstructPix2Pix; None for the editor's own.
-        iterations: iterations of tuning, one view each: in all, or in each stage of attention
+            editor's default.
+        image_guidance: s_I of InstructPix2Pix; None for the editor's default.
+        iterations: number of tuning iterations, one view each: in total, or per stage of attention
             warping.
-        l1, ssim, perceptual, normal, distortion: weights of the losses; that of ssim counts
-            1 - SSIM, that of distortion the form "ordered" of
+        l1, ssim, perceptual, normal, distortion: weights of the losses; that of ssim multiplies
+            1 - SSIM, the weight of distortion the form "ordered" of
             :func:`attnwarp.losses.depth_distortion`.
-        perceptual_encoder: :func:`attnwarp.encoders.load_encoder`'s name of the perceptual loss.
+        perceptual_encoder: name of the perceptual loss, for :func:`attnwarp.encoders.load_encoder`.
         color_rate: factor of the published learning rates of the colours.
-        background: behind the splats while tuning.
-        composite: picture outside the segments, where they are given: the edit ("none"), "black",
+        background: colour behind the splats while tuning.
+        composite: picture outside the segments, if segments are given: the edit ("none"), "black",
             or the "original" picture.
-        composite_blur: sigma in px that the segments are blurred with before compositing.
+        composite_blur: sigma in px of the segments' blur before compositing.
 
     Raises:
         ValueError: an unknown choice or a number out of range; the message names the field.
@@ -88,10 +87,10 @@ LAST_STEP = PUBLISHED_STEPS - 1
 
 
 def checked_start(start: tuple[int, int] | None) -> tuple[int, int] | None:
-    """``start`` as (lowest, highest) timestep of Stable Diffusion.
+    """Check ``start``: a (lowest, highest) timestep of Stable Diffusion, or None.
 
     Raises:
-        ValueError: it is something else.
+        ValueError: ``start`` is neither.
     """
     if start is None:
         return None
@@ -119,73 +118,73 @@ class AttentionWarpingSettings(MethodSettings):
     """Settings of :func:`attnwarp.methods.attention_warping`; the defaults are ``corrected``.
 
     Args:
-        stages: stages of editing and tuning.
-        views_per_stage: new views that a stage edits. None: an equal share of the views, at most
-            40. A stage for which no view is left is dropped.
-        fill_last_stage: whether a last stage that is short of views takes some that were edited
-            before, at random.
+        stages: number of stages of editing and tuning.
+        views_per_stage: number of new views per stage. None: an equal share of the views, at most
+            40. A stage without remaining views is dropped.
+        fill_last_stage: True fills a last stage that is short of views with views edited before,
+            at random.
         noise: "shared" by source and targets, pixel by pixel; "fresh" for each view; or "surface":
             a point of the surface has the same noise in every view
             (:mod:`attnwarp.methods.noise`).
-        latents: start of a view's edit: "random" ones, or the DDIM "inversion" of its
-            ``start_picture``, without guidance, of an editor that is guided by depth. Each view
-            then has a start of its own, so ``noise`` stays "shared" and ``start`` None. "by_stage":
-            random in the first stage, inversion in those after it.
-        source_prompt: prompt of the inversion: what the scene shows; None for the
+        latents: initial latents of a view's edit: "random", or the DDIM "inversion" of its
+            ``start_picture``, without guidance, by an editor guided by depth. Inverted latents
+            differ per view, so ``noise`` stays "shared" and ``start`` None. "by_stage": random in
+            the first stage, inversion in later stages.
+        source_prompt: prompt of the inversion, which describes the scene; None for the
             instruction.
-        start: (lowest, highest) timestep of Stable Diffusion, of which one is drawn for all views,
-            to start from in place of pure noise. On the editor's own schedule it becomes the step
-            that leaves as much of the picture
+        start: (lowest, highest) timestep of Stable Diffusion; one timestep in this range is drawn
+            for all views and replaces pure noise. On the editor's schedule it becomes the step
+            that leaves the same share of the picture
             (:meth:`attnwarp.editing.schedule.Schedule.published`).
         grid: grid of the steps below ``start``, :data:`attnwarp.editing.schedule.Grid`.
-        start_picture: picture that is noised to ``start`` or inverted: the "original", the current
-            "render" (IGS2GS), or "by_stage": the original in the first stage, the render after it.
+        start_picture: picture to noise to ``start`` or to invert: the "original", the current
+            "render" (IGS2GS), or "by_stage": the original in the first stage, the render later.
         suffix: suffix of the instruction.
         negative_prompt: negative prompt of a ControlNet's unconditional branch; None for the
-            editor's own.
-        text_guidance: s_T of the first stage; None for the editor's own.
-        guidance_drop: decrease of ``text_guidance`` in each further stage, which may fall to 0 and
-            not below.
+            editor's default.
+        text_guidance: s_T of the first stage; None for the editor's default.
+        guidance_drop: decrease of ``text_guidance`` per further stage; the result must not fall
+            below 0.
         source_text_guidance: s_T of the source; None for the first stage's.
-        batch: target views that go through the network together. Another batch gives other bits.
+        batch: number of target views per network pass. Results depend on it in the last bits.
         warp: correspondences and masks, :class:`attnwarp.warp.WarpSettings`.
-        mask: False injects wherever the target has a depth (the ablation "no M").
-        outside: features of what projects outside the source: the "border"'s, or "zeros", as
-            padding gives them. With a mask nothing is taken there.
-        sources: views whose features are recorded and warped. Those after the first are edited in
-            a chain outward from it, each covered by those before; a target's pixel takes the source
-            that sees it best (:mod:`attnwarp.methods.sight`).
-        confidence: weigh the features by how well the source sees the surface (foreshortening and
-            the margin of depth agreement) instead of by the mask alone.
-        estimate: weight at the first step of the source's warped estimate of the clean latents, in
-            the target's estimate. It falls to 0 at ``estimate_until``. 0 leaves it out.
-        estimate_until: share of the steps after which it is left out.
-        estimate_in: where it is warped: as "latents", whose cells keep the source's order of pixels
-            inside, or as a "picture", which is decoded, warped pixel by pixel and encoded again.
-            In each step of a view the editor then decodes the view and each source, and encodes
-            twice.
-        estimate_margin: margin of the source on either side of a depth edge that is not warped as
-            its estimate, since pixels there mix near and far; a share of its shorter side, rounded
-            to whole pixels.
-        depth_from: the model before the edit ("frozen") or as tuned so far ("current").
-        a0: weight of the injected features at the first step. At 0 nothing is recorded, and each
-            view is edited by itself, with all else equal: the control.
+        mask: True injects only inside M; False wherever the target has a depth (ablation "no M").
+        outside: features of points that project outside the source: the "border"'s, or "zeros", as
+            padding gives them. With a mask such points take no features.
+        sources: number of views whose features are recorded and warped. Those after the first are
+            edited in a chain outward from it, each covered by the ones before; a target's pixel
+            takes the source that sees it best (:mod:`attnwarp.methods.sight`).
+        confidence: True weighs the features by how well the source sees the surface (foreshortening
+            and the margin of depth agreement), False by the mask alone.
+        estimate: weight at the first step of the source's warped estimate of the clean latents in
+            the target's estimate. The weight falls to 0 at ``estimate_until``; 0 disables it.
+        estimate_until: share of the steps after which the source's estimate is unused.
+        estimate_in: space of the warp: "latents", whose cells keep the source's order of pixels
+            inside, or "picture", which is decoded, warped pixel by pixel and encoded again. The
+            editor then decodes the view and each source, and encodes twice, in each step of a
+            view.
+        estimate_margin: margin on either side of a source's depth edge excluded from the warped
+            estimate, since pixels there mix near and far; a share of the source's shorter side,
+            rounded to whole pixels.
+        depth_from: model of the depth: before the edit ("frozen") or as tuned so far ("current").
+        a0: weight of the injected features at the first step. 0 records nothing and edits each view
+            alone, with all else equal: the control.
         decay: "linear", a_t = a0 (T - t) / T, or "constant".
-        kinds: kinds of attention whose features are carried, such as ["self"]; None for all.
-        blocks: numbers of the editor's blocks whose features are carried; None for all that it
-            offers, such as the up-sampling blocks of a UNet at the latents' size and at half of it.
+        kinds: kinds of attention whose features are warped, such as ["self"]; None for all.
+        blocks: numbers of the editor's blocks whose features are warped; None for all it offers,
+            such as the up-sampling blocks of a UNet at the latents' size and at half of it.
         feature_steps: (from, until) shares of the steps whose features are recorded and injected.
-            The others leave every view its own: [0, 0.5] halves the memory.
+            In other steps views keep their features: [0, 0.5] halves the memory.
         branches: guidance branches that get features. None: text and image of InstructPix2Pix,
             both of a ControlNet.
-        feature_type: type of the recorded features. float16 halves their memory and rounds;
+        feature_type: dtype of the recorded features. float16 halves their memory and rounds;
             bfloat16 rounds eight times as coarsely and has float32's range.
         training: views that a stage tunes on. "all": the source and everything edited so far.
             "stage": the stage's views. "modulo": view ``step % n`` of the stage's n views, but the
-            source at every tenth step; of 40 views 4 are then never visited (the released code).
+            source at every tenth step; 4 of 40 views are then never visited (the released code).
         color_rate: factor of the published learning rates of colours. Adam moves a coefficient by
             at most its rate in a step: at 1, 900 steps change a colour by at most 0.63.
-        psnr_views: views that Edit PSNR counts; "before_last_stage" as the released code has it.
+        psnr_views: views counted in Edit PSNR; the released code uses "before_last_stage".
 
     Raises:
         ValueError: an unknown choice or a number out of range; the message names the field.
@@ -256,7 +255,7 @@ class AttentionWarpingSettings(MethodSettings):
                 " taken off; give text_guidance too, or set guidance_drop to 0"
             )
         last = self.guidance(self.stages - 1)
-        if last is not None and last < -1e-9:  # 0.3 - 3 * 0.1 is not below 0
+        if last is not None and last < -1e-9:  # tolerance: 0.3 - 3 * 0.1 is not below 0
             raise ValueError(
                 f"text_guidance, guidance_drop: got {self.text_guidance:g} and"
                 f" {self.guidance_drop:g}, so stage {self.stages} has {last:g}, expected at least 0"
@@ -281,7 +280,7 @@ class AttentionWarpingSettings(MethodSettings):
                 )
 
     def guidance(self, stage: int) -> float | None:
-        """s_T of a stage, counted from 0; None for the editor's own.
+        """Compute s_T of a stage, counted from 0; None for the editor's default.
 
         Example:
             >>> from attnwarp.methods import PRESETS
@@ -304,14 +303,14 @@ class AttentionWarpingSettings(MethodSettings):
         return self.latents == "inversion" or (self.latents == "by_stage" and stage > 0)
 
     def feature_range(self) -> range:
-        """Numbers of the steps whose features are recorded and injected, from 0.
+        """Compute the numbers, from 0, of the steps whose features are recorded and injected.
 
         Example:
             >>> from attnwarp.methods import preset
             >>> preset("attention_warping", steps=20, feature_steps=(0.0, 0.3)).feature_range()
             range(0, 6)
         """
-        # 0.1 * 30 is above 3 in floats: a share that names a step exactly means that step.
+        # 0.1 * 30 exceeds 3 in floats; a share equal to a step boundary must select that step.
         first, end = (math.ceil(share * self.steps - 1e-9) for share in self.feature_steps)
         return range(first, end)
 
@@ -320,14 +319,14 @@ class AttentionWarpingSettings(MethodSettings):
 class ByViewSettings(MethodSettings):
     """Settings of :func:`attnwarp.methods.by_view`.
 
-    The losses, rates and iterations are those of
-    :class:`attnwarp.methods.AttentionWarpingSettings`, so that the two differ in the edits alone.
+    The losses, rates and iterations equal those of
+    :class:`attnwarp.methods.AttentionWarpingSettings`, so the two methods differ only in the edits.
 
     Args:
-        start: (lowest, highest) timestep, of which each edit draws one to start from; None for pure
+        start: (lowest, highest) range of the starting timestep, drawn for each edit; None for pure
             noise.
-        batch: views that go through the network together; 1 where ``start`` is given and the noise
-            is fresh. Another batch gives other bits.
+        batch: number of views per network pass; 1 if ``start`` is given and the noise is fresh.
+            Results depend on it in the last bits.
 
     Example:
         >>> from attnwarp.methods import ByViewSettings
@@ -355,9 +354,9 @@ class IGS2GSSettings(MethodSettings):
     """Settings of :func:`attnwarp.methods.igs2gs`.
 
     Args:
-        every: iterations of tuning after which all views are edited again.
-        start: (lowest, highest) timestep, of which each edit draws one to start from.
-        grid: grid of the steps below it, :data:`attnwarp.editing.schedule.Grid`.
+        every: number of tuning iterations between two edits of all views.
+        start: (lowest, highest) range of the starting timestep, drawn for each edit.
+        grid: grid of the steps below the start, :data:`attnwarp.editing.schedule.Grid`.
 
     Example:
         >>> from attnwarp.methods import IGS2GSSettings
@@ -381,13 +380,13 @@ class DGESettings(MethodSettings):
     """Settings of :func:`attnwarp.methods.dge`.
 
     Args:
-        every: iterations of tuning after which other views are drawn and edited.
-        views: that a round edits; all where there are fewer.
-        batch: neighbouring views that share a key view.
-        starts: timestep that a round starts from; the last also serves all further rounds.
-        grid: grid of the steps below it, :data:`attnwarp.editing.schedule.Grid`.
-        plain_below: timestep below which every view has its own attention.
-        epipolar: distance in px of the layer from the epipolar line beyond which matches are
+        every: number of tuning iterations between two draws and edits of views.
+        views: number of views per round; all views if there are fewer.
+        batch: number of neighbouring views that share a key view.
+        starts: starting timestep of each round; the last also serves all further rounds.
+        grid: grid of the steps below the start, :data:`attnwarp.editing.schedule.Grid`.
+        plain_below: timestep below which every view uses plain self-attention.
+        epipolar: distance from the epipolar line, in px of the layer, beyond which matches are
             excluded; None excludes none.
 
     Example:
@@ -423,17 +422,17 @@ class GaussCtrlSettings(MethodSettings):
     """Settings of :func:`attnwarp.methods.gaussctrl`.
 
     Args:
-        views: that are edited: an equal share of each contiguous part of the views, at random; all
-            where there are fewer.
-        references: parts of the views, and reference views, one a part.
+        views: number of edited views: an equal share of each contiguous part of the views, at
+            random; all views if there are fewer.
+        references: number of parts of the views; each part gives one reference view.
         self_share: weight of a view's own keys in the UNet's self-attention; the rest is shared
             equally by the reference views.
-        control_share: the same in the ControlNet; None leaves its attention alone.
-        latents: start of an edit: the DDIM "inversion" of the render, or "random" ones.
+        control_share: ``self_share`` for the ControlNet; None keeps its attention unchanged.
+        latents: initial latents of an edit: DDIM "inversion" of the render, or "random".
         source_prompt: prompt of the inversion; None for the instruction.
         suffix: suffix of the instruction.
-        negative_prompt: negative prompt of the unconditional branch; None for the editor's own.
-        batch: views that go through the network together, besides the reference views.
+        negative_prompt: negative prompt of the unconditional branch; None for the editor's default.
+        batch: number of views per network pass, besides the reference views.
 
     Example:
         >>> from attnwarp.methods import GaussCtrlSettings
@@ -530,50 +529,50 @@ PRESETS: Named[Named[MethodSettings]] = Named({
         "random": GaussCtrlSettings(latents="random", **_STABLE_DIFFUSION),
     }),
 })  # fmt: skip
-"""Settings by the method's name and their own; the first of a method is its default.
+"""Settings by the method's name and the preset's name; a method's first preset is its default.
 
-Those of ``attention_warping`` have the warp of their name (:data:`attnwarp.warp.PRESETS`).
+Those of ``attention_warping`` use the warp preset of the same name (:data:`attnwarp.warp.PRESETS`).
 
-``paper``: the text. Each stage draws 40 views and tunes on these alone, depth comes from the scene
-as it stands, and pictures are black outside the segments. What the text leaves open is as in
-``corrected``.
+``paper``: the text. Each stage draws 40 views and tunes on these alone, depth comes from the
+current model, and pictures are black outside the segments. Choices left open by the text are as
+in ``corrected``.
 
-``released``: the authors' code with InstructPix2Pix. One timestep T in [700, 980] and one noise for
-all views, added at T, while the steps are those of a scheduler of T training steps; the original is
-noised in the first stage and the render after it. s_T = 12.5 - 1.5 stage, depth of the current
-model, 40 edits and 960 iterations a stage, tuning by the step's number modulo the stage's views, a
-short last stage filled up, segments blurred with sigma 1.5. ``released-controlnet``: the same with
-a ControlNet, where each view draws fresh noise in the first stage and starts from the inversion of
-the current render after it; the source has s_T 7.5 and the targets 12.5, prompts end in a suffix
-and there is a negative prompt.
+``released``: the authors' code with InstructPix2Pix. All views share one timestep T in [700, 980]
+and one noise, added at T, while the scheduler has T training steps; the original is noised in the
+first stage and the render later. s_T = 12.5 - 1.5 stage, depth of the current model, 40 edits and
+960 iterations a stage, tuning by the step's number modulo the stage's views, a short last stage
+filled up, segments blurred with sigma 1.5. ``released-controlnet``: the same with a ControlNet;
+each view draws fresh noise in the first stage and later starts from the inversion of the current
+render; the source has s_T 7.5 and the targets 12.5, prompts end in a suffix and there is a
+negative prompt.
 
-``corrected``: the default. Noise is shared, depth is that of the model before the edit, and a stage
+``corrected``: the default. Noise is shared, depth comes from the model before the edit, and a stage
 tunes on everything edited so far, with larger steps of the colours.
 
-``extended``: ``corrected`` with ideas beyond the paper: further sources, noise that sticks to the
-surface, and the sources' clean pictures, with a weight that falls from 1 to a half, but for their
-depth edges. The study ``beyond`` has each alone and all together.
+``extended``: ``corrected`` with extensions beyond the paper: further sources, noise that sticks to
+the surface, and the sources' clean pictures except at depth edges, with a weight that falls from 1
+to a half. The study ``beyond`` measures each extension alone and all together.
 
-``default`` of the others: the method, with the guidance and prompts of the editor at hand. Further
-ones have the guidance, the prompts and the grid of steps published for Stable Diffusion.
+``default`` of the other methods: the method with the editor's default guidance and prompts. Their
+other presets use the guidance, prompts and step grid published for Stable Diffusion.
 
 ``improved`` of ``igs2gs``: 3000 iterations in place of 7500. ``released`` of ``gaussctrl``: the
-authors' code, which also aligns the ControlNet's attention, without a share of the view's own, and
-inverts with the instruction. ``random``: GaussCtrl without its inversion.
+authors' code, which also aligns the ControlNet's attention, without a share of the view's own
+keys, and inverts with the instruction. ``random``: GaussCtrl without its inversion.
 """
 
 
 def preset(method: str, name: str | None = None, /, **changes: Any) -> Any:
-    """Settings of a method by name, with some fields changed.
+    """Return a method's preset by name, with some fields changed.
 
     Args:
-        method: a key of :data:`attnwarp.methods.METHODS`.
-        name: name of a preset of that method; its default if left out.
-        changes: fields of the method's settings; ``warp.NAME`` is a field of its warp.
+        method: key of :data:`attnwarp.methods.METHODS`.
+        name: name of a preset of the method; the method's default if omitted.
+        changes: fields of the method's settings; ``warp.NAME`` is a field of the warp's settings.
 
     Raises:
         ValueError: an unknown method, preset or field, or a value out of range; the message names
-            it.
+            the argument.
 
     Example:
         >>> from attnwarp.methods import preset

@@ -1,4 +1,4 @@
-"""Visibility of each pixel of a target from each source: the source it takes, and its weight."""
+"""Visibility of a target from its sources: the source and the weight of each target pixel."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ Size = tuple[int, int]
 
 
 def pixel_ratio(view: WarpedView) -> Tensor:
-    """(H, W) source pixels on the piece of surface that one target pixel covers; 0 where undefined.
+    """Count source pixels on the surface of one target pixel, (H, W); 0 where undefined.
 
     A camera has fx fy abs(n . X) / z^3 pixels on a unit of surface at the point X of its axes with
     the unit normal n; the ratio of two cameras is the determinant of the Jacobian of the plane's
     homography. Below 1 the source is foreshortened against the target, or farther away.
 
     Args:
-        view: with the target's normals.
+        view: warp with the target's normals.
 
     Raises:
         ValueError: the target has no normals.
@@ -53,15 +53,15 @@ def pixel_ratio(view: WarpedView) -> Tensor:
 
 
 def _density(camera: Camera, normal: Tensor, points: Tensor) -> Tensor:
-    """(H, W) pixels on a unit of surface, but for the normal's length."""
+    """Pixels per unit of surface, (H, W), up to the normal's length."""
     turned = normal @ torch.from_numpy(camera.rotation.T.copy())
     pixels = float(camera.K[0, 0] * camera.K[1, 1])
     return pixels * (turned * points).sum(dim=-1).abs() / points[..., 2].abs() ** 3
 
 
 def depth_margin(view: WarpedView) -> Tensor:
-    """(H, W) in [0, 1]: 1 - (abs(z - d) / tolerance)^2 of the rule of depth agreement; 1 without
-    that rule.
+    """Margin of depth agreement, (H, W) in [0, 1]: 1 - (abs(z - d) / tolerance)^2; 1 if the rule of
+    depth agreement is off.
     """
     s, both = view.settings, view.correspondence
     if not s.depth_agreement or view.source is None:
@@ -74,17 +74,17 @@ def depth_margin(view: WarpedView) -> Tensor:
 
 
 EDGE = 0.05
-"""Relative step of the depth that is an edge, as two taps that are not blended
+"""Relative depth step that counts as an edge; equals the step at which taps are not blended
 (:attr:`attnwarp.warp.WarpSettings.depth_spread`)."""
 
 
 def near_edges(depth: Array, margin: int) -> Tensor:
-    """(H, W) bool: pixels among the first ``margin`` on either side of a depth edge.
+    """Mark the pixels within ``margin`` on either side of a depth edge, (H, W) bool.
 
-    A picture's pixels there mix near and far. Inverse depth is affine in the pixel on a plane, so a
-    step of it beyond its neighbours' is an edge: a plane at a grazing angle has none. Undefined
-    depth counts as infinite. Pixels of the outermost rows and columns have one neighbour, so the
-    margin reaches them from their neighbour alone.
+    A picture's pixels at an edge mix near and far. Inverse depth is affine in the pixel on a plane,
+    so an inverse-depth step larger than its neighbours' is an edge, and a plane at a grazing angle
+    has none. Undefined depth counts as infinite. Pixels of the outermost rows and columns have one
+    neighbour and get the margin from that side alone.
 
     Args:
         depth: (H, W), undefined where it is NaN, zero, negative or infinite.
@@ -114,17 +114,17 @@ def near_edges(depth: Array, margin: int) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """A target seen by its sources.
+    """Visibility of a target from its sources: the source of each pixel, and its weight.
 
     Args:
         views: the warp from each source, in the order of the sources.
-        soft: weigh features by confidence instead of the mask alone.
-        scales: scales of each source: its edit's pixels per pixel of its photograph, over the same
-            of the target. Features have the edits' resolution, which photographs of several sizes
-            need not differ in. None where all are 1.
-        margins: margins of each source: px of its depth map on either side of a depth edge whose
-            picture is not taken. None where all are 0.
-        zeros: features of what projects outside a source are zeros, not its border's.
+        soft: True weighs features by confidence, False by the mask alone.
+        scales: (edit's pixels per photograph's pixel) of each source over the same of the target.
+            Features have the edits' resolution, which may differ between photographs of several
+            sizes. None if all are 1.
+        margins: margin of each source: px on either side of a depth edge whose picture is not
+            warped. None if all are 0.
+        zeros: True pads features outside a source with zeros, False with the border's values.
 
     Example:
         >>> import numpy as np
@@ -150,8 +150,8 @@ class Sight:
 
     @cached_property
     def quality(self) -> list[Tensor]:
-        """(H, W) float64 of each source: its :func:`pixel_ratio` of edits, at most 1, where its
-        mask passes; more pixels than the target has show nothing more.
+        """Quality of each source, (H, W) float64: :func:`pixel_ratio` of edits in the mask, at most
+        1, since pixels beyond the target's resolution show nothing more.
         """
         scales = [1.0] * len(self.views) if self.scales is None else self.scales
         return [
@@ -161,18 +161,18 @@ class Sight:
 
     @cached_property
     def confidence(self) -> list[Tensor]:
-        """(H, W) float64 in [0, 1] of each source: quality times :func:`depth_margin`."""
+        """Confidence of each source, (H, W) float64 in [0, 1]: quality by :func:`depth_margin`."""
         pairs = zip(self.quality, self.views, strict=True)
         return [quality * depth_margin(view) for quality, view in pairs]
 
     @property
     def mask(self) -> Tensor:
-        """(H, W) bool: some source sees the pixel."""
+        """Mask of the pixels seen by some source, (H, W) bool."""
         return torch.stack([view.mask for view in self.views]).any(dim=0)
 
     @property
     def weight(self) -> Tensor:
-        """(H, W) weight of the source that each pixel takes: its confidence, or 1 in its mask."""
+        """Weight of each pixel's source, (H, W): the source's confidence, or 1 in its mask."""
         if not self.soft:
             return self.mask.float()
         choice = self.choice((self.mask.shape[0], self.mask.shape[1]))
@@ -181,8 +181,8 @@ class Sight:
 
     @cached_property
     def clear(self) -> list[Tensor]:
-        """(H, W) bool of each source: what it shows there is farther from its depth edges than the
-        margin.
+        """Mask of each source, (H, W) bool: True if the source pixel lies farther from depth edges
+        than the margin.
         """
         margins = [0] * len(self.views) if self.margins is None else self.margins
         result = []
@@ -196,7 +196,7 @@ class Sight:
         return result
 
     def mask_at(self, number: int, size: Size, *, picture: bool = False) -> Tensor:
-        """(h, w) bool: where a source's mask passes; of its picture, where it is clear as well."""
+        """Resize a source's mask, (h, w) bool; for its picture, intersect with :attr:`clear`."""
         # The mask does not depend on the size of the source's grid.
         mask = self.views[number].at(size, source_size=size).mask
         if not picture or self.margins is None:
@@ -204,12 +204,12 @@ class Sight:
         return mask & (averaged(self.clear[number], size) >= 0.5)
 
     def choice(self, size: Size, *, picture: bool = False) -> Tensor:
-        """(h, w) int64: number of the source of the best quality among those whose mask passes at
-        that size, -1 where none does; of equals the first.
+        """Choose each pixel's source at a grid's size, (h, w) int64: the best quality among sources
+        whose mask passes, the first of equals, -1 without a source.
 
         Args:
             size: size of the grid.
-            picture: whether it is of the sources' pictures, which :attr:`margins` keep away from
+            picture: True chooses for the sources' pictures, which :attr:`margins` keep away from
                 depth edges.
         """
         key = size, picture and self.margins is not None
@@ -221,25 +221,25 @@ class Sight:
                 qualities = torch.stack([averaged(quality, size) for quality in self.quality])
                 qualities = torch.where(torch.stack(masks), qualities, -1.0)
                 best, number = qualities.max(dim=0)
-                # Rounding of the means must not decide between equals.
+                # Rounding of the means must not decide between equal qualities.
                 number = (qualities >= best - 1e-9).long().argmax(dim=0)
                 self._choices[key] = torch.where(best >= 0, number, -1)
         return self._choices[key]
 
     def warp(self, number: int, *, picture: bool = False) -> SourceWarp:
-        """The part of the target that takes a source's features, or its picture."""
+        """Build the warp of a source's features, or of its picture, to its part of the target."""
         return SourceWarp(self, number, picture)
 
 
 @dataclass(frozen=True, eq=False)
 class SourceWarp:
-    """The warp from one source to the pixels of a target that take it; a
+    """Warp from one source to the target pixels that use this source; a
     :class:`attnwarp.editing.injection.LayerWarp`.
 
     Args:
-        sight: sight of the target.
+        sight: visibility: which source each target pixel uses.
         number: number of the source.
-        picture: whether the warp is that of its picture, not of its features.
+        picture: True warps the source's picture, False its features.
     """
 
     sight: Sight
@@ -248,7 +248,7 @@ class SourceWarp:
     _at: dict[tuple[int, ...], LayerOfSource] = field(default_factory=dict, init=False, repr=False)
 
     def at(self, size: Size, *, source_size: Size | None = None) -> LayerOfSource:
-        """The warp of an (h, w) grid of the target from a grid of the source."""
+        """Build the warp from a grid of the source to an (h, w) grid of the target."""
         key = (*size, *(source_size or ()))
         if key not in self._at:
             layer = self.sight.views[self.number].at(size, source_size=source_size)
@@ -266,13 +266,13 @@ class SourceWarp:
 
 @dataclass(frozen=True, eq=False)
 class LayerOfSource:
-    """The warp of a layer from one source.
+    """Warp of a layer from one source.
 
     Args:
         warp: warp of the layer, with the mask.
         weight: (h w, 1) float32 in [0, 1], 0 outside the mask.
-        zeros: zeros stand around the source's features, as zero padding has it: a tap beyond the
-            border counts 0, so the border's value, which the warp gives there, is multiplied by the
+        zeros: True surrounds the source's features with zeros, as zero padding does: a tap beyond
+            the border counts 0, so the border's value returned by the warp is multiplied by the
             weight of the taps inside.
     """
 
@@ -282,12 +282,12 @@ class LayerOfSource:
 
     @property
     def mask(self) -> Tensor:
-        """(h, w) bool: where the warped features count."""
+        """Mask of the warped features, (h, w) bool."""
         return self.warp.mask
 
     @cached_property
     def inside(self) -> Tensor:
-        """(h w, 1) float64 weight of the taps within the source's grid; 0 without a position."""
+        """Weight of the taps within the source's grid, (h w, 1) float64; 0 without a position."""
         both = self.warp.correspondence
         size = both.xy.new_tensor([both.source.width, both.source.height])
         place = both.xy - 0.5
@@ -295,13 +295,13 @@ class LayerOfSource:
         return torch.nan_to_num(share, nan=0.0).reshape(-1, 1)
 
     def warp_tokens(self, source: Tensor) -> Tensor:
-        """Warp tokens as :meth:`attnwarp.warp.FeatureWarp.warp_tokens` tells."""
+        """Warp tokens like :meth:`attnwarp.warp.FeatureWarp.warp_tokens`."""
         warped = self.warp.warp_tokens(source)
         return warped * self.inside.to(warped) if self.zeros else warped
 
 
 def averaged(values: Tensor, size: Size) -> Tensor:
-    """(h, w) float64 means of (H, W) values over the pixels of another grid."""
+    """Average (H, W) values over the pixels of an (h, w) grid, float64."""
     rows = axis_weights(size[0], values.shape[0], "area")
     columns = axis_weights(size[1], values.shape[1], "area")
     return rows @ values.double() @ columns.T

@@ -11,14 +11,14 @@ import torch
 from attnwarp.methods.settings import MOST_VIEWS, AttentionWarpingSettings
 
 SOURCE_EVERY = 10
-"""The released code tunes on the source at every tenth step."""
+"""Interval in steps at which the released code tunes on the source."""
 
 
 def draw_stages(unedited: Sequence[int], settings: AttentionWarpingSettings) -> list[list[int]]:
     """Draw each stage's views at random from those not edited so far (line 3).
 
-    Where all are sources, one stage without views is left, which tunes on these. A last stage that
-    is short of views takes some of the earlier ones again, where the settings say so.
+    If all views are sources, one stage without views remains, which tunes on the sources. A last
+    stage short of views takes some of the earlier views again, if the settings say so.
 
     Example:
         >>> stages = draw_stages(range(1, 7), AttentionWarpingSettings(stages=2))
@@ -43,5 +43,5 @@ def draw_stages(unedited: Sequence[int], settings: AttentionWarpingSettings) -> 
 
 
 def released_order(views: int) -> Callable[[int], int]:
-    """The released code's order: the source, then view ``step % views``, which misses some."""
+    """Order of the released code: the source, then view ``step % views``, which misses some."""
     return lambda step: 0 if step % SOURCE_EVERY == 0 else 1 + step % views

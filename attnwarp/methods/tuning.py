@@ -27,7 +27,7 @@ from attnwarp.render import Render, render
 from attnwarp.workdir import Workdir
 
 Order = Callable[[int], int]
-"""Order of a round's views: the view that an iteration takes, by the iteration's number in the
+"""Order of a round's views: the view of an iteration, by the iteration's number in the
 round.
 """
 
@@ -42,30 +42,30 @@ class PerceptualLoss(Protocol):
 
     @property
     def smallest(self) -> int:
-        """Shortest side of a picture that it takes, px."""
+        """Shortest accepted side of a picture, px."""
         ...
 
     def features(self, picture: Tensor) -> list[Tensor]:
-        """Features that are compared, of a picture (H, W, 3) in [0, 1]."""
+        """Compute the compared features of a picture (H, W, 3) in [0, 1]."""
         ...
 
     def between(self, image: list[Tensor], target: list[Tensor]) -> Tensor:
-        """() the distance of two pictures by their features."""
+        """Compute the distance () of two pictures from their features."""
         ...
 
 
 def perceptual_net(
     settings: MethodSettings, device: str = "cpu", load: Callable[..., Any] = load_encoder
 ) -> PerceptualLoss | None:
-    """The perceptual distance of the settings on a device; None where no iteration takes it.
+    """Load the settings' perceptual distance on a device; None if no iteration uses it.
 
     Args:
-        settings: name it.
-        device: device of its network.
-        load: called as :func:`attnwarp.encoders.load_encoder` is.
+        settings: settings that name the distance.
+        device: device of the distance's network.
+        load: loader, called like :func:`attnwarp.encoders.load_encoder`.
 
     Raises:
-        InputError: no such encoder, or one of another kind.
+        InputError: the encoder is unknown or of another kind.
     """
     if not (settings.perceptual and settings.iterations):
         return None
@@ -74,11 +74,11 @@ def perceptual_net(
 
 @dataclass(frozen=True, eq=False)
 class TrainingView:
-    """A view to tune on.
+    """View to tune on.
 
     Attributes:
         number: number of the view.
-        camera: camera of the size of the picture.
+        camera: camera at the size of the picture.
         picture: (H, W, 3) in [0, 1].
     """
 
@@ -87,7 +87,7 @@ class TrainingView:
     picture: Image
 
     def on(self, device: torch.device) -> Tensor:
-        """(H, W, 3) the picture on a device, where it stays as long as the view."""
+        """Copy the picture (H, W, 3) to a device and cache it there while the view lives."""
         return self._tensors.setdefault(device, torch.from_numpy(self.picture).to(device))
 
     @cached_property
@@ -100,12 +100,12 @@ HELD_BYTES = 2**31
 
 
 class DrawnViews(Sequence[TrainingView]):
-    """Views to tune on that are made when they are drawn. The first whose pictures fit are kept;
+    """Views to tune on, created when drawn. The first views whose pictures fit are kept, since
     floating pictures of all views at once may fill the memory.
 
     Args:
-        makers: one a view.
-        held_bytes: bytes of pictures that are kept.
+        makers: constructors, one per view.
+        held_bytes: limit on the bytes of kept pictures.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class DrawnViews(Sequence[TrainingView]):
         return len(self._makers)
 
     def __getitem__(self, index: Any) -> Any:
-        """The view of a number, made anew where it is not kept."""
+        """Return the view of a number, created again unless kept."""
         if index in self._held:
             return self._held[index]
         view = self._makers[index]()
@@ -134,14 +134,14 @@ FEATURE_BYTES = 2**30
 
 
 class DistanceToViews:
-    """The perceptual distance of renders to the pictures of views.
+    """Perceptual distance of renders to the pictures of views.
 
-    What it compares of a view's picture is worked out once while the view lives, and kept for the
-    first views that fit. An iteration on a kept view takes a third less of the network.
+    The features of a view's picture are computed once while the view lives, and kept for the first
+    views that fit. An iteration on a kept view needs a third less of the network.
 
     Args:
         perceptual: the distance.
-        kept_bytes: bytes of the pictures' features.
+        kept_bytes: limit on the bytes of kept features.
     """
 
     def __init__(self, perceptual: PerceptualLoss, kept_bytes: int = FEATURE_BYTES) -> None:
@@ -149,7 +149,7 @@ class DistanceToViews:
         self._kept: WeakKeyDictionary[TrainingView, list[Tensor]] = WeakKeyDictionary()
 
     def __call__(self, image: Tensor, view: TrainingView) -> Tensor:
-        """() of a render (H, W, 3) in [0, 1], which may need a gradient, to a view's picture."""
+        """Compute the distance () of a render (H, W, 3), differentiable, to a view's picture."""
         target = self._of(view, image.device)
         return self._perceptual.between(self._perceptual.features(image), target)
 
@@ -165,26 +165,26 @@ class DistanceToViews:
 
 
 class Tuning:
-    """Splats, their optimiser and its place in the work; goes on through all rounds.
+    """Splats, their optimiser and its progress, shared by all rounds.
 
     Args:
         start: the splats before the edit.
-        cameras: cameras of all views; they decide the extent.
+        cameras: cameras of all views, which determine the scene's extent.
         settings: losses, rates, background, seed.
-        iterations: in all, over which the centres' learning rate falls.
+        iterations: total number of iterations, over which the centres' learning rate falls.
         backend: name of the renderer.
-        membership: (N,) in [0, 1], factor of each splat's steps; None for 1. A splat of 0 keeps its
-            bytes.
-        load: load of the perceptual distance, see :func:`perceptual_net`.
+        membership: (N,) in [0, 1], factor of each splat's steps; None for 1. A splat with factor 0
+            keeps its bytes.
+        load: loader of the perceptual distance, see :func:`perceptual_net`.
 
     Attributes:
         iteration: iterations done, over all rounds.
         loss: loss of the last iteration.
-        visits: how often each view was tuned on, by its number.
-        weights: by the loss that has them, the SHA-256 of its network's.
+        visits: number of iterations on each view, by the view's number.
+        weights: SHA-256 of each loss network's weights, by the loss.
 
     Raises:
-        InputError: no such perceptual distance.
+        InputError: the perceptual distance is unknown.
     """
 
     def __init__(
@@ -218,7 +218,7 @@ class Tuning:
         self.iteration = 0
         self.loss = math.nan
         self.visits: dict[int, int] = {}
-        # Here and not at its first use: before it, views are edited for hours.
+        # Loaded here, not at its first use, which may follow hours of editing.
         net = perceptual_net(settings, str(self.model.device), load)
         self._smallest: list[tuple[str, int, str]] = []
         if net is not None:
@@ -230,12 +230,12 @@ class Tuning:
         self.weights = {} if net is None else {"perceptual": net.about.weights_sha256}
 
     def check_sizes(self, cameras: Sequence[Camera]) -> None:
-        """Raise ValueError that names a view to tune on that is too small for a loss."""
+        """Raise ValueError, naming the view, if a view to tune on is too small for a loss."""
         for loss, smallest, setting in self._smallest:
             losses.check_sizes(cameras, smallest, loss, setting)
 
     def gaussians(self) -> Gaussians:
-        """The splats as they stand, outside autograd."""
+        """Return the current splats, outside autograd."""
         return self.model.gaussians().detach()
 
     def advance(
@@ -248,17 +248,17 @@ class Tuning:
         spent: Callable[[], bool] = lambda: False,
         step: Callable[[], None] = lambda: None,
     ) -> None:
-        """Tune through a round, from wherever it stands to its end, or until the budget is spent.
+        """Tune from the current iteration to the end of a round, or until the budget is spent.
 
         Args:
-            begin, end: iterations of the round.
-            views: to tune on.
+            begin, end: first iteration of the round, and the one after its last.
+            views: views to tune on.
             order: order of the views; None takes each once before any comes again, at random.
-            spent: true once no further iteration may begin.
-            step: called after each iteration.
+            spent: function that returns True once no further iteration may begin.
+            step: callback after each iteration.
         """
         if self.iteration == begin:
-            self.queue = []  # of the round before, whose views were others
+            self.queue = []  # the previous round had different views
         while self.iteration < end and not spent():
             self._iterate(self._next(views, self.iteration - begin, order))
             step()
@@ -273,7 +273,7 @@ class Tuning:
         return views[self.queue.pop()]
 
     def state(self) -> dict[str, Any]:
-        """Everything that the next iteration depends on."""
+        """Collect the state that the next iteration depends on."""
         return {
             "model": self.model.state(),
             "random": self.random.get_state(),
@@ -284,10 +284,10 @@ class Tuning:
         }
 
     def restore(self, folder: Workdir, name: str) -> None:
-        """Go on from a checkpoint of a folder.
+        """Resume from a checkpoint of a folder.
 
         Raises:
-            FileFormatError: it is damaged.
+            FileFormatError: the checkpoint is damaged.
         """
         state = folder.load(name)
         try:
@@ -327,7 +327,7 @@ class Tuning:
         self.visits[view.number] = self.visits.get(view.number, 0) + 1
 
     def _step(self, progress: float) -> None:
-        """One step of the model, of which each splat takes its membership's share."""
+        """Take one step of the model, scaled for each splat by its membership."""
         if self.membership is None:
             self.model.step(progress)
             return
@@ -340,11 +340,11 @@ class Tuning:
                 tensor.copy_(torch.lerp(before[name], tensor, share))
 
     def loss_of(self, picture: Render, view: TrainingView) -> Tensor:
-        """The weighted sum of the losses.
+        """Compute the weighted sum of the losses.
 
         Args:
             picture: the render.
-            view: picture that it shall become.
+            view: view with the target picture.
         """
         s = self.settings
         image = picture.color.float()

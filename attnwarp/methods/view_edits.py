@@ -1,4 +1,4 @@
-"""Edits of single views, as attention warping asks for them: guides, starts, sources recorded."""
+"""Edits of single views for attention warping: guides, initial latents, recorded sources."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ RECORDING = ".recording"
 
 @dataclass(frozen=True, eq=False)
 class RecordedSource:
-    """A source's edit in this sitting.
+    """Edit of a source in this process.
 
     Attributes:
         picture: (h, w, 3) in [0, 1].
-        recording: its features; None where their weight is 0.
-        estimates: (C, h, w) clean latents that were predicted at each step.
-        sight: sight of the sources before; None for the first.
+        recording: features of the source; None if their weight is 0.
+        estimates: (C, h, w) clean latents predicted at each step.
+        sight: visibility of this source from the earlier ones; None for the first.
     """
 
     picture: Image
@@ -62,14 +62,14 @@ class RecordedSource:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Start of views' edits.
+    """Initial state of views' edits.
 
     Attributes:
-        views: their numbers.
-        guides: as the editor takes them.
-        pictures: that are noised to the first timestep; none for pure noise.
-        latents: (B, C, h, w) of an inversion, or None.
-        replayed: the picture of an edit made by hand and its noise, or None.
+        views: numbers of the views.
+        guides: guides of the views, as the editor takes them.
+        pictures: pictures to noise to the first timestep; None for pure noise.
+        latents: (B, C, h, w) latents of an inversion, or None.
+        replayed: picture and noise of an edit made elsewhere, or None.
     """
 
     views: Sequence[int]
@@ -80,11 +80,11 @@ class Start:
 
 
 def check_editor(editor: Editor, settings: AttentionWarpingSettings) -> int | None:
-    """Draw Stable Diffusion's timestep that all edits start from; None for pure noise.
+    """Draw the Stable Diffusion timestep at which all edits start; None for pure noise.
 
     Raises:
-        ValueError: the settings ask for an inversion of an editor that changes pictures, for a
-            prompt that is too long, or for a start too low for the steps.
+        ValueError: the settings need an inversion but the editor changes pictures, the prompt is
+            too long, or the start is too low for the number of steps.
     """
     s = settings
     if s.latents != "random":
@@ -100,30 +100,31 @@ def check_editor(editor: Editor, settings: AttentionWarpingSettings) -> int | No
     low, high = s.start
     generator = torch.Generator().manual_seed(s.seed)
     timestep = int(torch.randint(low, high + 1, (1,), generator=generator))
-    # Refuses more steps than there are timesteps.
+    # This call refuses more steps than there are timesteps.
     editor.schedule.published(timestep, s.steps, s.grid)
     return timestep
 
 
 class ViewEdits:
-    """An editor at work on single views, and its sources.
+    """Editor of single views, with its sources.
 
     Args:
         work: the scene and the editor.
         settings: settings of the method.
         source: number of the source view.
-        by_hand: its edit made elsewhere, or None.
-        warps: from outside, or None.
+        by_hand: edit of the source made elsewhere, or None.
+        warps: external warps, or None.
         store: "device", "cpu" or "disk".
-        edit_source: edits a source by its place, for a sitting that found the edit done.
+        edit_source: function that edits the source of an index, for a process that found the edit
+            finished.
 
     Attributes:
         sources: numbers of the source views, in the order of editing.
-        features, geometry: recorded features, and the geometry that they are warped along.
+        features, geometry: recorded features, and the geometry of their warps.
         about, inputs: entries of the run's manifest.
 
     Raises:
-        ValueError: an argument or a setting that does not fit the editor or the views.
+        ValueError: an argument or a setting does not fit the editor or the views.
     """
 
     def __init__(
@@ -156,7 +157,7 @@ class ViewEdits:
         self.inputs = {"source_picture": None if self.by_hand is None else digest(self.by_hand)}
 
     def _checked_by_hand(self, picture: npt.NDArray[Any], source: int) -> Image:
-        """An edit made elsewhere, at the size of the source's edit."""
+        """Check an edit made elsewhere and resize it to the source's edit."""
         check.shape(np.asarray(picture), ("H", "W", 3), "source_picture")
         image = to_float(checked_image(picture, "source_picture"))
         size = (image.shape[0], image.shape[1])
@@ -169,7 +170,7 @@ class ViewEdits:
         return resized(image, self.work.sizes[source])
 
     def _further_sources(self, source: int) -> tuple[int, ...]:
-        """Sources after the first; those of the folder's edit are not chosen again."""
+        """Sources after the first; a resumed run keeps the sources of its folder."""
         if self.settings.sources == 1:
             return ()
         if self.work.folder.has(MANIFEST):
@@ -180,11 +181,11 @@ class ViewEdits:
             return self.geometry.chain(source)
 
     def check_stages(self, stages: int) -> None:
-        """Refuse, before any work, branches that a stage does not have."""
+        """Refuse, before any work, branches that a stage lacks."""
         self.features.check_batches(range(stages), further=len(self.sources) > 1)
 
     def notes(self, stages: int) -> list[str]:
-        """Lines on what the views or the editor leave of the settings."""
+        """Describe settings that the views or the editor limit, one line each."""
         asked, views = self.settings, len(self.names)
         longest, lines = max(self.work.sizes[self.sources[0]]), []
         if asked.size is not None and longest != asked.size:
@@ -216,8 +217,8 @@ class ViewEdits:
     # --- sources
 
     def recorded(self, count: int) -> list[RecordedSource]:
-        """The first sources with their features; edited anew, to the same bytes, in a sitting that
-        found them done.
+        """Return the first ``count`` sources with their features. A process that found their edits
+        finished edits them anew, to the same bytes.
         """
         while len(self._recorded) < count:
             number = len(self._recorded)
@@ -229,7 +230,7 @@ class ViewEdits:
         return self._recorded[:count]
 
     def keep(self, number: int, source: RecordedSource) -> None:
-        """Keep a source's edit for those that take its features."""
+        """Keep a source's edit for the views that take its features."""
         del self._recorded[number:], self.estimates.sources[number:], self.noise.orders[number:]
         self._recorded.append(source)
         self.estimates.sources.append(source.estimates)
@@ -237,7 +238,7 @@ class ViewEdits:
         self.noise.orders.append(self.noise.order(source.sight, size))
 
     def sight(self, sources: int, view: int, model: Gaussians) -> Sight | None:
-        """The view as the first sources see it; None where nothing is warped."""
+        """Compute the visibility of a view from the first sources; None if nothing is warped."""
         s = self.settings
         if not sources or (s.a0 == 0 and s.noise != "surface" and s.estimate == 0):
             return None
@@ -248,13 +249,13 @@ class ViewEdits:
     def start(
         self, views: Sequence[int], model: Gaussians, *, stage: int = 0, by_hand: bool = False
     ) -> Start:
-        """Start of views' edits, before features are recorded or injected.
+        """Prepare views' edits, before features are recorded or injected.
 
         Args:
-            views: their numbers.
-            model: the splats as they stand.
-            stage: from 0; sources are edited in the first.
-            by_hand: replay the edit made elsewhere, if there is one.
+            views: numbers of the views.
+            model: the current splats.
+            stage: number of the stage, from 0; sources are edited in the first.
+            by_hand: True replays the edit made elsewhere, if given.
         """
         work, s = self.work, self.settings
         before = work.frozen if s.depth_from == "frozen" else model
@@ -284,12 +285,12 @@ class ViewEdits:
         """Edit views from their start.
 
         Args:
-            start: start of the views.
-            sights: sights of each, for noise and estimates that are carried along.
-            step: called after each step.
+            start: initial state of the views.
+            sights: visibility of each view, for warped noise and estimates.
+            step: callback after each step.
 
         Returns:
-            (h, w, 3) pictures in [0, 1], and the estimates of a lone view where they are carried.
+            (h, w, 3) pictures in [0, 1], and the estimates of a lone view if estimates are warped.
         """
         work, s = self.work, self.settings
         if start.replayed is not None:
@@ -316,7 +317,7 @@ class ViewEdits:
         return result.images, kept
 
     def _timesteps(self) -> Sequence[Time]:
-        """Times of the source's edit."""
+        """Timesteps of the source's edit."""
         s, schedule = self.settings, self.work.editor.schedule
         if self.timestep is None:
             return schedule.timesteps(s.steps, self.latent_size(self.sources[0]))
@@ -327,29 +328,29 @@ class ViewEdits:
         return self.work.editor.noise_shape(self.work.sizes[view])[1:]
 
     def rows_of_source(self, number: int) -> int:
-        """Rows through the UNet for the edit of a source; one made by hand is inverted first."""
+        """Rows through the UNet for a source's edit; an edit made elsewhere is inverted first."""
         guidance = self.features.source_guidance(further=number > 0)
         by_hand = number == 0 and self.by_hand is not None
         return self.rows(1, guidance, 0) * (2 if by_hand else 1)
 
     def rows(self, views: int, guidance: float | None, stage: int) -> int:
-        """Rows through the UNet for the edits of a stage's views with a text guidance."""
+        """Rows through the UNet for the edits of a stage's views, given the text guidance."""
         s = self.settings
         rows = views * s.steps * len(self.features.branches(guidance))
         if s.inverts(stage):
             rows += views * inversion_rows(self.work.editor, s.steps)
         return rows
 
-    # --- what is left for people
+    # --- results for inspection
 
     def result(self, view: int, picture: Image, sight: Sight | None, sources: int) -> ViewEdit:
-        """A view's edit with its record and pictures.
+        """Collect a view's edit with its record and pictures.
 
         Args:
-            view: its number.
+            view: number of the view.
             picture: (h, w, 3) in [0, 1].
-            sight: as the sources see it.
-            sources: how many it could take features of; of a source, its own place.
+            sight: visibility of the view from the sources.
+            sources: number of sources available to the view; for a source, its index.
         """
         about: dict[str, Any] = {"injected": 0.0}
         pictures = {}
@@ -379,12 +380,12 @@ class ViewEdits:
 
     @property
     def _shown(self) -> FeaturePictures:
-        """Colours of features, of the first source's."""
+        """Colours of features, from the first source's principal components."""
         first = self._recorded[0].recording
         assert first is not None
         return FeaturePictures(first)
 
     def clear(self) -> None:
-        """Remove recordings on disk: those of a sitting that was killed are never read."""
+        """Remove recordings on disk: recordings of a killed process are never read."""
         if self.folder.is_dir():
             shutil.rmtree(self.folder)

@@ -23,10 +23,10 @@ from attnwarp.warp import WarpSettings, lift_masks, render_surface
 from attnwarp.workdir import Workdir
 
 Guide = npt.NDArray[Any]
-"""(h, w, 3) picture or (h, w) depth, as an editor takes it."""
+"""(h, w, 3) picture or (h, w) depth, depending on the editor."""
 
 NOISE, TIMESTEP, KEYS, VIEWS = range(4)
-"""Purposes of random numbers: no two draws share their seed."""
+"""Purposes of random numbers, so that no two draws share a seed."""
 
 
 class Work:
@@ -35,17 +35,17 @@ class Work:
     Args:
         gaussians: the splats before the edit.
         scene: cameras, pictures and segments.
-        editor: see :mod:`attnwarp.editing`.
-        instruction: in words.
+        editor: editor, see :mod:`attnwarp.editing`.
+        instruction: instruction in words.
         settings: settings of the method.
         backend: name of the renderer.
         folder: path of the run.
-        report: receives how the run stands.
+        report: receiver of progress.
 
     Attributes:
         frozen: the splats before the edit, outside autograd.
         sizes: (h, w) px of each view's edit.
-        near: nothing nearer is drawn.
+        near: near-plane depth, in scene units.
     """
 
     def __init__(
@@ -70,17 +70,17 @@ class Work:
         self.near = near_of(scene.cameras, gaussians)
 
     def picture(self, view: int) -> Image:
-        """(h, w, 3) of a view before the edit, at the size of its edit."""
+        """Return a view's picture before the edit, (h, w, 3), at the size of its edit."""
         return resized(self.scene.picture(view), self.sizes[view])
 
     def render(self, view: int, model: Gaussians) -> Image:
-        """(h, w, 3) of a view of the splats, at the size of its edit."""
+        """Render a view of the splats at the size of its edit, (h, w, 3)."""
         h, w = self.sizes[view]
         camera = self.scene.cameras[view].resize(w, h)
         return render_picture(model, camera, self.near, self.backend)
 
     def depth(self, view: int, model: Gaussians, warp: WarpSettings | None = None) -> Guide:
-        """(h, w) depth of splats; NaN where undefined."""
+        """Render the depth of splats, (h, w); NaN where undefined."""
         h, w = self.sizes[view]
         camera = self.scene.cameras[view].resize(w, h)
         settings = warp or WarpSettings()
@@ -88,22 +88,22 @@ class Work:
         return np.asarray(surface.depth)
 
     def guide(self, view: int, model: Gaussians, warp: WarpSettings | None = None) -> Guide:
-        """A view's picture, or the depth of splats, as the editor takes it."""
+        """Return a view's picture or the depth of splats, depending on the editor."""
         if self.editor.guide == "picture":
             return self.picture(view)
         return self.depth(view, model, warp)
 
     def composite(self, view: int, picture: Image) -> Image:
-        """The edit inside the view's segment, and outside what the settings say."""
+        """Compose the edit inside the view's segment with the settings' choice outside."""
         if self.scene.segments is None:
             return picture
         s, segment = self.settings, self.scene.segments[view]
         return composite(picture, self.picture(view), segment, s.composite, s.composite_blur)
 
     def membership(self) -> npt.NDArray[np.float64]:
-        """(N,) in [0, 1]: how far each splat before the edit belongs to the segments.
+        """Compute each splat's membership in the segments before the edit, (N,) in [0, 1].
 
-        0 up to a half, where its pixels are not marked, and 1 from three quarters on.
+        It is 0 if at most half of the splat's pixels are marked, and 1 from three quarters on.
         """
         segments = self.scene.segments
         assert segments is not None
@@ -113,7 +113,7 @@ class Work:
         return np.asarray(np.clip(4 * lifted.membership - 2, 0, 1))
 
     def regions(self, views: Sequence[int]) -> list[Segment] | None:
-        """Masks of views, for the noise of a bundled editor; None where everything is edited."""
+        """List views' masks for a bundled editor's noise; None if everything is edited."""
         segments = self.scene.segments
         return None if segments is None else [segments[view] for view in views]
 
@@ -127,8 +127,8 @@ class Work:
             )
 
     def takes(self, method: str, guide: str, kind: type[Any] | None = None) -> None:
-        """Raise ValueError unless the editor has the guide, or is of the class, that a method is
-        made for.
+        """Raise ValueError unless the editor has the guide, or is of the class, that a method
+        needs.
         """
         kinds = {"picture": "InstructPix2Pix, which takes pictures", "depth": "a depth ControlNet"}
         editor = self.editor
@@ -140,10 +140,10 @@ class Work:
             )
 
     def starts_at(self, lowest: int, field: str) -> None:
-        """Raise ValueError unless the settings' steps fit below a timestep to start from.
+        """Raise ValueError unless the settings' steps fit below a starting timestep.
 
         Args:
-            lowest: timestep of Stable Diffusion; where it fits, all above it do.
+            lowest: lowest starting timestep of Stable Diffusion; if it fits, all higher ones do.
             field: field of the settings, for the error.
         """
         steps = self.settings.steps
@@ -156,17 +156,17 @@ class Work:
             ) from None
 
     def seed(self, purpose: int, *numbers: int) -> int:
-        """A seed of its own for each purpose and numbers such as a round and a view."""
+        """Derive a separate seed from a purpose and numbers such as a round and a view."""
         return own_seed(self.settings.seed, purpose, *numbers)
 
     def generator(self, purpose: int, *numbers: int) -> torch.Generator:
-        """Random numbers of their own for each purpose and numbers."""
+        """Create a separate random generator for a purpose and numbers."""
         return torch.Generator().manual_seed(self.seed(purpose, *numbers))
 
     def noise(self, number: int, views: Sequence[int]) -> Tensor:
-        """(B, C, h, w) noise of edits in a round; a view's does not depend on those beside it.
+        """Draw (B, C, h, w) noise of a round's edits; a view's noise is independent of its batch.
 
-        In the first round it is that of attention warping with noise of each view's own, so that
+        In the first round it equals attention warping's noise drawn separately per view, so that
         methods can be compared at equal noise.
         """
         one = (1, *self.editor.noise_shape(self.sizes[views[0]]))
@@ -177,7 +177,7 @@ class Work:
         return torch.cat([shared_noise(one, seed) for seed in seeds])
 
     def timestep(self, number: int, view: int, limits: tuple[int, int]) -> int:
-        """Stable Diffusion's timestep that an edit starts from, drawn evenly within limits, both
+        """Draw the Stable Diffusion timestep at which an edit starts, evenly within limits, both
         included.
         """
         low, high = limits
@@ -187,18 +187,18 @@ class Work:
 
     @property
     def prompt(self) -> str:
-        """The instruction with the settings' suffix, if they have one."""
+        """Instruction with the settings' suffix, if any."""
         return self.instruction + getattr(self.settings, "suffix", "")
 
     @property
     def grid(self) -> Grid:
-        """Grid of the steps below a start, if the settings have one."""
+        """Grid of the steps below a start, if the settings define one."""
         grid: Grid = getattr(self.settings, "grid", "even")
         return grid
 
     def guided(self, text: float | None) -> AbstractContextManager[None]:
         """Use a text guidance, and the settings' image guidance and negative prompt, while a block
-        runs; None leaves the editor's own.
+        runs; None keeps the editor's default.
         """
         return guided(
             self.editor,
@@ -208,13 +208,13 @@ class Work:
         )
 
     def branches(self) -> int:
-        """Rows of the UNet's batch for one view."""
+        """Number of rows in the UNet's batch for one view."""
         with self.guided(self.settings.text_guidance):
             return len(self.editor.branches)
 
 
 def chunks(views: Sequence[int], size: int) -> tuple[tuple[int, ...], ...]:
-    """Views in groups of a size, in their order; the last may be smaller.
+    """Split views into groups of a size, in order; the last may be smaller.
 
     Example:
         >>> chunks([4, 5, 6], 2)
@@ -224,7 +224,7 @@ def chunks(views: Sequence[int], size: int) -> tuple[tuple[int, ...], ...]:
 
 
 def parts_of(total: int, size: int) -> list[int]:
-    """``total`` in parts of ``size`` and what is left; one part of 0 where there is none.
+    """Split ``total`` into parts of ``size`` and a remainder; a total of 0 gives one part of 0.
 
     Example:
         >>> parts_of(3000, 2500), parts_of(0, 10)

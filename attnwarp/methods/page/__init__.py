@@ -1,4 +1,4 @@
-"""The page that shows an edit by any method: one HTML file that needs no other."""
+"""Page that shows an edit by any method: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ from attnwarp.workdir import MANIFEST, Workdir
 PAGE = "index.html"
 
 MOST_VIEWS = 5
-"""Edited views on the page; the folder has the rest."""
+"""Largest number of edited views on the page; the folder has the rest."""
 
 MOST_SPLATS = 100_000
-"""Splats on the page, those that cover most; ``edited.ply`` has the rest."""
+"""Largest number of splats on the page, by covered area; ``edited.ply`` has the rest."""
 
 LONGEST = 512
 """Longest side of a picture on the page, in px."""
 
 EXACT, QUALITY = 128, 85
-"""Longest side in px of pictures that are kept exactly, and JPEG quality of larger ones, of 100."""
+"""Longest side in px of losslessly stored pictures, and JPEG quality of larger ones, of 100."""
 
 CANVAS = 512
-"""Longest side of the picture that the viewer draws, in px."""
+"""Longest side of the viewer's picture, in px."""
 
 RENDERS = ("renders/before", "renders/after")
 
@@ -71,16 +71,16 @@ def show_edit(
         before: the splats before the edit.
         cameras: cameras of the views.
         images: (H, W, 3) photograph of each view, sRGB, uint8, uint16 or floating in [0, 1].
-        editor: edits the page's views each alone, as the control; None for no control.
-        turntable: file of the orbit as a film, GIF or MP4; None for none.
-        note: warning that the page begins with.
-        report: receives each view of the control.
+        editor: editor of the control, which edits the page's views alone; None for no control.
+        turntable: file of the orbit's film, GIF or MP4; None for no film.
+        note: warning at the top of the page.
+        report: receiver of the control's progress, view by view.
 
     Returns:
-        The path of the page.
+        Path of the page.
     """
     page = _Page(folder, cameras, images, before)
-    # Views that a method edits alone are their own control.
+    # A method that edits views alone needs no control.
     if editor is not None and not page.edits_alone:
         views = [page.names.index(name) for name in page.shown]
         scene = Scene.checked(cameras, images, page.segments)
@@ -97,13 +97,13 @@ def show_edit(
         script=_file("viewer.js") + _file("page.js"),
     )
     path = folder.path / PAGE
-    # The name of a view may be no UTF-8.
+    # The name of a view may not be valid UTF-8.
     write_atomically(path, lambda stream: stream.write(text.encode("utf-8", "replace")))
     return path
 
 
 class _Page:
-    """The parts of a page, each as HTML."""
+    """Parts of a page, each as HTML."""
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class _Page:
         self.manifest, self.result = folder.read_json(MANIFEST), folder.read_json("result.json")
         self.names = file_stems(cameras)
         self.photographs = dict(zip(self.names, images, strict=True))
-        # A run that was cut short lacks the views that it planned last.
+        # A run ended by its budget lacks the last planned views.
         self.edited = [name for name in self.names if folder.has(f"views/{name}.png")]
         self.sources = [name for name in self.manifest.get("sources", []) if name in self.edited]
         others = [name for name in self.edited if name not in self.sources]
@@ -136,12 +136,12 @@ class _Page:
 
     @property
     def edits_alone(self) -> bool:
-        """True of a method that edits each view alone, with noise of its own."""
+        """True if the method edits each view alone, with separate noise."""
         method, noise = self.manifest["method"], self.manifest["settings"]["noise"]
         return bool(method == "by_view" and noise == "fresh")
 
     def head(self, note: str) -> str:
-        """The instruction, what was done, and warnings."""
+        """Write the instruction, a summary of the run, and warnings."""
         method = self.manifest["method"]
         cut = self.result["cut"]
         ended = f", cut short by its {cut.replace('_', ' ')}" if cut else ""
@@ -164,7 +164,7 @@ class _Page:
         return "\n".join(lines)
 
     def scene(self) -> str:
-        """The slider and the splats, side by side."""
+        """Write the slider and the splats, side by side."""
         buttons = "".join(
             f'<button aria-pressed="{str(k == 0).lower()}"'
             f' data-pictures=\'["before-{k}", "after-{k}"]\'>{escape(name)}</button>'
@@ -187,7 +187,7 @@ class _Page:
     def _viewer(self) -> str:
         with TemporaryDirectory() as place:
             path = Path(place) / "edited.splat"
-            # Viewers hold float32, which far from the origin would move splats.
+            # Viewers use float32, whose rounding would move splats far from the origin.
             write_splat(path, self.after, coordinates="relative")
             data = path.read_bytes()
         count = len(data) // RECORD.itemsize
@@ -220,7 +220,7 @@ class _Page:
         )
 
     def views(self) -> str:
-        """Rows of pictures, a column for each view."""
+        """Write rows of pictures, a column for each view."""
         carried = any(self.folder.has(f"features/{name}.png") for name in self.shown)
         rows: list[tuple[str, str, Callable[[str], Bytes | None]]] = [
             ("Photograph", "photograph", self._photograph),
@@ -270,7 +270,7 @@ class _Page:
         return f"Where features came from: {colors}; black from none"
 
     def _shares(self) -> str:
-        """Sentence on the part of the views that gets features."""
+        """Write a sentence on the part of the views that receives features."""
         lines = []
         for name in self.shown:
             about = self._record(name)
@@ -292,7 +292,7 @@ class _Page:
         return about[-1] if about and "injected" in about[-1] else None
 
     def agreement(self) -> str:
-        """Differences between pictures of one surface point."""
+        """Write the differences between pictures of one surface point."""
         sizes = {n: self.folder.read_picture(f"views/{n}.png").shape[:2] for n in self.shown}
         index = {name: self.names.index(name) for name in self.shown}
 
@@ -329,7 +329,7 @@ class _Page:
         )
 
     def outside(self) -> str:
-        """The share of the change outside the mask."""
+        """Write the share of the change outside the mask."""
         title, masks = "<h2>Does it stay inside?</h2>", self.segments
         if masks is None:
             return f"{title}<p>No mask was given, so everything may change.</p>"
@@ -354,13 +354,13 @@ class _Page:
         )
 
     def _lit(self, name: str) -> Bytes:
-        """The photograph, dark outside the mask."""
+        """Darken the photograph outside the mask."""
         mask = self.folder.read_picture(f"segments/{name}.png") / 255
         lit: Bytes = to_bytes(to_float(self.photographs[name]) * (0.2 + 0.8 * mask))
         return lit
 
     def orbit(self, turns: Sequence[Sequence[Bytes]]) -> str:
-        """Both scenes from cameras around them."""
+        """Write both scenes' renders from cameras around them."""
         frames = [[_data(picture, quality=80, exact=0) for picture in turn] for turn in turns]
         sides = "".join(
             f'<figure><img class="turned" alt="the scene {when}" src="{turn[0]}">'
@@ -375,7 +375,7 @@ class _Page:
         )
 
     def costs(self) -> str:
-        """Counts, seconds and settings, folded."""
+        """Write counts, seconds and settings, folded."""
         psnr, seconds = self.result["edit_psnr"], self.folder.read_json("times.json")
         counts = [
             (name.replace("_", " "), _short(v)) for name, v in self.result["counters"].items()
@@ -396,7 +396,7 @@ class _Page:
         return f"<h2>What it took</h2>{_table(('part', 'seconds'), times)}{folded}"
 
     def _photograph(self, name: str) -> Bytes:
-        """A view before its edit at the size of its edit."""
+        """Return a view before its edit, at the size of its edit."""
         h, w = self.folder.read_picture(f"views/{name}.png").shape[:2]
         return to_bytes(resized(to_float(self.photographs[name]), (h, w)))
 
@@ -409,7 +409,7 @@ def _file(name: str) -> str:
 
 
 def _shrunk(pixels: Bytes) -> Bytes:
-    """The picture, no larger than :data:`LONGEST`."""
+    """Shrink a picture to at most :data:`LONGEST`."""
     longest = max(pixels.shape[:2])
     if longest <= LONGEST:
         return pixels
@@ -418,7 +418,7 @@ def _shrunk(pixels: Bytes) -> Bytes:
 
 
 def _data(pixels: Bytes, quality: int = QUALITY, exact: int = EXACT) -> str:
-    """Address of a picture that is in the page: a PNG up to a longest side, a JPEG beyond."""
+    """Encode a picture as a data URL: PNG up to a longest side, JPEG beyond."""
     if max(pixels.shape[:2]) <= exact:
         return f"data:image/png;base64,{base64.b64encode(encode_png(pixels)).decode()}"
     import cv2
@@ -429,7 +429,7 @@ def _data(pixels: Bytes, quality: int = QUALITY, exact: int = EXACT) -> str:
 
 
 def _figure(text: str, picture: Bytes | None, id_: str = "") -> str:
-    """A picture that says what it shows, or its empty place."""
+    """Write a captioned picture, or a placeholder."""
     if picture is None:
         return "<span></span>"
     name = f' id="{id_}"' if id_ else ""

@@ -1,4 +1,4 @@
-"""Figures and pictures that a page shows beside an edit: its control, agreement, and spill."""
+"""Figures and pictures on an edit's page: its control, agreement, and spill."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from attnwarp.warp import preset, render_surface, sample_at, warp_surfaces
 from attnwarp.workdir import MANIFEST, Workdir
 
 CONTROL = "control"
-"""Folder of the views that were edited alone."""
+"""Folder of the views edited alone."""
 
 
 def edited_alone(
@@ -36,13 +36,13 @@ def edited_alone(
     views: Sequence[int],
     report: Reporter,
 ) -> None:
-    """Edit views each alone, with noise of its own and all else equal, into a run's folder.
+    """Edit each view alone, with separate noise and all else equal, into a run's folder.
 
     Args:
-        folder: path of the run that this is the control of.
-        gaussians, scene, editor: before the edit, and what edits.
-        views: their numbers; those that the folder has are kept.
-        report: receives each view.
+        folder: path of the controlled run.
+        gaussians, scene, editor: splats and scene before the edit, and the editor.
+        views: numbers of the views; views already in the folder are kept.
+        report: receiver of progress, view by view.
     """
     manifest, names = folder.read_json(MANIFEST), file_stems(scene.cameras)
     shared = {field.name for field in fields(ByViewSettings)} & manifest["settings"].keys()
@@ -66,18 +66,18 @@ def disagreement(
     pictures: Mapping[str, Mapping[int, Bytes]],
     segments: Mapping[int, npt.NDArray[np.bool_]] | None = None,
 ) -> dict[str, float]:
-    """Difference between pictures of one surface point: the mean over all ordered pairs of views,
-    at the correspondences of rendered splats that the preset ``corrected`` accepts.
+    """Average the difference between pictures of one surface point over all ordered pairs of views,
+    at correspondences of rendered splats accepted by the preset ``corrected``.
 
     Args:
         gaussians: the scene before the edit.
         cameras: cameras of the views, at the size of their pictures.
-        pictures: (H, W, 3) uint8 of each view, by what they show.
-        segments: (H, W) bool of each view: pixels of others do not count.
+        pictures: (H, W, 3) uint8 of each view, by kind of picture.
+        segments: (H, W) bool of each view: the pixels that count.
 
     Returns:
-        Mean absolute difference as a share of the full range, by what the pictures show; without
-        an entry where no two views see one point.
+        Mean absolute difference as a share of the full range, by kind of picture; a kind without
+        two views of one point has no entry.
 
     Example:
         >>> import numpy as np, torch
@@ -121,11 +121,11 @@ def spill(
     after: Sequence[npt.NDArray[Any]],
     segments: Sequence[npt.NDArray[np.bool_]],
 ) -> tuple[float, float]:
-    """Share of a change that lies outside what may change.
+    """Measure the share of a change that lies outside the segments.
 
     Args:
         before, after: (H, W, 3) pictures of each view.
-        segments: (H, W) bool of each: what may change.
+        segments: (H, W) bool of each view: the pixels that may change.
 
     Returns:
         The share of the summed absolute change outside (NaN for no change), and the segments' share

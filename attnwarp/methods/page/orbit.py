@@ -1,4 +1,4 @@
-"""Cameras around a scene, along the capture's own, and a film of what they show."""
+"""Orbit cameras around a scene, near the capture's cameras, and a film of their renders."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from attnwarp.methods.scene import near_of, render_picture
 Array = npt.NDArray[np.float64]
 
 FRAMES = 36
-"""Pictures of a turn: one every 10 degrees."""
+"""Frames per turn: one every 10 degrees."""
 
 SPEED = 12
-"""Pictures a second of a film."""
+"""Frames per second of a film."""
 
 LONGEST = 320
-"""Longest side of these pictures in px."""
+"""Longest side of a frame in px."""
 
 ALL_AROUND = np.radians(120)
-"""Cameras that leave no wider gap surround what they look at."""
+"""Largest gap between the directions of cameras that count as surrounding the scene."""
 
 SMOOTH = np.radians(15)
-"""Width of the mean over neighbouring cameras' heights and distances."""
+"""Width of the moving mean over neighbouring cameras' heights and distances."""
 
 FILMS = (".gif", ".mp4")
 
 
 def focus_of(cameras: Sequence[Camera], points: Array) -> Array:
-    """The point that cameras look at: nearest to all optical axes.
+    """Compute the point that cameras look at: nearest to all optical axes.
 
-    Where the axes are parallel or part, it lies as far before the cameras as what they see.
+    If the axes are parallel or diverge, the point lies at the scene's distance before the cameras.
 
     Args:
-        cameras: at least one.
-        points: (N, 3) of the scene.
+        cameras: cameras, at least one.
+        points: (N, 3) points of the scene.
 
     Returns:
         (3,) in world units.
@@ -65,7 +65,7 @@ def focus_of(cameras: Sequence[Camera], points: Array) -> Array:
     ahead = positions + axes * (np.median(depths) if depths else 1.0)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     system, right = across.sum(axis=0), (across @ positions[:, :, None]).sum(axis=0)[:, 0]
-    # A grain of what lies ahead decides where axes do not.
+    # A small weight of the points ahead decides if the axes do not.
     grain = 1e-9 * len(cameras)
     point = np.linalg.solve(system + grain * np.eye(3), right + grain * ahead.mean(axis=0))
     parallel = np.linalg.eigvalsh(system)[0] < 1e-3 * len(cameras)
@@ -74,16 +74,16 @@ def focus_of(cameras: Sequence[Camera], points: Array) -> Array:
 
 
 def orbit(cameras: Sequence[Camera], points: Array, *, first: int = 0) -> list[Camera]:
-    """Cameras that turn about what a capture looks at: all around, or to and fro where it was taken
-    from one side.
+    """Create cameras that orbit the point a capture looks at: all around, or to and fro if the
+    capture was taken from one side.
 
     Args:
-        cameras: cameras of the capture; height and distance follow those nearby.
-        points: (N, 3) of the scene.
-        first: number of the camera that a full turn begins beside.
+        cameras: cameras of the capture; the orbit's height and distance follow those nearby.
+        points: (N, 3) points of the scene.
+        first: number of the camera at which a full turn begins.
 
     Returns:
-        :data:`FRAMES` cameras, of which the last leads to the first.
+        :data:`FRAMES` cameras; the last leads to the first.
 
     Example:
         >>> import numpy as np
@@ -133,8 +133,8 @@ def orbit(cameras: Sequence[Camera], points: Array, *, first: int = 0) -> list[C
 
 
 def up_of(cameras: Sequence[Camera]) -> Array:
-    """(3,) direction upwards, of length 1: across the lower edges of the pictures, which a level
-    camera keeps level, and where these do not tell, along the mean of the upright ones.
+    """Estimate the upward direction, (3,) of length 1: across the pictures' lower edges, which a
+    level camera keeps level, or, if these do not determine it, the mean of the cameras' up axes.
 
     Example:
         >>> from attnwarp import Camera
@@ -155,16 +155,16 @@ def _unit(vector: Array) -> Array:
 
 
 def renders(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[Bytes]:
-    """(H, W, 3) uint8 of splats from each camera."""
+    """Render splats from each camera, (H, W, 3) uint8."""
     near = near_of(cameras, gaussians)
     return [to_bytes(render_picture(gaussians, camera, near, "auto")) for camera in cameras]
 
 
 def check_film(path: Path | None) -> None:
-    """Refuse a film of another format.
+    """Refuse a film of an unsupported format.
 
     Raises:
-        InputError: the name ends in neither of :data:`FILMS`.
+        InputError: the name's suffix is not in :data:`FILMS`.
     """
     if path is not None and path.suffix.lower() not in FILMS:
         raise InputError(f"--turntable: got {path}, expected a name ending in {' or '.join(FILMS)}")
@@ -174,11 +174,11 @@ def write_film(path: Path, before: Sequence[Bytes], after: Sequence[Bytes]) -> N
     """Write a turn as GIF or MP4, before on the left and after on the right.
 
     Args:
-        path: ends in one of :data:`FILMS`; an older file is replaced.
+        path: path that ends in one of :data:`FILMS`; an older file is replaced.
         before, after: (H, W, 3) uint8 frames.
 
     Raises:
-        InputError: another ending.
+        InputError: the suffix is not in :data:`FILMS`.
 
     Example:
         >>> from pathlib import Path
@@ -190,7 +190,7 @@ def write_film(path: Path, before: Sequence[Bytes], after: Sequence[Bytes]) -> N
     frames = []
     for pair in zip(before, after, strict=True):
         both = np.concatenate(pair, axis=1)
-        h, w = (side - side % 2 for side in both.shape[:2])  # as MP4's colours ask
+        h, w = (side - side % 2 for side in both.shape[:2])  # MP4's chroma needs even sides
         frames.append(both if path.suffix.lower() == ".gif" else both[:h, :w])
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".gif":
