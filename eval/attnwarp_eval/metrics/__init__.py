@@ -2,8 +2,8 @@
 out, no I/O.
 
 :data:`attnwarp_eval.metrics.registry.METRICS` has each figure's unit, direction and tolerance.
-docs/measuring/metrics.md tells which one to use. A figure with nothing to measure is NaN, never 0,
-with a count beside it.
+docs/measuring/metrics.md says which one to use. A figure with nothing to measure is NaN, never 0,
+with a count next to it.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ def picture(
     """``value`` (array or CPU tensor) as an (H, W, 3) float64 picture whose values in ``within``
     are in [0, 1].
 
-    What lies outside ``within`` may be anything, NaN included, and is 0 in the result, so that it
-    cannot leak into one.
+    Values outside ``within`` may be anything, NaN included, and are 0 in the result, so that they
+    cannot leak into a figure.
 
     Raises:
         ValueError: not float32 or float64; another shape; in ``within`` a value that is not finite
@@ -58,7 +58,7 @@ def region(value: Any, shape: tuple[int, ...], name: str = "mask") -> Mask:
 def pair(
     image: Any, target: Any, mask: Any, names: tuple[str, str] = ("image", "target")
 ) -> tuple[Array, Array, Mask]:
-    """Two pictures of one size and where they count, checked; see :func:`picture`."""
+    """Validate two pictures of one size and the mask of counted pixels; see :func:`picture`."""
     first = np.asarray(image)
     check.shape(first, ("H", "W", 3), names[0])
     inside = region(mask, first.shape)

@@ -1,5 +1,5 @@
-"""Shared by checks and metrics: validation of arrays, and means that are NaN where there is nothing
-to average.
+"""Helpers of checks and metrics: validation of arrays, and means that are NaN with nothing to
+average.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def floats(value: Any, shape: Sequence[int | str | None], name: str) -> Array:
 
 
 def mask(value: Any, shape: Sequence[int | str | None], name: str) -> Mask:
-    """``value`` (array or tensor) as a bool array of ``shape``; another type is refused."""
+    """``value`` (array or tensor) as a bool array of ``shape``; other types are refused."""
     array = np.asarray(value)
     if array.dtype != np.bool_:
         raise ValueError(f"{name}: got {array.dtype}, expected bool")
@@ -33,7 +33,7 @@ def mask(value: Any, shape: Sequence[int | str | None], name: str) -> Mask:
 
 
 def share(part: int, whole: int) -> float:
-    """part / whole, NaN when there is no whole."""
+    """part / whole, NaN if ``whole`` is 0."""
     return part / whole if whole else float("nan")
 
 
@@ -55,7 +55,7 @@ def quantiles(values: Array, qs: Sequence[float]) -> list[float]:
 
 
 def regions(edge: Mask | None, shape: tuple[int, ...]) -> dict[str, Mask]:
-    """The parts figures are given for, by suffix: everything and, where edges are known, the
+    """Regions of figures, by suffix: everything and, if edges are known, the
     interior and the band.
     """
     whole = np.ones(shape, dtype=bool)

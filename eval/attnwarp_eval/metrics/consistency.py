@@ -1,15 +1,15 @@
-"""Do two edited views agree about the colour of the same surface? Exactly, and as published work
+"""Agreement of two edited views on a surface's colour: exactly, and as published work
 approximates it.
 
-Exactly: :func:`cross_view` compares the colours that two pictures give the same surface point, at
-correspondences known from the scene itself. Published work has no such correspondences and takes
+Exactly: :func:`cross_view` compares the colours of the same surface point in two pictures, at
+correspondences known from the scene. Published work has no such correspondences and takes
 optical flow between the unedited pictures instead (Lai et al. 2018, Learning Blind Video Temporal
-Consistency). :func:`optical_flow` and :func:`flow_consistency` do that. Both paths differ in the
-positions alone.
+Consistency); :func:`optical_flow` and :func:`flow_consistency` implement this. Only the positions
+differ between the two.
 
 Pictures are sRGB in [0, 1]. Sampling is in linear light, since a pixel is a mean of light, and at
-exact positions in float64. Neither of two other samplers is used: ``cv2.remap`` rounds positions to
-1/32 px, and that of :mod:`attnwarp.warp` is under test.
+exact positions in float64. Two other samplers are unsuitable: ``cv2.remap`` rounds positions to
+1/32 px, and :mod:`attnwarp.warp` is under test.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ VIEW_DEPENDENT = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Disagreement:
-    """Disagreement of two pictures, pixel by pixel of the target, and the pixels that were counted.
+    """Disagreement of two pictures at each pixel of the target, and the counted pixels.
 
     Attributes:
         counted: (H, W) bool, pixels that were compared.
         linear: (H, W, 3) target minus source at the same point, linear RGB; NaN elsewhere.
-        srgb: (H, W, 3) the same of sRGB values.
+        srgb: (H, W, 3) the same for sRGB values.
         delta_e: (H, W) CIEDE2000 between the two colours (D65, 2 degree observer); NaN elsewhere.
-        candidates: number of pixels that were asked about; at exact correspondences those that have
+        candidates: number of pixels considered; at exact correspondences, pixels that have
             a position.
 
     Example:
@@ -72,7 +72,7 @@ class Disagreement:
     candidates: int
 
     def figures(self, prefix: str = "") -> dict[str, float]:
-        """The ``consistency.*`` figures, with ``prefix`` before each name; NaN where nothing was
+        """The ``consistency.*`` figures, with ``prefix`` before each name; NaN if no pixel was
         counted.
         """
         linear, srgb, delta_e = (
@@ -96,7 +96,7 @@ class Disagreement:
 def cross_view(
     source_srgb: Any, target_srgb: Any, pair: TwoView, *, mask: Any = None, exclude: Any = None
 ) -> Disagreement:
-    """Disagreement of two pictures about the same surface points, at exact correspondences.
+    """Compare the colours of the same surface points in two pictures, at exact correspondences.
 
     A target pixel counts if
 
@@ -105,15 +105,15 @@ def cross_view(
     - its position has all four bilinear taps, and
     - ``exclude`` does not contain it.
 
-    There the two TRUE pictures of a matt scene differ too. The causes are bilinear sampling, the
-    area that a pixel covers in either view, and the noise of the renderer. The same function of the
-    true pictures is this floor; report it beside the figure.
+    There the two TRUE pictures of a matt scene differ too, due to bilinear sampling, the
+    area that a pixel covers in either view, and the noise of the renderer. The same figure of the
+    true pictures is this floor; report it with the figure.
 
     Args:
         source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of the sizes of ``pair``'s cameras.
         pair: :func:`attnwarp_eval.truth.two_view` of them.
-        mask: (H, W) bool of the target, pixels to compare, such as the edited object's;
-            all if left out.
+        mask: (H, W) bool of the target, pixels to compare, such as the edited object's; by default
+            all.
         exclude: (H, W) bool of the target, pixels that may rightly differ, from
             :func:`view_dependent`.
 
@@ -143,17 +143,17 @@ def cross_view(
 def view_dependent(
     source_srgb: Any, target_srgb: Any, pair: TwoView, *, tolerance: float = VIEW_DEPENDENT
 ) -> Mask:
-    """(H, W) bool: target pixels whose surface truly looks different from the source, such as
+    """(H, W) bool: target pixels whose surface truly looks different in the source, such as
     highlights and reflections.
 
-    A pixel is one when its colour in the TRUE target leaves the range of the four taps around its
-    position in the TRUE source by more than ``tolerance``, in any channel of linear light. The
-    range, and not their blend, so that a fine texture that sampling cannot follow is no highlight.
-    False where the source does not show the pixel.
+    A pixel is view-dependent if its colour in the TRUE target leaves the range of the four taps
+    around its position in the TRUE source by more than ``tolerance``, in any channel of linear
+    light. The range is used instead of the blend, so that fine texture beyond the sampling limit
+    is no highlight. False where the source does not show the pixel.
 
     Args:
         source_srgb, target_srgb: (h, w, 3) and (H, W, 3), truth of the two unedited views, in
-            [0, 1]. An edit that makes a matt object shiny has highlights of its own: join the mask
+            [0, 1]. An edit that makes a matt object shiny adds highlights: join the mask
             of its truth with this one.
         pair: as for :func:`cross_view`.
         tolerance: in linear light, of 1; above the noise of the pictures.
@@ -181,7 +181,7 @@ def view_dependent(
     source, target = (to_linear(each) for each in _pictures(source_srgb, target_srgb, pair))
     ask = pair.visible & ~pair.edge & has_taps(pair.xy, source.shape)
     column, row = np.floor(pair.xy[ask] - 0.5).astype(np.int64).T
-    # The last pixel's centre has its second tap at weight 0, outside.
+    # At the last pixel's centre the second tap is outside, with weight 0.
     right, below = (
         np.minimum(column + 1, source.shape[1] - 1),
         np.minimum(row + 1, source.shape[0] - 1),
@@ -201,8 +201,8 @@ class Flow:
 
     Attributes:
         xy: (H, W, 2) source positions in pixels, centres at +0.5; NaN where there is no flow.
-        accepted: (H, W) bool: passes the forward-backward check, inside the source picture.
-        method: which algorithm.
+        accepted: (H, W) bool: inside the source picture and past the forward-backward check.
+        method: name of the algorithm.
 
     Example:
         >>> import numpy as np
@@ -223,13 +223,13 @@ def optical_flow(source_srgb: Any, target_srgb: Any, method: FlowMethod = "dis")
 
     Args:
         source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of one size; the UNEDITED pictures, as
-            published work has it.
+            in published work.
         method: "dis", Dense Inverse Search (Kroeger et al. 2016) with the medium preset, or
             "farneback" (Farneback 2003) with five levels and a window of 15 px. Both see 8-bit
             grey.
 
     Returns:
-        No flow at all, NaN and False everywhere, for pictures below 12 x 12 px.
+        Flow with NaN and False everywhere for pictures below 12 x 12 px.
 
     Raises:
         ValueError: pictures of different sizes or not sRGB in [0, 1]; another method.
@@ -269,12 +269,12 @@ def optical_flow(source_srgb: Any, target_srgb: Any, method: FlowMethod = "dis")
 def flow_consistency(
     source_srgb: Any, target_srgb: Any, flow: Flow, *, mask: Any = None
 ) -> Disagreement:
-    """Disagreement of two edited pictures along the flow of the unedited ones, where the
+    """Compare two edited pictures along the flow of the unedited ones, where the
     forward-backward check passes.
 
     Args:
         source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of the size of ``flow``.
-        flow: from :func:`optical_flow`.
+        flow: result of :func:`optical_flow`.
         mask: (H, W) bool of the target, pixels to compare; all if left out.
 
     Example:
@@ -358,7 +358,7 @@ def _flow(
     """(H, W, 2) displacement of each pixel of the target in the source, in px."""
     import cv2
 
-    cv: Any = cv2  # its stubs lack DIS, and None for the flow to start from
+    cv: Any = cv2  # its stubs lack DIS, and None as the initial flow
     if method == "dis":
         flow = cv.DISOpticalFlow_create(cv.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(
             target_colors, source_colors, None

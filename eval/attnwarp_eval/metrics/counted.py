@@ -1,4 +1,4 @@
-"""Counts that shares are of, so that a share can be compared by its odds."""
+"""Denominators of shares, so that a share can be compared by its odds."""
 
 from __future__ import annotations
 
@@ -35,5 +35,5 @@ COUNTED: Mapping[str, tuple[str, ...]] = {
     "warp.below_2px": ("warp.visible",),
     "warp.coverage": ("warp.visible",),
 }
-"""Name of a share -> counts whose sum it is a share of. A region or a grid that stands behind the
-share's name stands behind theirs too."""
+"""Name of a share -> counts whose sum is its denominator. A suffix of a region or a grid on the
+share's name applies to the counts' names too."""

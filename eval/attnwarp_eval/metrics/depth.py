@@ -12,19 +12,19 @@ from attnwarp_eval.metrics.arrays import floats, mask, mean, quantile, regions, 
 def depth_error(
     depth: Any, true_depth: Any, *, normal: Any = None, true_normal: Any = None, edge: Any = None
 ) -> dict[str, float]:
-    """Errors of a depth map, and of a normal map where both are given.
+    """Compute the errors of a depth map, and of a normal map if both normals are given.
 
     Args:
         depth: (H, W) depth along the optical axis; NaN, infinite or not positive is undefined.
         true_depth: (H, W), NaN where there is no surface.
         normal, true_normal: (H, W, 3) world normals that face the camera, of any length.
-        edge: (H, W) bool, the band around edges; given, every figure comes for the interior and the
-            band apart too.
+        edge: (H, W) bool, the band around edges; adds every figure for the interior and
+            for the band.
 
     Returns:
         Figures of :data:`attnwarp_eval.metrics.registry.METRICS`. Means are over pixels with a
-        surface and a depth; the delta shares over all pixels with a surface: one without a depth is
-        not within anything. NaN where there is nothing to measure.
+        surface and a depth. The delta shares are over all pixels with a surface: a pixel without a
+        depth is within no threshold. NaN with nothing to measure.
 
     Raises:
         ValueError: another shape or type, or one of the two normal maps without the other.
@@ -43,7 +43,7 @@ def depth_error(
         raise ValueError("normal, true_normal: got one of them, expected both or neither")
     angle = None
     if normal is not None:
-        # Imported here: torch takes a second, which a reader of the metrics' names should not wait.
+        # Imported here: torch takes a second, which listing metrics' names needs not.
         import torch
 
         from attnwarp.warp import angle_between

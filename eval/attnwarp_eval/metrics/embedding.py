@@ -1,8 +1,8 @@
 """Metrics of embeddings of pictures and texts. Pure: arrays in, arrays out; no network,
 no file.
 
-Everything is a cosine, so embeddings may come with any length. Which encoder gave them decides what
-the figures mean: keep its :class:`attnwarp.encoders.EncoderInfo` beside them.
+Every figure is a cosine, so embeddings may have any length. The encoder decides the meaning of the
+figures: keep its :class:`attnwarp.encoders.EncoderInfo` with them.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import numpy.typing as npt
 
 TINY_NORM = 1e-6
 """An embedding shorter than this has no direction: encoders compute in float32 with features of
-order 1 and give lengths of 1 to 100, of which this is the rounding."""
+order 1 and give lengths of 1 to 100; this is their rounding error."""
 
 TINY_DISPLACEMENT = 1e-5
-"""Two unit embeddings closer than this are taken for one. The same picture in another batch, with
+"""Two unit embeddings closer than this count as equal. The same picture in another batch, with
 other threads or in float64 moved its unit embedding by up to 1.2e-6 (ViT-B/32 and ViT-S/14 of
 random weights), and the direction of such a step means nothing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """Cosines, one a view.
+    """Cosines, one per view.
 
     Attributes:
         values: (N,) float64 in [-1, 1]; NaN where undefined.
@@ -51,7 +51,7 @@ class Similarity:
 
     @property
     def mean(self) -> float:
-        """Mean over the views that have a value; NaN where none has."""
+        """Mean over the views that have a value; NaN without any."""
         return float(np.nanmean(self.values)) if self.defined else float("nan")
 
 
@@ -60,11 +60,12 @@ def clip_similarity(images: npt.ArrayLike, text: npt.ArrayLike) -> Similarity:
 
     Args:
         images: (N, D) embeddings of the renders.
-        text: (D,) or (1, D) of the one prompt, or (N, D), one for each picture.
+        text: (D,) or (1, D) embedding of one prompt, or (N, D), one for each picture.
 
     Returns:
-        One value a picture, undefined where an embedding is shorter than TINY_NORM. It is the plain
-        cosine: neither multiplied by 100 nor cut off at 0, as some call by the name of CLIP score.
+        One value for each picture, undefined if an embedding is shorter than TINY_NORM. It is the
+        plain
+        cosine: neither multiplied by 100 nor clipped at 0, as in some definitions of CLIP score.
 
     Raises:
         ValueError: other shapes, or embeddings that are NaN or infinite.
@@ -90,14 +91,14 @@ def directional_similarity(
     """Cosine of the change of each picture with the change of the prompt.
 
     Args:
-        images_before, images_after: (N, D) embeddings, pair by pair of one view: the original and
-            its edited render.
-        text_before, text_after: (D,), (1, D) or (N, D) of the prompts that describe them.
+        images_before, images_after: (N, D) embeddings, pairs of one view: the original and its
+            edited render.
+        text_before, text_after: (D,), (1, D) or (N, D) embeddings of their prompts.
 
     Returns:
-        cos(I1 - I0, T1 - T0) of embeddings brought to unit length first, one a pair. Undefined
-        where an embedding is shorter than TINY_NORM, or a change smaller than TINY_DISPLACEMENT:
-        nothing was changed, and 0 would say that it was changed in a wrong direction.
+        cos(I1 - I0, T1 - T0) of embeddings first normalized to unit length, one per pair. Undefined
+        if an embedding is shorter than TINY_NORM, or a change smaller than TINY_DISPLACEMENT:
+        without a change, 0 would mean a change in a wrong direction.
 
     Raises:
         ValueError: other shapes, or embeddings that are NaN or infinite.
@@ -123,7 +124,7 @@ def directional_similarity(
 
 
 def direction_consistency(images_before: npt.ArrayLike, images_after: npt.ArrayLike) -> Similarity:
-    """Cosine of the changes of neighbouring views: 1 where the edit moves both the same way.
+    """Cosine of the changes of neighbouring views: 1 if the edit moves both in the same direction.
 
     The changes are those of :func:`directional_similarity`. Higher is better; a cosine has no unit.
 
@@ -158,22 +159,22 @@ def match_similarity(
     source_after: npt.ArrayLike,
     target_after: npt.ArrayLike,
 ) -> Similarity:
-    """Cosine, after the edit, of the patches of two views that matched before it.
+    """Cosine, after the edit, of patches of two views that matched before the edit.
 
-    Two patches match where each has the highest cosine with the other among all patches of its
-    view, before the edit. Of equally near patches the first counts. Higher is better; a cosine has
+    Two patches match if each has the highest cosine with the other among all patches of its view,
+    before the edit. Of equally near patches the first counts. Higher is better; a cosine has
     no unit.
 
     Args:
         source_before, source_after: (P, D) features of the source's patches before and after the
             edit, in one order: an encoder's ``tokens`` of one picture, reshaped.
-        target_before, target_after: (Q, D) of the target's.
+        target_before, target_after: (Q, D) features of the target's patches.
 
     Returns:
-        One value a match, in the order of the source's patches; undefined where the edit left a
-        feature shorter than TINY_NORM. Without a match no value, and a mean that is NaN. A feature
-        shorter than TINY_NORM before the edit matches nothing. A black picture has features too
-        where an encoder adds the place of a patch: its matches are by place alone.
+        One value per match, in the order of the source's patches; undefined where the edit left a
+        feature shorter than TINY_NORM. Without a match, no value and a NaN mean. A feature
+        shorter than TINY_NORM before the edit matches nothing. A black picture also has features
+        if an encoder adds the position of a patch: its matches are by position only.
 
     Raises:
         ValueError: other shapes, or features that are NaN or infinite.
@@ -215,16 +216,16 @@ def match_similarity(
 
 
 def image_similarity(source_edit: npt.ArrayLike, renders: npt.ArrayLike) -> Similarity:
-    """Cosine of each render with the edited source view: how far the scene follows the one picture
-    that was edited.
+    """Cosine of each render with the edited source view: how closely the scene follows the edited
+    picture.
 
     Args:
         source_edit: (D,) or (1, D) embedding of the edited source view.
         renders: (N, D) embeddings of the renders.
 
     Returns:
-        One value a render, undefined where an embedding is shorter than TINY_NORM. With DINO's
-        class token it is the DINO, with CLIP's picture embedding the CLIP single-image similarity.
+        One value for each render, undefined if an embedding is shorter than TINY_NORM. DINO's class
+        token gives the DINO, CLIP's picture embedding the CLIP single-image similarity.
 
     Raises:
         ValueError: other shapes, or embeddings that are NaN or infinite.
@@ -240,7 +241,7 @@ def image_similarity(source_edit: npt.ArrayLike, renders: npt.ArrayLike) -> Simi
 
 
 def _change(before: npt.ArrayLike, after: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """(N, D) difference of embeddings brought to unit length, pair by pair."""
+    """(N, D) difference of embeddings normalized to unit length, pair by pair."""
     second, first = _embeddings(after, "images_after"), _embeddings(before, "images_before")
     if first.shape != second.shape:
         raise ValueError(
@@ -269,7 +270,7 @@ def _embeddings(value: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
 def _matching(
     value: npt.ArrayLike, pictures: npt.NDArray[np.float64], name: str
 ) -> npt.NDArray[np.float64]:
-    """One embedding for all pictures, or one for each."""
+    """Validate one embedding for all pictures, or one for each."""
     array = np.asarray(value)
     array = _embeddings(array[None] if array.ndim == 1 else array, name)
     if array.shape[1] != pictures.shape[1] or len(array) not in (1, len(pictures)):
@@ -282,7 +283,7 @@ def _matching(
 
 def unit_rows(rows: npt.NDArray[np.float64], tiny: float = TINY_NORM) -> npt.NDArray[np.float64]:
     """Rows of length 1, and NaN where a row is shorter than ``tiny``."""
-    # Scaled first: the square of a float64 above 1e154 overflows.
+    # Scale first: the square of a float64 above 1e154 overflows.
     largest = np.abs(rows).max(axis=1, initial=0, keepdims=True)
     scaled = np.divide(rows, largest, out=np.zeros_like(rows), where=largest > 0)
     length = np.linalg.norm(scaled, axis=1, keepdims=True)
@@ -291,7 +292,7 @@ def unit_rows(rows: npt.NDArray[np.float64], tiny: float = TINY_NORM) -> npt.NDA
 
 
 def _cosine(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Cosines of unit rows; one row of either stands for all. Rounding past 1 is cut off, NaN
+    """Cosines of unit rows; a single row is broadcast. Rounding past 1 is clipped, NaN
     stays.
     """
     return np.asarray(np.clip((a * b).sum(axis=1), -1, 1))

@@ -1,8 +1,8 @@
-"""Do features of two views lie on each other's epipolar lines? Pictures and cameras in, no truth.
+"""Epipolar consistency of two views' features, from pictures and cameras, without truth.
 
 TSED, the thresholded symmetric epipolar distance (J. J. Yu et al., "Long-Term Photometric
-Consistent Novel View Synthesis with Diffusion Models", ICCV 2023): the share of view pairs with
-enough matches, the median of whose distances is small.
+Consistent Novel View Synthesis with Diffusion Models", ICCV 2023): the share of view pairs that
+have enough matches and a small median distance.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from attnwarp.camera import Camera
 
 LEAST_MATCHES = 10
-"""Matches that a pair needs, those of the paper."""
+"""Least matches of a pair, as in the paper."""
 
 LIMITS = (1, 2, 4)
 """Limits of the median distance in px."""
 
 RATIO = 0.8
-"""A match's distance of descriptors is below this share of the second best (Lowe 2004)."""
+"""Upper bound of a match's descriptor distance, as a share of the second best (Lowe 2004)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Tsed:
         medians: (P,) median distance of each pair in px; NaN without a baseline or with too few
             matches.
         matches: (P,) int, matches of each pair; 0 without a baseline.
-        baseline: (P,) bool, the pair has two centres of projection.
+        baseline: (P,) bool, whether the pair has two centres of projection.
 
     Example:
         >>> import numpy as np
@@ -56,7 +56,7 @@ class Tsed:
 
     def share(self, limit: float) -> float:
         """Share of the pairs with a baseline whose median is below ``limit`` px. A pair with too
-        few matches counts against, but where all have too few the share is NaN.
+        few matches counts against; if all have too few, the share is NaN.
         """
         measured = np.isfinite(self.medians).any()
         below = int((self.medians < limit).sum())
@@ -80,7 +80,7 @@ def epipolar_distance(source_xy: Any, target_xy: Any, F: Any) -> Array:
     """(N,) symmetric epipolar distance of matches, in px: the mean of the two distances of a match
     from the epipolar line of its partner.
 
-    A point at the epipole has no line in the other picture, and that distance is 0: nothing
+    A point at the epipole has no line in the other picture, and its distance is 0: no line
     contradicts it. Lower is better.
 
     Args:
@@ -119,7 +119,7 @@ def tsed(distances: Sequence[Any]) -> Tsed:
 
     Args:
         distances: for each pair the (N,) px of :func:`epipolar_distance`; None where the two views
-            have one centre of projection, and so no epipolar line.
+            share a centre of projection, and so have no epipolar line.
 
     Raises:
         ValueError: distances of another shape, or NaN or infinite.
@@ -148,13 +148,13 @@ def tsed(distances: Sequence[Any]) -> Tsed:
 
 
 def sift_matches(source_srgb: Any, target_srgb: Any) -> tuple[Array, Array]:
-    """Match SIFT features of two pictures, by OpenCV: both nearest to each other, and by a margin.
+    """Match SIFT features of two pictures with OpenCV: mutual nearest neighbours, by a margin.
 
     Args:
         source_srgb, target_srgb: (h, w, 3) and (H, W, 3) sRGB in [0, 1].
 
     Returns:
-        (N, 2) and (N, 2) positions in px, centres at +0.5. None at all, N = 0, for pictures without
+        (N, 2) and (N, 2) positions in px, centres at +0.5. N = 0 for pictures without
         features, such as black ones.
 
     Raises:
@@ -176,11 +176,11 @@ def sift_matches(source_srgb: Any, target_srgb: Any) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Keypoints of a picture, from :func:`sift_features`.
+    """Keypoints of a picture from :func:`sift_features`.
 
     Attributes:
         xy: (N, 2) px, pixel centres at +0.5.
-        descriptors: (N, 128) float32; None without a keypoint.
+        descriptors: (N, 128) float32; None without keypoints.
 
     Example:
         >>> import numpy as np
@@ -211,7 +211,7 @@ def sift_features(image_srgb: Any, name: str = "image_srgb") -> Keypoints:
     """
     import cv2
 
-    cv: Any = cv2  # its stubs lack the precise upscaling, without which positions are 0.25 px off
+    cv: Any = cv2  # its stubs lack precise upscaling, which corrects a shift of 0.25 px
     eight_bit = np.round(255 * picture(image_srgb, name)).astype(np.uint8)
     points, descriptors = cv.SIFT_create(enable_precise_upscale=True).detectAndCompute(
         cv.cvtColor(eight_bit, cv.COLOR_RGB2GRAY), None
@@ -220,13 +220,13 @@ def sift_features(image_srgb: Any, name: str = "image_srgb") -> Keypoints:
 
 
 def match_features(source: Keypoints, target: Keypoints) -> tuple[Array, Array]:
-    """Match features of two pictures: both nearest to each other, and by a margin.
+    """Match features of two pictures: mutual nearest neighbours, by a margin.
 
     Args:
-        source, target: from :func:`sift_features`.
+        source, target: keypoints from :func:`sift_features`.
 
     Returns:
-        (N, 2) and (N, 2) positions in px, as of :func:`sift_matches`.
+        (N, 2) and (N, 2) positions in px, as from :func:`sift_matches`.
 
     Example:
         >>> import numpy as np
@@ -257,8 +257,8 @@ def tsed_of_views(images: Sequence[Any], cameras: Sequence[Camera]) -> Tsed:
     """Judge neighbouring views by SIFT matches of their pictures, at known cameras.
 
     Args:
-        images: N pictures, (H, W, 3) sRGB in [0, 1], in the order of their path.
-        cameras: N, of the sizes of the pictures.
+        images: N pictures, (H, W, 3) sRGB in [0, 1], in path order.
+        cameras: N cameras of the pictures' sizes.
 
     Returns:
         One entry for each of the N - 1 pairs of neighbours. A pair of 512 px takes about 0.1 s.

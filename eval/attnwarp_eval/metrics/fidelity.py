@@ -33,21 +33,21 @@ def fidelity(
 ) -> dict[str, float]:
     """The ``fidelity.*`` figures of an edited view against the truth of the edit.
 
-    Figures are of the whole picture, ``.inside`` the edited object and ``.outside`` of it. Only the
-    last shows that a method also painted the rest of the picture. Pixels on the object's outline,
-    one on each side, count in neither: the mask is of pixel centres, and a pixel shows the mean of
-    its area. ``preserved_*`` compares the outside with the picture before the edit. It is less than
-    perfect for the truth too where an edited object reflects other light. So report ``preserved_*``
-    of the truth beside it.
+    Figures are of the whole picture, ``.inside`` and ``.outside`` the edited object. Only
+    ``.outside`` shows that a method also painted the rest of the picture. Pixels on the object's
+    outline, one on each side, count in neither: the mask is of pixel centres, and a pixel shows
+    the mean of its area. ``preserved_*`` compares the outside with the picture before the edit. It
+    is imperfect for the truth too if an edited object reflects other light, so report
+    ``preserved_*`` of the truth with it.
 
     Args:
         image_srgb: (H, W, 3) sRGB in [0, 1], the edited view.
-        truth_srgb: the same view of the scene as it should be after the edit
+        truth_srgb: the same view of the truly edited scene
             (:meth:`attnwarp_eval.scene.scene.Scene.edited`).
         mask: (H, W) bool, the edited object (:func:`attnwarp_eval.truth.edits.edit_mask`). All True
-            for an edit of the light, which leaves nothing outside: those figures are NaN.
-        original_srgb: the view before the edit; without it nothing is said about preservation.
-        distance: a perceptual distance; without it there is none. Inside and outside it is masked
+            for an edit of the light, which has no outside: ``.outside`` is NaN.
+        original_srgb: the view before the edit; without it there are no ``preserved_*`` figures.
+        distance: a perceptual distance; without it no ``distance``. Inside and outside are masked
             as :func:`attnwarp_eval.metrics.perceptual` says.
 
     Returns:
@@ -100,19 +100,19 @@ def nearest_answer(
     answers: Mapping[str, Mapping[str, Any]],
     masks: Mapping[str, Any] | None = None,
 ) -> tuple[str | None, dict[str, float]]:
-    """Answer that a method gave, of an ambiguous edit's right ones: one for all views, the least
-    mean MSE over them.
+    """Answer of an ambiguous edit that a method gave: one for all views, with the least mean MSE
+    over them.
 
-    One answer for all, since a method that answers differently from view to view is not free to
+    One answer for all, since a method may not answer differently from view to view
     (docs/truth/scenes.md).
 
     Args:
         images: (H, W, 3) sRGB by the view's name, the edited views.
-        answers: by the answer's name, its truth in the same views.
+        answers: truth of each answer in the same views, by name.
         masks: (H, W) bool by the view's name, the edited object.
 
     Returns:
-        The answer's name, None where nothing could be measured; and the PSNR in dB, pooled over the
+        The answer's name, None if nothing could be measured; and the PSNR in dB, pooled over the
         views, for each answer.
 
     Raises:
@@ -141,8 +141,8 @@ def nearest_answer(
 
 
 def _shrunk(part: Mask) -> Mask:
-    """Without the pixels that have one of the eight around them outside; the picture's border is no
-    outline.
+    """Part without the pixels that have one of their eight neighbours outside; the picture's border
+    is no outline.
     """
     from scipy.ndimage import binary_erosion
 

@@ -1,6 +1,6 @@
-"""Figures that a comparison of two runs is gated on, and how much worse each may get.
+"""Figures that gate a comparison of two runs, with their tolerated worsening.
 
-The direction of a figure and what counts as no change at all stand in the registry.
+The registry has each figure's direction, and its tolerance for no change.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from attnwarp_eval.metrics.registry import METRICS
 
 @dataclass(frozen=True)
 class Margin:
-    """The largest worsening of one view that is no regression by itself.
+    """Largest worsening of one view that is not a regression.
 
     A margin is wider than the registry's tolerance: another processor rounds a few pixels of a
     small picture to the other side of a threshold.
 
     Attributes:
-        absolute: in the metric's unit.
-        relative: a share of the baseline's value, added to ``absolute``.
+        absolute: margin in the metric's unit.
+        relative: margin as a share of the baseline's value, added to ``absolute``.
 
     Example:
         >>> GATES["warp.epe_median"].around(2.0)  # 0.02 px and 2 %
@@ -55,7 +55,7 @@ GATES: Mapping[str, Margin] = {
     "masks.recall": Margin(0.02),
     "masks.given": Margin(0.02),
     "masks.back": Margin(0.02),
-    # One part of a view that changes its answer moves these by a tenth.
+    # One part of a view that changes its answer changes these by a tenth.
     "parts.seen": Margin(0.1),
     "parts.through": Margin(0.1),
     "parts.bleed": Margin(0.05, 0.05),
@@ -91,8 +91,8 @@ EDITED = frozenset(
     (*(kind + of for kind in ("edit", "render") for of in ("", "_inside", "_next", "_seen")),
      "edit_render", "after", "seen", "unseen")
 )  # fmt: skip
-"""Endings of a metric's name where an edit is measured: edited views, renders of edited splats,
-their edited object, their neighbours, what the source saw; of a lifted mask also what it did not.
+"""Endings of a metric's name for edits: edited views, renders of edited splats, their edited
+object, their neighbours, pixels visible in the source; for a lifted mask also the invisible ones.
 """
 
 
@@ -100,13 +100,13 @@ COUNTERS: Mapping[str, Margin] = dict.fromkeys(
     ("visible", "tile_pairs", "pairs", "source_pairs", "composited", "contributing"),
     Margin(0.0, 1e-3),
 )
-"""Margins of the counters that stand behind a comparison of rounded numbers, such as whether a
+"""Margins of the counters that depend on comparisons of rounded numbers, such as whether a
 splat reaches a tile: another processor counts a few more or less. All others must be the same.
 """
 
 
 def same_count(counter: str, before: int, now: int) -> bool:
-    """Return True if two counts of a cell are the same work.
+    """Return True if two counts of a cell are equal within the counter's margin.
 
     Example:
         >>> same_count("pairs", 966_432, 966_416), same_count("taps", 300_672, 300_671)
@@ -117,8 +117,8 @@ def same_count(counter: str, before: int, now: int) -> bool:
 
 def gated(key: str) -> bool:
     """Return True if a result's key is gated: a metric of :data:`GATES`, over the whole picture, on
-    a feature grid or of an edit (:data:`EDITED`). Regions of a picture follow from the whole; keys
-    of known flaws rate a metric, not the code.
+    a feature grid or of an edit (:data:`EDITED`). Regions of a picture follow from the whole, and
+    keys of known flaws rate a metric, not the code.
 
     Example:
         >>> [gated(key) for key in ("depth.abs_rel", "warp.epe_median_layer.64", "depth.rmse")]
@@ -133,7 +133,7 @@ def gated(key: str) -> bool:
 
 
 def margin(key: str) -> Margin:
-    """The margin behind a gated key. KeyError: it is not gated.
+    """Margin of a gated key. KeyError: the key is not gated.
 
     Example:
         >>> margin("warp.epe_median_layer.64").absolute

@@ -1,5 +1,5 @@
-"""A run's report: report.md, report.html (self-contained) and results.jsonl, made from its cells
-alone.
+"""Report of a run: report.md, report.html (self-contained) and results.jsonl, made from its cells
+only.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ __all__ = ["problems", "read_results", "write_report", "write_report_of_parts"]
 
 
 def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -> list[Path]:
-    """Write the report of a run's folder, from whatever cells are done.
+    """Write the report of a run's folder from its finished cells.
 
     Args:
-        timings: False leaves out everything measured in seconds or memory, so that two runs of the
+        timings: False leaves out measured seconds and memory, so that two runs of the
             same study on the same code give the same bytes.
-        pictures: False leaves out the views' pictures, for a report that lies beside the code or
+        pictures: False leaves out the views' pictures, for a report stored with the code or
             in a CI summary.
 
     Returns:
-        The files written, the one a person opens first at the end.
+        The written files; the last is the one to open first.
 
     Raises:
-        StoreError: the folder is no run, or a picture is not the one that was written.
+        StoreError: the folder is not a run, or a picture has changed since it was written.
 
     Example:
         >>> from attnwarp_eval.study import Store, parse_study
@@ -59,13 +59,13 @@ def write_report_of_parts(folder: Path, *, timings: bool = True) -> list[Path]:
 
     Args:
         folder: path of ``results*.jsonl.xz``, parts of one study.
-        timings: see :func:`write_report`.
+        timings: as for :func:`write_report`.
 
     Returns:
-        The files written, the one a person opens first at the end.
+        The written files; the last is the one to open first.
 
     Raises:
-        InputError: raw results that cannot be read, or are of no one study.
+        InputError: raw results are unreadable or of different studies.
 
     Example:
         >>> from attnwarp_eval.report.raw import write_raw
@@ -85,7 +85,7 @@ def write_report_of_parts(folder: Path, *, timings: bool = True) -> list[Path]:
 
 
 def wrong_results(store: Store) -> list[str]:
-    """Faults of a run's ``results.jsonl``, at most one line. It may not be there yet."""
+    """Faults of a run's ``results.jsonl``, at most one line. A missing file is no fault."""
     path = store.root / "results.jsonl"
     there = {file.is_file() for file in (path, _sum_of(path))}
     if there == {False}:
@@ -102,7 +102,7 @@ def _sum_of(path: Path) -> Path:
 
 
 def _sum_line(path: Path, content: bytes) -> bytes:
-    """Line of a checksum as sha256sum writes it, which can check it too."""
+    """Checksum line in the format of sha256sum, which can check it."""
     return f"{hashlib.sha256(content).hexdigest()}  {path.name}\n".encode()
 
 

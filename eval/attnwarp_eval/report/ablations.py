@@ -26,20 +26,20 @@ POOLED = (
 )
 
 CLAIMED = "†"
-"""Stands beside the p-value of a comparison that a claim makes."""
+"""Mark of a p-value that belongs to a claim."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A variant against the baseline of its table, in one metric.
+    """Comparison of a variant with the baseline of its table, in one metric.
 
     Attributes:
-        variant, metric: names.
+        variant, metric: names of the variant and the metric.
         specification: specification of the metric.
-        difference: the variant's against the baseline's.
-        p: adjusted over the table, or over the claims where one makes this comparison.
-        claim: the one that does.
-        verdict: empty where no direction of the metric is better.
+        difference: difference of the variant from the baseline.
+        p: p-value adjusted over the table, or over the claims if a claim makes this comparison.
+        claim: claim that makes this comparison, if any.
+        verdict: verdict; empty if no direction of the metric is better.
     """
 
     variant: str
@@ -52,19 +52,19 @@ class Row:
 
     @property
     def text(self) -> str:
-        """The difference, with the interval that agrees with the verdict."""
+        """The difference, with the interval of the verdict's level."""
         level = EQUAL_LEVEL if self.verdict == "equal" else self.difference.level(self.p)
         return difference_text(self.difference, self.specification.unit, level)
 
     @property
     def outcome(self) -> str:
-        """The verdict; of fewer than six scenes, how many agree."""
+        """The verdict; for fewer than six scenes, the number of scenes that agree."""
         few = self.verdict and self.difference.scenes < FEWEST_SCENES
         return no_verdict(self.difference) if few else self.verdict
 
 
 def ablations(results: Results, compared: Sequence[Sequence[Row]]) -> list[Section]:
-    """A section for each ablation that the study names."""
+    """Sections, one for each ablation of the study."""
     sections = list(map(partial(_section, results), results.study.ablations, compared))
     for section, ablation in zip(sections, results.study.ablations, strict=True):
         own = report_of(ablation.probe)
@@ -82,7 +82,7 @@ def _section(results: Results, ablation: Ablation, compared: Sequence[Row]) -> S
     if missing:
         section.text.append(f"**Not measured:** {', '.join(missing)}.")
     columns = own.columns_at(results.layer)
-    # Probes that render nothing for a view count no pairs.
+    # A probe without renders has no counts of pairs.
     counted = any("pairs" in results.counters(own.name, name) for name in names)
     rows = []
     for name in names:
@@ -120,7 +120,7 @@ def _section(results: Results, ablation: Ablation, compared: Sequence[Row]) -> S
 
 
 def compared_of(results: Results, judged: Sequence[JudgedClaim]) -> list[list[Row]]:
-    """The :func:`rows_of` each table of variants of the study."""
+    """Rows of each table of variants of the study, from :func:`rows_of`."""
     claimed = of_comparisons(judged)
     return [rows_of(results, ablation, claimed) for ablation in results.study.ablations]
 
@@ -128,13 +128,13 @@ def compared_of(results: Results, judged: Sequence[JudgedClaim]) -> list[list[Ro
 def rows_of(
     results: Results, ablation: Ablation, claimed: Mapping[Comparison, JudgedClaim]
 ) -> list[Row]:
-    """Each variant against the baseline, in each metric that its probe tests.
+    """Rows of each variant against the baseline, in each metric that its probe tests.
 
-    A comparison has one verdict in a report. So one that a claim judges has the claim's, and is no
-    test of this table.
+    A comparison has one verdict in a report. So a comparison that a claim judges takes the claim's
+    verdict, and is not a test of this table.
 
     Args:
-        claimed: from :func:`attnwarp_eval.report.judging.of_comparisons`.
+        claimed: result of :func:`attnwarp_eval.report.judging.of_comparisons`.
     """
     own, baseline = report_of(ablation.probe), ablation.baseline
     pairs = [

@@ -1,4 +1,4 @@
-"""Answer of a run, in words and one table: what a reader should know first."""
+"""Answer of a run, in words and one table: the opening of its report."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from attnwarp_eval.study.turns import timed_in_turn
 TITLE = "Answer"
 
 ASKS = re.compile(r"(^|, )(what|which|how|where|do|does|is|are)\b", re.IGNORECASE)
-"""Beginning of a question, of a title or of its last part."""
+"""Beginning of a question in a title or in a title's last part."""
 
 _UNITS = {
     "px": "px",
@@ -31,11 +31,11 @@ _UNITS = {
     "rows": "rows",
     "views": "views",
 }
-"""Unit of a metric -> the word behind its figure, where the figure is not changed."""
+"""Unit of a metric -> the word after its figure, for figures shown unconverted."""
 
 
 def answer(results: Results, timings: bool = True, pictures: bool = True) -> Section | None:
-    """The answer to a study's own question; None where it states none."""
+    """The answer to a study's question; None for a study without one."""
     asked = results.study.answer
     if asked is None:
         return None
@@ -62,7 +62,7 @@ def answer(results: Results, timings: bool = True, pictures: bool = True) -> Sec
 
 
 MOST_CLAIMS, MOST_TOLD = 12, 5
-"""Rows at most of a table of claims in an answer, and claims at most that its text speaks of."""
+"""Limits of the rows in an answer's table of claims, and of the claims in its text."""
 
 OUTCOMES = {
     "holds": "As expected",
@@ -72,14 +72,14 @@ OUTCOMES = {
     "can't tell": "Cannot be told",
     "blind": "No verdict, since the control failed",
 }
-"""Verdict -> how it is said, in the order in which claims are shown."""
+"""Verdict -> its wording, in the order in which claims are shown."""
 
 
 def by_claims(
     results: Results, judged: Sequence[JudgedClaim], timings: bool = True
 ) -> Section | None:
-    """The answer of a study that judges claims and states no question of its own; None of a run
-    that gives no verdict.
+    """The answer of a study that judges claims and states no question; None for a run
+    without a verdict.
 
     Args:
         timings: whether seconds are shown.
@@ -93,7 +93,7 @@ def by_claims(
     counted = " ".join(f"{OUTCOMES[kind]}: {n}." for kind, n in counts.items() if n)
     several = len(own) > 1
     text = [f"{len(own)} expectation{'s are' if several else ' is'} judged. {counted}"]
-    # The headlines, then what nobody expected; shown in their order, since one speaks of another.
+    # The headlines, then unexpected results; in their order, since a claim may refer to another.
     chosen = sorted(
         (one for one in judged if one.told),
         key=lambda one: (one.claim.headline or math.inf, one.verdict != "the opposite holds"),
@@ -133,20 +133,20 @@ def by_claims(
 
 
 def against(judged: JudgedClaim) -> str:
-    """Mean of each side of a claim in words, the one that it speaks of first."""
+    """Mean of each side of a claim in words, in the order of the claim."""
     metric = probe(judged.claim.probe).metric(judged.metric)
     means = [in_words(side.mean, metric, judged.metric) for side in judged.sides.values()]
     return " against ".join(reversed(means))
 
 
 def question(results: Results) -> list[str]:
-    """The study's title in bold, where it is a question."""
+    """The study's title in bold, if it is a question."""
     title = results.study.title.rstrip("?. ")
     return [f"**{title}?**"] if ASKS.search(title) else []
 
 
 def _time_of_pair(results: Results) -> Iterator[str]:
-    """A sentence on the seconds of the first table's baseline and its first variant."""
+    """Sentence on the seconds of the first table's baseline and its first variant."""
     for ablation in results.study.ablations[:1]:
         own = report_of(ablation.probe)
         timed = timed_in_turn(results, own.stage) if own.stage else None
@@ -162,7 +162,7 @@ def _time_of_pair(results: Results) -> Iterator[str]:
 
 
 def measured_in_words(results: Results) -> str:
-    """Words on what a run measured, for a report that answers no question."""
+    """Summary of a run's measurements, for a report that answers no question."""
     study = results.study
     things = dict.fromkeys(
         "seconds taken in turn" if probe(name).times_in_turn else report_of(name).measures or name
@@ -177,12 +177,12 @@ def measured_in_words(results: Results) -> str:
 
 
 def in_words(value: float, metric: Metric, key: str) -> str:
-    """A figure with its unit, as a person says it.
+    """Format a figure with its unit for a sentence.
 
     Args:
         value: value of the figure; NaN where undefined.
-        metric: its specification.
-        key: its name in a record, whose last part may be the size of a feature grid.
+        metric: specification of the figure.
+        key: name of the figure in a record; its last part may be the size of a feature grid.
 
     Example:
         >>> from attnwarp_eval.metrics.registry import METRICS
@@ -212,8 +212,8 @@ def _figure(results: Results, column: AnswerColumn, variant: str) -> tuple[Inter
 
 
 def _filled(results: Results, asked: Answer, sentence: str) -> str:
-    """A sentence with the run's figures in the place of ``{column|variant}``; empty where the run
-    measured none of one.
+    """Fill ``{column|variant}`` in a sentence with the run's figures; empty if the run lacks
+    a figure.
     """
 
     columns = {**asked.figures, **asked.columns}
@@ -230,7 +230,7 @@ def _filled(results: Results, asked: Answer, sentence: str) -> str:
 
 
 def _table(results: Results, asked: Answer, timings: bool) -> tuple[Table, list[str]]:
-    """The table, and the variants that are the best in the column that decides."""
+    """The table, and the best variants in the deciding column."""
     rows = {name: [f"`{name}`"] for name in asked.variants}
     columns, decided = ["variant"], list[str]()
     for title, column in asked.columns.items():
@@ -240,7 +240,7 @@ def _table(results: Results, asked: Answer, timings: bool) -> tuple[Table, list[
         leaders = _leaders({name: value.mean for name, (value, _) in figures.items()}, metric)
         if title == asked.decides:
             decided = leaders
-        # What is said of all figures stands once, in the column's head.
+        # A unit shared by all figures is shown once, in the column's head.
         _, _, unit = in_words(1.0, metric, key).partition(" ")
         columns.append(title if unit in ("", "%") else f"{title}, {unit}")
         for name, (value, _) in figures.items():
@@ -277,7 +277,7 @@ def _cell(value: float, metric: Metric, key: str, unit: str) -> str:
 
 
 def _leaders(values: Mapping[str, float], metric: Metric) -> list[str]:
-    """Variants with the best value, equals together; none where no direction is better."""
+    """Variants with the best value, ties included; none if no direction is better."""
     size = {
         name: abs(value) if metric.direction in ("lower", "zero") else -value
         for name, value in values.items()
@@ -292,7 +292,7 @@ def _leaders(values: Mapping[str, float], metric: Metric) -> list[str]:
 
 
 def _in_turn(results: Results, asked: Answer) -> dict[str, float]:
-    """Seconds of variants that were timed in turn; those of cells depend on what else ran."""
+    """Seconds of variants timed in turn; seconds of cells depend on the machine's load."""
     stage = report_of(asked.columns[asked.decides].probe).stage
     timed = timed_in_turn(results, stage) if stage else None
     if timed is None:
@@ -301,7 +301,7 @@ def _in_turn(results: Results, asked: Answer) -> dict[str, float]:
 
 
 def _advice(results: Results, asked: Answer, leaders: list[str]) -> str:
-    """The variant to use, by the column that decides; of fewer than six scenes, the best one."""
+    """The variant to use, by the deciding column; for fewer than six scenes, the best one."""
     if not leaders:
         return f"No variant is better than the others in {asked.decides}."
     column = asked.columns[asked.decides]
@@ -314,7 +314,7 @@ def _advice(results: Results, asked: Answer, leaders: list[str]) -> str:
 
 
 def _costs(results: Results, asked: Answer, leaders: list[str]) -> Iterator[str]:
-    """Sentences on seconds: those of the variant to use, and those behind the pictures."""
+    """Sentences on seconds: of the variant to use, and of the pictures' variants."""
     own = report_of(asked.columns[asked.decides].probe)
     taken = _in_turn(results, asked)
     cheapest = min(taken, key=lambda name: taken[name], default="")

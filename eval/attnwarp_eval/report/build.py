@@ -26,7 +26,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
     """The report's content; figures are written below ``root``/figures.
 
     Args:
-        timings: whether anything measured in seconds or bytes of memory is shown.
+        timings: whether measured seconds and memory are shown.
         pictures: whether the views' pictures are shown.
     """
     study = results.study
@@ -64,7 +64,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
                 "**One scene says nothing of others. Name six scenes or more for a verdict.**"
             )
     for scene, lines in results.notices.items():
-        # As code: names of files may have asterisks.
+        # Formatted as code: names of files may have asterisks.
         lead += ["**Scene {}**: `{}`".format(scene, line.replace("`", "'")) for line in lines]
     layout = Layout(root, timings)
     claims = load_claims()
@@ -112,7 +112,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
 
 
 def _front(study: Study, sections: Sequence[Section]) -> list[Picture]:
-    """The figure of the front whose metric decides the answer; the first one where none does."""
+    """The figure of the front whose metric decides the answer, by default of the first front."""
     figures = next((section.figures for section in sections if section.title == FRONTS), [])
     asked = study.answer
     column = None if asked is None else asked.columns[asked.decides]
@@ -126,7 +126,7 @@ def _front(study: Study, sections: Sequence[Section]) -> list[Picture]:
 
 
 def problems(results: Results) -> list[str]:
-    """Faults of the instrument in this run, one line each; empty when it is calibrated.
+    """Faults of the instrument in this run, one line each; empty if it is calibrated.
 
     Example:
         >>> from attnwarp_eval.study import parse_study

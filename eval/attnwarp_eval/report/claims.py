@@ -1,4 +1,4 @@
-"""Claims of claims.yaml, and what a run measures of each."""
+"""Claims of claims.yaml, and their measurement from a run."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.study import parse_variant
 
 Seen = Literal["", "seen", "not seen", "not measured"]
-"""Outcome of a claim's control; empty where it has none."""
+"""Outcome of a claim's control; empty without a control."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One entry of claims.yaml, whose head explains the keys."""
+    """Entry of claims.yaml; the head of that file explains the keys."""
 
     id: str
     text: str
@@ -47,7 +47,7 @@ class Claim:
     plain: str = ""
 
     def of_each_editor(self) -> list[Claim]:
-        """The claim for each of its editors; itself where it has none."""
+        """The claim for each of its editors; the claim itself without editors."""
         if not self.editors:
             return [self]
         return [self._of_editor(name) for name in self.editors]
@@ -71,12 +71,12 @@ class Claim:
 
     @property
     def sign(self) -> int:
-        """The sign that the contrast is expected to have."""
+        """Expected sign of the contrast."""
         return 1 if self.expect == "higher" else -1
 
     @property
     def bound(self) -> float | None:
-        """Bound of equality as :meth:`Contrast.verdict` takes it; None where the claim has none.
+        """Bound of equality as :meth:`Contrast.verdict` takes it; None without one.
 
         Example:
             >>> side = {"preset": "corrected"}
@@ -93,7 +93,7 @@ class Claim:
         return math.log1p(share) if ratio else share
 
     def measure(self, results: Results) -> Measured | None:
-        """The sides of the claim; None where the run has no variant of that content."""
+        """Measure the sides of the claim; None if the run lacks a variant of that content."""
         metric = self.metric.replace("{layer}", str(results.layer))
         a, b = self._variant(results, self.a), self._variant(results, self.b)
         if b is None and self.or_b is not None:
@@ -106,7 +106,7 @@ class Claim:
                 f"yaw {yaw[0]:g} to {yaw[1]:g}": results.views(self.probe, a, metric, yaw)
                 for yaw in self.compare_yaw
             }
-            # Different views cannot be paired; their means can, scene by scene.
+            # Different views cannot be paired, but their means over each scene can.
             low, high = (
                 {s: {"mean": over_scenes({s: v}).mean} for s, v in table.items()}
                 for table in tables.values()
@@ -126,12 +126,12 @@ class Claim:
             limit = {s: dict.fromkeys(views, self.against) for s, views in first.items()}
             sides = {a: over_scenes(first)}
             return Measured(metric, sides, limit, first, contrast(limit, first, "plain"))
-        # Over the views that both have: only there is the difference of the means the claim's.
+        # Means over the shared views: only their difference is the claim's.
         sides = dict(zip(names, map(over_scenes, common([first, second])), strict=True))
         return Measured(metric, sides, first, second, value, self._control(results, names[1]))
 
     def _control(self, results: Results, reference: str) -> Seen:
-        """Tell whether the run sees the claim's control, by one test at 5 %."""
+        """Test at 5 % whether the run detects the claim's control."""
         if self.control is None:
             return ""
         key = str(self.control.get("metric", self.metric)).replace("{layer}", str(results.layer))
@@ -151,8 +151,8 @@ class Claim:
 
 @dataclass(frozen=True)
 class Measured:
-    """The sides of a claim by name, the two tables whose difference it predicts, that difference on
-    the scale of the figure, and whether the claim's control was seen.
+    """Sides of a claim by name, the two tables whose difference it predicts, that difference on the
+    scale of the figure, and whether the claim's control was detected.
     """
 
     metric: str
@@ -165,7 +165,7 @@ class Measured:
 
 @cache
 def load_claims() -> tuple[Claim, ...]:
-    """The claims that ship with the package."""
+    """Load the bundled claims."""
     text = (resources.files("attnwarp_eval.report") / "claims.yaml").read_text()
     return tuple(
         Claim(**_tuples(one)) for entry in read_yaml(text)[1] for one in _of_each_metric(entry)
@@ -173,7 +173,7 @@ def load_claims() -> tuple[Claim, ...]:
 
 
 def _of_each_metric(entry: dict[str, Any]) -> list[dict[str, Any]]:
-    """An entry with ``metrics`` is a claim for each of them; any other is one itself."""
+    """Expand an entry with ``metrics`` to one claim for each; other entries are single claims."""
     common = dict(entry)
     metrics = common.pop("metrics", None)
     if metrics is None:
@@ -203,11 +203,11 @@ def _tuples(entry: dict[str, Any]) -> dict[str, Any]:
 def variant_like(
     results: Results, data: Mapping[str, Any], name: str, *, own: bool = False
 ) -> str | None:
-    """The name of the first measured variant that means what ``data`` means.
+    """Name of the first measured variant with the meaning of ``data``.
 
     Args:
-        data: a variant as a study's YAML has it.
-        own: whether settings that ``data`` leaves out may be the variant's own.
+        data: a variant in the format of a study's YAML.
+        own: whether the variant may set what ``data`` leaves out.
     """
     asked, study = probe(name), results.study
     if name not in study.probes:

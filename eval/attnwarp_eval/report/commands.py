@@ -1,4 +1,4 @@
-"""The command that opens the view of each picture of a report in 3D."""
+"""Commands that open the views of a report's pictures in 3D."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from attnwarp_eval.inspect.command import inspect_command
 from attnwarp_eval.study.results import Results
 
 FOLDER = "."
-"""The run as the commands name it: they are for a shell in its folder, wherever that is moved."""
+"""Path of the run in the commands: relative, for a shell in its folder wherever it is moved."""
 
 COLORS = {
     "mask": "mask",
@@ -19,14 +19,14 @@ COLORS = {
     "edited": "edit disagreement",
 }
 """Pictures of a variant that can be inspected, and the colouring that explains each; None for the
-command's own choice."""
+command's default."""
 
 
 def add_commands(results: Results, sections: Sequence[Section]) -> None:
-    """Give pictures of a variant in a target view their command; the others have none.
+    """Set the command of each picture of a variant in a target view; other pictures have none.
 
     Args:
-        sections: sections with galleries that also get one command a scene, for plain text.
+        sections: sections with galleries, which also get one command per scene, for plain text.
     """
     commands = {path: (scene, command) for path, scene, command in _commands(results)}
     for gallery in (section.gallery for section in sections):
@@ -55,7 +55,7 @@ def _commands(results: Results) -> Iterator[tuple[str, str, str]]:
             or variant not in study.variants
         ):
             continue
-        # Views that are no targets of the scene, such as those of a fit, cannot be opened.
+        # Views that are not targets of the scene, such as a fit's, cannot be opened.
         targets = cell.record.spec.get("views", [])
         for picture in cell.record.pictures:
             if picture.content in COLORS and picture.view.rpartition("/")[2] in targets:

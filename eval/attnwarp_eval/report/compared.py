@@ -1,5 +1,5 @@
-"""Two variants of a run in one figure, on the figure's own scale; the one way in which a report
-compares them.
+"""Comparison of two variants of a run in one figure, on the figure's scale; every comparison in a
+report uses it.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ Yaw = tuple[float, float]
 def between(
     results: Results, name: str, first: str, second: str, metric: str, yaw: Yaw | None = None
 ) -> Contrast:
-    """The second variant against the first.
+    """Contrast of the second variant with the first.
 
     Args:
-        yaw: closed range of degrees that a view's yaw from the source must lie in; any if None.
+        yaw: closed range of views' yaws from the source, in degrees; any if None.
     """
     a, b = (results.views(name, who, metric, yaw) for who in (first, second))
     sides = [_counts(results, name, who, metric, yaw) for who in (first, second)]
@@ -44,11 +44,11 @@ def on_scale(
     b: ByView,
     counts: list[ByView | None],
 ) -> Contrast:
-    """One table of a figure against another, on the figure's scale.
+    """Contrast of two tables of a figure, on the figure's scale.
 
     Args:
         a, b: scene -> view (and seed) -> value.
-        counts: things that each share is of; None where they are not known.
+        counts: denominators of the shares; None if unknown.
     """
     specification = probe(name).metric(metric)
     first, second = counts
@@ -59,8 +59,8 @@ def on_scale(
 
 
 def floor_of(results: Results, metric: str, specification: Metric) -> float:
-    """The error below which a figure means nothing: that of the calibration, where it is a distance
-    that the calibration has too, and at least the metric's tolerance.
+    """Error below which a figure means nothing: the calibration's error if it has the same
+    distance, and at least the metric's tolerance.
     """
     if specification.unit not in ("px", "layer px"):
         return specification.atol
@@ -78,7 +78,7 @@ def floor_of(results: Results, metric: str, specification: Metric) -> float:
 def _counts(
     results: Results, name: str, variant: str, metric: str, yaw: Yaw | None
 ) -> ByView | None:
-    """Things that each share is of; None where the run has not counted them."""
+    """Denominators of the shares; None if the run has no counts."""
     specification = probe(name).metric(metric)
     behind = metric.removeprefix(specification.name)
     tables = [
@@ -101,10 +101,10 @@ def _counts(
 
 
 def difference_text(value: Contrast, unit: str, level: float = 0.95) -> str:
-    """A difference for a reader, with the interval that agrees with its verdict; below six scenes
+    """Format a difference with the interval of its verdict's level; below six scenes
     with the lowest and the highest scene.
 
-    Factors up to 2 are shown in percent, larger ones and those of odds as factors.
+    Factors up to 2 are shown in percent, larger ones and ratios of odds as factors.
 
     Example:
         >>> tables = [{f"s{k}": {"v": v + 0.01 * v * k} for k in range(6)} for v in (1.0, 0.6)]
@@ -136,7 +136,7 @@ def scene_texts(value: Contrast, unit: str, scenes: Sequence[str]) -> list[str]:
     """The difference of each scene; a dash where it is undefined.
 
     Args:
-        scenes: names, in the order wanted.
+        scenes: names of scenes, in display order.
 
     Example:
         >>> tables = [{f"s{k}": {"v": v + 0.01 * v * k} for k in range(2)} for v in (1.0, 0.6)]
@@ -153,7 +153,7 @@ def scene_texts(value: Contrast, unit: str, scenes: Sequence[str]) -> list[str]:
 
 
 def no_verdict(value: Contrast) -> str:
-    """Count of the scenes that have the sign of their mean, where fewer than six give no verdict.
+    """Count of the scenes with the sign of the mean, for fewer than six, which give no verdict.
 
     Example:
         >>> tables = [{f"s{k}": {"v": v + 0.01 * k} for k in range(2)} for v in (1.0, 0.6)]
@@ -167,10 +167,10 @@ def no_verdict(value: Contrast) -> str:
 
 
 def detectable_text(value: Contrast) -> str:
-    """The smallest difference that one test at 5 % would tell in 80 % of studies.
+    """The smallest difference that one test at 5 % detects in 80 % of studies.
 
     Args:
-        value: value with the spread between scenes.
+        value: contrast with the spread between scenes.
     """
     least = value.student.detectable
     if value.scenes < FEWEST_SCENES or not math.isfinite(least):

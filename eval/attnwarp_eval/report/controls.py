@@ -1,4 +1,4 @@
-"""Controls of a study of edits: what its figures see of wrong features and of another seed."""
+"""Controls of a study of edits: detection of wrong features and of another seed by its figures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from attnwarp_eval.study.shared.controls import OTHER_SEED
 from attnwarp_eval.study.shared.edits import VariantPart
 
 BLIND: Literal["blind"] = "blind"
-"""Word that stands for "can't tell" where the study's control failed."""
+"""Replacement of "can't tell" if the study's control failed."""
 
 
 def is_control(variant: Variant) -> bool:
@@ -25,7 +25,7 @@ def is_control(variant: Variant) -> bool:
 
 
 def controls_of(results: Results, name: str, baseline: str) -> dict[str, str]:
-    """Measured controls of a variant: what each does, by its label.
+    """Measured controls of a variant, by label.
 
     A control differs from its variant in ``control`` alone.
     """
@@ -41,7 +41,7 @@ def controls_of(results: Results, name: str, baseline: str) -> dict[str, str]:
 
 
 def seen(results: Results, name: str, metric: str, baseline: str, label: str) -> bool:
-    """Return True if a figure tells a control from its variant: worse, or other for a seed.
+    """Return True if a figure separates a control from its variant: worse, or different for a seed.
 
     Args:
         results, name, baseline: as for :func:`controls_of`.
@@ -55,10 +55,10 @@ def seen(results: Results, name: str, metric: str, baseline: str, label: str) ->
 
 
 def blind(results: Results, name: str, metric: str, baseline: str) -> bool:
-    """Return True if a study has controls of a variant, and a figure tells none of them from it.
+    """Return True if a study has controls of a variant, and a figure separates none from it.
 
-    Features from the wrong place have to do worse. Where they don't, the figure does not depend on
-    where features come from, so "can't tell" about two warps says nothing.
+    Features from the wrong place must do worse. Otherwise the figure does not depend on the
+    source of features, so "can't tell" about two warps says nothing.
 
     Args:
         metric: a figure for which one direction is better.
@@ -69,8 +69,8 @@ def blind(results: Results, name: str, metric: str, baseline: str) -> bool:
 
 
 def controls(results: Results) -> list[Section]:
-    """The section on controls, one table for each baseline that has some; none of fewer than six
-    scenes, on which no test sees anything.
+    """The section on controls, a table for each baseline with controls; none for fewer than six
+    scenes, on which no test can detect a difference.
     """
     if len(results.study.scenes) < FEWEST_SCENES:
         return []

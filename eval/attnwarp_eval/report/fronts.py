@@ -1,4 +1,4 @@
-"""Cost of accuracy in time: error against seconds, taken in turn where a probe has done so."""
+"""Cost of accuracy in time: error against seconds, timed in turn if a probe did so."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from attnwarp_eval.study.turns import Timed, timed_in_turn
 TITLE = "What accuracy costs in time"
 
 DRAWS = 1000
-"""Resamples of scenes and rounds."""
+"""Number of resamples of scenes and rounds."""
 
 
 def fronts(results: Results, layout: Layout) -> list[Section]:
-    """The section of fronts, with its figures; none where the study names no front."""
+    """The section of fronts, with its figures; none if the study has no front."""
     reports = {front.probe: report_of(front.probe) for front in results.study.fronts}
     in_turn = {own.stage: timed_in_turn(results, own.stage) for own in reports.values()}
     text = _text(reports.values(), in_turn)
@@ -82,7 +82,7 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
 
 
 def _probabilities(timed: Timed, shared: Shared, names: Sequence[str]) -> dict[str, str]:
-    """Probability that each variant is on the front; a dash for one scene, which says nothing of
+    """Probability that each variant is on the front; a dash for one scene, which says nothing about
     others.
     """
     means = np.array(
@@ -100,7 +100,7 @@ def _probabilities(timed: Timed, shared: Shared, names: Sequence[str]) -> dict[s
 def _cheapest(
     results: Results, shared: Shared, points: Mapping[str, tuple[Interval, Interval]], time: str
 ) -> list[Table]:
-    """The cheapest variant for an error: chosen on every other scene, checked on the rest."""
+    """Cheapest variant for an error: chosen on every other scene, checked on the rest."""
     scenes = results.study.scene_names
     chosen_on, checked_on = scenes[::2], scenes[1::2]
     seconds = {name: each.mean for name, (each, _) in points.items()}
@@ -164,7 +164,7 @@ def _in_turn(timed: Timed) -> str:
 def _points(
     results: Results, front: Front, shared: Shared, cost: str, timed: Timed | None
 ) -> tuple[dict[str, tuple[Interval, Interval]], list[list[str]]]:
-    """Seconds and quality of each comparable variant; the rows but for their last column."""
+    """Seconds and quality of each comparable variant, and the rows without their last column."""
     points: dict[str, tuple[Interval, Interval]] = {}
     rows = []
     for name in front.variants:
@@ -173,7 +173,7 @@ def _points(
         if name in shared.apart and quality.views:
             shown += ", own views"
         if timed is not None and name not in timed.names:
-            # Seconds of another kind have no place on the same axis.
+            # Seconds of different kinds cannot share an axis.
             rows.append([name, shown, "–", "not timed", "–"])
             continue
         if timed is not None:

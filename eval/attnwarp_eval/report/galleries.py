@@ -25,7 +25,7 @@ def galleries(results: Results) -> list[Section]:
 
 
 def _shared(results: Results, apart: set[str]) -> list[Section]:
-    """The pictures of all probes but those that stand apart."""
+    """The pictures of all probes except those with a separate section."""
     by_view: dict[tuple[str, str], list[tuple[str, PictureFile]]] = {}
     for cell in results.cells:
         if cell.probe in apart:

@@ -1,4 +1,4 @@
-"""Verdicts on claims: of the one study that judges each, adjusted together; and their section."""
+"""Verdicts on claims, each from its one judging study, adjusted together; and their section."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ Here = Literal["seen", "seen where defined", "mixed", "not seen", "depends on th
 
 @dataclass(frozen=True)
 class JudgedClaim:
-    """A claim, what a run has of it, and the verdict.
+    """A claim, its measurement in a run, and the verdict.
 
     Attributes:
-        claim: for one editor, where it has several.
-        measured: measured of the run.
-        agreement: views with the expected sign, and all of them.
+        claim: claim, for one editor if it has several.
+        measured: measurement of the run.
+        agreement: numbers of views with the expected sign, and of all views.
         here: result on the run's scenes.
-        below_floor: scenes in which both sides disagree less than true views do.
-        judges: whether the run is of the study that judges the claim, on a sample.
-        p: adjusted p-value; that of its own test before :func:`decided`.
-        verdict: None where another study judges.
+        below_floor: number of scenes in which both sides disagree less than true views.
+        judges: whether the run belongs to the claim's judging study, on a sample.
+        p: adjusted p-value; unadjusted before :func:`decided`.
+        verdict: verdict; None if another study judges.
     """
 
     claim: Claim
@@ -73,7 +73,7 @@ class JudgedClaim:
 
     @property
     def difference(self) -> str:
-        """The difference in words, with the interval that agrees with the verdict."""
+        """The difference in words, with the interval of the verdict's level."""
         level = EQUAL_LEVEL if self.verdict == "equal" else 0.95
         if self.verdict not in (None, "equal"):
             level = self.contrast.level(self.p)
@@ -83,13 +83,13 @@ class JudgedClaim:
 
     @property
     def told(self) -> bool:
-        """True if there is a verdict that says something."""
+        """True if there is a verdict other than "can't tell"."""
         return self.verdict in ("holds", "the opposite holds", "equal")
 
     @property
     def in_words(self) -> str:
-        """The verdict; of what cannot be told also how many scenes would tell it, of fewer than six
-        scenes how many agree, and of what another study judges its name.
+        """The verdict; for "can't tell", also the scenes needed to tell; for fewer than six scenes,
+        the number that agree; for a claim of another study, that study's name.
         """
         if self.verdict is None:
             return f"judged by `{self.claim.study}`"
@@ -127,10 +127,10 @@ def _bound(claim: Claim) -> str:
 
 
 def judge(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
-    """Every claim that the run has measurements for; those that its study judges with a verdict,
+    """Every claim that the run has measurements for; claims that its study judges have a verdict,
     adjusted over them.
 
-    A claim about the editor's working is judged for each of its editors; :func:`together` makes
+    A claim about the editor's mechanism is judged for each of its editors; :func:`together` makes
     one verdict of them.
     """
     return decided(found(results, claims))
@@ -158,11 +158,11 @@ def found(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
 
 
 def decided(claims: Iterable[JudgedClaim]) -> list[JudgedClaim]:
-    """Claims with their verdicts, p-values adjusted over all that are judged
+    """Claims with their verdicts, p-values adjusted over all judged claims
     (Benjamini-Hochberg).
 
     Args:
-        claims: claims of one run, or of the runs of all studies that judge.
+        claims: claims of one run, or of the runs of all judging studies.
     """
     every = list(claims)
     adjusted = benjamini_hochberg([c.p if c.judges else float("nan") for c in every])
@@ -178,8 +178,8 @@ def _verdict(judged: JudgedClaim, p: float) -> Verdict:
         return "can't tell"
     told = judged.contrast.verdict(claim.expect, adjusted_p=p, bound=claim.bound)
     if control == "not seen":
-        # That wrong features do as well takes a gain from the right ones, and every null its
-        # meaning. It explains no loss.
+        # If wrong features do as well, a gain from the right ones and every null result lose their
+        # meaning. A loss keeps its meaning.
         lost = told == "worse" and "worse" in (claim.control or {})
         return "the opposite holds" if lost else "blind"
     words: dict[str, Verdict] = {"better": "holds", "worse": "the opposite holds", "equal": "equal"}
@@ -187,12 +187,12 @@ def _verdict(judged: JudgedClaim, p: float) -> Verdict:
 
 
 Comparison = tuple[str, str, frozenset[str]]
-"""A probe, a metric and two variants."""
+"""Key of a comparison: a probe, a metric and two variants."""
 
 
 def of_comparisons(judged: Iterable[JudgedClaim]) -> dict[Comparison, JudgedClaim]:
-    """The claim that judges each comparison of two variants, over all views: a table that shows
-    such a comparison has the claim's verdict.
+    """The claim that judges each comparison of two variants over all views: tables show the claim's
+    verdict for such a comparison.
     """
     return {
         (one.claim.probe, one.metric, frozenset(one.sides)): one
@@ -204,10 +204,10 @@ def of_comparisons(judged: Iterable[JudgedClaim]) -> dict[Comparison, JudgedClai
 def together(
     findings: Sequence[JudgedClaim], editors: Sequence[str]
 ) -> tuple[Here, Verdict | None]:
-    """One verdict of the findings of a claim about the editor's working.
+    """Merge the findings of a claim about the editor's mechanism into one verdict.
 
-    It has one only where all editors were measured and agree; else it depends on the editor, or
-    cannot be told from the editors that were measured.
+    A verdict requires that all editors were measured and agree; otherwise it depends on the editor,
+    or cannot be told from the measured editors.
     """
     here, verdicts = {f.here for f in findings}, {f.verdict for f in findings}
     seen: Here = next(iter(here)) if len(here) == 1 else "depends on the editor"
@@ -221,9 +221,9 @@ def together(
 
 
 def _here(claim: Claim, measured: Measured, scenes: int) -> Here:
-    """Tell whether the mean difference has the expected sign in every scene.
+    """Describe whether the mean difference has the expected sign in every scene.
 
-    ``scenes``: how many the study has. One without values cannot show what is expected.
+    ``scenes``: number of the study's scenes. A scene without values cannot show the expected sign.
     """
     shared = common([measured.a, measured.b])
     values = [abs(x) for table in shared for views in table.values() for x in views.values()]
@@ -268,14 +268,14 @@ MANY = (
     f"- **Difference**: {SCALE}\n"
     "- **Scenes**: those in which the difference is defined."
 )
-"""Meaning of the columns of six scenes and more."""
+"""Meaning of the columns for at least six scenes."""
 
 FEW = (
     "- **Here** says how many scenes have the sign of their mean. So few give no verdict; one study"
     " judges each claim, on scenes that were drawn.\n"
     f"- Each scene's column has its difference: {SCALE} A dash: undefined."
 )
-"""Meaning of the columns of fewer scenes."""
+"""Meaning of the columns for fewer scenes."""
 
 SAMPLED = (
     "**In general** is said of {scenes}, and scenes like these. Flipped signs of the scenes'"
@@ -285,11 +285,11 @@ SAMPLED = (
     " true pictures, was not told apart. **p by t** is Student's on the same scale, not adjusted."
     " Below six scenes there is no verdict."
 )
-"""Paragraph on a report whose study judges claims."""
+"""Paragraph for a report whose study judges claims."""
 
 
 def claims_section(results: Results, findings: Sequence[JudgedClaim]) -> Section:
-    """The section of the report."""
+    """The report's section on claims."""
     declared = {claim.id: claim for claim in load_claims()}
     judges = any(finding.judges for finding in findings)
     rows, names = [], results.study.scene_names

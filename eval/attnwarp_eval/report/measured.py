@@ -1,4 +1,4 @@
-"""Measurement of a run: metrics, code, machine, seconds; and the cells that failed."""
+"""Measurement of a run: metrics, code, machine, seconds; and failed cells."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STAGES = ("setup", "truth", "splats", "method", "sample", "checks", "pictures")
 
 
 def failures(results: Results) -> list[Section]:
-    """The section of failed cells, none if all went well."""
+    """The section of failed cells, none without failures."""
     if not results.failures:
         return []
     rows = [[f.scene, f.variant, f.probe, f.error] for f in results.failures]
@@ -23,7 +23,7 @@ def failures(results: Results) -> list[Section]:
 
 
 def measured(results: Results, timings: bool) -> Section:
-    """The section that says what the figures mean and what they were computed with."""
+    """The section on the meaning of the figures and the environment of their computation."""
     metrics = {
         metric.name: metric
         for cell in results.cells
@@ -65,8 +65,8 @@ def measured(results: Results, timings: bool) -> Section:
 
 
 def _environments(records: list[Record[Any]]) -> list[str]:
-    """Every state of code, versions and machine that cells of this run were computed with, and how
-    many.
+    """Every state of code, versions and machine that computed cells of this run, with the number of
+    cells.
     """
     counted: dict[str, int] = {}
     states = {(record.environment.revision, record.environment.source) for record in records}
@@ -76,7 +76,7 @@ def _environments(records: list[Record[Any]]) -> list[str]:
         code = f"revision `{revision[:12]}`" if revision else "an installed copy"
         if environment.dirty:
             code += " with local changes"
-        # One revision has several sources where plugins changed.
+        # One revision has several source hashes if plugins changed.
         several = sum(other == revision for other, _ in states) > 1
         if environment.source and (environment.dirty or not revision or several):
             code += f" (source `{environment.source[:12]}`)"

@@ -1,4 +1,4 @@
-"""Scenes that each claim of a study needs, by those that a run has, and what the rest costs."""
+"""Scenes needed by each claim of a study, estimated from a run, and the cost of the rest."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ INTEREST = {
     "dE00": 1.0,
     "cosine": 0.02,
 }
-"""Smallest difference of interest: by the scale, or by the unit of what is compared plainly."""
+"""Smallest difference of interest: by scale, or by unit for plain differences."""
 
 COLUMNS = (
     "claim or row", "metric", "difference of interest", "spread between scenes", "scenes needed",
@@ -41,7 +41,7 @@ COLUMNS = (
 
 
 def interest(metric: Metric, scale: Scale) -> float | None:
-    """Smallest difference of a metric that matters, on a scale; None where nobody has said.
+    """Smallest difference of a metric that matters, on a scale; None if undefined.
 
     Example:
         >>> from attnwarp_eval.metrics.registry import METRICS
@@ -52,18 +52,18 @@ def interest(metric: Metric, scale: Scale) -> float | None:
 
 
 def needed(value: Contrast, difference: float) -> int:
-    """Scenes with which a test at 5 % tells a true difference in 80 % of studies, at least six.
+    """Scenes with which a test at 5 % detects a true difference in 80 % of studies, at least six.
 
     Args:
-        value: value with the spread between scenes.
-        difference: on the contrast's scale.
+        value: contrast with the spread between scenes.
+        difference: true difference on the contrast's scale.
     """
     return max(FEWEST, scenes_needed(difference, value.deviation))
 
 
 def plan_scenes(results: Results) -> Table:
-    """For each claim, and each row of the study's tables of differences, the scenes it needs; no
-    row where fewer than three scenes are done.
+    """Scenes needed for each claim and each row of the study's tables of differences; no row if
+    fewer than three scenes are done.
     """
     rows = []
     for title, name, metric, value in _contrasts(results):
@@ -99,12 +99,12 @@ def _difference(value: float, scale: Scale) -> str:
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of cells that are still to do.
+    """Cost of the cells to do.
 
     Attributes:
         hours: hours of one worker.
-        gigabytes: that they add to the run's folder.
-        unknown: cells of kinds of which none was measured; they are in neither.
+        gigabytes: added to the run's folder.
+        unknown: number of cells of unmeasured kinds; ``hours`` and ``gigabytes`` exclude them.
     """
 
     hours: float
@@ -115,11 +115,11 @@ class Cost:
 def cost_of(
     kinds: Iterable[tuple[str, tuple[str, ...]]], measured: tuple[Results, Path] | None
 ) -> Cost:
-    """Cost of cells, from the means of finished cells of their kind.
+    """Estimate the cost of cells from the means of finished cells of their kind.
 
     Args:
         kinds: probe and variants of each cell to do.
-        measured: the part that is done, with its folder; None for none.
+        measured: results of the finished part, with its folder, or None.
     """
     seconds: dict[tuple[str, tuple[str, ...]], list[float]] = {}
     size = 0.0
@@ -141,8 +141,8 @@ def _bytes(folder: Path) -> int:
 
 
 def seconds_of(record: Record[Any]) -> float:
-    """Seconds of a cell, each counted once: the first view and the others are within the rest, and
-    parts of an edit within its whole.
+    """Seconds of a cell, each counted once: the stages of the first and the other views are within
+    other stages, and parts of an edit within its whole.
     """
     inner = ("warm", "steady", "method: ") if "whole" in record.cost.seconds else ("warm", "steady")
     return sum(

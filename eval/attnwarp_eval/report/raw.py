@@ -1,5 +1,6 @@
-"""Raw results of a run in one compressed file, from which every figure of its report is computed
-again: ``results.jsonl.xz``, the study and then one line a cell.
+"""Raw results of a run in one compressed file, from which every figure of its report can be
+computed
+again: ``results.jsonl.xz``, the study and then one line for each cell.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.study import parse_study
 
 FORMAT = 1
-"""Version of the file's layout; a reader refuses others."""
+"""Version of the file's layout; readers refuse other versions."""
 
 NAME = "results.jsonl.xz"
 
@@ -32,7 +33,7 @@ PARTS = "results*.jsonl.xz"
 """Files of raw results in a folder; several are parts of one study."""
 
 DIGITS = 6
-"""Significant digits of a figure: what is lost is below every tolerance of a metric."""
+"""Significant digits of a figure: the rounding is below every tolerance of a metric."""
 
 
 def write_raw(store: Store, path: Path) -> Path:
@@ -45,7 +46,7 @@ def write_raw(store: Store, path: Path) -> Path:
         Path of the file.
 
     Raises:
-        StoreError: the folder is no run, or a record is damaged.
+        StoreError: the folder is not a run, or a record is damaged.
     """
     if path.is_dir() or not path.suffix:
         path = path / NAME
@@ -60,7 +61,7 @@ def _lines(store: Store) -> Iterator[str]:
     study = dict(stored["study"])
     if study.get("population"):
         study["scenes"] = [Path(name).name for name in study["scenes"]]
-        if "meshes" in study["population"]:  # the folder is of this machine
+        if "meshes" in study["population"]:  # the folder is specific to this machine
             name = Path(study["population"]["meshes"]).name
             study["population"] = {**study["population"], "meshes": name}
     notices = {name: entry.get("notices", []) for name, entry in stored["scenes"].items()}
@@ -85,7 +86,7 @@ def _shortened(value: Any) -> Any:
 
 
 def read_raw(path: Path) -> Results:
-    """The results that a file of raw results holds.
+    """Read the results in a file of raw results.
 
     Raises:
         InputError: the file is damaged, of another version, or its study cannot be read.
@@ -104,10 +105,10 @@ def read_raw(path: Path) -> Results:
 
 
 def _study(data: Any) -> Study:
-    """The study of raw results, in this version's words: the results outlive keys and values."""
+    """Parse the study of raw results, with old keys and values translated to this version."""
     for variant in data.get("variants", {}).values():
         if variant.get("options", {}).get("method") == "each view alone":
-            # Committed results have it, of edits that are those of a0: 0 to the bit.
+            # Committed results have it, for edits bit-identical to those with a0: 0.
             del variant["options"]["method"]
             variant["options"]["a0"] = 0.0
     try:
@@ -131,19 +132,19 @@ def _outcome(cell: dict[str, Any], record: dict[str, Any] | None) -> Outcome:
 
 
 def read_parts(folder: Path) -> Results:
-    """The results that a folder's files of raw results hold, as one run.
+    """Read a folder's files of raw results as one run.
 
     Raises:
-        InputError: see :func:`read_raw` and :func:`together`.
+        InputError: as for :func:`read_raw` and :func:`together`.
     """
     return together([read_raw(path) for path in sorted(folder.glob(PARTS))])
 
 
 def together(parts: Sequence[Results]) -> Results:
-    """Parts of one study, run on some of its scenes each, as one run.
+    """Merge parts of one study, each run on some of its scenes, into one run.
 
     Raises:
-        InputError: they are of studies that differ in more than their scenes.
+        InputError: the parts' studies differ in more than their scenes.
     """
     whole = max((part.study for part in parts), key=_count)
     keys = [_but_scenes(part) for part in parts]
@@ -173,7 +174,7 @@ def _count(study: Study) -> int:
 
 
 def _but_scenes(part: Results) -> dict[str, Any]:
-    """All that decides the cells of a study but for its scenes."""
+    """All that decides the cells of a study, without its scenes."""
     data = part.study.model_dump(mode="json")
     for name in ("scenes", "title", "description"):
         data.pop(name)

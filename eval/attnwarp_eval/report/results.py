@@ -15,10 +15,10 @@ from attnwarp_eval.study.store import Store, StoreError
 
 
 def read_results(store: Store) -> Results:
-    """The finished cells of a run, and a failure for each damaged record.
+    """Read the finished cells of a run, and add a failure for each damaged record.
 
     Raises:
-        StoreError: see :func:`attnwarp_eval.study.run.stored_study`.
+        StoreError: as for :func:`attnwarp_eval.study.run.stored_study`.
 
     Example:
         >>> from attnwarp_eval.study import parse_study
@@ -32,7 +32,7 @@ def read_results(store: Store) -> Results:
     """
     stored = stored_study(store)
     done = store.done()
-    # The folder may hold failures of cells that the study had before its content changed.
+    # The folder may hold failures of cells from before the study's content changed.
     ids = {cell["id"] for cell in stored.cells}
     failures = [Failure.from_json(f) for f in store.failures() if f["id"] in ids]
     cells = []
@@ -42,7 +42,7 @@ def read_results(store: Store) -> Results:
             try:
                 record = store.read_as(cell["id"], probe(cell["probe"]).read)
             except StoreError as error:
-                # One damaged file must not cost the report of the others.
+                # One damaged file must not prevent a report of the others.
                 failures.append(
                     Failure(
                         cell["scene"],
@@ -57,11 +57,11 @@ def read_results(store: Store) -> Results:
 
 
 def lines(results: Results, timings: bool = True) -> Iterable[str]:
-    """results.jsonl: one line a (cell, figure of quality), sorted, so that a diff of two runs can
+    """Lines of results.jsonl: one per (cell, figure of quality), sorted, so that a diff can
     be read.
 
     Args:
-        timings: whether seconds and memory are in the lines.
+        timings: whether the lines include seconds and memory.
     """
     rows = []
     for cell in results.cells:
@@ -71,7 +71,7 @@ def lines(results: Results, timings: bool = True) -> Iterable[str]:
         for name in sorted({name for view in record.views for name in view.metrics}):
             metric = probe(cell.probe).metric(name)
             if metric.is_count:
-                continue  # counts that describe; they stay in the cell's own file
+                continue  # descriptive counts; they stay in the cell's file
             values = {v.name: _shortened(v.metrics.get(name, math.nan)) for v in record.views}
             defined = [v for v in values.values() if v is not None]
             row = {
@@ -102,5 +102,5 @@ def lines(results: Results, timings: bool = True) -> Iterable[str]:
 
 
 def _shortened(value: float) -> float | None:
-    """Nine significant digits: more than any tolerance asks for. The cells have every bit."""
+    """Round to nine significant digits: more than any tolerance needs. Cells keep every bit."""
     return None if math.isnan(value) else float(f"{value:.9g}")

@@ -1,6 +1,4 @@
-"""One table of verdicts from the raw results of all studies, and the lines that README.md takes
-from it.
-"""
+"""Table of verdicts from the raw results of all studies, and the lines of README.md from it."""
 
 from __future__ import annotations
 
@@ -28,20 +26,20 @@ from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.turns import Timed, timed_in_turn
 
 TABLE, LINES = "verdicts", "headlines"
-"""Marks of the blocks that :func:`filled` fills: ``<!-- verdicts -->`` and its end."""
+"""Marks of the blocks replaced by :func:`filled`: ``<!-- verdicts -->`` and its end."""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A claim with its verdict over all studies.
+    """Claim with its verdict over all studies.
 
     Attributes:
-        claim: for one editor, where it has several.
-        judged: None where its study has no raw results, or lacks a side.
+        claim: claim, for one editor if it has several.
+        judged: judged claim; None if its study has no raw results, or lacks a side.
         time: ratio of the last side's seconds to the first one's, taken in turn; a dash without.
         report: folder of the report.
-        by_answers: difference in words of edits with several right answers and of edits with one,
-            where the study has both.
+        by_answers: description of the difference for edits with several right answers and with one,
+            if the study has both.
     """
 
     claim: Claim
@@ -52,7 +50,7 @@ class Judged:
 
     @property
     def measured(self) -> str:
-        """Mean of each side in words, the one that the claim speaks of first."""
+        """Mean of each side in words, in the order of the claim."""
         return "–" if self.judged is None else against(self.judged)
 
 
@@ -60,10 +58,10 @@ def verdicts(folder: Path) -> list[Judged]:
     """Every claim with its verdict, p-values adjusted over all studies together.
 
     Args:
-        folder: path of reports, with raw results beside each.
+        folder: path of reports, with raw results next to each.
 
     Raises:
-        InputError: raw results that cannot be read, or are of no one study.
+        InputError: raw results are unreadable or of different studies.
     """
     parts: dict[str, list[tuple[Path, Results]]] = defaultdict(list)
     for path in sorted(folder.rglob(PARTS)):
@@ -145,7 +143,7 @@ def table(judged: list[Judged], beside: Path) -> Table:
     """The table of all claims.
 
     Args:
-        beside: folder that links start from.
+        beside: folder that links are relative to.
     """
     rows = []
     for each in judged:
@@ -171,7 +169,7 @@ def table(judged: list[Judged], beside: Path) -> Table:
 
 
 def headlines(judged: list[Judged]) -> list[str]:
-    """Lines of the claims that README.md names, in their order; none where none was judged."""
+    """Lines of the claims that README.md names, in their order; none if none was judged."""
     chosen = sorted(
         (each for each in judged if each.claim.headline), key=lambda each: each.claim.headline
     )
@@ -189,7 +187,7 @@ def headlines(judged: list[Judged]) -> list[str]:
 
 
 def _plainly(one: JudgedClaim) -> str:
-    """Difference as a person tells it: shares side by side, errors in percent or as a factor."""
+    """Difference in plain words: shares side by side, errors in percent or as a factor."""
     factor, _, _ = one.contrast.shown()
     if one.contrast.scale != "ratio":
         return against(one)
@@ -199,11 +197,11 @@ def _plainly(one: JudgedClaim) -> str:
 
 
 def filled(text: str, judged: list[Judged], beside: Path) -> str:
-    """A document with the table and the lines in their marked places; lines stay as they are while
-    no claim among them has raw results.
+    """Fill a document's marked places with the table and the lines; lines stay as they are while
+    none of their claims has raw results.
 
     Args:
-        judged: judged of :func:`verdicts`.
+        judged: result of :func:`verdicts`.
 
     Example:
         >>> filled("<!-- headlines -->\\nas before\\n<!-- /headlines -->\\n", [], Path())
@@ -222,7 +220,7 @@ def filled(text: str, judged: list[Judged], beside: Path) -> str:
 
 
 def marked(text: str) -> bool:
-    """Return True if a document has a place for the table or the lines."""
+    """Return True if a document has marks for the table or the lines."""
     return any(_begin(mark) in text and _end(mark) in text for mark in (TABLE, LINES))
 
 
