@@ -1,4 +1,4 @@
-"""Editors: what all of them have, and the loop that denoises several views together."""
+"""Editors: their common interface, and the loop that denoises several views together."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ Guide = Literal["picture", "depth"]
 STEPS = 20
 
 LATENT_CHANNELS = 4
-"""Channels of Stable Diffusion's latents, used where an autoencoder's configuration names none."""
+"""Channels of Stable Diffusion's latents; default if an autoencoder's configuration has none."""
 
 MOST_GUIDANCE = 1000.0
-"""Bound of guidance weights; those in use are below 20."""
+"""Upper bound of guidance weights; practical ones are below 20."""
 
 
 class Task(Protocol):
-    """An edit of some views, ready to be denoised."""
+    """Edit of some views, ready to be denoised."""
 
     @property
     def branches(self) -> tuple[str, ...]:
-        """The guidance branches in the order of the UNet's batch."""
+        """Guidance branches in the order of the UNet's batch."""
         ...
 
     @property
@@ -47,12 +47,12 @@ class Task(Protocol):
         ...
 
     def predict(self, latents: Tensor, timestep: Time) -> Tensor:
-        """The network's guided output for (B, C, h, w) latents at a step."""
+        """Compute the network's guided output for (B, C, h, w) latents at a step."""
         ...
 
 
 class Editor(Network, Protocol):
-    """A diffusion model that edits views. Each is a file in :mod:`attnwarp.editing.editors`."""
+    """Diffusion model that edits views; one file each in :mod:`attnwarp.editing.editors`."""
 
     @property
     def guide(self) -> Guide:
@@ -66,39 +66,39 @@ class Editor(Network, Protocol):
 
     @property
     def carries(self) -> tuple[str, ...]:
-        """Guidance branches whose features methods carry, unless told otherwise."""
+        """Guidance branches whose features methods warp by default."""
         ...
 
     @property
     def options(self) -> tuple[str, ...]:
-        """Names of its attributes that decide its edits, which :func:`guided` sets: of
-        ``text_guidance``, ``image_guidance`` and ``negative_prompt`` those that it has, and others.
+        """Names of the attributes that determine edits and that :func:`guided` can set: its
+        ``text_guidance``, ``image_guidance`` and ``negative_prompt``, if present, and others.
         """
         ...
 
     @property
     def parts(self) -> Mapping[str, Any]:
-        """Networks and tokenizers by diffusers' names of them."""
+        """Networks and tokenizers by their names in diffusers."""
         ...
 
     @property
     def own_size(self) -> int:
-        """Longest side in px of the pictures that it was made for."""
+        """Longest side in px of the pictures the model was trained for."""
         ...
 
     @property
     def side_multiple(self) -> int:
-        """Pixels that the sides of a picture are rounded to a multiple of."""
+        """Number in px to whose multiples the sides of a picture are rounded."""
         ...
 
     def noise_shape(self, size: Size) -> tuple[int, int, int]:
-        """(C, h, w) of the noise of an (H, W) px view. Layers have the size (h, w), halved as often
-        as they say.
+        """Compute the noise's (C, h, w) for an (H, W) px view. A layer has the size (h, w), halved
+        :attr:`~attnwarp.editing.layers.Layer.level` times.
         """
         ...
 
     def check_text(self, text: str) -> None:
-        """Raise ValueError for a text that is longer than the model takes."""
+        """Raise ValueError if a text exceeds the model's limit."""
         ...
 
     def task(
@@ -107,41 +107,41 @@ class Editor(Network, Protocol):
         prompt: str,
         regions: Sequence[npt.NDArray[Any]] | None = None,
     ) -> Task:
-        """An edit of views.
+        """Prepare an edit of views.
 
         Args:
-            guides: pictures or depth maps, as :attr:`guide` says.
-            prompt: instruction or description.
-            regions: (H, W) of each view in [0, 1]: what is edited; None for all of it. Editors
-                that make nothing of it pass over it.
+            guides: pictures or depth maps, depending on :attr:`guide`.
+            prompt: instruction or description, depending on the editor.
+            regions: (H, W) edited region of each view in [0, 1]; None for all of it. Some editors
+                ignore regions.
         """
         ...
 
     def encode(self, pictures: Sequence[Image]) -> Tensor:
-        """(B, C, h, w) scaled latents of (H, W, 3) pictures in [0, 1]."""
+        """Encode (H, W, 3) pictures in [0, 1] as (B, C, h, w) scaled latents."""
         ...
 
     def decode(self, latents: Tensor) -> list[Image]:
-        """Pictures of scaled latents."""
+        """Decode scaled latents to pictures."""
         ...
 
     def pixels(self, latents: Tensor) -> Tensor:
-        """(B, 3, H, W) of scaled latents as they are decoded: values may leave [0, 1]."""
+        """Decode scaled latents to (B, 3, H, W) without clamping: values may leave [0, 1]."""
         ...
 
     def latents(self, pixels: Tensor) -> Tensor:
-        """(B, C, h, w) scaled latents of (B, 3, H, W) pixels, whose values may leave [0, 1]."""
+        """Encode (B, 3, H, W) pixels as (B, C, h, w) scaled latents; pixels may leave [0, 1]."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Edit:
-    """The result of an edit.
+    """Result of an edit.
 
     Attributes:
-        images: (H, W, 3) float32 sRGB in [0, 1], one a view.
+        images: (H, W, 3) float32 sRGB in [0, 1], one per view.
         latents: (B, C, h, w) scaled latents.
-        timesteps: timesteps of the editor's schedule that were run.
+        timesteps: executed timesteps of the editor's schedule.
     """
 
     images: list[Image]
@@ -150,10 +150,10 @@ class Edit:
 
 
 def shared_noise(shape: tuple[int, int, int, int], seed: int) -> Tensor:
-    """(B, C, h, w) white noise, the same for all views.
+    """Draw (B, C, h, w) white noise, the same for all views.
 
     Args:
-        shape: (B, C, h, w).
+        shape: shape of the noise, (B, C, h, w).
         seed: seed of torch's generator.
 
     Example:
@@ -165,10 +165,10 @@ def shared_noise(shape: tuple[int, int, int, int], seed: int) -> Tensor:
 
 
 def drawn(shape: Sequence[int], seed: int) -> Tensor:
-    """Standard normal numbers, float32.
+    """Draw standard normal numbers, float32.
 
-    Drawn on the CPU, so that every device starts from the same bits, and in float32 whatever the
-    process's default type is: float64 would draw other numbers.
+    The draw runs on the CPU, so that every device starts from the same bits, and in float32 even
+    if the process's default dtype is float64, which would draw other numbers.
 
     Args:
         shape: shape of the result.
@@ -200,31 +200,32 @@ def edit(
 
     Args:
         editor: the model.
-        guides: guides of the views, all of one size: what ``editor.task`` takes.
-        prompt: instruction or description.
-        steps: number of steps of DDIM.
-        seed: seed of the noise, which the views share.
-        start: Stable Diffusion's timestep T to start from, as publications give it. The views' own
-            latents are noised to T's share of signal, then ``steps`` steps follow
-            (:meth:`attnwarp.editing.schedule.Schedule.published`). Left out, the edit starts from
-            pure noise.
-        grid: grid of the steps below ``start``; noise is added at ``start`` in either.
-        pictures: (H, W, 3) that ``start`` begins from; ``guides`` if left out.
-        noise: (B, C, h, w) in place of the seed's.
-        latents: (B, C, h, w) to begin from as they are, such as those of an inversion; neither
-            ``start`` nor ``noise`` goes with them.
-        on_step: called with the step, the number of steps and the latents after each step.
-        estimate: called with the step and the (B, C, h, w) clean latents that are predicted there;
-            what it returns takes their place.
-        regions: (H, W) of each view in [0, 1]: what is edited, over which a bundled editor's noise
+        guides: guides of the views, all of one size, as ``editor.task`` takes them.
+        prompt: instruction or description, depending on the editor.
+        steps: number of DDIM steps.
+        seed: seed of the noise shared by the views.
+        start: Stable Diffusion's timestep T to start from, as in publications. The views' latents
+            are noised to T's share of signal, then ``steps`` steps follow
+            (:meth:`attnwarp.editing.schedule.Schedule.published`). None starts from pure
+            noise.
+        grid: grid of the steps below ``start``; noise is added at ``start`` in both grids.
+        pictures: (H, W, 3) pictures noised to ``start``; ``guides`` if omitted.
+        noise: (B, C, h, w) noise that replaces the seed's.
+        latents: (B, C, h, w) unchanged initial latents, such as those of an inversion; excludes
+            ``start`` and ``noise``.
+        on_step: callback with the step, the number of steps and the latents, after each step.
+        estimate: function of the step and the predicted (B, C, h, w) clean latents that returns
+            their replacement.
+        regions: (H, W) edited region of each view in [0, 1]; a bundled editor averages its noise
+            there to settle choices that the prompt leaves open. None is the full picture.
             draws what the prompt leaves open; None for all of it.
 
     Returns:
         The edited views.
 
     Raises:
-        ValueError: sizes or numbers that do not fit, or arguments that would be ignored; the
-            message names them.
+        ValueError: sizes or numbers do not fit, or an argument would be ignored; the message
+            names the argument.
 
     Example:
         >>> import numpy as np
@@ -274,7 +275,7 @@ def edit(
 
 @contextmanager
 def guided(editor: Any, **values: Any) -> Iterator[None]:
-    """Set options of an editor while the block runs; None leaves its own.
+    """Set options of an editor while the block runs; None keeps an option's value.
 
     Raises:
         ValueError: the editor has no such option.
@@ -294,16 +295,16 @@ def guided(editor: Any, **values: Any) -> Iterator[None]:
 
 
 def tensor_of(images: Sequence[npt.NDArray[Any]], name: str, multiple: int) -> Tensor:
-    """(B, 3, H, W) float32 in [0, 1] of (H, W, 3) pictures, checked.
+    """Check (H, W, 3) pictures and stack them as (B, 3, H, W) float32 in [0, 1].
 
     Args:
-        images: at least one, all of one size.
+        images: pictures, at least one, all of one size.
         name: name of the argument, for errors.
         multiple: number that divides both sides.
 
     Raises:
-        ValueError: no picture, another shape, several sizes, sides of other multiples, values that
-            are not finite or not in [0, 1].
+        ValueError: no picture, a wrong shape, several sizes, sides that are not multiples, or
+            values that are not finite or not in [0, 1].
 
     Example:
         >>> import numpy as np
@@ -341,18 +342,18 @@ def check_networks(
     name: str,
     hint: str = "",
 ) -> None:
-    """Refuse networks that do not fit each other, by their configurations.
+    """Refuse networks whose configurations do not fit each other.
 
     Args:
-        network: network of a UNet or a ControlNet.
+        network: UNet or ControlNet.
         text_encoder: text encoder of the same model.
-        channels: that the network has to take.
+        channels: required number of input channels of the network.
         name: name of the network, for the message.
-        hint: network that takes so many channels, for the message.
+        hint: description of a network with this number of channels, for the message.
 
     Raises:
-        ValueError: another number of channels, texts of another size, or a model that takes more
-            than a text.
+        ValueError: a different number of channels, texts of another size, or a model that needs
+            more inputs than a text.
     """
     if network.get("addition_embed_type") is not None:
         raise ValueError(
@@ -378,10 +379,10 @@ def check_networks(
 
 
 def check_scheduler(scheduler: Any) -> None:
-    """Refuse what has no DDIM steps, and tell what these do otherwise than diffusers'.
+    """Refuse a scheduler without DDIM steps, and warn of settings that these steps ignore.
 
     Raises:
-        ValueError: no DDIMScheduler.
+        ValueError: the scheduler is not a DDIMScheduler.
     """
     from diffusers import DDIMScheduler
 
@@ -401,7 +402,7 @@ def check_scheduler(scheduler: Any) -> None:
 
 
 class Latent(ABC):
-    """A UNet with an autoencoder and a text encoder: what both kinds of Stable Diffusion share."""
+    """UNet with an autoencoder and a text encoder: the base of both Stable Diffusion editors."""
 
     def __init__(
         self, unet: Any, vae: Any, text_encoder: Any, tokenizer: Any, scheduler: Any
@@ -429,7 +430,7 @@ class Latent(ABC):
         return paper_layers(self.unet)
 
     def call(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:
-        """The pass that the UNet is called for."""
+        """Describe the pass of a UNet call."""
         return unet_call(self.branches, args, kwargs)
 
     @property
@@ -440,29 +441,29 @@ class Latent(ABC):
 
     @property
     def own_size(self) -> int:
-        """Longest side in px of the pictures that the UNet was made for; 64 latents where it names
-        none.
+        """Longest side in px of the pictures the UNet was trained for; a UNet without a
+        configured size counts as 64 latents.
         """
         size = getattr(self.unet.config, "sample_size", None) or 64
         return int((max(size) if isinstance(size, list | tuple) else size) * self.factor)
 
     @property
     def side_multiple(self) -> int:
-        """Pixels that sides are multiples of: two halvings of the latents are exact, as many as
-        layers with attention need, and further ones are padded by the UNet.
+        """Number in px that divides the sides: two halvings of the latents are exact, as the layers
+        with attention need; further halvings are padded by the UNet.
         """
         halvings = len(self.unet.config.block_out_channels) - 1
         return int(self.factor * 2 ** min(2, halvings))
 
     def noise_shape(self, size: Size) -> tuple[int, int, int]:
-        """(C, h, w) of the latents of an (H, W) px view."""
+        """Compute the latents' (C, h, w) for an (H, W) px view."""
         h, w = size
         return int(self.unet.config.out_channels), h // self.factor, w // self.factor
 
     def raw_latents(self, pictures: Tensor) -> Tensor:
-        """(B, C, h, w) of (B, 3, H, W) in [0, 1], the mode, not scaled.
+        """Encode (B, 3, H, W) in [0, 1] as (B, C, h, w): the distribution's mode, not scaled.
 
-        Picture by picture: Stable Diffusion's autoencoder takes 0.6 GiB for one of 512 px.
+        Pictures are encoded one by one: Stable Diffusion's autoencoder takes 0.6 GiB for 512 px.
         """
         rows = []
         with torch.no_grad():
@@ -473,17 +474,17 @@ class Latent(ABC):
         return torch.cat(rows)
 
     def encode(self, pictures: Sequence[Image]) -> Tensor:
-        """(B, C, h, w) scaled latents of (H, W, 3) pictures in [0, 1]."""
+        """Encode (H, W, 3) pictures in [0, 1] as (B, C, h, w) scaled latents."""
         return self.latents(tensor_of(pictures, "pictures", self.factor))
 
     def latents(self, pixels: Tensor) -> Tensor:
-        """(B, C, h, w) scaled latents of (B, 3, H, W) pixels, whose values may leave [0, 1]."""
+        """Encode (B, 3, H, W) pixels as (B, C, h, w) scaled latents; pixels may leave [0, 1]."""
         return self.raw_latents(pixels) * self.vae.config.scaling_factor
 
     def pixels(self, latents: Tensor) -> Tensor:
-        """(B, 3, H, W) of scaled latents as they are decoded: values may leave [0, 1].
+        """Decode scaled latents to (B, 3, H, W) without clamping: values may leave [0, 1].
 
-        Picture by picture, as :meth:`raw_latents`.
+        Pictures are decoded one by one, as in :meth:`raw_latents`.
         """
         with torch.no_grad():
             scaled = latents.to(self.vae.dtype) / self.vae.config.scaling_factor
@@ -491,10 +492,10 @@ class Latent(ABC):
         return torch.cat(rows).float() / 2 + 0.5
 
     def decode(self, latents: Tensor) -> list[Image]:
-        """(H, W, 3) float32 pictures in [0, 1] of scaled latents.
+        """Decode scaled latents to (H, W, 3) float32 pictures in [0, 1].
 
         Raises:
-            ValueError: latents, or what the decoder makes of them, that are not finite.
+            ValueError: the latents or the decoded values are not finite.
         """
         pixels = self.pixels(latents)
         # A NaN would become a black pixel.
@@ -510,12 +511,12 @@ class Latent(ABC):
 
     @property
     def text_limit(self) -> int:
-        """Tokens that the text encoder takes; tokenizers of some folders name no limit."""
+        """Token limit of the text encoder; some folders' tokenizers have no limit."""
         own = self.tokenizer.model_max_length
         return int(min(own, getattr(self.text_encoder.config, "max_position_embeddings", own)))
 
     def check_text(self, text: str) -> None:
-        """Raise ValueError for a text that is longer than the encoder takes."""
+        """Raise ValueError if a text exceeds the encoder's limit."""
         limit = self.text_limit
         length = len(self.tokenizer(text, verbose=False).input_ids)
         if length > limit:
@@ -525,7 +526,7 @@ class Latent(ABC):
             )
 
     def embed(self, texts: Sequence[str]) -> Tensor:
-        """(N, L, D) embeddings; a text longer than the encoder takes is refused."""
+        """Embed texts, (N, L, D); a text beyond the encoder's limit is refused."""
         limit = self.text_limit
         for text in texts:
             self.check_text(text)

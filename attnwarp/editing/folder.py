@@ -17,14 +17,14 @@ from attnwarp.io.text import read_text
 
 WEIGHTS = ("diffusion_pytorch_model", "model", "pytorch_model")
 ENDINGS = {None: (".safetensors", ".bin"), "fp16": (".fp16.safetensors",)}
-"""Endings of weights in one file, by diffusers' variant; None is the plain one."""
+"""Suffixes of single-file weights, by diffusers' variant; None is the default variant."""
 
 INDICES = {None: "*.index.json", "fp16": "*.index.fp16.json"}
-"""Patterns for the index of weights that are split over files."""
+"""Patterns of the index file of sharded weights."""
 
 
 def require_diffusers() -> None:
-    """Raise InputError where the extra is not installed."""
+    """Raise InputError if the extra is not installed."""
     try:
         import diffusers  # noqa: F401
     except ImportError:
@@ -34,10 +34,10 @@ def require_diffusers() -> None:
 
 
 def load_parts(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -> dict[str, Any]:
-    """UNet, autoencoder, text encoder, tokenizer and a DDIM scheduler of a folder.
+    """Load a folder's UNet, autoencoder, text encoder, tokenizer and a DDIM scheduler.
 
     Raises:
-        InputError: no such device; files that are missing, by name, or that cannot be read.
+        InputError: the device is unknown, or files are missing (named) or unreadable.
     """
     require_diffusers()
     device_of(device)
@@ -55,7 +55,7 @@ def load_parts(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -
     pair = all((words / name).is_file() for name in ("vocab.json", "merges.txt"))
     if not pair and not (words / "tokenizer.json").is_file():
         missing.append("tokenizer/vocab.json with merges.txt, or tokenizer/tokenizer.json")
-    # What pads a text stands there.
+    # This file defines the padding token.
     if not (words / "tokenizer_config.json").is_file():
         missing.append("tokenizer/tokenizer_config.json")
     if missing:
@@ -81,17 +81,17 @@ def load_parts(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -
     with readable(words):
         parts["tokenizer"] = AutoTokenizer.from_pretrained(words, local_files_only=True)
     with readable(folder / "scheduler"):
-        # DDIMScheduler clips latents unless told; a folder of another scheduler tells nothing.
+        # DDIMScheduler clips by default; other schedulers' configs lack the setting.
         told = DDIMScheduler.load_config(folder / "scheduler", local_files_only=True)
         parts["scheduler"] = DDIMScheduler.from_config({"clip_sample": False, **told})
     return parts
 
 
 def load_controlnet(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -> Any:
-    """The ControlNet of a folder.
+    """Load a folder's ControlNet.
 
     Raises:
-        InputError: files that are missing, by name, or that cannot be read.
+        InputError: files are missing (named) or unreadable.
     """
     require_diffusers()
     folder = Path(folder)
@@ -105,24 +105,24 @@ def load_controlnet(folder: str | Path, *, device: str = "cpu", dtype: torch.dty
 
 
 def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> Any:
-    """A network of diffusers or transformers from its folder.
+    """Load a network of diffusers or transformers from its folder.
 
     Raises:
-        InputError: files that cannot be read, lack tensors, or hold values that are not finite.
+        InputError: files are unreadable, lack tensors, or hold values that are not finite.
     """
     from transformers import PreTrainedModel
     from transformers.utils import logging
 
-    # Its bar of a second's loading would stand among a command's own lines.
+    # A progress bar for a second of loading would clutter the command's output.
     bars = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()
-    # Without accelerate, diffusers loads in the plain way, and warns unless that is asked for.
+    # Without accelerate, diffusers uses plain loading and warns unless this is requested.
     how: dict[str, Any] = {} if issubclass(kind, PreTrainedModel) else {"low_cpu_mem_usage": False}
     if _variants(folder) == ["fp16"]:
         how["variant"] = "fp16"
     try:
         with readable(folder):
-            # Quietly filling what a file lacks with random numbers would look like a bad editor.
+            # Silently random values for missing tensors would look like a bad editor.
             loaded = kind.from_pretrained(
                 folder, local_files_only=True, torch_dtype=dtype, output_loading_info=True, **how
             )
@@ -145,10 +145,10 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
 
 
 def pipeline_of(folder: Path) -> str | None:
-    """The pipeline that a folder's model_index.json names; None where there is no such file.
+    """Read the pipeline's name from a folder's model_index.json; None without the file.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: the file is unreadable.
     """
     path = folder / "model_index.json"
     if not path.is_file():
@@ -158,10 +158,10 @@ def pipeline_of(folder: Path) -> str | None:
 
 
 def config_of(folder: str | Path, name: str) -> dict[str, Any]:
-    """The configuration of a network in a folder; empty where it is missing, which loading says.
+    """Read a network's configuration in a folder; empty if missing, which loading reports.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: the file is unreadable.
     """
     place = Path(folder) / name
     path = place / "config.json"
@@ -175,10 +175,10 @@ def config_of(folder: str | Path, name: str) -> dict[str, Any]:
 
 
 def class_of(folder: Path, *kinds: Any) -> Any:
-    """The class of a network in a folder, by its configuration; the first where that names none.
+    """Find a network's class by its folder's configuration; the first if none is configured.
 
     Raises:
-        InputError: another class.
+        InputError: the configured class is not among ``kinds``.
     """
     wanted = config_of(folder.parent, folder.name).get("_class_name")
     names = [kind.__name__ for kind in kinds]
@@ -189,7 +189,7 @@ def class_of(folder: Path, *kinds: Any) -> Any:
 
 @contextmanager
 def named(folder: str | Path) -> Iterator[None]:
-    """Put a folder's name before what is wrong with the networks in it."""
+    """Prefix a network's error with the name of its folder."""
     try:
         yield
     except ValueError as error:
@@ -198,8 +198,8 @@ def named(folder: str | Path) -> Iterator[None]:
 
 @contextmanager
 def readable(folder: Path) -> Iterator[None]:
-    """Turn what transformers, diffusers and tokenizers raise for a damaged file, of many kinds,
-    into one line.
+    """Convert the many kinds of errors that transformers, diffusers and tokenizers raise for a
+    damaged file into one line.
     """
     try:
         yield
@@ -218,7 +218,7 @@ def _missing(folder: Path) -> list[str]:
 
 
 def _variants(folder: Path) -> list[str | None]:
-    """Variants of the weights that a folder has."""
+    """List the variants of a folder's weights."""
     return [
         variant
         for variant, endings in ENDINGS.items()

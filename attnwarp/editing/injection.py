@@ -16,36 +16,36 @@ from attnwarp.warp.sampling import work_type
 
 
 class TokenWarp(Protocol):
-    """The warp of one grid, such as :class:`attnwarp.warp.FeatureWarp`."""
+    """Warp of one grid, such as :class:`attnwarp.warp.FeatureWarp`."""
 
     @property
     def weight(self) -> Tensor:
-        """(H W, 1) in [0, 1]: M, 1 where the source shows what the target does."""
+        """Weight M, (H W, 1) in [0, 1]; 1 if source and target show the same surface."""
         ...
 
     def warp_tokens(self, source: Tensor) -> Tensor:
-        """(1, H W, C) of the source's (1, h w, C) tokens."""
+        """Warp the source's (1, h w, C) tokens to (1, H W, C)."""
         ...
 
 
 class LayerWarp(Protocol):
-    """A warp from a source view to a target view, such as :class:`attnwarp.warp.WarpedView`."""
+    """Warp from a source view to a target view, such as :class:`attnwarp.warp.WarpedView`."""
 
     def at(self, size: Size, *, source_size: Size | None = None) -> TokenWarp:
-        """The warp of an (h, w) grid of the target from a grid of the source."""
+        """Build the warp from a grid of the source to an (h, w) grid of the target."""
         ...
 
 
 class Identity:
-    """The warp of a view onto itself, on any grid."""
+    """Warp of a view onto itself, on any grid."""
 
     weight = torch.ones(1, 1, dtype=torch.float32)
 
     def at(self, size: Size, *, source_size: Size | None = None) -> Identity:
-        """The identity.
+        """Return the identity.
 
         Raises:
-            ValueError: grids of two sizes.
+            ValueError: the grids differ in size.
         """
         if source_size not in (None, size):
             raise ValueError(
@@ -55,20 +55,20 @@ class Identity:
         return self
 
     def warp_tokens(self, source: Tensor) -> Tensor:
-        """The tokens as they are."""
+        """Return the tokens unchanged."""
         return source
 
 
 Weight = Callable[[int, int], float]
-"""a_t by the step's number t, from 0, and the number of steps T."""
+"""Function of the step t, from 0, and the number of steps T that returns a_t."""
 
 Blend = Callable[[TokenWarp, Tensor, Tensor, float], Tensor]
-"""(1, H W, C) of a warp, the source's (1, h w, C) tokens, the target's own and the weight a_t."""
+"""Blend (1, H W, C) from a warp, the source's (1, h w, C) and the target's tokens, and a_t."""
 
 
 def blended(blend: Blend, warp: TokenWarp, source: Tensor, new: Tensor, a: float) -> Tensor:
-    """(1, H W, C) tokens of a blend in the type of ``new``: those of half precision are summed in
-    float32 and rounded once.
+    """Blend (1, H W, C) tokens in the dtype of ``new``: half precision is summed in float32 and
+    rounded once.
     """
     work = work_type(new.dtype)
     return blend(warp, source.to(work), new.to(work), a).to(new.dtype)
@@ -83,23 +83,23 @@ def inject(
     blend: Blend,
     warps: Sequence[LayerWarp | None] = (None,),
 ) -> Iterator[None]:
-    """Blend recorded features into an editor's attention while the block runs, at each layer's own
-    size. Steps whose features were not chosen stay as they are, and so do branches that were not
-    recorded.
+    """Blend recorded features into an editor's attention, at each layer's size, while the block
+    runs. Steps and branches that were not recorded stay unchanged.
 
-    :func:`attnwarp.methods.attention_warping.inject` is this with the paper's weight and blend.
+    :func:`attnwarp.methods.attention_warping.inject` is this function with the paper's weight and
+    blend.
 
     Args:
-        editor: the editor that the features came from, or one of its shape.
+        editor: editor that the features were recorded from, or an equally shaped one.
         recording: features of the source view.
-        weight: a_t; where it is 0 features stay as they are.
-        blend: blend of a layer's tokens; half precision comes to it as float32.
-        warps: warps of the pictures of a batch, one each: :class:`attnwarp.warp.WarpedView` or None
-            for the identity.
+        weight: function that returns a_t; features stay unchanged if it is 0.
+        blend: blend of a layer's tokens; gets half precision as float32.
+        warps: warps of the pictures of a batch, one each: :class:`attnwarp.warp.WarpedView`, or
+            None for the identity.
 
     Raises:
-        ValueError: a timestep, branch or size that does not match the recording, or a run that was
-            recorded in fewer steps than planned; the message names it.
+        ValueError: a timestep, branch or size does not match the recording, or the recorded run had
+            fewer steps than planned; the message names the mismatch.
 
     An example is at :func:`attnwarp.methods.attention_warping.a_t`.
     """

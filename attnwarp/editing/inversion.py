@@ -1,7 +1,7 @@
-"""The noise behind a picture: DDIM inversion, and edit-friendly DDPM inversion.
+"""Noise that reproduces a picture: DDIM inversion, and edit-friendly DDPM inversion.
 
-With the latter a picture edited by hand can be the source of an edit: its features are recorded
-while its own noise is replayed.
+Edit-friendly inversion lets a picture edited by hand be the source of an edit: its features are
+recorded while its inverted noise is replayed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from attnwarp.editing.editor import Editor, Image, Task, drawn, guided, shared_n
 from attnwarp.editing.schedule import Schedule, Time, following
 
 Predict = Callable[[Tensor, Time], Tensor]
-"""A network's output for latents at a step, such as ``Task.predict``."""
+"""Function that returns a network's output for latents at a step, such as ``Task.predict``."""
 
 
 def ddim_invert(
@@ -29,24 +29,24 @@ def ddim_invert(
     timesteps: Sequence[Time],
     begin: Time | None = None,
 ) -> Tensor:
-    """(B, C, h, w) latents at the first of ``timesteps`` from which the steps of a schedule
-    reconstruct the picture.
+    """Invert a picture: find (B, C, h, w) latents at the first of ``timesteps`` from which the
+    steps of a schedule reconstruct it.
 
-    Each step takes the network's output at the latents it starts from (Song et al. 2021, section
-    4.3), so the reconstruction is exact for small steps only. Guidance above 1 increases its error:
-    invert with a task that has none.
+    Each step uses the network's output at its starting latents (Song et al. 2021, section 4.3), so
+    the reconstruction is exact for small steps only. Guidance above 1 increases the error, so
+    invert with an unguided task.
 
     Args:
-        schedule: schedule of the model; its network predicts noise or v. One that predicts the
-            picture gives no noise of a clean picture, and needs ``begin``.
-        predict: the network's output.
+        schedule: schedule of the model; its network predicts noise or v. A network that predicts
+            the picture gives no noise of a clean picture, and needs ``begin``.
+        predict: function that returns the network's output.
         latents: (B, C, h, w) scaled latents of the picture.
         timesteps: timesteps of the edit, falling.
-        begin: timestep that the latents were noised to; the timesteps are then those above. Left
-            out, the latents are clean.
+        begin: timestep of the noised ``latents``; ``timesteps`` are then all above it. None means
+            clean latents.
 
     Raises:
-        ValueError: a network that predicts the picture, of clean latents.
+        ValueError: the network predicts the picture and the latents are clean.
 
     Example:
         >>> from attnwarp.editing.schedule import DDIM
@@ -82,15 +82,15 @@ def invert_view(
     steps: int,
     seed: int = 0,
 ) -> Tensor:
-    """(1, C, h, w) latents from which unguided DDIM with the same prompt reconstructs a view.
+    """Invert a view: (1, C, h, w) latents from which unguided DDIM with the prompt restores it.
 
     Args:
-        editor: a model that draws the whole picture, such as a depth ControlNet.
+        editor: model that draws the full picture, such as a depth ControlNet.
         guide: guide of the view, as ``editor.task`` takes it.
-        picture: (H, W, 3) of the view, in [0, 1].
-        prompt: description of the picture; "" names nothing.
+        picture: (H, W, 3) picture of the view, in [0, 1].
+        prompt: description of the picture; may be "".
         steps: number of steps of the edit.
-        seed: seed of the noise that latents get where the schedule needs some, the same for all
+        seed: seed of the noise added to the latents if the schedule needs some, the same for all
             views.
 
     Example:
@@ -113,7 +113,7 @@ def invert_view(
 
 
 def inversion_rows(editor: Editor, steps: int) -> int:
-    """Rows through the network for the inversion of a view.
+    """Count the rows through the network for the inversion of a view.
 
     Example:
         >>> from attnwarp.editing.small import load_editor
@@ -125,13 +125,13 @@ def inversion_rows(editor: Editor, steps: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class NoiseMaps:
-    """Start and noise by which DDPM sampling arrives at a given picture.
+    """Initial latents and noise from which DDPM sampling reproduces a given picture.
 
     Attributes:
-        timesteps: falling.
-        start: (B, C, h, w) latents at the first of them.
-        maps: (steps, B, C, h, w) noise of each step, in units of its standard deviation. Where that
-            is 0, what the step itself lacks. Float32 where the latents have half precision.
+        timesteps: timesteps, falling.
+        start: (B, C, h, w) latents at the first timestep.
+        maps: (steps, B, C, h, w) noise of each step, in units of its standard deviation, or, if
+            that is 0, the step's residual. Float32 for latents of half precision.
     """
 
     timesteps: Sequence[Time]
@@ -148,23 +148,23 @@ def edit_friendly_invert(
     noises: Tensor | None = None,
     seed: int = 0,
 ) -> NoiseMaps:
-    """Edit-friendly DDPM inversion (Huberman-Spiegelglas et al. 2024) with eta 1.
+    """Invert by edit-friendly DDPM inversion (Huberman-Spiegelglas et al. 2024) with eta 1.
 
-    Every x_t gets a noise of its own, so the noise maps are larger and carry the picture's layout.
+    Every x_t gets independent noise, so the noise maps are larger and carry the picture's layout.
 
     Args:
-        schedule: schedule of the model; any prediction.
-        predict: the network's output.
+        schedule: schedule of the model, with any prediction type.
+        predict: function that returns the network's output.
         latents: (B, C, h, w) scaled latents of the picture.
-        timesteps: falling. To skip the noisiest, leave them out: the paper takes
+        timesteps: timesteps, falling; omit the noisiest to skip them. The paper takes
             ``schedule.timesteps(100)[36:]`` of Stable Diffusion, text guidance 3.5 with a prompt
-            for the picture, and 15 in the replay with one for its edit.
+            for the picture, and 15 in the replay with a prompt for its edit.
         noises: (steps, B, C, h, w) white noise of the steps, in the order of ``timesteps``; drawn
-            from ``seed`` if left out.
+            from ``seed`` if omitted.
         seed: seed of the drawn noises.
 
     Raises:
-        ValueError: noises of another shape.
+        ValueError: the noises have a different shape.
 
     Example:
         >>> from attnwarp.editing.schedule import DDIM
@@ -192,7 +192,7 @@ def edit_friendly_invert(
             scale = sigma if sigma > 0 else torch.ones_like(sigma)
             noise = (states[step + 1] - mean) / scale
             maps.append(noise)
-            # From the map just found, so that rounding does not add up.
+            # Continue from the rounded map, so that rounding errors do not accumulate.
             x = (mean + scale * noise).to(x.dtype)
     return NoiseMaps(list(timesteps), start, torch.stack(maps))
 
@@ -200,13 +200,13 @@ def edit_friendly_invert(
 def noise_maps(
     editor: Editor, task: Task, picture: Image, timesteps: Sequence[Time], seed: int
 ) -> NoiseMaps:
-    """Noise maps of a picture made elsewhere, whose first state has the noise of all views.
+    """Compute noise maps of an external picture; its first state has the noise of all views.
 
     Args:
         editor: the model.
-        task: task of its edit.
-        picture: (H, W, 3) in [0, 1].
-        timesteps: falling.
+        task: task of the picture's edit.
+        picture: external picture, (H, W, 3) in [0, 1].
+        timesteps: timesteps, falling.
         seed: seed of :func:`attnwarp.editing.editor.shared_noise`.
     """
     latents = editor.encode([picture])
@@ -222,15 +222,15 @@ def replay(
     *,
     on_step: Callable[[int, int, Tensor], None] | None = None,
 ) -> Tensor:
-    """(B, C, h, w) latents that the noise maps lead to.
+    """Sample (B, C, h, w) latents with given noise maps.
 
-    With the task of the inversion they are those of its picture; with another prompt, of its edit.
+    The task of the inversion reproduces its picture; another prompt edits the picture.
 
     Args:
-        schedule: schedule of the model, that of the inversion.
-        predict: the network's output.
+        schedule: schedule used by the inversion.
+        predict: function that returns the network's output.
         noise: noise of :func:`edit_friendly_invert`.
-        on_step: called with the step, the number of steps and the latents after each step.
+        on_step: callback with the step, the number of steps and the latents, after each step.
     """
     x = noise.start
     with torch.no_grad():

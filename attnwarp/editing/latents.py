@@ -1,4 +1,4 @@
-"""Latents of the bundled editors: a fixed orthogonal transform of 4 x 4 blocks, nothing learned."""
+"""Latents of the bundled editors: a fixed, unlearned orthogonal transform of 4 x 4 blocks."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from diffusers.models.modeling_utils import ModelMixin
 from torch import Tensor
 
 BLOCK = 4
-"""Pixels along a block's side: the picture's side over that of the latents."""
+"""Side of a block in px: the picture's side over the latents' side."""
 
 CHANNELS = 3 * BLOCK**2
 
 GAINS = (0.5, 1.0, 1.0)
-"""Gain of a block's mean, its coarse and its fine details. A mean over 16 px has a standard
-deviation near 2 where details have 0.1 to 0.3; white noise of unit variance should not decide
-everything about the details before it decides the colour."""
+"""Gains of a block's mean, coarse and fine details. A mean over 16 px has a standard deviation near
+2, details 0.1 to 0.3; without gains, white noise of unit variance would settle the details before
+the colour."""
 
 
 def haar_basis() -> Tensor:
-    """(48, 3, 4, 4) orthonormal kernels: two levels of the Haar transform of opponent colours.
+    """Build (48, 3, 4, 4) orthonormal kernels: a two-level Haar transform of opponent colours.
 
     Channels 0 to 2 are the mean of a block's luminance, red against blue, green against both; 3 to
     11 the coarse details; 12 to 47 the fine ones.
@@ -52,15 +52,15 @@ def haar_basis() -> Tensor:
 
 
 class HaarLatents(ModelMixin, ConfigMixin):
-    """Pictures as latents and back, with the calls of a diffusers autoencoder.
+    """Transform between pictures and latents, with the interface of a diffusers autoencoder.
 
-    The transform is orthogonal but for its gains, so nothing is lost and there is nothing to train.
+    The transform is orthogonal up to its gains: it is lossless and needs no training.
 
     Args:
-        block_out_channels: diffusers' pipelines read the factor between picture and latents off its
-            length: 2 ** (3 - 1) = 4.
-        latent_channels: 48.
-        scaling_factor: factor of latents after encoding; the gains stand in its place.
+        block_out_channels: tuple of length 3, from which diffusers' pipelines compute the factor
+            between picture and latents, 2 ** (3 - 1) = 4.
+        latent_channels: number of channels, 48.
+        scaling_factor: factor of latents after encoding; here the gains replace it.
 
     Example:
         >>> import torch
@@ -86,11 +86,11 @@ class HaarLatents(ModelMixin, ConfigMixin):
         basis = haar_basis().float()
         self.register_buffer("encoder", basis * gains[:, None, None, None], persistent=False)
         self.register_buffer("decoder", basis / gains[:, None, None, None], persistent=False)
-        # diffusers reads a model's dtype off its parameters, and this one has none to learn.
+        # diffusers reads a model's dtype from its parameters, and this model has none to learn.
         self.unit = torch.nn.Parameter(torch.ones(1, dtype=torch.float32), requires_grad=False)
 
     def encode(self, x: Tensor, return_dict: bool = True) -> AutoencoderTinyOutput | tuple[Tensor]:
-        """(B, 3, H, W) pictures in [-1, 1], sides multiples of 4 -> (B, 48, H / 4, W / 4)."""
+        """Encode (B, 3, H, W) in [-1, 1], sides multiples of 4, as (B, 48, H / 4, W / 4)."""
         if x.ndim != 4 or x.shape[1] != 3 or x.shape[2] % BLOCK or x.shape[3] % BLOCK:
             raise ValueError(
                 f"x: got shape {tuple(x.shape)}, expected (B, 3, H, W) with sides that are"
@@ -102,7 +102,7 @@ class HaarLatents(ModelMixin, ConfigMixin):
     def decode(
         self, x: Tensor, generator: torch.Generator | None = None, return_dict: bool = True
     ) -> DecoderOutput | tuple[Tensor]:
-        """(B, 48, h, w) latents -> (B, 3, 4 h, 4 w) pictures; ``generator`` is not used."""
+        """Decode (B, 48, h, w) latents to (B, 3, 4 h, 4 w) pictures; ``generator`` is unused."""
         if x.ndim != 4 or x.shape[1] != CHANNELS:
             raise ValueError(f"x: got shape {tuple(x.shape)}, expected (B, {CHANNELS}, h, w)")
         sample = torch.nn.functional.conv_transpose2d(x, self.decoder.to(x.dtype), stride=BLOCK)

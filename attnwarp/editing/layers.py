@@ -22,8 +22,8 @@ from attnwarp.editing.schedule import Size
 Kind = Literal["self", "cross", "joint"]
 
 Rows = Literal["image", "image first", "after text"]
-"""Rows of a layer's sequence that are the image's: all of them, the first ones (those of reference
-pictures or of the text follow), or those after the text's."""
+"""Image rows of a layer's sequence: all rows, the first ones (rows of reference pictures or of the
+text follow), or the rows after the text."""
 
 PIX2PIX_BRANCHES = ("text", "image", "uncond")
 """Order of the guidance branches in the batch of diffusers' InstructPix2Pix pipeline."""
@@ -34,15 +34,15 @@ CONTROLNET_BRANCHES = ("uncond", "text")
 
 @dataclass(frozen=True, eq=False)
 class Call:
-    """One pass of a network.
+    """Description of one pass of a network.
 
     Attributes:
-        timesteps: timesteps as the network got them.
-        latent_size: (h, w).
-        batch: rows.
-        branches: guidance branches in the order of the batch. An editor that runs them one after
-            another has one in each pass.
-        text: tokens of the text, which stand before the image's in some layers.
+        timesteps: timesteps as passed to the network.
+        latent_size: (h, w) of the latents.
+        batch: number of rows.
+        branches: guidance branches in the order of the batch. An editor that runs branches
+            sequentially has one branch per pass.
+        text: number of text tokens, which precede the image's in some layers.
     """
 
     timesteps: Any
@@ -53,23 +53,23 @@ class Call:
 
     @functools.cached_property
     def timestep(self) -> float:
-        """Timestep of the pass. Reading it waits for a GPU, so only hooks that need it do."""
+        """Timestep of the pass. Reading it synchronises with the GPU, so avoid needless reads."""
         return float(torch.as_tensor(self.timesteps).reshape(-1)[0])
 
 
 @dataclass(frozen=True)
 class Layer:
-    """An attention layer of a network.
+    """Attention layer of a network.
 
     Attributes:
         name: name of the module, such as ``up_blocks.3.attentions.2.transformer_blocks.0.attn2``.
         kind: "self", "cross" or "joint".
-        level: how often the latents are halved before it; its size is that fraction of theirs.
-        channels: C of its features.
-        block: number of its block, as the editor counts them.
-        at: whether the features are the module's "output", or its "input": those of parallel
-            blocks, whose output has more in it, come into their projection.
-        rows: which rows of the sequence are the image's.
+        level: number of halvings of the latents before the layer.
+        channels: C of the layer's features.
+        block: number of the layer's block, in the editor's count.
+        at: "output" takes the features from the module's output, "input" from its input. Parallel
+            blocks use the input of their projection, since their output mixes in more.
+        rows: image rows of the sequence.
 
     Example:
         >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 1, 64)
@@ -86,7 +86,7 @@ class Layer:
     rows: Rows = "image"
 
     def size(self, latent_size: Size) -> Size:
-        """(h, w) of the layer. Each stride of 2 rounds an odd side up.
+        """Compute the (h, w) of the layer. Each stride of 2 rounds an odd side up.
 
         Example:
             >>> Layer("up_blocks.0.attentions.0", "self", 2, 64).size((50, 64))
@@ -98,8 +98,8 @@ class Layer:
         return h, w
 
     def image_tokens(self, value: Any, call: Call) -> Tensor:
-        """(B, h w, C) image tokens of the module's output or input: of a tuple its first tensor, of
-        that the image's rows, and of an input the first C channels.
+        """Extract (B, h w, C) image tokens of the module's output or input: a tuple's first tensor,
+        the image rows, and of an input the first C channels.
 
         Example:
             >>> layer = Layer("attn", "joint", 0, 2, rows="after text")
@@ -117,7 +117,7 @@ class Layer:
         return tokens
 
     def put_back(self, value: Any, tokens: Tensor, call: Call) -> Any:
-        """The module's output or input with other image tokens; all others keep their bits."""
+        """Replace the image tokens in the module's output or input; others keep their bits."""
         tensor = value[0] if isinstance(value, tuple) else value
         if tensor.shape == tokens.shape:
             changed = tokens
@@ -133,30 +133,30 @@ class Layer:
 
 
 class Network(Protocol):
-    """A network whose attention is recorded and replaced: any editor, or :class:`BareUNet`."""
+    """Network whose attention is recorded and replaced: any editor, or :class:`BareUNet`."""
 
     @property
     def network(self) -> Any:
-        """The torch module that each pass calls."""
+        """Torch module called in each pass."""
         ...
 
     @property
     def branches(self) -> tuple[str, ...]:
-        """Guidance branches of a step, in the order in which they run."""
+        """Guidance branches of a step, in execution order."""
         ...
 
     def layers(self) -> tuple[Layer, ...]:
-        """Layers whose features a method may carry."""
+        """Layers whose features a method may warp."""
         ...
 
     def call(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:
-        """The pass that the network is called for, from its arguments."""
+        """Describe a pass of the network from the call's arguments."""
         ...
 
 
 @dataclass(frozen=True)
 class BareUNet:
-    """A diffusers UNet in a pipeline or a loop of one's own.
+    """UNet of diffusers, used in a custom pipeline or loop.
 
     Args:
         network: the UNet.
@@ -172,22 +172,22 @@ class BareUNet:
         return paper_layers(self.network)
 
     def call(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:
-        """The pass of a UNet, :func:`unet_call`."""
+        """Describe a pass of the UNet, by :func:`unet_call`."""
         return unet_call(self.branches, args, kwargs)
 
 
 def unet_call(branches: tuple[str, ...], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:
-    """The pass of a diffusers UNet, from its arguments."""
+    """Describe a pass of a diffusers UNet from the call's arguments."""
     sample = args[0] if args else kwargs["sample"]
     timestep = args[1] if len(args) > 1 else kwargs["timestep"]
     return Call(timestep, (sample.shape[-2], sample.shape[-1]), sample.shape[0], branches)
 
 
 def all_layers(unet: torch.nn.Module) -> tuple[Layer, ...]:
-    """Every attention layer of a diffusers UNet, in the order of its processors.
+    """List all attention layers of a diffusers UNet, in the order of its processors.
 
     Args:
-        unet: with ``attn_processors`` and ``up_blocks``.
+        unet: UNet with ``attn_processors`` and ``up_blocks``.
     """
     levels = len(list(unet.get_submodule("up_blocks").children()))
     layers = []
@@ -210,8 +210,8 @@ def all_layers(unet: torch.nn.Module) -> tuple[Layer, ...]:
 
 
 def paper_layers(unet: torch.nn.Module) -> tuple[Layer, ...]:
-    """Layers of a diffusers UNet that the paper carries: those of the up-sampling blocks at the
-    latents' size and at half of it.
+    """List the layers of a diffusers UNet that the paper warps: those of the up-sampling blocks at
+    the latents' size and at half of it.
     """
     layers = all_layers(unet)
     return tuple(one for one in layers if one.name.startswith("up_blocks") and one.level <= 1)
@@ -223,7 +223,7 @@ def choose_layers(
     kinds: Sequence[Kind] | None = None,
     blocks: Sequence[int] | None = None,
 ) -> tuple[Layer, ...]:
-    """Some of an editor's layers.
+    """Select layers of an editor.
 
     Args:
         layers: layers that the editor offers.
@@ -231,7 +231,7 @@ def choose_layers(
         blocks: numbers of blocks; None for all.
 
     Raises:
-        ValueError: an unknown kind, or a choice that no layer matches.
+        ValueError: a kind is unknown, or no layer matches.
 
     Example:
         >>> from attnwarp.editing.small import load_editor
@@ -263,12 +263,12 @@ def hooked(editor: Network, layers: Sequence[Layer], hook: Hook) -> Iterator[Non
     Args:
         editor: editor whose network is hooked.
         layers: layers of that network.
-        hook: its (batch, H W, C) result replaces the features; None leaves them. Gradients flow
-            through.
+        hook: function whose (batch, H W, C) result replaces the features; None keeps them.
+            Gradients flow through.
 
     Raises:
-        RuntimeError: at the end, if something kept a layer's hook from being called; the message
-            names the likely cause.
+        RuntimeError: at the end of the block, if a layer's hook was never called; the message names
+            the likely cause.
     """
     network, now = editor.network, list[Call]()
     called: set[str] = set()
@@ -310,8 +310,8 @@ def hooked(editor: Network, layers: Sequence[Layer], hook: Hook) -> Iterator[Non
 
 
 class Steps:
-    """Counter of denoising steps by the passes of a network: a branch that runs again begins the
-    next step.
+    """Counter of denoising steps by the passes of a network: a repeated branch begins the next
+    step.
     """
 
     def __init__(self) -> None:
@@ -329,7 +329,7 @@ class Steps:
 
 
 def check_rows(call: Call, views: int) -> None:
-    """Raise ValueError unless a pass has a row for each view in each of its branches."""
+    """Raise ValueError unless a pass has one row per view in each of its branches."""
     if call.batch != len(call.branches) * views:
         raise ValueError(
             f"batch: got {call.batch} rows, expected {len(call.branches) * views}: {views} views in"
@@ -338,7 +338,7 @@ def check_rows(call: Call, views: int) -> None:
 
 
 def _cause(network: torch.nn.Module, missing: Sequence[str], *, passes: bool) -> str:
-    """Reason why hooks of layers were not called."""
+    """Explain why hooks of layers were not called."""
     modules = [network, *map(network.get_submodule, missing)]
     compiled = any(
         hasattr(module, "_orig_mod") or getattr(module, "_compiled_call_impl", None) is not None

@@ -1,4 +1,4 @@
-"""Memory of an editor: what its weights take, and diffusers' own switches that take less."""
+"""Memory of an editor: the size of its weights, and diffusers' memory-saving options."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from attnwarp.errors import optional_imports
 BLOCKS = {"offload_type": "block_level", "num_blocks_per_group": 1}
 
 LEAVES = {"offload_type": "leaf_level"}
-"""Offloading of networks whose parts are called from outside their own forward."""
+"""Offloading options of networks whose submodules are called outside their forward."""
 
 
 def networks_of(editor: Editor) -> dict[str, Any]:
-    """Networks of an editor by name."""
+    """Map names to the networks of an editor."""
     return {k: part for k, part in editor.parts.items() if isinstance(part, torch.nn.Module)}
 
 
 def weight_bytes(editor: Editor) -> int:
-    """Bytes of an editor's weights as loaded; what layers compute comes on top.
+    """Count the bytes of an editor's loaded weights; activations need additional memory.
 
     Example:
         >>> from attnwarp.editing.small import load_editor
@@ -37,19 +37,19 @@ def weight_bytes(editor: Editor) -> int:
 
 
 def save_memory(editor: Editor, device: str) -> None:
-    """Keep an editor's weights in main memory, and compute on a device all the same.
+    """Keep an editor's weights in main memory, and compute on a device.
 
     Each block of a network is moved to the device while it computes (diffusers' group offloading),
-    and the autoencoder takes pictures larger than it was made for in tiles, whose seams it blends.
-    Attention in slices is none of it: torch's own attention takes less memory than slices do.
+    and the autoencoder processes pictures beyond its training size in blended tiles. Attention is
+    not sliced, since torch's attention takes less memory than slices do.
 
     Args:
-        editor: editor with networks that lie in main memory.
-        device: that computes, "cpu" or "cuda".
+        editor: editor whose networks are in main memory.
+        device: computing device, "cpu" or "cuda".
 
     Raises:
-        InputError: no such device.
-        MissingExtraError: accelerate is not installed, by which diffusers moves blocks.
+        InputError: the device is unknown.
+        MissingExtraError: accelerate, which diffusers needs to move blocks, is not installed.
 
     Example:
         >>> from attnwarp.editing.small import load_editor

@@ -1,4 +1,4 @@
-"""Recorded attention features: what is kept of a run, the memory it takes, and the recording."""
+"""Recorded attention features: the plan, its memory, and the recording."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from attnwarp.editing.schedule import Size
 
 @dataclass(frozen=True)
 class RecordingPlan:
-    """Plan of a recording: features to keep, and the memory they take, before anything runs.
+    """Plan of a recording: the features to keep and their memory, computed in advance.
 
     Args:
         layers: layers to record, :func:`choose_layers`.
@@ -29,14 +29,14 @@ class RecordingPlan:
         keep: guidance branches to record, such as ("text", "image"); ("text",) without guidance.
         steps: number of steps of denoising.
         views: pictures in a batch.
-        dtype: dtype of what is stored. Half precision halves the memory and rounds.
-        store: "device" leaves features where they are made, "cpu" moves them to main memory, a
-            Path of a folder writes them there. Each recording has a folder of its own in it.
-        chosen: numbers of the steps to record, from 0; all of them if left out. The others are
+        dtype: dtype of the stored features. Half precision halves the memory and rounds.
+        store: "device" keeps features on their device, "cpu" moves them to main memory, a Path of a
+            folder writes them there, each recording into a separate subfolder.
+        chosen: numbers of the steps to record, from 0; all steps if omitted. Other steps are
             neither stored nor injected, so half of the steps take half of the memory.
 
     Raises:
-        ValueError: nothing to record, or an unknown branch, step or store; the message names it.
+        ValueError: nothing to record, or a branch, step or store is unknown; the message names it.
 
     Example:
         >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
@@ -81,7 +81,7 @@ class RecordingPlan:
 
     @property
     def recorded(self) -> frozenset[int]:
-        """Numbers of the steps that are stored, from 0.
+        """Numbers of the stored steps, from 0.
 
         Example:
             >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
@@ -92,7 +92,7 @@ class RecordingPlan:
 
     @property
     def bytes(self) -> int:
-        """Bytes of all features together."""
+        """Total bytes of all features."""
         values = 0
         for layer in self.layers:
             h, w = layer.size(self.latent_size)
@@ -104,10 +104,10 @@ class RecordingPlan:
 
 
 def in_words(plans: Sequence[RecordingPlan]) -> str:
-    """A line for the recordings of one or several sources, with the memory of all together.
+    """Describe the recordings of one or several sources in a line, with their total memory.
 
     Args:
-        plans: at least one; layers, branches and steps are said of the first.
+        plans: plans, at least one; the line states layers, branches and steps of the first.
 
     Example:
         >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
@@ -143,8 +143,8 @@ class Recording:
 
     Attributes:
         plan: plan of the recording.
-        timesteps: timesteps of the steps so far, in their order, those without features included. A
-            scheduler that evaluates a timestep twice (PNDM, Heun) has it twice.
+        timesteps: timesteps of the steps so far, in order, including steps without features. A
+            scheduler that evaluates a timestep twice (PNDM, Heun) lists it twice.
     """
 
     plan: RecordingPlan
@@ -156,14 +156,14 @@ class Recording:
 
     @functools.cached_property
     def _folder(self) -> Path:
-        """A new folder, so that no other recording writes to the same files."""
+        """Create a new folder, so that no other recording writes to the same files."""
         store = Path(self.plan.store)
         store.mkdir(parents=True, exist_ok=True)
         return Path(tempfile.mkdtemp(prefix="recording-", dir=store))
 
     @property
     def bytes(self) -> int:
-        """Memory or disk that the features hold, whole storages counted."""
+        """Bytes of the features' memory or files, counting complete storages."""
         storages = {}
         for value in self._features.values():
             if isinstance(value, Tensor):
@@ -172,11 +172,11 @@ class Recording:
         return sum(storages.values()) + sum(path.stat().st_size for path in files)
 
     def features(self, timestep: float, layer: Layer, branch: str) -> Tensor:
-        """(views, H W, C) features of a step, a layer and a branch; of the first step with that
-        timestep.
+        """Return (views, H W, C) features of a step, a layer and a branch; of the first step if the
+        timestep repeats.
 
         Raises:
-            ValueError: not recorded; the message names what is.
+            ValueError: the features are not recorded; the message lists the recorded ones.
         """
         return self._features_of(self.step_of(timestep), layer, branch)
 
@@ -198,14 +198,14 @@ class Recording:
         return value
 
     def step_of(self, timestep: float, begin: int = 0) -> int:
-        """The number of a timestep among those of the recorded run, from 0.
+        """Find the number, from 0, of a timestep's step in the recorded run.
 
         Args:
-            begin: begin of those with that timestep, the first from this number on, or else the
-                first.
+            begin: number of the step at which the search begins; if it finds nothing, the first
+                step of that timestep is taken.
 
         Raises:
-            ValueError: the run had no such timestep.
+            ValueError: the run lacks the timestep.
         """
         if timestep not in self.timesteps:
             listed = ", ".join(f"{t:g}" for t in self.timesteps) or "none"
@@ -217,7 +217,7 @@ class Recording:
         return self.timesteps.index(timestep, begin if later else 0)
 
     def _check_range(self, number: int, layer: Layer, features: Tensor, stored: Tensor) -> None:
-        """Refuse features that half precision turned into infinities."""
+        """Refuse features that overflowed in half precision."""
         largest = torch.finfo(self.plan.dtype).max
         if largest >= torch.finfo(features.dtype).max or not bool(torch.isinf(stored).any()):
             return
@@ -233,7 +233,7 @@ class Recording:
         """Store (views, H W, C) features of a branch."""
         plan = self.plan
         key = (number, layer.name, branch)
-        # A copy of its own: a slice would keep the whole batch's memory alive.
+        # Copy, since a slice would keep the full batch's memory alive.
         stored = torch.empty_like(features, dtype=plan.dtype, memory_format=torch.contiguous_format)
         stored.copy_(features.detach())
         self._check_range(number, layer, features, stored)
@@ -251,16 +251,16 @@ class Recording:
 
 @contextmanager
 def record(editor: Network, plan: RecordingPlan) -> Iterator[Recording]:
-    """Record the image tokens of attention layers while the block runs. No bit of them changes.
+    """Record the image tokens of attention layers, unchanged, while the block runs.
 
     Args:
         editor: editor whose network is recorded; any loop may call it.
             :class:`~attnwarp.editing.layers.BareUNet` records the UNet of another pipeline.
-        plan: features to record; ``print(plan)`` tells the memory that it takes.
+        plan: features to record; ``print(plan)`` shows their memory.
 
     Raises:
-        ValueError: a branch that the editor lacks; latents of another size, a batch of another
-            number of rows, or more steps, than planned.
+        ValueError: the editor lacks a branch, or the size of the latents, the number of rows or the
+            number of steps differs from the plan.
 
     Example:
         >>> import numpy as np

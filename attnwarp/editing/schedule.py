@@ -1,4 +1,4 @@
-"""Noise schedules, and the steps of an editor's own loop."""
+"""Noise schedules, and the steps of an editor's denoising loop."""
 
 from __future__ import annotations
 
@@ -18,17 +18,16 @@ T = TypeVar("T")
 Prediction = Literal["epsilon", "sample", "v_prediction"]
 
 Grid = Literal["even", "scheduler"]
-"""Timesteps below a start T: "even" ones from T itself, or those of a "scheduler" that is made anew
-for T training steps, as published code has it: from T - T / steps + 1 down to 1, though noise is
-added at T.
+"""Timesteps below a start T: "even" ones from T down, or those of a "scheduler" built for T
+training steps, as in published code: from T - T / steps + 1 down to 1, though noise is added at T.
 """
 
 PUBLISHED_STEPS = 1000
-"""Steps of Stable Diffusion, whose numbers publications give."""
+"""Number of Stable Diffusion's training steps, the unit of published timesteps."""
 
 
 Time = float
-"""A step's time: the number of a training step (DDIM), or the share of noise (flow)."""
+"""Time of a step: the number of a training step (DDIM), or the share of noise (flow)."""
 
 
 class Schedule(Protocol):
@@ -39,31 +38,31 @@ class Schedule(Protocol):
 
     @property
     def needs_noise(self) -> bool:
-        """True where the network says nothing of a clean picture's noise: an inversion has to begin
-        at a noised one.
+        """True if the network gives no noise of a clean picture, so that an inversion must begin at
+        a noised picture.
         """
         ...
 
     def timesteps(self, steps: int, size: Size) -> Sequence[Time]:
-        """Falling times from pure noise.
+        """Compute falling times from pure noise.
 
         Args:
             steps: number of steps.
             size: (h, w) of the latents; some models' steps depend on it.
 
         Raises:
-            ValueError: more steps than there are.
+            ValueError: more steps than the schedule has.
         """
         ...
 
     def published(self, start: int, steps: int, grid: Grid = "even") -> Sequence[Time]:
-        """Times that stand for steps of Stable Diffusion, as publications give them.
+        """Convert published Stable Diffusion timesteps to times of this schedule.
 
-        A method noises a picture to a published timestep T. It relies on the share of the picture
-        that is left there and not on the number T. So each of Stable Diffusion's steps
-        (:func:`published_steps`) becomes the time at which as much of the picture is left, for the
-        same noise. Of a range, T is drawn on Stable Diffusion's clock, and each draw becomes a time
-        here. So shares of signal come as often as published.
+        A method noises a picture to a published timestep T and relies on the remaining share of the
+        picture, not on the number T. So each of Stable Diffusion's steps (:func:`published_steps`)
+        becomes the time at which the same share of the picture remains under the same noise. If T
+        comes from a range, it is drawn on Stable Diffusion's clock and each draw is converted, so
+        shares of signal occur as often as published.
 
         Args:
             start: Stable Diffusion's first timestep, in [0, 999].
@@ -71,16 +70,16 @@ class Schedule(Protocol):
             grid: grid of the steps, :data:`Grid`.
 
         Raises:
-            ValueError: no such timestep, or more steps than there are from there.
+            ValueError: the timestep is out of range, or has fewer timesteps below it than steps.
         """
         ...
 
     def add_noise(self, x: Tensor, noise: Tensor, timestep: Time) -> Tensor:
-        """Clean latents noised to a time, in the type of ``x``."""
+        """Noise clean latents to a time, in the dtype of ``x``."""
         ...
 
     def estimate(self, output: Tensor, x: Tensor, timestep: Time) -> Tensor:
-        """Clean latents that a network's output at ``x`` predicts; float32 of half precision."""
+        """Predict clean latents from a network's output at ``x``; half precision gives float32."""
         ...
 
     def step(
@@ -91,26 +90,26 @@ class Schedule(Protocol):
         following: Time | None,
         clean: Tensor | None = None,
     ) -> Tensor:
-        """One deterministic step, in either direction.
+        """Take one deterministic step, in either direction.
 
         Args:
             output: output of the network at ``x``.
             x: latents at ``timestep``.
             timestep: time of ``x``; None for clean latents.
-            following: time to go to; None for clean latents.
-            clean: latents taken in place of the predicted clean ones; the noise is then what they
-                leave of ``x``.
+            following: target time; None for clean latents.
+            clean: latents that replace the predicted clean ones; the noise is then the rest of
+                ``x``.
 
         Returns:
-            Latents at ``following``, in the type of ``x``.
+            Latents at ``following``, in the dtype of ``x``.
         """
         ...
 
     def noisy_step(
         self, output: Tensor, x: Tensor, timestep: Time, following: Time | None
     ) -> tuple[Tensor, Tensor]:
-        """Mean and () standard deviation of the next state where steps add noise; float32 of half
-        precision. The deviation is 0 where they add none.
+        """Compute the mean and () standard deviation of the next state; half precision gives
+        float32. The deviation is 0 for steps that add no noise.
         """
         ...
 
@@ -119,15 +118,15 @@ class Schedule(Protocol):
 class DDIM:
     """Noise schedule of a diffusion model, with the steps of DDIM (Song et al. 2021).
 
-    float16 has no number between 0.9995 and 1, where alpha-bar of the last steps lies, and 1 -
-    alpha-bar would be 0: hence float32.
+    Alpha-bar is float32: in float16 the last steps' alpha-bar, between 0.9995 and 1, would round to
+    1, and 1 - alpha-bar to 0.
 
     Args:
         alphas: (N,) float32 alpha-bar of the training steps: x_t = sqrt(alpha-bar) x_0 +
             sqrt(1 - alpha-bar) noise.
-        prediction: prediction type of the network, in diffusers' words.
+        prediction: prediction type of the network, as named in diffusers.
         final_alpha: alpha-bar after the last step.
-        spacing: falling timesteps of a number of steps; even ones if left out.
+        spacing: function from a number of steps to falling timesteps; evenly spaced if omitted.
     """
 
     alphas: Tensor
@@ -137,7 +136,7 @@ class DDIM:
 
     @classmethod
     def of(cls, scheduler: Any) -> DDIM:
-        """The schedule of a diffusers DDIMScheduler, with its spacing."""
+        """Convert a diffusers DDIMScheduler, including its spacing."""
         kind = scheduler.config.prediction_type
         check.one_of(kind, ("epsilon", "sample", "v_prediction"), "prediction_type")
 
@@ -149,11 +148,11 @@ class DDIM:
 
     @property
     def needs_noise(self) -> bool:
-        """True of a network that predicts the picture."""
+        """True if the network predicts the picture."""
         return self.prediction == "sample"
 
     def timesteps(self, steps: int, size: Size | None = None) -> list[int]:
-        """Steps from pure noise, as the model's own scheduler spaces them: see :class:`Schedule`.
+        """Compute steps from pure noise, spaced by the model's scheduler: see :class:`Schedule`.
 
         Example:
             >>> DDIM(torch.linspace(0.99, 0.01, 1000), "epsilon", 1.0).timesteps(4)
@@ -164,7 +163,7 @@ class DDIM:
         if self.spacing is None:
             return steps_from(count - 1, steps)
         timesteps = list(self.spacing(steps))
-        if max(timesteps) >= count:  # an offset moves the first of as many as were trained
+        if max(timesteps) >= count:  # an offset can push the first timestep beyond the trained ones
             raise ValueError(
                 f"steps: got {steps}, the first of which would be timestep {max(timesteps)} of this"
                 f" editor's schedule, that ends at {count - 1}; take fewer"
@@ -172,12 +171,13 @@ class DDIM:
         return timesteps
 
     def published(self, start: int, steps: int, grid: Grid = "even") -> list[int]:
-        """Steps of the nearest alpha-bar: see :meth:`Schedule.published`. With Stable Diffusion's
-        own schedule they are the same steps.
+        """Find the steps of the nearest alpha-bar: see :meth:`Schedule.published`. With Stable
+        Diffusion's schedule the steps stay the same.
 
-        Stable Diffusion's last step still shows some of the picture, and methods rely on it. So it
-        does not become the pure noise that another schedule may end in. Where neighbours have the
-        same nearest step, each is one below the other, so that no step is taken twice.
+        Stable Diffusion's last step still shows some of the picture, and methods rely on it. So
+        that step does not become the pure noise in which another schedule may end. If neighbours
+        have the same nearest step, each goes one below the previous, so that no step is taken
+        twice.
 
         Example:
             >>> alphas = stable_diffusion_alphas()
@@ -200,17 +200,17 @@ class DDIM:
         return result
 
     def alpha(self, timestep: Time | None) -> Tensor:
-        """() alpha-bar of a step; None is what comes after the last."""
+        """Return alpha-bar () of a step; None means after the last step."""
         return torch.tensor(self.final_alpha) if timestep is None else self.alphas[int(timestep)]
 
     def add_noise(self, x: Tensor, noise: Tensor, timestep: Time) -> Tensor:
-        """sqrt(alpha-bar) x + sqrt(1 - alpha-bar) noise, in the type of ``x``."""
+        """Compute sqrt(alpha-bar) x + sqrt(1 - alpha-bar) noise, in the dtype of ``x``."""
         clean = widened(x)
         a = self.alpha(timestep).to(clean)
         return (a.sqrt() * clean + (1 - a).sqrt() * widened(noise)).to(x.dtype)
 
     def split(self, output: Tensor, x: Tensor, timestep: Time | None) -> tuple[Tensor, Tensor]:
-        """The predicted x_0 and noise, from a network's output at x; float32 of half precision."""
+        """Predict x_0 and noise from a network's output at x; half precision gives float32."""
         x, output = widened(x), widened(output)
         a = self.alpha(timestep).to(x)
         match self.prediction:
@@ -221,7 +221,7 @@ class DDIM:
         return a.sqrt() * x - (1 - a).sqrt() * output, a.sqrt() * output + (1 - a).sqrt() * x
 
     def estimate(self, output: Tensor, x: Tensor, timestep: Time) -> Tensor:
-        """The predicted x_0; float32 of half precision."""
+        """Predict x_0; half precision gives float32."""
         return self.split(output, x, timestep)[0]
 
     def step(
@@ -232,12 +232,12 @@ class DDIM:
         following: Time | None,
         clean: Tensor | None = None,
     ) -> Tensor:
-        """A step with eta 0 (Song et al. 2021, eq. 12): see :meth:`Schedule.step`."""
+        """Take a step with eta 0 (Song et al. 2021, eq. 12): see :meth:`Schedule.step`."""
         before = widened(x)
         now, then = self.alpha(timestep).to(before), self.alpha(following).to(before)
         x0, noise = self.split(output, x, timestep)
         if clean is not None:
-            # By the difference, so that what is unchanged keeps the bits of its noise.
+            # Computed from the difference, so that unchanged latents keep the bits of their noise.
             noise = noise - (now / (1 - now)).sqrt() * (clean - x0)
             x0 = clean
         return (then.sqrt() * x0 + (1 - then).sqrt() * noise).to(x.dtype)
@@ -245,7 +245,7 @@ class DDIM:
     def noisy_step(
         self, output: Tensor, x: Tensor, timestep: Time, following: Time | None
     ) -> tuple[Tensor, Tensor]:
-        """A step with eta 1, as DDPM has it (eq. 12 and 16): see :meth:`Schedule.noisy_step`."""
+        """Take a step with eta 1, as in DDPM (eq. 12 and 16): see :meth:`Schedule.noisy_step`."""
         now, then = self.alpha(timestep), self.alpha(following)
         x0, noise = self.split(output, x, timestep)
         sigma = ((1 - then) / (1 - now) * (1 - now / then)).clamp_min(0).sqrt().to(x0)
@@ -254,7 +254,7 @@ class DDIM:
 
 
 def even_shares(steps: int, size: Size) -> list[float]:
-    """Falling shares of noise, evenly from 1 to 1 / steps.
+    """Compute falling shares of noise, evenly from 1 to 1 / steps.
 
     Example:
         >>> even_shares(4, (64, 64))
@@ -265,12 +265,12 @@ def even_shares(steps: int, size: Size) -> list[float]:
 
 @dataclass(frozen=True, eq=False)
 class Flow:
-    """Straight path between picture and noise, x_s = (1 - s) x_0 + s noise, of a network that gives
-    the velocity noise - x_0 (Lipman et al. 2023, Liu et al. 2023). Times are the shares s.
+    """Straight path between picture and noise, x_s = (1 - s) x_0 + s noise, for a network that
+    predicts the velocity noise - x_0 (Lipman et al. 2023, Liu et al. 2023). Times are the shares s.
 
     Args:
-        spacing: falling shares in (0, 1] of a number of steps at (h, w) latents. Models that shift
-            them by the number of tokens have a function of their own.
+        spacing: function from a number of steps and the (h, w) of latents to falling shares in
+            (0, 1]. Models that shift shares by the number of tokens pass their function.
 
     Example:
         >>> x, noise = torch.tensor([2.0]), torch.tensor([4.0])
@@ -283,12 +283,12 @@ class Flow:
     needs_noise: bool = False
 
     def timesteps(self, steps: int, size: Size) -> list[float]:
-        """Shares from pure noise: see :class:`Schedule`."""
+        """Compute shares from pure noise: see :class:`Schedule`."""
         check.number(steps, 1, PUBLISHED_STEPS, "steps", whole=True)
         return list(self.spacing(steps, size))
 
     def published(self, start: int, steps: int, grid: Grid = "even") -> list[float]:
-        """Shares that leave as much of the picture: see :meth:`Schedule.published`.
+        """Compute shares that leave as much of the picture: see :meth:`Schedule.published`.
 
         Example:
             >>> [round(share, 3) for share in Flow().published(980, 2)]
@@ -299,11 +299,11 @@ class Flow:
         return list((noise / (noise + signal)).tolist())
 
     def add_noise(self, x: Tensor, noise: Tensor, timestep: Time) -> Tensor:
-        """(1 - s) x + s noise, in the type of ``x``."""
+        """Compute (1 - s) x + s noise, in the dtype of ``x``."""
         return ((1 - timestep) * widened(x) + timestep * widened(noise)).to(x.dtype)
 
     def estimate(self, output: Tensor, x: Tensor, timestep: Time) -> Tensor:
-        """x - s velocity; float32 of half precision."""
+        """Compute x - s velocity; half precision gives float32."""
         return widened(x) - timestep * widened(output)
 
     def step(
@@ -314,7 +314,7 @@ class Flow:
         following: Time | None,
         clean: Tensor | None = None,
     ) -> Tensor:
-        """A step of Euler, x + (s' - s) velocity: see :meth:`Schedule.step`."""
+        """Take an Euler step, x + (s' - s) velocity: see :meth:`Schedule.step`."""
         before, now = widened(x), timestep or 0.0
         velocity = widened(output) if clean is None else (before - clean) / now
         return (before + ((following or 0.0) - now) * velocity).to(x.dtype)
@@ -322,18 +322,18 @@ class Flow:
     def noisy_step(
         self, output: Tensor, x: Tensor, timestep: Time, following: Time | None
     ) -> tuple[Tensor, Tensor]:
-        """Step of Euler; it adds no noise."""
+        """Take an Euler step; it adds no noise."""
         before = widened(x)
         return self.step(output, before, timestep, following), before.new_zeros(())
 
 
 def widened(x: Tensor) -> Tensor:
-    """``x`` in the type that a step is computed in."""
+    """Convert ``x`` to the dtype in which a step is computed."""
     return x.to(work_type(x.dtype))
 
 
 def steps_from(start: int, steps: int) -> list[int]:
-    """``steps`` timesteps that fall evenly from ``start``, as "trailing" ones do from the last.
+    """Space ``steps`` timesteps evenly down from ``start``, as "trailing" does from the last.
 
     Args:
         start: first timestep, at least ``steps`` - 1.
@@ -355,19 +355,19 @@ def steps_from(start: int, steps: int) -> list[int]:
 def stable_diffusion_alphas() -> Tensor:
     """(1000,) float64 alpha-bar of Stable Diffusion 1.
 
-    The products of 1 - beta, whose roots rise evenly from sqrt(0.00085) to sqrt(0.012):
-    ``scaled_linear`` in diffusers, ``make_beta_schedule`` in CompVis' code. The last is 0.0047:
-    7 % of the signal's amplitude is left.
+    The values are products of 1 - beta, and the roots of beta rise evenly from sqrt(0.00085) to
+    sqrt(0.012): ``scaled_linear`` in diffusers, ``make_beta_schedule`` in CompVis' code. The last
+    value is 0.0047: 7 % of the signal's amplitude is left.
     """
     roots = torch.linspace(0.00085**0.5, 0.012**0.5, PUBLISHED_STEPS, dtype=torch.float64)
     return torch.cumprod(1 - roots.square(), 0)
 
 
 def published_steps(start: int, steps: int, grid: Grid = "even") -> list[int]:
-    """Timesteps of Stable Diffusion that an edit from ``start`` denoises at.
+    """Compute the Stable Diffusion timesteps at which an edit from ``start`` denoises.
 
     Args:
-        start: timestep that noise is added at.
+        start: timestep at which noise is added.
         steps: number of steps.
         grid: grid of the steps, :data:`Grid`.
 
@@ -388,17 +388,17 @@ def published_steps(start: int, steps: int, grid: Grid = "even") -> list[int]:
 
 
 def published_alphas(start: int, steps: int, grid: Grid) -> Tensor:
-    """(steps,) float64 alpha-bar of :func:`published_steps`.
+    """Return alpha-bar of :func:`published_steps`, (steps,) float64.
 
     Raises:
-        ValueError: no such timestep, or fewer timesteps than steps.
+        ValueError: the timestep is out of range, or there are fewer timesteps than steps.
     """
     check.number(start, 0, PUBLISHED_STEPS - 1, "start", whole=True)
     return stable_diffusion_alphas()[published_steps(start, steps, grid)]
 
 
 def following(timesteps: Sequence[T]) -> list[tuple[T, T | None]]:
-    """Each timestep with the one that follows it; None after the last.
+    """Pair each timestep with its successor; None after the last.
 
     Example:
         >>> following([999, 499])

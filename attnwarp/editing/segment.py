@@ -1,7 +1,7 @@
-"""Masks by words: what is edited, said in words instead of drawn.
+"""Masks by words: the edited part, named in words instead of drawn.
 
 ``GroundedSam`` detects boxes with Grounding DINO and outlines them with SAM, both from local
-folders. ``ClipSegmenter`` needs no download: it rates places of the picture with
+folders. ``ClipSegmenter`` needs no download: it scores regions of the picture with
 clip-parts.
 """
 
@@ -26,17 +26,17 @@ Mask = npt.NDArray[np.bool_]
 """(H, W)."""
 
 WORKING_SIDE = 256
-"""Larger pictures are cut at this short side in px."""
+"""Largest short side in px at which a picture is segmented."""
 
 LONGEST_SIDE = 1024
-"""Longest side in px of what is rated and cut: a panorama would take memory without bound. Pictures
-up to 4:1 stay below it.
+"""Longest side in px at which a picture is scored and segmented, since a panorama would take
+unbounded memory. Pictures up to 4:1 stay below this limit.
 """
 
 
 @runtime_checkable
 class Segmenter(Protocol):
-    """A picture and words to a mask.
+    """Function from a picture and words to a mask.
 
     Example:
         >>> isinstance(ClipSegmenter.bundled(), Segmenter)
@@ -44,25 +44,25 @@ class Segmenter(Protocol):
     """
 
     def segment(self, image: Image, words: str) -> Mask:
-        """(H, W) bool: True where the picture shows what the words name.
+        """Segment the object named by the words, (H, W) bool.
 
         Args:
             image: (H, W, 3) sRGB, floating, in [0, 1].
             words: a noun with or without attributes, such as "bear" or "red mug".
 
         Raises:
-            NoDetectionError: the picture shows nothing of the kind.
-            ValueError: a picture of another shape, type or range, or no words.
+            NoDetectionError: the picture does not show the object.
+            ValueError: the picture has a wrong shape, dtype or range, or the words are empty.
         """
         ...
 
 
 class NoDetectionError(InputError):
-    """A picture in which a segmenter detects nothing that the words name.
+    """Error for a picture in which a segmenter detects no object named by the words.
 
     Args:
-        words: words that were searched for.
-        view: name of the view, if it has one.
+        words: searched words.
+        view: name of the view, if any.
     """
 
     def __init__(self, words: str, view: str | None = None) -> None:
@@ -76,15 +76,15 @@ class NoDetectionError(InputError):
 def segments_of(
     segmenter: Segmenter, words: str, names: Sequence[str]
 ) -> Callable[[int, Image], Mask]:
-    """Masks of views as a function of a view's number and picture, as methods take them.
+    """Return a function from a view's number and picture to its mask, as methods take it.
 
     Args:
-        segmenter: see :class:`Segmenter`.
-        words: words of what is edited.
+        segmenter: finder of the words, see :class:`Segmenter`.
+        words: words that name the edited part.
         names: names of the views, for errors.
 
     Raises:
-        NoDetectionError: by the function; the message names the words and the view.
+        NoDetectionError: raised by the function; the message names the words and the view.
 
     Example:
         >>> class Bright:  # a segmenter of one's own
@@ -105,14 +105,14 @@ def segments_of(
 
 
 def load_segmenter(name: str, *, device: str = "cpu") -> Segmenter:
-    """A segmenter by name.
+    """Load a segmenter by name.
 
     Args:
         name: "clip-parts", or "DINO_FOLDER,SAM_FOLDER" of transformers' models.
         device: "cpu" or "cuda", for the models in folders.
 
     Raises:
-        InputError: no such segmenter, or files that are missing, by name.
+        InputError: the segmenter is unknown, or files are missing; the message names them.
 
     Example:
         >>> type(load_segmenter("clip-parts")).__name__
@@ -125,10 +125,10 @@ def load_segmenter(name: str, *, device: str = "cpu") -> Segmenter:
 
 
 def segmenter_folders(name: str) -> tuple[Path, Path] | None:
-    """The folders of Grounding DINO and SAM that a segmenter's name gives; None for clip-parts.
+    """Parse the Grounding DINO and SAM folders from a segmenter's name; None for clip-parts.
 
     Raises:
-        InputError: no such segmenter, or files that are missing, by name.
+        InputError: the segmenter is unknown, or files are missing; the message names them.
     """
     if name == "clip-parts":
         return None
@@ -148,16 +148,16 @@ def _check_folders(dino: Path, sam: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class GroundedSam:
-    """Grounding DINO's boxes, outlined by SAM: the union of each box's best mask.
+    """Segmenter that outlines Grounding DINO's boxes with SAM and unites each box's best mask.
 
     Args:
         detector: transformers' ``GroundingDinoForObjectDetection``.
-        detector_processor: its processor.
+        detector_processor: processor of the detector.
         sam: transformers' ``SamModel``.
-        sam_processor: its processor.
-        box_threshold: least value of a box's best score, in [0, 1].
-        text_threshold: least value of the scores that name a box, in [0, 1]. A box that no word
-            of the text names, only a mark between words, is dropped.
+        sam_processor: processor of SAM.
+        box_threshold: lower bound of a box's best score, in [0, 1].
+        text_threshold: lower bound of the scores that label a box, in [0, 1]. A box labelled by no
+            word of the text, only by punctuation, is dropped.
     """
 
     detector: Any
@@ -177,18 +177,18 @@ class GroundedSam:
     def from_folders(
         cls, dino: Path, sam: Path, *, device: str = "cpu", **thresholds: float
     ) -> GroundedSam:
-        """Both models from local folders in the format of transformers; nothing is downloaded.
+        """Load both models from local folders in transformers' format; nothing is downloaded.
 
         Args:
-            dino: such as IDEA-Research/grounding-dino-tiny: config.json, model.safetensors,
+            dino: folder such as IDEA-Research/grounding-dino-tiny: config.json, model.safetensors,
                 preprocessor_config.json, and tokenizer.json or vocab.txt.
-            sam: such as facebook/sam-vit-base: config.json, model.safetensors and
+            sam: folder such as facebook/sam-vit-base: config.json, model.safetensors and
                 preprocessor_config.json.
             device: "cpu" or "cuda".
             thresholds: ``box_threshold``, ``text_threshold``.
 
         Raises:
-            InputError: files that are missing, by name, or that cannot be read.
+            InputError: files are missing (named) or unreadable.
             MissingExtraError: transformers is not installed.
         """
         from attnwarp.devices import device_of
@@ -218,7 +218,7 @@ class GroundedSam:
         return cls(*parts, **thresholds)
 
     def segment(self, image: Image, words: str) -> Mask:
-        """Segment as :meth:`Segmenter.segment` tells. Several things are separated by a period:
+        """Segment by words, see :meth:`Segmenter.segment`. A period separates several objects:
         "bear. mug".
         """
         import torch
@@ -235,7 +235,7 @@ class GroundedSam:
         return mask
 
     def _boxes(self, pixels: npt.NDArray[np.uint8], text: str) -> Any:
-        """(N, 4) x0, y0, x1, y1 in px."""
+        """Detect boxes, (N, 4) x0, y0, x1, y1 in px."""
         # Grounding DINO was trained on lower-case phrases that end with a period.
         prompt = text.lower() if text.endswith(".") else f"{text.lower()}."
         processor = self.detector_processor
@@ -253,11 +253,11 @@ class GroundedSam:
             for label in result["text_labels"]
         ]
         boxes = result["boxes"].cpu()
-        # Without a box, transformers still gives one empty label.
+        # Without a box, transformers still returns one empty label.
         return boxes[np.array(named[: len(boxes)], dtype=bool)]
 
     def _outline(self, pixels: npt.NDArray[np.uint8], boxes: Any) -> Mask:
-        """(H, W) union over boxes of the mask that SAM itself rates best."""
+        """Unite the masks, (H, W), that SAM scores best for each box."""
         inputs = self.sam_processor(pixels, input_boxes=[boxes.tolist()], return_tensors="pt")
         device = self.sam.device
         output = self.sam(
@@ -272,7 +272,7 @@ class GroundedSam:
 
 
 def _check_folder(folder: Path, model_type: str, tokenizers: tuple[str, ...]) -> None:
-    """Raise InputError that names the files a folder of transformers lacks."""
+    """Raise InputError if a transformers folder lacks files; the message names them."""
     from attnwarp.encoders.preprocess import read_json
 
     if not folder.is_dir():
@@ -308,20 +308,20 @@ def _checked_words(words: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ClipSegmenter:
-    """Places rated by a text and image encoder, then cut out along colours by OpenCV's grabCut.
+    """Segmenter that scores regions by a text and image encoder and cuts along colours by grabCut.
 
-    A pixel's probability is the mean of what the encoder says of the place around it, over several
-    sizes of the picture. grabCut (Rother, Kolmogorov, Blake 2004) starts from the probable pixels.
-    The constants come from training worlds that the encoder did not learn from. Its overlap with
-    exact masks is in reports/editor/segments.md. Look at its masks before you use them.
+    A pixel's probability is the mean of the encoder's scores of its surroundings, over several
+    sizes of the picture. OpenCV's grabCut (Rother, Kolmogorov, Blake 2004) starts from the probable
+    pixels. The constants come from training worlds that the encoder did not learn from. The overlap
+    with exact masks is in reports/editor/segments.md. Inspect the masks before using them.
 
     Args:
-        encoder: encoder of places and words; see :func:`attnwarp.encoders.load_encoder`.
-        sides: sides of the sizes at which the picture is rated, the short side in px.
-        likely: least probability of what is first taken for the thing.
-        background: a pixel less probable than this can never become part of the mask.
-        sure: a pixel at least as probable as this stays in it.
-        detection: least probability, in [0, 1], that the best pixel must have.
+        encoder: encoder of regions and words; see :func:`attnwarp.encoders.load_encoder`.
+        sides: short sides, in px, of the sizes at which the picture is scored.
+        likely: lower bound of the probability of initial foreground pixels.
+        background: probability below which a pixel never joins the mask.
+        sure: probability from which a pixel always stays in the mask.
+        detection: lower bound of the best pixel's probability, in [0, 1].
 
     Example:
         >>> import numpy as np
@@ -344,7 +344,7 @@ class ClipSegmenter:
         return cls(encoder)
 
     def segment(self, image: Image, words: str) -> Mask:
-        """Segment as :meth:`Segmenter.segment` tells."""
+        """Segment by words, see :meth:`Segmenter.segment`."""
         import cv2
 
         picture: Image = checked_image(image)
@@ -363,11 +363,11 @@ class ClipSegmenter:
         return mask
 
     def relevance(self, image: Image, words: str) -> npt.NDArray[np.float64]:
-        """(H, W) in [0, 1]: probability that the words are true of the place of a pixel.
+        """Estimate the probability that the words describe each pixel, (H, W) in [0, 1].
 
         Args:
             image: (H, W, 3) sRGB, floating, in [0, 1].
-            words: see :meth:`segment`.
+            words: words as in :meth:`segment`.
         """
         import cv2
 
@@ -381,7 +381,7 @@ class ClipSegmenter:
         return total / len(self.sides)
 
     def _cut(self, picture: Image, probability: npt.NDArray[np.float64]) -> Mask:
-        """(H, W) the probable pixels, moved to borders of colour."""
+        """Snap the mask of probable pixels, (H, W), to borders of colour."""
         import cv2
 
         labels = np.full(probability.shape, cv2.GC_PR_BGD, np.uint8)
@@ -389,14 +389,14 @@ class ClipSegmenter:
         labels[probability < self.background] = cv2.GC_BGD
         labels[probability >= self.sure] = cv2.GC_FGD
         likely = probability >= self.likely
-        # grabCut needs colours of both.
+        # grabCut needs pixels of both foreground and background.
         if likely.all() or not likely.any():
             return likely
         return _grab_cut(np.rint(255 * picture).astype(np.uint8), labels)
 
 
 def _resized(picture: Image, short: int) -> Image:
-    """The picture with a short side of that many px, or a long side of :data:`LONGEST_SIDE`."""
+    """Resize a picture to a short side in px, or to a long side of :data:`LONGEST_SIDE`."""
     import cv2
 
     height, width = picture.shape[:2]
@@ -409,27 +409,27 @@ def _resized(picture: Image, short: int) -> Image:
 
 
 def _grab_cut(pixels: npt.NDArray[np.uint8], labels: npt.NDArray[np.uint8]) -> Mask:
-    """(H, W) foreground of five rounds from (H, W) labels, which are left as they are."""
+    """Compute the (H, W) foreground in five rounds from (H, W) labels, which stay unchanged."""
     import cv2
 
     result = labels.copy()
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.setRNGSeed(0)  # of its k-means
+    cv2.setRNGSeed(0)  # seeds grabCut's k-means
     cv2.grabCut(pixels, result, (0, 0, 0, 0), *models, 5, cv2.GC_INIT_WITH_MASK)
     return np.isin(result, (cv2.GC_FGD, cv2.GC_PR_FGD))
 
 
 RADII = tuple(0.05 * 1.2**step for step in range(13))
-"""Reaches that a click is cut out with, of the picture's diagonal."""
+"""Radii tried around a click, as shares of the picture's diagonal."""
 
 CLICKED, NEAR = 0.25, 0.7
-"""Shares of a reach: what surely belongs to the clicked thing, and what first is taken for it."""
+"""Shares of a radius: sure foreground, and initial foreground."""
 
 GROWN = 1.5
-"""Least area of a cut, in what surely belongs to it: a smaller one found nothing of its own."""
+"""Smallest area of a cut over its sure foreground; a smaller cut found no object."""
 
 CORE, WITHIN = 0.5, 0.9
-"""Shares of a box's half axes: what surely belongs to the thing, and what first is taken for it."""
+"""Shares of a box's half axes: sure foreground, and initial foreground."""
 
 
 def cut_out(
@@ -438,19 +438,19 @@ def cut_out(
     box: Sequence[float] | None = None,
     at: Sequence[float] | None = None,
 ) -> Mask:
-    """(H, W) bool: a thing that a box or a click marks, by OpenCV's grabCut.
+    """Cut out an object marked by a box or a click, by OpenCV's grabCut, (H, W) bool.
 
-    A box says how large the thing is. A click does not: grabCut runs with a row of reaches, and of
-    its results, the parts around the click, that is taken which the next smaller and the next
-    larger reach change least. Boxes are surer.
+    A box gives the object's size, a click does not: grabCut runs with a series of radii, and the
+    chosen result, restricted to the part around the click, is the one most similar to the results
+    of the next smaller and next larger radius. Boxes are more reliable.
 
     Args:
         image: (H, W, 3) sRGB, floating, in [0, 1].
-        box: x0, y0, x1, y1 in px around the thing; what lies outside is none of it.
-        at: x, y in px of a point on the thing, best its middle.
+        box: x0, y0, x1, y1 in px around the object; everything outside is background.
+        at: x, y in px of a point on the object, ideally its middle.
 
     Raises:
-        InputError: neither or both, beside the picture, a box without area, or nothing found.
+        InputError: neither or both given, a mark outside, an empty box, or nothing found.
 
     Example:
         >>> import numpy as np
@@ -500,14 +500,14 @@ def check_marks(
     box: Sequence[float] | None = None,
     at: Sequence[float] | None = None,
 ) -> None:
-    """Refuse a box or a point beside a picture, and a box without area.
+    """Refuse a box or a point outside a picture, and a box without area.
 
     Args:
         width, height: width and height of the picture, px.
-        box, at: see :func:`cut_out`.
+        box, at: marks, see :func:`cut_out`.
 
     Raises:
-        InputError: it is one of these.
+        InputError: a mark is outside the picture, or the box has no area.
     """
     for name, marks in (("--box", box), ("--at", at)):
         limits = [width, height] * (len(marks or ()) // 2)
@@ -533,7 +533,7 @@ def _cut_box(
     within = (x0 <= x) & (x <= x1) & (y0 <= y) & (y <= y1)
     middle, half = ((x0 + x1) / 2, (y0 + y1) / 2), ((x1 - x0) / 2, (y1 - y0) / 2)
     away = np.hypot((x - middle[0]) / half[0], (y - middle[1]) / half[1])
-    if within.all():  # grabCut needs colours of both
+    if within.all():  # grabCut needs background pixels too
         within = away < 1
     labels = np.where(within, _label("PR_BGD"), _label("BGD"))
     labels[within & (away < WITHIN)] = _label("PR_FGD")
@@ -569,7 +569,7 @@ def _cut_click(
     def alike(a: Mask, b: Mask) -> float:
         return float((a & b).sum() / max(1, (a | b).sum()))
 
-    if len(cuts) < 3:  # a picture of a few pixels
+    if len(cuts) < 3:  # tiny picture
         return np.zeros(away.shape, bool)
     steps = [alike(a, b) for a, b in pairwise(cuts)]
     steadiness = [min(a, b) * big for (a, b), big in zip(pairwise(steps), grown[1:], strict=False)]
@@ -577,7 +577,7 @@ def _cut_click(
 
 
 def _label(name: str) -> int:
-    """grabCut's number of a label, such as "PR_FGD": probably foreground."""
+    """Look up grabCut's number of a label, such as "PR_FGD" (probably foreground)."""
     import cv2
 
     return int(getattr(cv2, f"GC_{name}"))

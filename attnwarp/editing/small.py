@@ -1,4 +1,4 @@
-"""The editors that ship with the package: small, trained from nothing by eval/training/, read from
+"""Bundled editors: small, trained from scratch by eval/training/, read from
 weights/.
 """
 
@@ -22,25 +22,25 @@ if TYPE_CHECKING:
 WEIGHTS = Path(__file__).parent / "weights"
 
 SUMS = "sha256.json"
-"""File beside a bundled editor's others with the SHA-256 of each."""
+"""File in a bundled editor's folder with the SHA-256 of its other files."""
 
 ONE_THREAD_PARAMETERS = 50_000_000
-"""A UNet of fewer parameters runs on one thread. The bundled ones, of 3 million, took 20 times
-the CPU time on two threads of a busy machine, and other bits."""
+"""Parameters below which a UNet runs on one thread. The bundled UNets, of 3 million, took 20 times
+the CPU time on two threads of a busy machine, with different bits."""
 
 TEXT_GUIDANCE, IMAGE_GUIDANCE = 1.5, 1.0
-"""Guidance weights of bundled editors. At higher text guidance a few colours take most answers, and
+"""Guidance weights of bundled editors. Higher text guidance favours a few colours, and
 colours saturate.
 """
 
 DEPTH_GUIDANCE = 2.0
-"""Guidance weight of a bundled editor that takes depth; ControlNet's own 5 to 7.5 saturates its
+"""Guidance weight of a bundled editor guided by depth; ControlNet's usual 5 to 7.5 saturates its
 colours.
 """
 
 
 def bundled() -> list[str]:
-    """Names of the bundled editors.
+    """List the names of the bundled editors.
 
     Example:
         >>> bundled()
@@ -50,10 +50,10 @@ def bundled() -> list[str]:
 
 
 def check_sums(folder: Path) -> None:
-    """Hold the files of a bundled editor to the SHA-256 that were written with them.
+    """Check the files of a bundled editor against their recorded SHA-256.
 
     Raises:
-        InputError: a file is missing or another one; the message names it.
+        InputError: a file is missing or differs; the message names the file.
     """
     for name, expected in json.loads((folder / SUMS).read_text()).items():
         path = folder / name
@@ -65,7 +65,7 @@ def check_sums(folder: Path) -> None:
 
 
 def write_sums(folder: Path) -> None:
-    """Write the SHA-256 of every file of an editor, as :func:`check_sums` reads them."""
+    """Write the SHA-256 of every file of an editor, for :func:`check_sums`."""
     files = sorted(path for path in folder.rglob("*") if path.suffix in (".json", ".safetensors"))
     sums = {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
@@ -76,8 +76,8 @@ def write_sums(folder: Path) -> None:
 
 
 def thread_count(editor: Any, asked: int | None = None) -> int:
-    """Threads of torch for an editor: those asked for, else one for a small UNet and all cores for
-    a large one.
+    """Number of torch threads for an editor: the requested number, else one for a small UNet and
+    all cores for a large one.
 
     Example:
         >>> thread_count(load_editor("small-plain"))
@@ -101,24 +101,24 @@ LOOKS = {
     *("time", "light", "sky", "colour", "statue", "something", "else", "another", "other"),
     *("different", "new"),
 }
-"""Words by which instructions of the training ask for a colour, a material, a pattern, a ground or
-a time of day, one or any. Others name things, or join.
+"""Words by which training instructions ask for a colour, a material, a pattern, a ground or a time
+of day, one or any. Other words name objects or join.
 """
 
 
 def check_words(name: str, text: str, *, anyway: bool = False) -> None:
-    """Refuse an instruction of which an editor would do nothing, before the editor is loaded; warn
-    of words that a bundled editor was not trained on.
+    """Refuse, before loading, an instruction that an editor would ignore; warn of words that a
+    bundled editor was not trained on.
 
     Args:
         name: name of the editor, as :func:`load_editor` takes it.
         text: the instruction.
-        anyway: take one without a word of :data:`LOOKS`. An editor that is guided by depth does,
-            since its text describes the edited scene.
+        anyway: True accepts an instruction without a word of :data:`LOOKS`, as for an editor
+            guided by depth, whose text describes the edited scene.
 
     Raises:
-        InputError: no words; of a bundled editor that is guided by pictures, no word of
-            :data:`LOOKS`.
+        InputError: the text has no words, or, for a bundled editor guided by pictures, no word
+            of :data:`LOOKS`.
     """
     if not text.strip():
         raise InputError("instruction: is empty, expected words such as 'make it red'")
@@ -142,8 +142,8 @@ def check_words(name: str, text: str, *, anyway: bool = False) -> None:
 
 
 def unknown_words(name: str, text: str) -> list[str]:
-    """Words that a bundled editor was not trained on: its tokenizer has a token for each word of
-    the training texts, and takes others apart.
+    """Words that a bundled editor was not trained on: its tokenizer has a token for each training
+    word and splits other words.
 
     Example:
         >>> unknown_words("small-plain", "make the bear furious and red")
@@ -155,18 +155,18 @@ def unknown_words(name: str, text: str) -> list[str]:
 
 
 def _words(text: str) -> list[str]:
-    """The words of a text, each once."""
+    """List the distinct words of a text."""
     return [*dict.fromkeys(re.findall(r"[^\W\d_]+", unicodedata.normalize("NFKC", text)))]
 
 
 def guide_of(name_or_folder: str) -> Guide:
-    """Tell the guide of an editor without loading it.
+    """Determine the guide of an editor without loading it.
 
     Args:
         name_or_folder: name or folder of the editor, as :func:`load_editor` takes it.
 
     Raises:
-        InputError: no such editor or folder.
+        InputError: the editor or folder does not exist.
 
     Example:
         >>> guide_of("small-depth"), guide_of("small-plain")
@@ -180,17 +180,17 @@ def guide_of(name_or_folder: str) -> Guide:
 
 
 def kind_of(folder: Path) -> Any:
-    """The class of the editor in a folder, by the pipeline that its model_index.json names;
-    InstructPix2Pix where it names none.
+    """Find the editor class of a folder by the pipeline in its model_index.json;
+    InstructPix2Pix if the file names none.
 
     Raises:
-        InputError: a pipeline that no editor reads.
+        InputError: no editor reads the pipeline.
     """
     from attnwarp.editing.editors import kinds
     from attnwarp.editing.folder import pipeline_of
 
     known, named = kinds(), pipeline_of(folder)
-    # A UNet's folder may be of any pipeline of Stable Diffusion.
+    # A UNet's folder may belong to any Stable Diffusion pipeline.
     if named not in known and named is not None and not (folder / "unet").is_dir():
         raise InputError(
             f"{folder}: is of the pipeline {named!r}, which no editor reads; expected one of"
@@ -200,13 +200,13 @@ def kind_of(folder: Path) -> Any:
 
 
 def folders_of(name_or_folder: str) -> tuple[Path, Path | None]:
-    """An editor's folder, and its ControlNet's; None for an editor that is guided by pictures.
+    """Find the folders of an editor and of its ControlNet (None for a picture-guided editor).
 
     Args:
         name_or_folder: name or folder of the editor, as :func:`load_editor` takes it.
 
     Raises:
-        InputError: no such editor or folder.
+        InputError: the editor or folder does not exist.
 
     Example:
         >>> [folder.name for folder in folders_of("small-depth")]
@@ -228,7 +228,7 @@ def folders_of(name_or_folder: str) -> tuple[Path, Path | None]:
 
 
 def _pair(folders: str) -> tuple[Path, Path]:
-    """The two folders of ``BASE,CONTROLNET``."""
+    """Split ``BASE,CONTROLNET`` into its two folders."""
     parts = [part.strip() for part in folders.split(",")]
     if len(parts) != 2 or not all(parts):
         raise InputError(f"editor {folders!r}: expected two folders, BASE,CONTROLNET")
@@ -241,21 +241,21 @@ def _pair(folders: str) -> tuple[Path, Path]:
 
 @on_cpu_unless_named
 def load_editor(name_or_folder: str, **settings: Any) -> Editor:
-    """An editor by its name, such as "small-plain", or from folders in diffusers' format.
+    """Load an editor by name, such as "small-plain", or from folders in diffusers' format.
 
-    A folder with a folder ``controlnet`` in it gives a
-    :class:`~attnwarp.editing.editors.controlnet.DepthControlNet`; so do two folders.
+    A folder with a subfolder ``controlnet``, or a pair of folders, gives a
+    :class:`~attnwarp.editing.editors.controlnet.DepthControlNet`.
 
     Args:
-        name_or_folder: a bundled editor's name, a path, or "BASE,CONTROLNET", the paths of a
+        name_or_folder: name of a bundled editor, a path, or "BASE,CONTROLNET", the paths of a
             Stable Diffusion and of its ControlNet.
         settings: ``device``, ``dtype`` and the options of the editor's class, such as
-            ``text_guidance``. ``draws=False`` takes from a bundled editor what lets the noise's
-            mean choose an answer; ``low_memory=True`` is
+            ``text_guidance``. ``draws=False`` removes from a bundled editor the part by which the
+            noise's mean chooses an answer; ``low_memory=True`` calls
             :func:`attnwarp.editing.memory.save_memory`.
 
     Raises:
-        InputError: no such editor or folder, or files that are missing, by name.
+        InputError: the editor or folder does not exist, or files are missing (named).
 
     Example:
         >>> editor = load_editor("small-plain")

@@ -1,6 +1,6 @@
-"""The network of the bundled editors: diffusers' own UNet, which predicts the change of a picture.
+"""Network of the bundled editors: diffusers' UNet, predicting the change of a picture.
 
-It is a class of its own so that diffusers' pipelines load it from a folder as it is.
+It is a separate class so that diffusers' pipelines can load it from a folder unchanged.
 """
 
 from __future__ import annotations
@@ -11,47 +11,47 @@ from typing import Any
 import torch
 from diffusers import UNet2DConditionModel
 
-# diffusers' pipelines know a component's kind by the base class of that name in its module.
+# diffusers' pipelines identify a component by the base class of this name in its module.
 from diffusers.models.modeling_utils import ModelMixin  # noqa: F401
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from torch import Tensor
 
 ANSWERS = 64
-"""Number of answers that a noise can draw."""
+"""Number of answers that the noise can select."""
 
 
 SETTLED, OPEN = 850, 920
-"""Time steps (of 1000): below the first the noise draws nothing more, above the second all it can.
+"""Time steps (of 1000): below SETTLED the noise selects nothing, above OPEN it has full influence.
 
 In between the noisy picture itself comes to show the answer.
 """
 
 
 class EditUNet(UNet2DConditionModel):
-    """A conditional UNet whose output is added to the source picture's latents.
+    """Conditional UNet whose output is added to the source picture's latents.
 
     Half of the input channels are the noisy latents, the other half the latents of the picture
-    before the edit (InstructPix2Pix). Its prediction is the edited picture ("sample" in diffusers),
-    and most of that is the picture before.
+    before the edit (InstructPix2Pix). The network predicts the edited picture ("sample" in
+    diffusers), most of which equals the picture before.
 
-    Where the text leaves the answer open, the noise draws it: the mean of the noisy latents over
-    a region, seen together with the text, is added to the text's tokens. So the first step
-    settles the answer, as low frequencies of the noise do in large models, and cross-attention is
-    what the answer acts through.
+    If the text leaves the answer open, the noise selects it: a term computed from the text and the
+    mean of the noisy latents over a region is added to the text's tokens. So the first step settles
+    the answer, as low frequencies of the noise do in large models, and the answer acts through
+    cross-attention.
 
     Attributes:
-        draw: from the mean, at unit variance where all is noise, and the text's last token to what
-            is added to all tokens; None adds nothing.
-        region: (V, h, w) weights in [0, 1] of where the noise is pooled, for each view of a batch
-            of V views times branches: what is edited. None is the whole picture, as in training.
-            The sum is divided by the root of the summed squares, so that white noise keeps its
-            variance whatever the region. Where a region is empty the whole picture counts.
+        draw: network from the mean, at unit variance for pure noise, and the text's last token to
+            the term added to all tokens; None adds nothing.
+        region: (V, h, w) weights in [0, 1] of the edited region over which the noise is pooled,
+            for each view of a batch of V views times branches. None is the full picture, as in
+            training. The sum is divided by the root of the summed squares, so that white noise
+            keeps its variance for any region. An empty region counts as the full picture.
     """
 
     draw: torch.nn.Module | None
     region: Tensor | None = None
 
-    # diffusers reads the configuration's names from this signature; it has no types.
+    # diffusers reads the configuration's names from this untyped signature.
     @functools.wraps(UNet2DConditionModel.__init__)  # type: ignore[misc]
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)
@@ -69,11 +69,11 @@ class EditUNet(UNet2DConditionModel):
         """Run the base class with the source's latents (the second half of ``sample``) added.
 
         Args:
-            sample: (B, 2C, h, w).
+            sample: (B, 2C, h, w) noisy latents and latents of the source.
             timestep: timestep of the noisy latents.
             encoder_hidden_states: (B, L, D) tokens of the text.
             args, more: arguments of the base class.
-            return_dict: False gives a tuple.
+            return_dict: True returns an output object, False a tuple.
         """
         noisy, before = sample.split(self.config.out_channels, dim=1)
         if self.draw is not None:
@@ -90,7 +90,7 @@ class EditUNet(UNet2DConditionModel):
         return UNet2DConditionOutput(sample=result) if return_dict else (result,)
 
     def _pooled(self, noisy: Tensor) -> Tensor:
-        """(B, C) mean over the region at unit variance where all is white noise."""
+        """Average over the region, (B, C), scaled to unit variance for white noise."""
         if self.region is None:
             cells = noisy.shape[2] * noisy.shape[3]
             return noisy.mean(dim=(2, 3)) * cells**0.5

@@ -1,5 +1,5 @@
-"""Editors, one a file: a class with the decorator :func:`reads` is found by the folders that it
-reads (docs/project/extending.md).
+"""Editors, one per file: a class with the decorator :func:`reads` is found by its pipelines'
+folders (docs/project/extending.md).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ _kinds: dict[str, type[Any]] = {}
 
 
 def reads(*pipelines: str) -> Callable[[K], K]:
-    """Class decorator: ``from_folder`` of the class reads folders of these diffusers pipelines, by
-    the name in their model_index.json.
+    """Register a class whose ``from_folder`` reads folders of these diffusers pipelines, named in
+    their model_index.json.
     """
 
     def register(kind: K) -> K:
@@ -29,7 +29,7 @@ def reads(*pipelines: str) -> Callable[[K], K]:
 
 @cache
 def kinds() -> Mapping[str, type[Any]]:
-    """Classes of editors by the pipelines whose folders they read."""
+    """Map each pipeline to the editor class that reads its folders."""
     for module in pkgutil.iter_modules(__path__):
         importlib.import_module(f"{__name__}.{module.name}")
     return _kinds

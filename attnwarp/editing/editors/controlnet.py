@@ -1,4 +1,4 @@
-"""Depth ControlNet (Zhang et al. 2023): a depth map and a prompt give a picture."""
+"""Depth ControlNet (Zhang et al. 2023): a picture from a depth map and a prompt."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from attnwarp.editing.schedule import Time
 
 
 def control_image(depth: npt.NDArray[Any]) -> Image:
-    """(H, W, 3) float32 control picture of a depth map: 1 / (d + 1e-5) over its maximum.
+    """Convert a depth map to an (H, W, 3) float32 control picture: 1 / (d + 1e-5) over its maximum.
 
     Args:
-        depth: (H, W) along the optical axis; where it is NaN the picture is 0, as of nothing near.
-            A view that sees no surface has a black picture.
+        depth: (H, W) depth along the optical axis; NaN gives 0, the value of infinite depth. A view
+            without surface has a black picture.
 
     Example:
         >>> control_image(np.array([[1.0, 2.0, np.nan]]))[0, :, 0].round(3).tolist()
@@ -51,7 +51,7 @@ def control_image(depth: npt.NDArray[Any]) -> Image:
 def check_base(
     unet: Mapping[str, Any], text_encoder: Mapping[str, Any], vae: Mapping[str, Any]
 ) -> None:
-    """Refuse configurations that are not of one plain Stable Diffusion.
+    """Refuse configurations that do not form a plain Stable Diffusion model.
 
     Raises:
         ValueError: see :func:`attnwarp.editing.editor.check_networks`.
@@ -77,14 +77,14 @@ def check_controlnet(
 
 @reads("StableDiffusionControlNetPipeline")
 class DepthControlNet(Latent):
-    """An :class:`~attnwarp.editing.editor.Editor` over diffusers' own models.
+    """Depth-guided :class:`~attnwarp.editing.editor.Editor` of diffusers models.
 
     Args:
         unet, vae, text_encoder, tokenizer: networks and tokenizer of diffusers and
             transformers.
         scheduler: a DDIMScheduler.
-        controlnet: controlnet of diffusers, for depth.
-        text_guidance: s of e = e_un + s (e_txt - e_un); 1 turns it off, and the batch is a half.
+        controlnet: ControlNet of diffusers, for depth.
+        text_guidance: s of e = e_un + s (e_txt - e_un); 1 turns guidance off and halves the batch.
         control_scale: factor of the ControlNet's residuals.
         negative_prompt: negative prompt of the unconditional branch.
     """
@@ -120,21 +120,21 @@ class DepthControlNet(Latent):
     def from_folder(
         cls, folder: str | Path, controlnet: str | Path | None = None, **settings: Any
     ) -> DepthControlNet:
-        """An editor from local folders in diffusers' format; nothing is downloaded.
+        """Load an editor from local folders in diffusers' format; nothing is downloaded.
 
         Args:
-            folder: with unet, vae, text_encoder, tokenizer and scheduler.
-            controlnet: folder of the ControlNet, ``folder``/controlnet if left out.
+            folder: folder with unet, vae, text_encoder, tokenizer and scheduler.
+            controlnet: folder of the ControlNet, ``folder``/controlnet if omitted.
             settings: ``device``, ``dtype`` and the settings of this class.
 
         Raises:
-            InputError: files that are missing or of another kind, by name.
+            InputError: files are missing or of another kind; the message names them.
         """
         from attnwarp.editing.folder import config_of, load_controlnet, load_parts, named
 
         device, dtype = settings.pop("device", "cpu"), settings.pop("dtype", torch.float32)
         place = Path(folder) / "controlnet" if controlnet is None else Path(controlnet)
-        # Before any weights: those of a large model might not fit the memory.
+        # Checked before loading weights, since a large model might not fit the memory.
         words, vae = config_of(folder, "text_encoder"), config_of(folder, "vae")
         with named(folder):
             check_base(config_of(folder, "unet"), words, vae)
@@ -146,7 +146,7 @@ class DepthControlNet(Latent):
 
     @property
     def branches(self) -> tuple[str, ...]:
-        """The guidance branches in the order of the UNet's batch."""
+        """Guidance branches in the order of the UNet's batch."""
         return CONTROLNET_BRANCHES if self.text_guidance != 1 else ("text",)
 
     @property
@@ -160,7 +160,7 @@ class DepthControlNet(Latent):
         prompt: str,
         regions: Sequence[npt.NDArray[Any]] | None = None,
     ) -> ControlTask:
-        """A picture for each (H, W) depth map, by one prompt; regions change nothing."""
+        """Prepare one picture per (H, W) depth map, from one prompt; regions are ignored."""
         control = tensor_of([control_image(depth) for depth in guides], "guides", self.factor)
         control = control.to(self.unet.device, self.controlnet.dtype)
         views = len(control)
@@ -180,8 +180,8 @@ class ControlTask:
 
     Attributes:
         editor: editor with the networks.
-        text: (branches x B, L, D).
-        control: (branches x B, 3, H, W).
+        text: (branches x B, L, D) embeddings.
+        control: (branches x B, 3, H, W) control pictures.
         shape: (B, C, h, w) of the latents.
     """
 
@@ -192,11 +192,11 @@ class ControlTask:
 
     @property
     def branches(self) -> tuple[str, ...]:
-        """The guidance branches in the order of the UNet's batch."""
+        """Guidance branches in the order of the UNet's batch."""
         return self.editor.branches
 
     def predict(self, latents: Tensor, timestep: Time) -> Tensor:
-        """The guided output for (B, C, h, w) latents at a step."""
+        """Compute the guided output for (B, C, h, w) latents at a step."""
         editor = self.editor
         noisy = torch.cat([latents] * len(self.branches))
         step = torch.tensor(int(timestep), device=latents.device)

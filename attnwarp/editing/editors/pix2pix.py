@@ -1,4 +1,4 @@
-"""InstructPix2Pix (Brooks et al. 2023): a picture and an instruction give the edited picture."""
+"""InstructPix2Pix (Brooks et al. 2023): an edited picture from a picture and an instruction."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from attnwarp.editing.schedule import Time
 def check_pix2pix(
     unet: Mapping[str, Any], text_encoder: Mapping[str, Any], vae: Mapping[str, Any]
 ) -> None:
-    """Refuse configurations that are not of one InstructPix2Pix model.
+    """Refuse configurations that do not form an InstructPix2Pix model.
 
     Raises:
-        ValueError: see :func:`attnwarp.editing.editor.check_networks`; or a tiny autoencoder, whose
-            latents are scaled already, while the network takes those of a picture unscaled.
+        ValueError: see :func:`attnwarp.editing.editor.check_networks`; or the autoencoder is tiny:
+            its latents are always scaled, while the network needs a picture's unscaled ones.
     """
     if vae.get("_class_name") == "AutoencoderTiny":
         raise ValueError(
@@ -47,14 +47,14 @@ def check_pix2pix(
 
 @reads("StableDiffusionInstructPix2PixPipeline")
 class InstructPix2Pix(Latent):
-    """An :class:`~attnwarp.editing.editor.Editor` over diffusers' own models.
+    """Picture-guided :class:`~attnwarp.editing.editor.Editor` of diffusers models.
 
     Args:
         unet, vae, text_encoder, tokenizer: networks and tokenizer of diffusers and
             transformers.
         scheduler: a DDIMScheduler.
         text_guidance: s_T of e = e_un + s_T (e_txt - e_img) + s_I (e_img - e_un).
-        image_guidance: s_I. Guidance is off, and the batch a third, where s_T is 1 and s_I is 1.
+        image_guidance: s_I. With s_T = s_I = 1 guidance is off and the batch is a third.
     """
 
     guide: Guide = "picture"
@@ -83,26 +83,26 @@ class InstructPix2Pix(Latent):
 
     @classmethod
     def from_folder(cls, folder: str | Path, **settings: Any) -> InstructPix2Pix:
-        """An editor from a local folder in diffusers' format; nothing is downloaded.
+        """Load an editor from a local folder in diffusers' format; nothing is downloaded.
 
         Args:
-            folder: with unet, vae, text_encoder, tokenizer and scheduler.
+            folder: folder with unet, vae, text_encoder, tokenizer and scheduler.
             settings: ``device``, ``dtype``, ``text_guidance``, ``image_guidance``.
 
         Raises:
-            InputError: files that are missing or of another kind, by name.
+            InputError: files are missing or of another kind; the message names them.
         """
         from attnwarp.editing.folder import config_of, load_parts, named
 
         device, dtype = settings.pop("device", "cpu"), settings.pop("dtype", torch.float32)
-        # Before any weights: those of a large model might not fit the memory.
+        # Checked before loading weights, since a large model might not fit the memory.
         with named(folder):
             check_pix2pix(*(config_of(folder, name) for name in ("unet", "text_encoder", "vae")))
         return cls(**load_parts(folder, device=device, dtype=dtype), **settings)
 
     @property
     def branches(self) -> tuple[str, ...]:
-        """The guidance branches that run, in the order of the UNet's batch."""
+        """Active guidance branches, in the order of the UNet's batch."""
         return tuple(branch_shares(self.text_guidance, self.image_guidance))
 
     def task(
@@ -111,13 +111,14 @@ class InstructPix2Pix(Latent):
         prompt: str,
         regions: Sequence[npt.NDArray[Any]] | None = None,
     ) -> Pix2PixTask:
-        """An edit of (H, W, 3) pictures in [0, 1] by one instruction.
+        """Prepare an edit of (H, W, 3) pictures in [0, 1] by one instruction.
 
         Args:
             guides: the pictures.
             prompt: the instruction.
-            regions: (H, W) of each in [0, 1]: what is edited, over which a bundled editor's noise
-                draws what the instruction leaves open; None for all of it.
+            regions: (H, W) edited region of each picture in [0, 1]; a bundled editor averages its
+                noise there to settle choices that the instruction leaves open. None is the full
+                picture.
         """
         pictures = tensor_of(guides, "guides", self.factor)
         before = self.raw_latents(pictures)  # not scaled, as the model was trained
@@ -138,15 +139,15 @@ class InstructPix2Pix(Latent):
 
 
 def _on_grid(regions: Sequence[npt.NDArray[Any]], size: tuple[int, int]) -> Tensor:
-    """(B, h, w) shares of each latent's pixels that regions cover."""
+    """Compute the share of each latent's pixels covered by the regions, (B, h, w)."""
     rows = [torch.from_numpy(np.asarray(region, np.float32))[None, None] for region in regions]
     return torch.cat([torch.nn.functional.adaptive_avg_pool2d(row, size)[0] for row in rows])
 
 
 def branch_shares(text_guidance: float, image_guidance: float) -> dict[str, float]:
-    """The share that each guidance branch has in the output, without those that have none.
+    """Compute each guidance branch's coefficient in the output, omitting zero ones.
 
-    e_un + s_T (e_txt - e_img) + s_I (e_img - e_un), sorted by branch (Brooks et al. 2023, Eq. 3).
+    The output is e_un + s_T (e_txt - e_img) + s_I (e_img - e_un) (Brooks et al. 2023, Eq. 3).
 
     Example:
         >>> branch_shares(7.5, 1.5)
@@ -164,11 +165,11 @@ class Pix2PixTask:
 
     Attributes:
         editor: editor with the networks.
-        text: (branches x B, L, D).
-        before: (branches x B, C, h, w).
-        views: B.
-        shares: shares of the branches in the output, in the order of the UNet's batch.
-        region: (B, h, w) of what is edited, for :class:`attnwarp.editing.small_unet.EditUNet`.
+        text: (branches x B, L, D) embeddings.
+        before: (branches x B, C, h, w) latents of the pictures.
+        views: B, the number of views.
+        shares: coefficients of the branches in the output, in the order of the UNet's batch.
+        region: (B, h, w) edited region, for :class:`attnwarp.editing.small_unet.EditUNet`.
     """
 
     editor: InstructPix2Pix
@@ -180,7 +181,7 @@ class Pix2PixTask:
 
     @property
     def branches(self) -> tuple[str, ...]:
-        """The guidance branches in the order of the UNet's batch."""
+        """Guidance branches in the order of the UNet's batch."""
         return tuple(self.shares)
 
     @property
@@ -190,7 +191,7 @@ class Pix2PixTask:
         return self.views, c, h, w
 
     def predict(self, latents: Tensor, timestep: Time) -> Tensor:
-        """The guided output for (B, C, h, w) latents at a step."""
+        """Compute the guided output for (B, C, h, w) latents at a step."""
         editor = self.editor
         noisy = torch.cat([latents] * len(self.branches))
         step = torch.tensor(int(timestep), device=latents.device)
