@@ -1,5 +1,5 @@
-"""Warps: correspondences between two views, visibility from the source, and sampling. See
-docs/method/warping.md."""
+"""Warps: correspondences between two views, visibility from the source, and sampling;
+see docs/method/warping.md."""
 
 from attnwarp.warp.correspondence import (
     Correspondence,

@@ -1,9 +1,9 @@
 """Position of each pixel of a target in the source image.
 
 Coordinates are pixels with centres at +0.5, so an image spans [0, W] x [0, H], and a coordinate u
-of an image becomes exactly u * s in the image resized by s. A correspondence is worked out once for
-a pair of views, in float64; any number of feature maps, of any channel count, is then sampled along
-it.
+of an image becomes exactly u * s in the image resized by s. A correspondence is computed once per
+pair of views, in float64; any number of feature maps, of any channel count, can then be sampled
+along it.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from attnwarp.warp.settings import DepthInterpolation, PixelCenters
 class Correspondence:
     """Position of each pixel of a target grid in the source image.
 
-    Made by :func:`correspond`. Every tensor is float64.
+    Built by :func:`correspond`. Every tensor is float64.
 
     Args:
-        source, target: the cameras; their sizes are the sizes of the two grids.
-        xy: (H, W, 2) source pixels (centres at +0.5, whatever ``pixel_centers`` is); NaN where
+        source, target: cameras whose sizes are the sizes of the two grids.
+        xy: (H, W, 2) source pixels (centres at +0.5 for any ``pixel_centers``); NaN where
             undefined.
-        points: (H, W, 3) the surface points in the source camera's axes; NaN where the target's
-            depth is undefined.
+        points: (H, W, 3) surface points in the source camera's axes; NaN where the target's depth
+            is undefined.
         target_depth: (H, W) depth along the target's optical axis; NaN where undefined.
-        pixel_centers: the convention it was computed with, see :func:`correspond`.
-        in_front: points at and behind the source camera have no ``xy``.
+        pixel_centers: convention of the computation, see :func:`correspond`.
+        in_front: True leaves points at and behind the source camera without ``xy``.
 
     Example:
         >>> import numpy as np
@@ -72,30 +72,30 @@ class Correspondence:
 
     @property
     def sizes(self) -> str:
-        """(H, W) of the target and of the source, such as "(48, 64) <- (48, 64)"."""
+        """Describe (H, W) of target and source, such as "(48, 64) <- (48, 64)"."""
         target, source = ((c.height, c.width) for c in (self.target, self.source))
         return f"{target} <- {source}"
 
     @property
     def z(self) -> Tensor:
-        """(H, W) depth of the points in the source camera, of either sign; NaN without a target
+        """Depth of the points in the source camera, (H, W), of either sign; NaN without a target
         depth.
         """
         return self.points[..., 2]
 
     @property
     def defined(self) -> Tensor:
-        """(H, W) bool: pixels that have a source position."""
+        """Mask of the pixels with a source position, (H, W) bool."""
         return torch.isfinite(self.xy).all(dim=-1)
 
     @property
     def target_points(self) -> Tensor:
-        """(H, W, 3) the same surface points in the target camera's axes."""
+        """Surface points in the target camera's axes, (H, W, 3)."""
         return _directions(self.target, self.pixel_centers) * self.target_depth[..., None]
 
 
 def share_of(mask: Tensor) -> str:
-    """Share of a mask that is True, such as "48 %"."""
+    """Format the True share of a mask, such as "48 %"."""
     return f"{100 * float(mask.double().mean()):.0f} %"
 
 
@@ -110,22 +110,22 @@ def correspond(
     """Locate each target pixel's surface point in the source image.
 
     The pixel is unprojected with its depth, moved by the relative pose of the cameras, and
-    projected. The pose is formed from the difference of the cameras' centres, so that far-away
-    worlds and tiny baselines keep their digits.
+    projected. The pose uses the difference of the cameras' centres, so far-away worlds and tiny
+    baselines keep their digits.
 
     Args:
         source, target: cameras in one world.
         target_depth: (H, W) depth along the target's optical axis, of the target's size. Zero,
             negative, infinite and NaN depths are undefined: they are masked, never filled.
-        pixel_centers: "half" puts the centre of pixel j at j + 0.5. "integer" reproduces a slip of
-            the published code: pixel j, whose depth was sampled at j + 0.5, is unprojected at j,
+        pixel_centers: "half" puts the centre of pixel j at j + 0.5. "integer" reproduces an error
+            of the published code: pixel j, whose depth was sampled at j + 0.5, is unprojected at j,
             and the projection u is read as the index u, which is the position u + 0.5. The error is
-            a fraction of a pixel of the grid the cameras have.
-        in_front: leave points at and behind the source camera without a position. False reproduces
-            warps that lack the test: such points project through the centre, upside down.
+            a fraction of a pixel of the cameras' grid.
+        in_front: True leaves points at and behind the source camera without a position. False
+            reproduces warps that lack the test: such points project upside down through the centre.
 
     Raises:
-        ValueError: the depth has another size than ``target``, or is not of a floating type.
+        ValueError: the depth's size differs from ``target``, or its type is not floating.
 
     Example:
         >>> import numpy as np
@@ -152,7 +152,7 @@ def correspond(
     points = camera_points @ pose[:3, :3].T + pose[:3, 3]
     z = points[..., 2]
     usable = (z > 0) if in_front else (z != 0) & torch.isfinite(z)
-    # Masked before the divide: a point in the plane of the camera centre has no position at all.
+    # Masked before the division: a point in the camera centre's plane has no position.
     normalised = points / torch.where(usable, z, torch.nan)[..., None]
     xy = (normalised @ torch.from_numpy(source.K.copy()).T)[..., :2]
     if pixel_centers == "integer":
@@ -173,19 +173,19 @@ def correspond_at(
     interpolation: DepthInterpolation = "inverse",
     spread: float | None = TAP_SPREAD,
 ) -> Correspondence:
-    """The correspondence of a feature grid: cameras resized, depth taken to the centres of the
-    grid's pixels.
+    """Compute the correspondence of a feature grid: resize the cameras and interpolate depth at the
+    centres of the grid's pixels.
 
     Args:
         source, target, target_depth, pixel_centers, in_front: as in :func:`correspond`, at image
             size.
         size: (h, w) of the target's feature grid.
-        source_size: (h, w) of the source's; by default the source image scaled as the target's is.
+        source_size: (h, w) of the source's grid; by default scaled like the target's.
         interpolation, spread: as in :func:`resize_depth`.
 
     Raises:
-        ValueError: as :func:`correspond`, :func:`layer_size`, and a size that is no pair of whole
-            numbers from 1.
+        ValueError: as :func:`correspond` and :func:`layer_size`, or the size is not a pair of
+            positive integers.
 
     Example:
         >>> import numpy as np
@@ -215,12 +215,12 @@ def correspond_at(
 
 
 def layer_size(source: Camera, target: Camera, size: tuple[int, int]) -> tuple[int, int]:
-    """(h, w) of the source's feature grid when the target's is ``size``, at the same fraction of
-    the image.
+    """Compute (h, w) of the source's feature grid for a target grid of ``size``, at the same
+    fraction of the image.
 
     Raises:
-        ValueError: a size that is no pair of whole numbers from 1, or that does not give whole
-            numbers.
+        ValueError: the size is not a pair of positive integers, or the source's size would not be
+            integers.
 
     Example:
         >>> import numpy as np
@@ -241,10 +241,10 @@ def layer_size(source: Camera, target: Camera, size: tuple[int, int]) -> tuple[i
 
 
 def in_bounds(correspondence: Correspondence, size: tuple[int, int] | None = None) -> Tensor:
-    """(H, W) bool: the position lies inside an image of ``size`` (h, w), by default the source's.
+    """Mask positions inside an image of ``size`` (h, w), by default the source's, (H, W) bool.
 
-    With half centres that is 0 <= x <= W. With integer centres the method takes the index for the
-    position, so it is the index that is held against 0 <= u < W.
+    With half centres the test is 0 <= x <= W. With integer centres the method confuses index and
+    position, so the test is 0 <= u < W on the index.
 
     Example:
         >>> import numpy as np
@@ -274,7 +274,7 @@ def _directions(camera: Camera, pixel_centers: str) -> Tensor:
 
 
 def check_proportions(size: Sequence[int], camera: Camera, name: str) -> None:
-    """Raise ValueError unless a map of ``size`` (h, w) can show a camera's whole view."""
+    """Raise ValueError unless a map of ``size`` (h, w) has the camera's aspect ratio."""
     check.same_aspect(
         (size[0], size[1]),
         (camera.height, camera.width),
@@ -284,7 +284,7 @@ def check_proportions(size: Sequence[int], camera: Camera, name: str) -> None:
 
 
 def positions_in(correspondence: Correspondence, width: int, height: int) -> Tensor:
-    """(H, W, 2) positions in an image of another size on the source's view."""
+    """Convert positions to a source image of another size, (H, W, 2)."""
     source = correspondence.source
     if correspondence.pixel_centers == "integer":
         scale = torch.tensor(

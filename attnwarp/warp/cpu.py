@@ -1,7 +1,7 @@
-"""The kernels of the CPU on tensors: pairs of views, and differentiable sampling.
+"""CPU kernels on tensors: pairs of views, and differentiable sampling.
 
-Threads follow ``torch.set_num_threads``, as the renderer's do; the result has the same bits for any
-number of them.
+Threads follow ``torch.set_num_threads``, as in the renderer; the result has the same bits for any
+number of threads.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from attnwarp.warp.settings import DepthInterpolation, MaskResize, WarpSettings
 from attnwarp.warp.taps import SNAP, Taps
 
 PIECE = 1 << 16
-"""Values that one job writes, about: a few hundred kilobytes, which stay in the cache."""
+"""Approximate number of values written by one job: a few hundred kilobytes, which fit the cache."""
 CHANNELS = 64
-"""Channels of one job of a gradient: whole cache lines."""
+"""Number of channels of one gradient job: complete cache lines."""
 _STORED = {torch.float16: np.uint16, torch.bfloat16: np.int16}
 
 
@@ -43,14 +43,14 @@ def correspond_and_mask(
     """Compute the correspondence and the rules that have a kernel, in one pass over the pixels.
 
     Args:
-        source, target: the cameras.
-        parts: parts of both surfaces, by :func:`attnwarp.warp.rules.parts_of`; pictures were
-            checked.
-        rules: those of the settings.
-        settings: the choices.
+        source, target: cameras of the pair.
+        parts: parts of both surfaces, by :func:`attnwarp.warp.rules.parts_of`, with checked
+            pictures.
+        rules: active rules of the settings.
+        settings: settings of the warp.
 
     Returns:
-        The correspondence, the (H, W) mask of each rule that has a kernel, and the mask of all.
+        Correspondence, the (H, W) mask of each rule with a kernel, and their conjunction.
     """
     size = (target.height, target.width)
     kernels = [rule for name in pair.RULES for rule in RULES if rule.name == name]
@@ -83,12 +83,12 @@ def correspond_layer(
     target_depth: Tensor,
     settings: WarpSettings,
 ) -> Correspondence:
-    """:func:`attnwarp.warp.correspond_at` by kernels.
+    """Compute :func:`attnwarp.warp.correspond_at` by kernels.
 
     Args:
-        source, target: the cameras of the feature grids.
+        source, target: cameras of the feature grids.
         target_depth: (H, W) float64 depth of the target's image.
-        settings: the choices; ``depth_interpolation`` and ``depth_spread`` among them.
+        settings: settings of the warp, with ``depth_interpolation`` and ``depth_spread``.
     """
     positions = _positions((target.height, target.width))
     views = _pair(source, target, settings)
@@ -105,7 +105,7 @@ def correspond_layer(
 
 
 def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize, defined: Tensor) -> Tensor:
-    """:func:`attnwarp.warp.resize_mask` by kernels, and ``defined``, both (h, w)."""
+    """Compute :func:`attnwarp.warp.resize_mask` by kernels and intersect ``defined``, (h, w)."""
     rows, columns = _axis(size[0], mask.shape[0], mode), _axis(size[1], mask.shape[1], mode)
     result = _pool.empty(size, np.bool_)
     run_jobs(
@@ -121,7 +121,7 @@ def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize, defined: 
 def taps_at(
     correspondence: Correspondence, size: tuple[int, int], dtype: torch.dtype, device: torch.device
 ) -> Taps:
-    """:func:`attnwarp.warp.sampling.taps_at` by kernels; ``device`` is the host's memory."""
+    """Compute :func:`attnwarp.warp.sampling.taps_at` by kernels; ``device`` must be the CPU."""
     xy = correspondence.xy.contiguous().numpy()
     shape = (4, *xy.shape[:2])
     index = _pool.empty(shape, np.int32)
@@ -135,14 +135,14 @@ def taps_at(
 
 
 def sample_maps(maps: Tensor, taps: Taps) -> Tensor:
-    """:func:`attnwarp.warp.sampling.sample_maps` by kernels."""
+    """Compute :func:`attnwarp.warp.sampling.sample_maps` by kernels."""
     planes = maps.reshape(-1, maps.shape[-1])
     result: Tensor = _SampleMaps.apply(planes, taps)
     return result.reshape(*maps.shape[:-1], taps.index.shape[1])
 
 
 def sample_tokens(tokens: Tensor, taps: Taps) -> Tensor:
-    """:func:`attnwarp.warp.sampling.sample_tokens` by kernels, in the type of the tokens."""
+    """Compute :func:`attnwarp.warp.sampling.sample_tokens` by kernels, in the tokens' dtype."""
     result: Tensor = _SampleTokens.apply(tokens, taps)
     return result
 
@@ -207,7 +207,7 @@ def _pieces(tokens: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _values(tensor: Tensor) -> np.ndarray:
-    """The tensor's own memory where it is contiguous, half precision as integers."""
+    """View a tensor as numpy (a copy unless contiguous), half precision as integers."""
     tensor = tensor.detach().contiguous()
     stored = _STORED.get(tensor.dtype)
     return tensor.numpy() if stored is None else tensor.view(torch.int16).numpy().view(stored)
@@ -283,7 +283,7 @@ def _correspondence(
 def _views(
     source: Camera, maps: Mapping[str, Array], size: tuple[int, int]
 ) -> tuple[pair.View, pair.View]:
-    """Maps of target and source that the rules read: all float32, or all float64."""
+    """Collect the target's and source's maps read by the rules: all float32 or all float64."""
     arrays = {name: _floating(value, name) for name, value in maps.items()}
     for name, array in arrays.items():
         view, _, part = name.partition("_")

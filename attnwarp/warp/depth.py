@@ -1,4 +1,4 @@
-"""Depth maps: what counts as a depth, and depth between the centres of pixels."""
+"""Depth maps: validity, interpolation between pixel centres, and slope."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array: TypeAlias = Tensor | npt.NDArray[Any]
 
 
 TAP_SPREAD = 0.02
-"""Depth taps whose largest exceeds the smallest by more than this fraction straddle an edge and are
+"""Relative spread of depth taps, largest over smallest, beyond which they straddle an edge and are
 not blended.
 
 Rejecting at 2 % left 0 wrong labels of the 0.1 % to 10.8 % that a z-buffer gave without it, in a
@@ -33,23 +33,23 @@ def resize_depth(
     interpolation: DepthInterpolation = "inverse",
     spread: float | None = TAP_SPREAD,
 ) -> Tensor:
-    """A depth map at the centres of another grid's pixels.
+    """Interpolate a depth map at the pixel centres of another grid.
 
     Args:
         depth: (H, W) depth along the optical axis.
-        size: (h, w) of the grid; its pixel (i, j) has its centre at ((j + 0.5) W / w, (i + 0.5) H /
-            h).
+        size: (h, w) of the grid; the centre of its pixel (i, j) is at ((j + 0.5) W / w,
+            (i + 0.5) H / h).
         interpolation: "inverse" is bilinear in 1 / z, exact on a plane at any slant; "bilinear" is
-            bilinear in z; "nearest" takes the pixel that holds the centre.
-        spread: reject (NaN) taps of which the largest exceeds the smallest by more than this
-            fraction; None blends.
+            bilinear in z; "nearest" takes the pixel that contains the centre.
+        spread: relative spread, largest over smallest, above which taps are rejected (NaN); None
+            always blends.
 
     Returns:
-        (h, w) float64, NaN where a tap that counts is undefined or where the taps were rejected.
+        (h, w) float64, NaN if a tap of nonzero weight is undefined or the taps were rejected.
 
     Raises:
-        ValueError: a depth of another shape or type, or a size that is no pair of whole numbers
-            from 1.
+        ValueError: the depth has a wrong shape or type, or the size is not a pair of positive
+            integers.
 
     Example:
         >>> import torch
@@ -68,7 +68,7 @@ def resize_depth(
 
 
 def as_tensor(value: Array, name: str) -> Tensor:
-    """Floating values as a detached tensor, which shares their memory where torch can read it.
+    """Convert floating values to a detached tensor, sharing memory if torch can read it.
 
     Raises:
         ValueError: the values are not of a floating type.
@@ -81,7 +81,7 @@ def as_tensor(value: Array, name: str) -> Tensor:
 
 
 def as_float64(value: Array, name: str) -> Tensor:
-    """Floating values as a detached float64 tensor on the CPU.
+    """Convert floating values to a detached float64 tensor on the CPU.
 
     Raises:
         ValueError: the values are not of a floating type.
@@ -90,15 +90,15 @@ def as_float64(value: Array, name: str) -> Tensor:
 
 
 def valid_depth(value: Array, name: str) -> Tensor:
-    """(H, W) float64 depth, NaN where it is zero, negative or infinite."""
+    """Convert depth to (H, W) float64; zero, negative and infinite values become NaN."""
     depth = as_float64(value, name)
     check.shape(depth, ("H", "W"), name)
     return torch.where((depth > 0) & torch.isfinite(depth), depth, torch.nan)
 
 
 def blend_depth(depth: Tensor, xy: Tensor, interpolation: str, spread: float | None) -> Tensor:
-    """Depth (NaN where undefined) at finite positions; NaN where taps are undefined or spread too
-    far.
+    """Interpolate depth (NaN where undefined) at finite positions; NaN if taps are undefined or
+    spread too far.
     """
     check.one_of(interpolation, get_args(DepthInterpolation), "interpolation")
     h, w = depth.shape
@@ -121,12 +121,12 @@ def blend_depth(depth: Tensor, xy: Tensor, interpolation: str, spread: float | N
 
 
 def depth_slope(depth: Array) -> Tensor:
-    """Depth's change per pixel: the smaller one-sided |dz| of each axis, summed over the axes.
+    """Compute the depth slope per pixel: the smaller one-sided |dz| of each axis, summed over axes.
 
-    The smaller side is the surface's own where the other one steps off an edge.
+    The smaller side follows the surface if the other side crosses an edge.
 
     Args:
-        depth: (H, W), undefined where it is NaN, zero, negative or infinite.
+        depth: (H, W) depth; NaN, zero, negative and infinite values are undefined.
 
     Returns:
         (H, W) float64; an axis without a defined neighbour adds 0, an undefined pixel gives NaN.
@@ -137,7 +137,7 @@ def depth_slope(depth: Array) -> Tensor:
         >>> depth_slope(torch.tensor([[1.0, 1.5, 2.0, 9.0]])).tolist()
         [[0.5, 0.5, 0.5, 7.0]]
     """
-    # A hole coded 0 would be a slope of z, and the tolerance of depth agreement as large.
+    # A hole coded 0 would give a slope of z, and depth agreement an equally large tolerance.
     z = valid_depth(depth, "depth")
     slope = torch.zeros_like(z)
     for axis in (0, 1):

@@ -1,4 +1,4 @@
-"""The warp of one feature size: feature maps and attention tokens."""
+"""Warp of one feature size: feature maps and attention tokens."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from attnwarp.warp.correspondence import Correspondence
 from attnwarp.warp.taps import Taps
 
 Backend: TypeAlias = Literal["auto", "reference"]
-"""Backend that computes a warp: "reference" is the definition in torch, on any device. "auto" takes
-the kernels (:mod:`attnwarp.warp.cpu`) for what lies in the host's memory, and torch elsewhere.
+"""Backend that computes a warp: "reference" is the definition in torch, on any device. "auto" uses
+the kernels (:mod:`attnwarp.warp.cpu`) for CPU tensors, and torch elsewhere.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureWarp:
-    """The warp at one feature size.
+    """Warp at one feature size.
 
-    Taps and weights are made once for a size, a device and a type: the warp of a layer copies
+    Taps and weights are built once per size, device and dtype, so the warp of a layer copies
     nothing to or from the host.
 
     Args:
-        correspondence: on the target's feature grid of H x W, into the source's of h x w.
-        mask: (H, W) bool, where the warped features count.
+        correspondence: map from the target's H x W feature grid into the source's h x w grid.
+        mask: (H, W) bool, True where the warped features count.
         backend: "auto" or "reference"; both give the same bits.
 
     Example:
@@ -51,47 +51,47 @@ class FeatureWarp:
 
     @cached_property
     def weight(self) -> Tensor:
-        """(H W, 1) float32: 1 in the mask, 0 elsewhere."""
+        """Weight (H W, 1) float32: 1 inside the mask, 0 elsewhere."""
         return self.mask.reshape(-1, 1).float()
 
     def warp(self, features: Tensor | np.ndarray[Any, Any]) -> Tensor:
-        """Target features (C, H, W) or (B, C, H, W) from the source's.
+        """Warp source features to the target, (C, H, W) or (B, C, H, W).
 
         Args:
             features: (C, h, w) or (B, C, h, w) floating, of any size with the aspect ratio of the
                 source's grid: :func:`attnwarp.warp.sample`.
 
         Returns:
-            In the type of ``features``; 0 where a pixel has no position in the source, NaN where it
-            reads one. NaN stands for undefined and is never filled.
+            Features in the dtype of ``features``; 0 for a pixel without a source position, NaN for
+            a pixel that reads a NaN: NaN means undefined and is never filled.
 
         Raises:
-            ValueError: another number of axes, another aspect ratio, or a type that cannot be
+            ValueError: the number of axes or the aspect ratio is wrong, or the dtype cannot be
                 blended.
         """
         if isinstance(features, np.ndarray):
             features = torch.from_numpy(np.ascontiguousarray(features))
         check.instance(features, Tensor, "features", "torch.Tensor")
         if features.ndim not in (3, 4) or not features.dtype.is_floating_point:
-            return sampling.sample(features, self.correspondence)[0]  # says what is wrong
+            return sampling.sample(features, self.correspondence)[0]  # raises the error
         self._check_size(features)
         taps = self._taps_for(features, *features.shape[-2:])
         warped = self._engine(features).sample_maps(features.flatten(-2), taps)
         return warped.unflatten(-1, tuple(self.mask.shape))
 
     def warp_tokens(self, source: check.Array) -> Tensor:
-        """The source's tokens, warped to the target's grid.
+        """Warp the source's tokens to the target's grid.
 
         Args:
-            source: (B, h*w, C) floating, row by row of the source's feature grid. The gradient
+            source: (B, h*w, C) floating tokens, row by row of the source's grid. The gradient
                 flows back through the result.
 
         Returns:
-            (B, H*W, C) in the source's type, 0 where a pixel has no position in the source. An edit
-            blends them into the target's own: :func:`attnwarp.methods.attention_warping.blend`.
+            (B, H*W, C) in the source's dtype, 0 for a pixel without a source position. An edit
+            blends them into the target's tokens: :func:`attnwarp.methods.attention_warping.blend`.
 
         Raises:
-            ValueError: another shape than the source grid's, or a type that cannot be blended.
+            ValueError: the shape differs from the source grid, or the dtype cannot be blended.
 
         Example:
             >>> import numpy as np, torch
@@ -124,10 +124,10 @@ class FeatureWarp:
         check.same_aspect((h, w), (camera.height, camera.width), "features", remedy)
 
     def _engine(self, features: Tensor) -> Any:
-        """The module that samples: kernels or torch."""
+        """Choose the sampling module: kernels or torch."""
         if self.backend == "reference" or features.device.type != "cpu":
             return sampling
-        # numba takes its time to import.
+        # numba is slow to import.
         from attnwarp.warp import cpu
 
         return cpu

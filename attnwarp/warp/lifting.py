@@ -1,8 +1,8 @@
-"""Masks lifted through splats: what masks of a few views mark, in any other view.
+"""Masks lifted through splats: from masks of a few views to the mask of any other view.
 
-A splat takes part in a mask by the share of its weight that lies on marked pixels. Splats that no
-mask's view sees follow from their neighbours: they get the chance that a random walk over splats
-near in position, normal and colour meets what is marked first (Grady, "Random Walks for Image
+A splat's membership in a mask is the share of its weight on marked pixels. Splats seen by no masked
+view follow their neighbours: they get the probability that a random walk over splats near in
+position, normal and colour reaches a marked splat first (Grady, "Random Walks for Image
 Segmentation", PAMI 2006).
 """
 
@@ -25,35 +25,35 @@ from attnwarp.render import Render, render
 from attnwarp.warp.view import near_plane
 
 NEIGHBORS = 16
-"""Splats that each is tied to."""
+"""Number of neighbours to which each splat is tied."""
 
 COLOR_SPREAD, NORMAL_SPREAD = 0.1, 0.3
 """Difference of two splats' sRGB colours, and the sine of the angle between their normals, at which
-their tie is exp(-1/2) as strong as that of equal ones."""
+their tie is exp(-1/2) as strong as the tie of equal splats."""
 
 SEEN = 0.1
-"""Least share of its own footprint that a splat shows where its votes count. Less shines through
-what stands in front, or is the rim of a splat that peeks out behind a thing's outline."""
+"""Smallest visible share of a splat's footprint for its votes to count. A smaller share shines
+through an occluder, or is the rim of a splat behind an object's outline."""
 
 TRUST = 30.0
-"""Strength of the votes of a splat that shows all of itself, in strongest ties."""
+"""Strength of a fully visible splat's votes, in units of the strongest tie."""
 
 OPPOSED = 0.25
-"""Least distance from 1/2 of two views' votes on one splat that contradict each other."""
+"""Smallest distance from 1/2 of two views' votes on a splat that count as contradictory."""
 
 
 @dataclass(frozen=True, eq=False)
 class LiftedMask:
-    """Part of a scene of N splats that masks of a few views mark; :func:`lift_masks` makes it.
+    """Part of a scene of N splats marked by masks of a few views; built by :func:`lift_masks`.
 
     Attributes:
-        membership: (N,) float64 in [0, 1]: how far each splat belongs to what is marked.
-        seen: (N,) bool: shown by a mask's view, so that its votes decide.
-        reached: (N,) bool: seen, or tied to seen splats; the others are left out (membership 0).
-        disputed: (N,) bool: seen by several masks' views, of which one says it belongs and one
-            says it does not.
-        agreement: for each mask, the intersection over union of it and of this, rendered there; NaN
-            where both are empty.
+        membership: (N,) float64 in [0, 1]: each splat's membership in the marked part.
+        seen: (N,) bool: splats visible in a masked view, whose votes decide.
+        reached: (N,) bool: splats seen, or tied to seen ones; all others get membership 0.
+        disputed: (N,) bool: splats seen by several masked views whose votes contradict each
+            other.
+        agreement: for each mask, its intersection over union with the rendered membership; NaN if
+            both are empty.
 
     Example:
         >>> import numpy as np, torch
@@ -78,9 +78,9 @@ class LiftedMask:
     agreement: tuple[float, ...]
 
     def render(self, camera: Camera) -> npt.NDArray[np.float32]:
-        """(H, W) in [0, 1]: how much of what a pixel shows is marked; above 1/2 is inside.
+        """Render the marked share of each pixel, (H, W) in [0, 1]; above 1/2 is inside.
 
-        0 where nothing is drawn.
+        Pixels without splats are 0.
         """
         return _shown(self.gaussians, self.membership, camera, self.near, self.backend)
 
@@ -94,28 +94,29 @@ def lift_masks(
     near: float | None = None,
     backend: str = "auto",
 ) -> LiftedMask:
-    """Lift masks of one or a few views of one thing through splats.
+    """Lift masks of one object in one or a few views through splats.
 
-    A splat's vote is the mean of the mask over its pixels, weighed by how much of each it makes up.
-    That mean is one derivative: of sum(mask * picture) in a value that the splat is drawn with. The
-    memberships x minimise sum_i c_i (x_i - vote_i)^2 + sum_ij t_ij (x_i - x_j)^2: c grows with how
-    much of its own footprint a splat shows, and t ties neighbours that are alike in normal and
-    colour. So seen splats keep their votes, and unseen ones get the chance that a random walk from
-    them ends at what is marked.
+    A splat's vote is the mean of the mask over its pixels, weighed by its contribution to each.
+    That mean is one derivative: of sum(mask * picture) with respect to a value drawn with the
+        splat. The
+    memberships x minimise sum_i c_i (x_i - vote_i)^2 + sum_ij t_ij (x_i - x_j)^2: c grows with the
+    visible share of a splat's footprint, and t ties neighbours that are alike in normal and colour.
+    So seen splats keep their votes, and unseen ones get the probability that a random walk from
+    them ends at a marked splat.
 
     Args:
         gaussians: N splats of kind "2d" or "3d".
         cameras: cameras of the masked views.
         masks: (h, w) of each view, bool or floating in [0, 1], of the camera's aspect ratio at any
-            size. What none of them marks is outside, so a mask marks all of the thing that its view
-            shows.
-        near: near-plane depth, in scene units; in each view a hundredth of the splats' median
-            distance if left out.
+            size. Everything unmarked is outside, so each mask must cover the object's visible part
+            completely.
+        near: near-plane depth, in scene units; by default a hundredth of the splats' median
+            distance in each view.
         backend: renderer name, as for :func:`attnwarp.render.render`.
 
     Raises:
-        ValueError: no masks, another number of cameras, or a mask of another shape, type or range;
-            the message names it.
+        ValueError: no masks, a wrong number of cameras, or a mask of wrong shape, type or range;
+            the message names the argument.
 
     Example:
         A wall of two colours: the mask of its left half, seen from the front, from the side.
@@ -200,7 +201,7 @@ def _votes(
     near: float | None,
     backend: str,
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """(N,) sum over counted pixels of w_i mask, and of w_i."""
+    """Sum w_i mask, and w_i, over counted pixels, (N,) each."""
     values = torch.zeros(
         len(splats), 2, dtype=torch.float32, device=splats.means.device, requires_grad=True
     )
@@ -213,10 +214,10 @@ def _votes(
 
 
 def _counted(mask: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
-    """(h, w) bool: pixels whose votes count: all but those along a mask's outline.
+    """Select the pixels whose votes count, (h, w) bool: all but those along a mask's outline.
 
-    There splats of both sides show, whose rims peek out. The inside of what is too thin to have
-    anything but an outline counts.
+    Splats of both sides appear at an outline with protruding rims. The inside of a part too thin to
+    have anything but an outline counts.
     """
     import cv2
 
@@ -249,11 +250,10 @@ def _picture(
 
 
 def footprints(splats: Gaussians, camera: Camera) -> npt.NDArray[np.float64]:
-    """(N,) px of each splat's opacity summed over a picture in which nothing hides it.
+    """Sum each splat's unoccluded opacity over a picture, (N,) px.
 
-    2 pi opacity sqrt(det S), S the covariance that the splat's has where it is projected (EWA
-    splatting, Zwicker et al. 2001) with the screen filter added. 1 where a splat lies behind the
-    camera.
+    The sum is 2 pi opacity sqrt(det S), with S the splat's projected covariance (EWA splatting,
+    Zwicker et al. 2001) plus the screen filter. A splat behind the camera gets 1.
 
     Example:
         >>> import torch
@@ -284,7 +284,7 @@ def footprints(splats: Gaussians, camera: Camera) -> npt.NDArray[np.float64]:
 def _settled(
     splats: Gaussians, vote: npt.NDArray[np.float64], trust: npt.NDArray[np.float64]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    """Memberships that votes and ties settle on; whether a splat is tied to any that is seen."""
+    """Solve for memberships from votes and ties; flag the splats tied to any seen splat."""
     from scipy.sparse import diags
     from scipy.sparse.csgraph import connected_components
     from scipy.sparse.linalg import cg
@@ -294,7 +294,7 @@ def _settled(
     reached = np.isin(part, np.unique(part[trust > 0]))
     if not (vote * trust).any():
         return np.zeros(len(vote)), reached
-    # What no vote reaches is held at 0, so that the system has one solution.
+    # Splats that no vote reaches are fixed at 0, so that the system has one solution.
     held = np.where(reached, trust, 1.0)
     degree = np.asarray(ties.sum(axis=1)).ravel()
     system = diags(degree + held) - ties
@@ -306,7 +306,7 @@ def _settled(
 
 
 def _ties(splats: Gaussians) -> Any:
-    """(N, N) sparse symmetric ties of neighbours, in [0, 1]."""
+    """Compute sparse symmetric ties of neighbours, (N, N) in [0, 1]."""
     from scipy.sparse import coo_array
     from scipy.spatial import cKDTree
 
@@ -321,7 +321,7 @@ def _ties(splats: Gaussians) -> Any:
     reach = np.median(distance, axis=1)
     crowded = reach == 0
     if crowded.any():
-        # Copies at one place are spaced as the places are; any length will do where there is one.
+        # Coincident copies use the spacing of distinct places; a single place allows any length.
         places = np.unique(place, axis=0)
         k = min(NEIGHBORS, len(places) - 1)
         apart, _ = cKDTree(places).query(place[crowded], k=k + 1)

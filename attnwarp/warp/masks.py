@@ -14,20 +14,20 @@ from attnwarp.warp.settings import MaskResize
 
 
 def resize_mask(mask: check.Array, size: tuple[int, int], mode: MaskResize = "area") -> Tensor:
-    """A mask on another grid; more than half counts.
+    """Resize a mask to another grid; a pixel covered by more than half is True.
 
     Args:
-        mask: (H, W) bool.
-        size: (h, w) of the other grid.
+        mask: (H, W) bool mask.
+        size: (h, w) of the new grid.
         mode: "area" weighs every mask pixel by its overlap with the new pixel; "bilinear" reads the
-            4 pixels around the new centre; "nearest" the one that holds it.
+            4 pixels around the new centre; "nearest" the pixel that contains the new centre.
 
     Returns:
         (h, w) bool.
 
     Raises:
-        ValueError: a mask of another shape or type, a size that is no pair of whole numbers from
-            1, or another mode.
+        ValueError: the mask has a wrong shape or type, the size is not a pair of positive integers,
+            or the mode is unknown.
 
     Example:
         >>> import torch
@@ -44,13 +44,13 @@ def resize_mask(mask: check.Array, size: tuple[int, int], mode: MaskResize = "ar
     rows = axis_weights(h, mask.shape[0], mode)
     columns = axis_weights(w, mask.shape[1], mode)
     share = rows @ mask.double().cpu() @ columns.T
-    # Half of a pixel is not more than half, whatever the last bit of the sum says.
+    # Exactly half of a pixel must not count, even if the sum's rounding exceeds a half.
     return (share > 0.5 + 1e-9).to(mask.device)
 
 
 @functools.lru_cache(maxsize=32)
 def axis_weights(new: int, old: int, mode: MaskResize) -> Tensor:
-    """(new, old) float64 shares of each old pixel of an axis in each new one; not to be written."""
+    """Compute the share of each old pixel in each new one, (new, old) float64; read-only."""
     weigh: Callable[[int, int], Tensor] = {
         "area": _area_weights,
         "bilinear": _linear_weights,

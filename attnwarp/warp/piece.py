@@ -1,4 +1,4 @@
-"""Piece of surface around a point of a picture: what depth parts from it is another thing."""
+"""Connected surface around a point of a picture, bounded by steps in depth."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from attnwarp.gaussians import Gaussians
 from attnwarp.warp.view import render_surface
 
 STEP = 0.02
-"""Distance of a neighbour's point from a pixel's tangent plane, of its depth, that parts them."""
+"""Distance of a neighbour from a pixel's tangent plane, over its depth, that separates the two."""
 
 FLAT, LEVEL = 0.01, 0.7
-"""Limits of the largest plane: distance from it, of the median depth, and least cosine."""
+"""Limits of the largest plane: distance over the median depth, and smallest cosine of normals."""
 
 DRAWN, TRIED = 10_000, 300
-"""Pixels that vote for the largest plane, and those whose planes are tried."""
+"""Number of pixels that vote for the largest plane, and number of tried planes."""
 
 
 def piece_around(
@@ -29,17 +29,17 @@ def piece_around(
     *,
     near: float | None = None,
 ) -> npt.NDArray[np.bool_]:
-    """(H, W) bool: pixels that a path of rendered surface joins to one, and a pixel around them.
+    """Select the pixels connected to a pixel by rendered surface, dilated by a pixel, (H, W) bool.
 
-    A path has no step in depth, and avoids the largest plane, on which things stand, unless it
-    begins there. All is joined where nothing is drawn at the pixel.
+    A connecting path has no step in depth, and avoids the largest plane, on which objects stand,
+    unless it begins there. If nothing is drawn at the pixel, all pixels are selected.
 
     Args:
         gaussians: splats of either kind.
         camera: camera of the picture.
-        at: x, y in px of it.
-        near: near-plane depth, in scene units; a hundredth of the splats' median distance if left
-            out.
+        at: x, y of the point, in px of the picture.
+        near: near-plane depth, in scene units; by default a hundredth of the splats' median
+            distance.
 
     Example:
         >>> import torch
@@ -84,7 +84,7 @@ def piece_around(
 
 
 def _in_largest_plane(place: Any, normal: Any, solid: Any, reach: float) -> npt.NDArray[np.bool_]:
-    """(H, W) bool: points in the plane that most lie in (RANSAC, Fischler & Bolles 1981)."""
+    """Select the largest plane's points, (H, W) bool (RANSAC, Fischler & Bolles 1981)."""
 
     def members(place: Any, normal: Any, point: Any, direction: Any) -> npt.NDArray[np.bool_]:
         near = np.abs((place - point) @ direction) < reach

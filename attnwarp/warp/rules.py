@@ -1,7 +1,7 @@
-"""Rules of visibility: each is a mask of the target pixels that pass.
+"""Rules of visibility: each rule is a mask of the target pixels that pass.
 
-A rule is a pure function that returns an (H, W) bool tensor on the target's grid, True where the
-pixel passes. A pixel whose answer is undefined does not pass. :data:`RULES` has a record of each.
+A rule is a pure function that returns an (H, W) bool tensor on the target's grid, True for passing
+pixels. A pixel with an undefined result does not pass. :data:`RULES` has a record of each rule.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from attnwarp.warp.settings import GaussianFilter, WarpSettings
 from attnwarp.warp.surface import Surface, needed
 
 EXACT_DEPTH_TOLERANCE = 1e-4
-"""Relative depth tolerance for depth that is exact (ray cast). With half a pixel's slope it missed
-none of the hidden pixels of a card 5 mm above its ground, which every fixed threshold above 5 mm
-misses whole."""
+"""Relative depth tolerance for exact (ray cast) depth. With half a pixel's slope it missed none of
+the hidden pixels of a card 5 mm above its ground, which every fixed threshold above 5 mm misses
+completely."""
 
 
 def in_front(correspondence: Correspondence) -> Tensor:
-    """The point lies in front of the source camera (z > 0).
+    """Rule: the point lies in front of the source camera (z > 0).
 
     Args:
         correspondence: correspondence of the target's pixels, by :func:`attnwarp.warp.correspond`.
@@ -56,17 +56,17 @@ def opaque(
     target_alpha: Array | None = None,
     source_alpha: Array | None = None,
 ) -> Tensor:
-    """Both images show surface rather than background.
+    """Rule: both images show surface rather than background.
 
     Args:
         correspondence: correspondence of the target's pixels, by :func:`attnwarp.warp.correspond`.
-        minimum: smallest alpha that counts.
-        target_alpha: (H, W) in [0, 1]; left out, every pixel passes.
-        source_alpha: (h, w) in [0, 1], read bilinearly at the source position; left out, every
+        minimum: smallest alpha that counts as surface.
+        target_alpha: (H, W) in [0, 1]; if omitted, every pixel passes.
+        source_alpha: (h, w) in [0, 1], read bilinearly at the source position; if omitted, every
             pixel passes.
 
     Raises:
-        ValueError: an alpha of another shape, aspect ratio or type.
+        ValueError: an alpha has a wrong shape, aspect ratio or type.
 
     Example:
         >>> import numpy as np
@@ -91,7 +91,7 @@ def depth_agrees(
     slope: float = 0.5,
     spread: float | None = TAP_SPREAD,
 ) -> Tensor:
-    """The point's depth in the source camera is the source's own depth at its position.
+    """Rule: the point's depth in the source camera equals the source's depth map at its position.
 
     ``|z - d| <= relative * z + slope * (depth_slope at the nearest source pixel)``, with d
     interpolated in 1 / z and taps that straddle an edge rejected.
@@ -100,11 +100,11 @@ def depth_agrees(
         correspondence: correspondence of the target's pixels, by :func:`attnwarp.warp.correspond`.
         source_depth: (h, w) depth along the source's optical axis, NaN where undefined.
         relative: tolerance as a fraction of z, :data:`EXACT_DEPTH_TOLERANCE` for exact depth.
-        slope: pixels of the source's depth slope to allow.
+        slope: tolerance in pixels of the source's depth slope.
         spread: as in :func:`attnwarp.warp.depth.resize_depth`.
 
     Raises:
-        ValueError: a depth of another shape, aspect ratio or type.
+        ValueError: the depth has a wrong shape, aspect ratio or type.
 
     Example:
         >>> import numpy as np
@@ -126,7 +126,7 @@ def depth_agrees(
 def depth_tolerance(
     correspondence: Correspondence, source_depth: Array, *, relative: float, slope: float
 ) -> Tensor:
-    """(H, W) difference of depths that :func:`depth_agrees` allows; arguments as there.
+    """Compute the depth difference allowed by :func:`depth_agrees`, (H, W), from its arguments.
 
     Example:
         >>> import numpy as np
@@ -149,17 +149,17 @@ def photometric(
     target_image: Array,
     limit: float = 0.2,
 ) -> Tensor:
-    """The warped source image looks like the target's: mean over channels of the absolute
-    difference <= ``limit``.
+    """Rule: the warped source image resembles the target image: the mean over channels of the
+    absolute difference is at most ``limit``.
 
     Args:
         correspondence: correspondence of the target's pixels, by :func:`attnwarp.warp.correspond`.
-        source_image: (h, w, C), before any edit, sRGB in [0, 1].
-        target_image: (H, W, C), likewise.
-        limit: the largest difference that passes.
+        source_image: (h, w, C) image before any edit, sRGB in [0, 1].
+        target_image: (H, W, C) image before any edit, sRGB in [0, 1].
+        limit: largest passing difference.
 
     Raises:
-        ValueError: an image of another shape, aspect ratio or type.
+        ValueError: an image has a wrong shape, aspect ratio or type.
 
     Example:
         >>> import numpy as np
@@ -178,10 +178,10 @@ def photometric(
 
 
 def facing(correspondence: Correspondence, target_normal: Array) -> Tensor:
-    """Source and target see the same side of the surface.
+    """Rule: source and target see the same side of the surface.
 
-    World-space normals, flipped to each camera: they agree exactly where both cameras lie on one
-    side of the tangent plane.
+    World-space normals are flipped to face each camera: they agree exactly if both cameras lie on
+    one side of the tangent plane.
 
     Args:
         correspondence: correspondence of the target's pixels, by :func:`attnwarp.warp.correspond`.
@@ -189,7 +189,7 @@ def facing(correspondence: Correspondence, target_normal: Array) -> Tensor:
             undefined.
 
     Raises:
-        ValueError: normals of another shape or type.
+        ValueError: the normals have a wrong shape or type.
 
     Example:
         >>> import numpy as np
@@ -213,14 +213,14 @@ def facing(correspondence: Correspondence, target_normal: Array) -> Tensor:
 def source_incidence(
     correspondence: Correspondence, target_normal: Array, angle: float = 60.0
 ) -> Tensor:
-    """:func:`facing`, and the source sees the surface within ``angle`` degrees of its normal.
+    """Rule: :func:`facing`, and the source sees the surface within ``angle`` degrees of its normal.
 
     Args:
         correspondence, target_normal: as :func:`facing`.
-        angle: degrees.
+        angle: largest angle in degrees.
 
     Raises:
-        ValueError: normals of another shape or type.
+        ValueError: the normals have a wrong shape or type.
 
     Example:
         >>> import numpy as np
@@ -246,18 +246,18 @@ def source_incidence(
 def camera_frame(
     correspondence: Correspondence, target_normal: Array, angle: float = 60.0
 ) -> Tensor:
-    """The published code's test: camera-space normals, flipped to each camera, within ``angle``
-    degrees of each other.
+    """Rule of the published code: camera-space normals, flipped to each camera, lie within
+    ``angle`` degrees of each other.
 
-    The two normals are in the axes of different cameras, so the angle between them contains the
-    cameras' relative rotation. The same surface seen by a rolled camera fails.
+    The two normals are in the axes of different cameras, so their angle contains the cameras'
+    relative rotation. The same surface seen by a rolled camera fails.
 
     Args:
         correspondence, target_normal: as :func:`facing`.
-        angle: degrees.
+        angle: largest angle in degrees.
 
     Raises:
-        ValueError: normals of another shape or type.
+        ValueError: the normals have a wrong shape or type.
 
     Example:
         >>> import numpy as np
@@ -278,17 +278,17 @@ def camera_frame(
 def gaussian_filter(
     gaussians: Gaussians, source: Camera, target: Camera, rule: GaussianFilter, angle: float = 60.0
 ) -> Tensor:
-    """Mask of the Gaussians that remain when the target's depth is rendered.
+    """Select the Gaussians that remain in the render of the target's depth.
 
     Args:
-        gaussians: gaussians of the scene.
-        source, target: the cameras.
-        rule: "none" keeps all. "facing" keeps those of which both cameras see the same side,
+        gaussians: Gaussians of the scene.
+        source, target: cameras of the pair.
+        rule: "none" keeps all. "facing" keeps Gaussians seen from the same side by both cameras,
             "source_incidence" those the source also sees within ``angle`` of the normal.
             "camera_frame" keeps those whose camera-space normals, each flipped to its camera, are
             within ``angle`` degrees across the two frames (the published code). "printed" drops
             exactly those (the paper's text: "excluded if n_s . n_t >= cos 60").
-        angle: degrees.
+        angle: largest angle in degrees.
 
     Returns:
         (N,) bool.
@@ -319,7 +319,7 @@ def gaussian_filter(
     ]
     if rule in ("camera_frame", "printed"):
         within = angle_between(seen[0], seen[1]) < angle
-        # The printed rule takes the angle itself with it.
+        # The printed rule includes the limit angle.
         return within if rule == "camera_frame" else ~(angle_between(seen[0], seen[1]) <= angle)
     world = [
         s @ torch.from_numpy(camera.rotation.copy())
@@ -330,10 +330,10 @@ def gaussian_filter(
 
 
 def angle_between(a: check.Array, b: check.Array) -> Tensor:
-    """(...) angle in degrees between vectors (..., 3) of any length; NaN for a zero vector.
+    """Compute the angle (...) in degrees between vectors (..., 3) of any length; NaN for zero.
 
-    2 atan2(|a/|a| - b/|b||, |a/|a| + b/|b||) (Kahan, "How futile are mindless assessments of
-    roundoff", 2006), which keeps its digits near 0 and 180 where an arccosine loses half of them.
+    The formula 2 atan2(|a/|a| - b/|b||, |a/|a| + b/|b||) (Kahan, "How futile are mindless
+    assessments of roundoff", 2006) keeps digits near 0 and 180, where an arccosine loses half.
 
     Example:
         >>> import torch
@@ -353,8 +353,8 @@ def angle_between(a: check.Array, b: check.Array) -> Tensor:
 def _opacity(
     correspondence: Correspondence, target_alpha: Array | None, source_alpha: Array | None
 ) -> Tensor:
-    """(H, W) smaller alpha of both views, infinite where neither has one, NaN outside the
-    source."""
+    """Compute the smaller alpha of both views, (H, W): infinite without any alpha, NaN outside
+    the source."""
     smaller = torch.full(correspondence.z.shape, torch.inf, dtype=torch.float64)
     if target_alpha is not None:
         smaller = as_float64(target_alpha, "target_alpha")
@@ -369,7 +369,7 @@ def _opacity(
 
 
 def _difference(correspondence: Correspondence, source_image: Array, target_image: Array) -> Tensor:
-    """(H, W) mean over channels of the warped source's absolute difference from the target."""
+    """Average the warped source's absolute difference from the target over channels, (H, W)."""
     source = as_float64(source_image, "source_image")
     target = as_float64(target_image, "target_image")
     check.shape(source, ("H", "W", "C"), "source_image")
@@ -381,7 +381,7 @@ def _difference(correspondence: Correspondence, source_image: Array, target_imag
 
 
 def _frame_angle(correspondence: Correspondence, target_normal: Array) -> Tensor:
-    """(H, W) degrees between camera-space normals, each turned to its camera."""
+    """Compute degrees between camera-space normals, each flipped to its camera, (H, W)."""
     normal, defined = _normals(correspondence, target_normal)
     source = _flip(_rotate(correspondence.source, normal), correspondence.points)
     target = _flip(_rotate(correspondence.target, normal), correspondence.target_points)
@@ -389,7 +389,7 @@ def _frame_angle(correspondence: Correspondence, target_normal: Array) -> Tensor
 
 
 def _incidence(correspondence: Correspondence, target_normal: Array) -> Tensor:
-    """(H, W) degrees between the side that the target sees and the direction to the source."""
+    """Compute degrees between the target-facing normal and the direction to the source, (H, W)."""
     normal, defined = _normals(correspondence, target_normal)
     n, points = _rotate(correspondence.source, normal), correspondence.points
     centre = correspondence.source.relative_to(correspondence.target)[:3, 3]
@@ -405,20 +405,20 @@ def _normals(correspondence: Correspondence, target_normal: Array) -> tuple[Tens
 
 
 def _rotate(camera: Camera, normal: Tensor) -> Tensor:
-    """World directions in the camera's axes."""
+    """Rotate world directions to the camera's axes."""
     return normal @ torch.from_numpy(camera.rotation.T.copy())
 
 
 def _flip(normal: Tensor, points: Tensor) -> Tensor:
-    """Camera-space normals at camera-space points, turned to look at the camera."""
+    """Flip camera-space normals at camera-space points to face the camera."""
     return torch.where((normal * points).sum(dim=-1, keepdim=True) > 0, -normal, normal)
 
 
 def _side(source: Camera, normal: Tensor, points: Tensor, target: Camera) -> Tensor:
-    """Positive where both camera centres lie on one side of the tangent planes.
+    """Test the side of tangent planes: positive if both camera centres lie on one side.
 
-    n . (C - X) for each camera, in the source's axes, where the target's centre comes from the
-    relative pose.
+    The test uses n . (C - X) for each camera, in the source's axes, where the target's centre comes
+    from the relative pose.
     """
     n = _rotate(source, normal)
     centre = torch.from_numpy(source.relative_to(target)[:3, 3].copy())
@@ -427,24 +427,24 @@ def _side(source: Camera, normal: Tensor, points: Tensor, target: Camera) -> Ten
 
 @dataclass(frozen=True, eq=False)
 class Rule:
-    """A rule of visibility: what turns it on, what it reads, and its mask.
+    """Rule of visibility: its activation, its inputs, and its mask.
 
-    A further rule is an entry of :data:`RULES`, with the field of
-    :class:`~attnwarp.warp.settings.WarpSettings` that turns it on. Where a kernel of its name
-    stands in ``attnwarp/warp/_kernels/pair.py``, that is computed in place of the definition.
+    To add a rule, append an entry to :data:`RULES`, with the field of
+    :class:`~attnwarp.warp.settings.WarpSettings` that enables it. A kernel of the same name in
+    ``attnwarp/warp/_kernels/pair.py`` replaces the definition.
 
     Args:
-        name: name of its mask in :attr:`~attnwarp.warp.view.WarpedView.rules`.
-        definition: function of the correspondence and, by keyword, of all that is read, to an (H,
-            W) bool mask, or to None where the rule has nothing to say.
-        setting: field of the settings that turns it on by True, a number, or the rule's name; None
-            for a rule of every view.
-        reads: parts of both surfaces that it needs, such as "source_depth" or "target_normal".
-        may_read: parts that are None where they are not given, such as "source_alpha" or
+        name: name of the mask in :attr:`~attnwarp.warp.view.WarpedView.rules`.
+        definition: function of the correspondence and, by keyword, of all inputs that returns an
+            (H, W) bool mask, or None if the rule does not apply.
+        setting: field of the settings that enables the rule by True, a number, or the rule's name;
+            None for a rule of every view.
+        reads: required parts of both surfaces, such as "source_depth" or "target_normal".
+        may_read: optional parts, None if not given, such as "source_alpha" or
             "target_segment".
-        limits: field of the settings for each further keyword.
-        margin: function of the same arguments to the (H, W) distance from the other verdict,
-            positive where the rule passes and NaN where that is undefined; None without one.
+        limits: field of the settings for each additional keyword.
+        margin: function of the same arguments that returns the (H, W) distance to the opposite
+            verdict, positive for passing pixels and NaN where undefined; None without a margin.
         unit: unit of the margin.
 
     Example:
@@ -473,11 +473,11 @@ class Rule:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Parts of the surfaces that it looks at."""
+        """Parts of the surfaces that the rule reads."""
         return (*self.reads, *self.may_read)
 
     def on(self, settings: WarpSettings) -> bool:
-        """True where the settings have the rule."""
+        """Return True if the settings enable the rule."""
         if self.setting is None:
             return True
         value = getattr(settings, self.setting, None)
@@ -486,14 +486,14 @@ class Rule:
         return value is not None and value is not False
 
     def arguments(self, settings: WarpSettings, parts: Mapping[str, Any]) -> dict[str, Any]:
-        """Keywords of the definition and of the margin.
+        """Collect the keywords of the definition and of the margin.
 
         Args:
-            settings: the choices.
-            parts: all that is given, by :func:`parts_of`.
+            settings: settings of the warp.
+            parts: all given parts, by :func:`parts_of`.
 
         Raises:
-            ValueError: a part that the rule needs is not given.
+            ValueError: a required part is missing.
         """
         setting = self.setting or self.name
         value = getattr(settings, setting, None)
@@ -508,7 +508,7 @@ class Rule:
 def parts_of(
     target: Surface, source: Surface | None, segment: Tensor | None = None
 ) -> dict[str, Any]:
-    """Inputs of the rules by name: parts of both surfaces, and ``target_segment``.
+    """Collect the rules' inputs by name: parts of both surfaces, and ``target_segment``.
 
     Example:
         >>> import numpy as np
@@ -526,7 +526,7 @@ def parts_of(
 
 
 def parts_read(settings: WarpSettings) -> set[str]:
-    """Names of the parts that the settings' rules look at, as in :attr:`Rule.reads`.
+    """Collect the names of the parts read by the settings' rules, as in :attr:`Rule.reads`.
 
     Example:
         >>> from attnwarp.warp import PRESETS, parts_read
@@ -543,7 +543,7 @@ def _in_bounds(correspondence: Correspondence, bounds: str) -> Tensor:
 
 def _border(correspondence: Correspondence, bounds: str) -> Tensor:
     camera = correspondence.source if bounds == "source" else correspondence.target
-    # With integer centres the method holds the index against the border.
+    # With integer centres the method compares the index with the border.
     slip = 0.5 if correspondence.pixel_centers == "integer" else 0.0
     low = correspondence.xy - slip
     high = torch.tensor([camera.width, camera.height], dtype=torch.float64) - low
@@ -661,4 +661,4 @@ RULES: list[Rule] = [
         may_read=("target_segment",),
     ),
 ]
-"""Every rule, in the order in which a view lists them."""
+"""All rules, in the order in which a view lists them."""

@@ -1,7 +1,7 @@
 """Sampling of features and depth at the positions of a correspondence, in torch on any device.
 
 This is the definition. :mod:`attnwarp.warp.cpu` has kernels that give the same bits for feature
-maps and tokens in the host's memory.
+maps and tokens on the CPU.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ def sample(
     *,
     mode: Literal["bilinear", "nearest"] = "bilinear",
 ) -> tuple[Tensor, Tensor]:
-    """A source feature map, warped to the target's grid.
+    """Warp a source feature map to the target's grid.
 
     Args:
-        features: (C, h, w) or (B, C, h, w) on the source's image, of any size of its aspect ratio:
-            a position u becomes u * w / W (for integer centres u * (w - 1) / (W - 1) on indices,
-            which is what align_corners=True does). Its gradient flows back through the result.
+        features: (C, h, w) or (B, C, h, w) map of the source's image, of any size of its aspect
+            ratio: a position u becomes u * w / W (for integer centres u * (w - 1) / (W - 1) on
+            indices, as with align_corners=True). The gradient flows back through the result.
         correspondence: H x W positions, float64; moved to the features' device.
         mode: "bilinear" for floating types: weights and sums in float32 for half precision, in the
-            features' own type otherwise. "nearest" for any type, labels included.
+            features' dtype otherwise. "nearest" for any type, labels included.
 
     Returns:
-        warped: (C, H, W) or (B, C, H, W) in the features' type. A position outside the image takes
+        warped: (C, H, W) or (B, C, H, W) in the features' dtype. A position outside the image takes
             the border's value; a pixel without a position is 0, so that it cannot spread NaN into a
-            network. Use the mask.
-        mask: (H, W) bool, the position lies inside the source image (:func:`in_bounds`).
+            network. Apply the mask.
+        mask: (H, W) bool, True if the position lies inside the source image (:func:`in_bounds`).
 
     Raises:
-        ValueError: another number of axes or aspect ratio, a type that cannot be blended, an
+        ValueError: a wrong number of axes or aspect ratio, a dtype that cannot be blended, or an
             unknown mode.
 
     Example:
@@ -75,19 +75,19 @@ def sample(
 def sample_at(
     features: check.Array, xy: check.Array, *, mode: Literal["bilinear", "nearest"] = "bilinear"
 ) -> Tensor:
-    """Features at positions of their own image.
+    """Sample features at positions in the features' grid.
 
     Args:
-        features: (..., h, w).
+        features: (..., h, w) maps.
         xy: (H, W, 2) positions in pixels of the feature map (centres at +0.5), float32 or float64.
             NaN gives 0.
         mode: as in :func:`sample`.
 
     Returns:
-        (..., H, W) in the features' type.
+        (..., H, W) in the features' dtype.
 
     Raises:
-        ValueError: a half-precision or integer ``xy``: bfloat16 cannot even tell 256.5 from 257.
+        ValueError: a half-precision or integer ``xy``: bfloat16 rounds 256.5 to 256.
 
     Example:
         >>> import torch
@@ -128,19 +128,19 @@ def sample_at(
 
 
 def work_type(dtype: torch.dtype) -> torch.dtype:
-    """The type of weights and sums: float32 for half precision, else the features' own."""
+    """Return the dtype of weights and sums: float32 for half precision, else the features'."""
     return torch.float32 if dtype in (torch.float16, torch.bfloat16) else dtype
 
 
 def taps_at(
     correspondence: Correspondence, size: tuple[int, int], dtype: torch.dtype, device: torch.device
 ) -> Taps:
-    """The taps of a correspondence in the source's image at another size.
+    """Compute the taps of a correspondence in the source's image at another size.
 
     Args:
-        size: (h, w) of that image.
-        dtype: dtype of the weights, which are worked out in float64.
-        device: where the taps shall lie.
+        size: (h, w) of the resized image.
+        dtype: dtype of the weights, which are computed in float64.
+        device: target device of the taps.
     """
     h, w = size
     taps = taps_of(positions_in(correspondence, w, h), h, w)
@@ -148,27 +148,27 @@ def taps_at(
 
 
 def sample_maps(maps: Tensor, taps: Taps) -> Tensor:
-    """(..., N) weighted sums of the pixels of maps, in the maps' type.
+    """Sum weighted pixels of maps, (..., N), in the maps' dtype.
 
     Args:
-        maps: (..., h*w) floating.
+        maps: (..., h*w) floating maps.
         taps: taps of N positions, with weights of :func:`work_type`, on the maps' device.
     """
     total = torch.zeros((), dtype=taps.weight.dtype, device=maps.device)
-    # Converted before it is read: the gradient sums what reads a pixel in this type too, and is
-    # rounded once.
+    # Converted before reading: the gradient then sums the reads of a pixel in this dtype too, and
+    # is rounded once.
     values = maps.to(total.dtype)
     for index, share in zip(taps.index, taps.weight, strict=True):
-        # A tap of weight 0 may hold anything, an infinity included.
+        # A tap of weight 0 may have any value, even infinity.
         total = total + torch.where(share > 0, values[..., index] * share, 0)
     return total.to(maps.dtype)
 
 
 def sample_tokens(tokens: Tensor, taps: Taps) -> Tensor:
-    """(B, N, C) weighted sums of tokens, in the weights' type.
+    """Sum weighted tokens, (B, N, C), in the weights' dtype.
 
     Args:
-        tokens: (B, h*w, C) floating, row by row of the picture.
+        tokens: (B, h*w, C) floating tokens, row by row of the picture.
         taps: as in :func:`sample_maps`.
     """
     total = torch.zeros((), dtype=taps.weight.dtype, device=tokens.device)
@@ -184,7 +184,7 @@ def sample_depth(
     *,
     spread: float | None = TAP_SPREAD,
 ) -> Tensor:
-    """The source's own depth at the positions of a correspondence, bilinear in 1 / z.
+    """Sample the source's depth map at a correspondence's positions, bilinear in 1 / z.
 
     Args:
         source_depth: (h, w) depth along the source's optical axis, of any size of the source's
@@ -192,10 +192,10 @@ def sample_depth(
         spread: as in :func:`resize_depth`.
 
     Returns:
-        (H, W) float64, NaN outside the source image and where the taps do not answer.
+        (H, W) float64, NaN outside the source image and for rejected taps.
 
     Raises:
-        ValueError: a depth of another shape, aspect ratio or type.
+        ValueError: the depth has a wrong shape, aspect ratio or type.
 
     Example:
         >>> import numpy as np

@@ -1,4 +1,4 @@
-"""Surface before a view: its depth, opacity, picture and normals."""
+"""Surface seen in a view: its depth, opacity, picture and normals."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ class Surface:
     """Depth, normals, opacity and picture of one view.
 
     Args:
-        depth: (H, W) along the optical axis, NaN where undefined.
+        depth: (H, W) depth along the optical axis, NaN where undefined.
         normal: (H, W, 3) world normals of either sign and any length, NaN or zero where undefined.
-        alpha: (H, W) in [0, 1]; None is opaque everywhere.
+        alpha: (H, W) in [0, 1]; None means opaque everywhere.
         image: (H, W, C) sRGB in [0, 1], before any edit.
-        counters: how much work it was to render, see :class:`attnwarp.render.Render`.
+        counters: work counters of the render, see :class:`attnwarp.render.Render`.
 
     Example:
         >>> import numpy as np
@@ -41,10 +41,10 @@ class Surface:
 
 
 def needed(value: Array | None, name: str, rule: str) -> Array:
-    """A part of a surface that a rule cannot do without.
+    """Return a part of a surface that a rule requires.
 
     Raises:
-        ValueError: it is not given; the message names the rule.
+        ValueError: the part is missing; the message names the rule.
     """
     if value is None:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Bilinear taps: the pixels that a position reads, and their weights."""
+"""Bilinear taps: the pixels read by a position, and their weights."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import torch
 from torch import Tensor
 
 SNAP = 1e-7
-"""Coordinates this close (in px) to a tap are put on it, so that a view warped onto itself returns
-its own bits.
+"""Distance in px below which coordinates snap to a tap, so that a view warped onto itself keeps its
+bits.
 """
 
 
 def clamp_index(value: Tensor, length: int) -> Tensor:
-    """Integer indices, held inside an axis of ``length`` pixels."""
+    """Clamp values to integer indices of an axis of ``length`` pixels."""
     return value.clamp(0, length - 1).long()
 
 
 def bilinear_taps(xy: Tensor, h: int, w: int) -> tuple[list[Tensor], Tensor]:
-    """Flat indices (four of (H, W)) and weights (4, H, W) of bilinear sampling at finite positions,
-    borders clamped.
+    """Compute flat indices (four of (H, W)) and weights (4, H, W) of bilinear sampling at finite
+    positions, borders clamped.
     """
     low: list[Tensor] = []
     share: list[Tensor] = []
@@ -43,12 +43,12 @@ def bilinear_taps(xy: Tensor, h: int, w: int) -> tuple[list[Tensor], Tensor]:
 
 @dataclass(frozen=True, eq=False)
 class Taps:
-    """The four taps of N positions on one grid of pixels.
+    """Four taps of N positions on one grid of pixels.
 
     Args:
         index: (4, N) int64 or int32, flat indices into the grid's pixels, row by row.
-        weight: (4, N) float64 or float32, in [0, 1]; 0 for a tap that is not read. A position that
-            is undefined reads none.
+        weight: (4, N) float64 or float32, in [0, 1]; 0 for an unread tap. An undefined position
+            has four unread taps.
     """
 
     index: Tensor
@@ -56,17 +56,17 @@ class Taps:
 
     @functools.cached_property
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """``index`` as uint32 and ``weight``, for the kernels."""
+        """Return ``index`` as uint32 and ``weight``, for the kernels."""
         index = self.index.to(device="cpu", dtype=torch.int32).numpy()
         return index.view(np.uint32), self.weight.cpu().numpy()
 
 
 def taps_of(xy: Tensor, h: int, w: int) -> Taps:
-    """The taps of positions on an h x w grid, weights in float64.
+    """Compute the taps of positions on an h x w grid, weights in float64.
 
     Args:
-        xy: (H, W, 2) float64 positions in pixels of the grid (centres at +0.5); NaN reads nothing.
-        h, w: the grid's size.
+        xy: (H, W, 2) float64 positions in pixels of the grid (centres at +0.5); NaN reads no tap.
+        h, w: size of the grid.
     """
     # NaN is masked before it reaches an index.
     defined = torch.isfinite(xy).all(dim=-1)

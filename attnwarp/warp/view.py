@@ -1,4 +1,4 @@
-"""Everything for a pair of views: the correspondence, the rules' masks, and the feature grids."""
+"""Warp of a pair of views: the correspondence, the rules' masks, and the feature grids."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ from attnwarp.warp.settings import PRESETS, WarpSettings
 from attnwarp.warp.surface import Surface
 
 OVERSHOOT = 0.1
-"""Largest distance beyond [0, 1] that a picture may reach: cubic resampling overshoots an edge by a
+"""Largest accepted distance of a picture beyond [0, 1]: cubic resampling overshoots an edge by a
 tenth.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class WarpedView:
-    """One target view seen from one source: the correspondence at image size and the mask.
+    """Warp of one target view from one source: the correspondence at image size and the mask.
 
     Args:
-        settings: the choices it was made with.
+        settings: settings of the warp.
         correspondence: correspondence of the H x W target image.
-        mask: (H, W) bool, all rules together.
-        rules: each rule's own (H, W) mask, by name, in the order they were applied. ``defined`` is
-            always among them.
-        target, source: the surfaces it was made from; ``source`` is None where no rule needed it.
-        backend: who computes the feature grids, see :func:`warp_surfaces`.
+        mask: (H, W) bool, the conjunction of all rules.
+        rules: (H, W) mask of each rule, by name, in the order of application; always includes
+            ``defined``.
+        target, source: surfaces of both views; ``source`` is None if no rule needed it.
+        backend: backend of the feature grids, see :func:`warp_surfaces`.
 
     Example:
         >>> import numpy as np
@@ -67,7 +67,7 @@ class WarpedView:
     target: Surface
     source: Surface | None = None
     backend: Backend = "auto"
-    # Not of ``init``, so that dataclasses.replace begins anew: the layers have the mask.
+    # Excluded from ``init``, so that dataclasses.replace drops the layers, which contain the mask.
     _at: dict[tuple[int, ...], FeatureWarp] = field(default_factory=dict, init=False, repr=False)
 
     def __repr__(self) -> str:
@@ -76,10 +76,10 @@ class WarpedView:
         return f"WarpedView({sizes}, mask {share_of(self.mask)}; rules: {rules})"
 
     def with_mask(self, mask: Tensor) -> WarpedView:
-        """This warp with another mask, such as the exact one.
+        """Return this warp with another mask, such as the exact one.
 
         Args:
-            mask: (H, W) bool; pixels without a position in the source are left out of it.
+            mask: (H, W) bool; pixels without a source position are removed from it.
 
         Example:
             >>> import numpy as np
@@ -96,18 +96,18 @@ class WarpedView:
     def at(
         self, size: tuple[int, int], *, source_size: tuple[int, int] | None = None
     ) -> FeatureWarp:
-        """The warp of an (h, w) feature grid: its own correspondence, and the mask resized as the
-        settings say.
+        """Build the warp of an (h, w) feature grid: the grid's correspondence, and the mask resized
+        as the settings specify.
 
-        Worked out once per size. The mask drops pixels whose correspondence is undefined at this
-        size.
+        The result is computed once per size. Its mask excludes pixels whose correspondence is
+        undefined at this size.
 
         Args:
             size: (h, w) of the target's features.
-            source_size: (h, w) of the source's; by default at the same fraction of its image.
+            source_size: (h, w) of the source's features; by default the same fraction of its image.
 
         Raises:
-            ValueError: a size that is no pair of whole numbers from 1.
+            ValueError: a size is not a pair of positive integers.
         """
         size = check.size(size, "size")
         source, target = self.correspondence.source, self.correspondence.target
@@ -162,31 +162,31 @@ def warp_surfaces(
     backend: Backend = "auto",
     warn_empty: bool = True,
 ) -> WarpedView:
-    """The correspondence and the mask of a pair of views, from depth maps: rendered, measured or
-    exact.
+    """Compute the correspondence and the mask of a pair of views from depth maps: rendered,
+    measured or exact.
 
     Args:
-        source, target: the cameras.
-        target_surface: surface that the target sees; its normals are needed by the normal tests,
-            its image by the photometric. The rule ``opaque`` takes a view without alpha, target or
-            source, for opaque everywhere.
-        source_surface: surface that the source sees; needed by depth agreement (depth) and the
+        source, target: cameras of the pair.
+        target_surface: surface seen by the target; the normal tests need its normals, the
+            photometric test its image. The rule ``opaque`` treats a view without alpha, target or
+            source, as opaque everywhere.
+        source_surface: surface seen by the source; needed by depth agreement (depth) and the
             photometric test (image).
-        settings: which rules, and how. ``gaussian_filter``, ``depth`` and ``depth_statistic``
-            concern the rendering of the surfaces and play no part here.
-        target_segment: (H, W) bool, the part of the target that is edited; for settings with
+        settings: settings of the rules. ``gaussian_filter``, ``depth`` and ``depth_statistic``
+            concern the rendering of the surfaces and are unused here.
+        target_segment: (H, W) bool, the edited part of the target; for settings with
             ``segment``.
         backend: "auto" computes with kernels (:mod:`attnwarp.warp.cpu`), "reference" with the
-            definition in torch. Positions agree to 1e-6 px, masks but for a pixel within rounding
+            definition in torch. Positions agree to 1e-6 px, masks except for pixels within rounding
             of a rule's threshold.
-        warn_empty: warn where no pixel of the target has a position in the source. A loop over
-            views, some of which see nothing, turns it off.
+        warn_empty: True warns if no pixel of the target has a source position. A loop over views,
+            some of which see nothing, turns the warning off.
 
     Raises:
-        ValueError: a rule needs something that is not given, or what is given is read by no rule;
-            the message names both. A picture or a segment of another size than its view's; a
-            picture in 0 to 255.
-        TypeError: an argument of another type.
+        ValueError: a rule lacks an input, or no rule reads a given input; the message names both.
+            A picture or a segment differs in size from its view; a picture ranges from 0 to
+            255.
+        TypeError: an argument has a wrong type.
 
     Example:
         >>> import numpy as np
@@ -263,24 +263,23 @@ def warp_view(
     warp_backend: Backend = "auto",
     warn_empty: bool = True,
 ) -> WarpedView:
-    """The correspondence and the mask of a pair of views, from splats.
+    """Compute the correspondence and the mask of a pair of views from splats.
 
-    Renders what the settings' rules ask for and hands it to :func:`warp_surfaces`. The Gaussian
-    filter concerns the target's render; the source's own depth is that of the whole model.
+    Render the surfaces that the settings' rules need and call :func:`warp_surfaces`. The Gaussian
+    filter applies to the target's render; the source's depth comes from the unfiltered model.
 
     Args:
-        gaussians: the model before the edit. Hand in the current one to reproduce codes that warp
-            with it.
-        source, target: the cameras.
-        settings: which rules, and how.
-        source_image, target_image: (H, W, 3) sRGB images before the edit, for the photometric test,
-            the target's of its camera's size and the source's of its aspect ratio;
-            by default the renders of ``gaussians``. For settings with ``photometric``.
-        target_segment: (H, W) bool, the part of the target that is edited; for settings with
+        gaussians: model before the edit; the current model reproduces codes that warp with it.
+        source, target: cameras of the pair.
+        settings: settings of the rules.
+        source_image, target_image: (H, W, 3) sRGB images before the edit, for the photometric test
+            (settings with ``photometric``): the target's at its camera's size, the source's at its
+            aspect ratio; by default the renders of ``gaussians``.
+        target_segment: (H, W) bool, the edited part of the target; for settings with
             ``segment``.
-        source_surface: the source's render if it is at hand, :func:`render_surface`; one source
-            serves many targets.
-        near: as in :func:`render_surface`.
+        source_surface: existing render of the source, by :func:`render_surface`; one source serves
+            many targets.
+        near: near-plane depth as in :func:`render_surface`.
         backend: name of the renderer, as in :func:`attnwarp.render.render`.
         warp_backend, warn_empty: arguments of the warp, as in :func:`warp_surfaces`.
 
@@ -328,7 +327,7 @@ def warp_view(
         backend=warp_backend,
         warn_empty=False,
     )
-    # Where a filter left splats out, it may be what emptied the view.
+    # The Gaussian filter may have emptied the view.
     if warn_empty and filtered is gaussians:
         _warn_if_empty(view, UNSEEN)
     return view
@@ -343,19 +342,19 @@ def render_surface(
     near: float | None = None,
     backend: str = "auto",
 ) -> Surface:
-    """Depth, normals, alpha and colour of splats, rendered as ``settings`` demand.
+    """Render depth, normals, alpha and colour of splats as ``settings`` specify.
 
     Args:
-        gaussians: to render.
+        gaussians: splats to render.
         camera: camera of the rendered view; (H, W) is its size.
-        settings: their ``depth``, ``depth_statistic`` and ``undefined_depth`` choose the depth. 3D
-            splats have "peak" depth in place of "intersection".
-        near: nothing nearer than this depth is seen, in scene units; a hundredth of the splats'
-            median distance if left out.
-        backend: name of :func:`attnwarp.render.render`.
+        settings: settings whose ``depth``, ``depth_statistic`` and ``undefined_depth`` define the
+            depth. 3D splats use "peak" depth for "intersection".
+        near: near-plane depth, in scene units; by default a hundredth of the splats' median
+            distance.
+        backend: name of the renderer, for :func:`attnwarp.render.render`.
 
     Returns:
-        A surface of (H, W) tensors without gradients, on the CPU.
+        Surface of (H, W) tensors without gradients, on the CPU.
 
     Example:
         >>> import torch
@@ -380,7 +379,7 @@ def render_surface(
     if settings.undefined_depth == "farthest":
         undefined = z.isnan()
         farthest = torch.where(undefined, -torch.inf, z).max()
-        z = torch.where(undefined & farthest.isfinite(), farthest, z)  # none where nothing is seen
+        z = torch.where(undefined & farthest.isfinite(), farthest, z)  # NaN if the view is empty
     return Surface(
         z.cpu(), seen.normal.cpu(), seen.alpha.cpu(), seen.color.cpu(), dict(seen.counters)
     )
@@ -393,11 +392,11 @@ def _check_pair(source: Camera, target: Camera, settings: WarpSettings) -> None:
 
 
 def _check_pictures(source: Camera, target: Camera, parts: Mapping[str, Array]) -> None:
-    """Check the pictures that rules read: of their views, in [0, 1]."""
+    """Check the pictures read by rules: size or aspect ratio of their views, values in [0, 1]."""
     first, second = parts.get("source_image"), parts.get("target_image")
     if first is not None:
         check.shape(first, ("H", "W", "C"), "source_image")
-        # The source's is read at positions, so at any resolution.
+        # The source's picture is sampled at positions, so any resolution is valid.
         size = (source.height, source.width)
         check.same_aspect(tuple(first.shape[:2]), size, "source_image", "its axes are (H, W, C)")
     if second is not None:
@@ -406,9 +405,9 @@ def _check_pictures(source: Camera, target: Camera, parts: Mapping[str, Array]) 
     for name, image in (("source_image", first), ("target_image", second)):
         if image is None:
             continue
-        # A render's colours may exceed 1 here and there, resampling may overshoot either end.
-        # Tensors of 8 bits have no mean of their own.
-        # A copy of arrays, since torch reads neither flipped nor big-endian ones.
+        # A render's colours may slightly exceed 1, and resampling may overshoot either end.
+        # 8-bit tensors have no mean.
+        # Arrays are copied, since torch reads neither flipped nor big-endian ones.
         plain = image if isinstance(image, Tensor) else torch.from_numpy(np.array(image, "f4"))
         values = plain.float()
         if values.min() < -OVERSHOOT or values.mean() > 1 + OVERSHOOT:
@@ -423,7 +422,7 @@ NO_DEPTH = "the target's depth is nowhere finite and above zero; check the depth
 
 
 def _warn_if_empty(view: WarpedView, without_surface: str) -> None:
-    # numpy's any: torch's reads a byte at a time.
+    # numpy's any, since torch's reads one byte at a time.
     if view.rules["defined"].numpy().any():
         return
     surface = torch.isfinite(view.correspondence.target_depth).any()
@@ -438,7 +437,7 @@ def _warn_if_empty(view: WarpedView, without_surface: str) -> None:
 
 
 def _refuse_unread(settings: WarpSettings, **given: Array | None) -> None:
-    """Raise ValueError if something is given that no rule of the settings reads."""
+    """Raise ValueError if no rule of the settings reads a given input."""
     for name, value in given.items():
         if value is not None and name not in parts_read(settings):
             off = [rule.setting for rule in RULES if name in rule.parts and rule.setting]
@@ -450,7 +449,7 @@ def _refuse_unread(settings: WarpSettings, **given: Array | None) -> None:
 
 
 def _checked_segment(segment: Array, target: Camera) -> Tensor:
-    """(H, W) bool on the CPU."""
+    """Check the segment, (H, W) bool, and move it to the CPU."""
     tensor = segment if isinstance(segment, Tensor) else torch.from_numpy(np.array(segment))
     check.shape(tensor, (target.height, target.width), "target_segment")
     if tensor.dtype != torch.bool:
@@ -462,10 +461,10 @@ def _checked_segment(segment: Array, target: Camera) -> Tensor:
 
 
 def near_plane(gaussians: Gaussians, camera: Camera) -> float:
-    """A hundredth of the splats' median distance from the camera, in scene units.
+    """Compute a hundredth of the splats' median distance from the camera, in scene units.
 
-    An absolute length would draw what hangs before the camera in a scene of large units, and
-    nothing at all in one of small units.
+    An absolute length would draw floaters in front of the camera in a scene of large units, and
+    nothing at all in a scene of small units.
     """
     if not len(gaussians):
         from attnwarp.render.constants import NEAR

@@ -1,10 +1,10 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
-"""A pair of views: positions, and every rule of the mask, in one pass over the target's pixels.
+"""Kernels of a pair of views: positions and all mask rules in one pass over the target's pixels.
 
-The definition is :mod:`attnwarp.warp.correspondence`, ``depth``, ``rules`` and ``masks``; names and
-the order of sums are theirs. Everything is float64. What stands in a product of matrices there is
-a chain of fused multiply-adds here, as in the BLAS of processors that have them; all else is
-rounded step by step.
+The definitions are in :mod:`attnwarp.warp.correspondence`, ``depth``, ``rules`` and ``masks``;
+names and summation order match them. Everything is float64. A matrix product in a definition
+becomes a chain of fused multiply-adds here, as in the BLAS of processors that support them; every
+other operation is rounded separately.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ INVERSE, BILINEAR, NEAREST = range(3)
 
 
 class Lens(NamedTuple):
-    """Intrinsics of one camera, in pixels, and its image's size."""
+    """Intrinsics of one camera, in pixels, and its image size."""
 
     fx: float
     skew: float
@@ -37,7 +37,7 @@ class Lens(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """Two cameras; ``pose`` (3, 4) takes points from the target's axes to the source's."""
+    """Pair of cameras; ``pose`` (3, 4) maps points from the target's axes to the source's."""
 
     source: Lens
     target: Lens
@@ -52,7 +52,7 @@ class Pair(NamedTuple):
 
 
 class Positions(NamedTuple):
-    """The fields of a Correspondence, to be filled."""
+    """Output buffers with the fields of a Correspondence."""
 
     xy: np.ndarray
     points: np.ndarray
@@ -60,7 +60,7 @@ class Positions(NamedTuple):
 
 
 class View(NamedTuple):
-    """Maps of a view; (0, 0) or (0, 0, 0) arrays for those that no rule needs."""
+    """Maps of a view; maps that no rule needs are (0, 0) or (0, 0, 0) arrays."""
 
     depth: np.ndarray
     alpha: np.ndarray
@@ -69,9 +69,9 @@ class View(NamedTuple):
 
 
 class Pixel(NamedTuple):
-    """A pixel of the target: its place, depth, point in the source's axes and source position.
+    """Pixel of the target: its place, depth, point in the source's axes and source position.
 
-    ``u``, ``v`` and ``taps`` are the position's in pixels of the source's depth, where it lies
+    ``u``, ``v`` and ``taps`` give the position in pixels of the source's depth map, if it is
     ``inside`` the source image.
     """
 
@@ -91,7 +91,7 @@ class Pixel(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """One axis of a mask that is resized: (new, old) weights, 0 outside of first <= k < last."""
+    """Resize weights of one mask axis, (new, old), zero outside of first <= k < last."""
 
     weights: np.ndarray
     first: np.ndarray
@@ -100,7 +100,7 @@ class Axis(NamedTuple):
 
 @intrinsic
 def _fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
-    """x y + z, rounded once where the machine can."""
+    """Compute x y + z, rounded once if the processor supports it."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         double = ir.DoubleType()
@@ -113,7 +113,7 @@ def _fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
 
 @exact_inlined
 def _turn(matrix, row, x, y, z):
-    """Row ``row`` of matrix @ (x, y, z)."""
+    """Compute row ``row`` of matrix @ (x, y, z)."""
     return _fma(z, matrix[row, 2], _fma(y, matrix[row, 1], x * matrix[row, 0]))
 
 
@@ -124,13 +124,13 @@ def _valid(depth):
 
 @exact_inlined
 def _clamp(value, length):
-    # Unsigned, so that numba does not look for indices that count from the end.
+    # Unsigned, so that numba skips the check for negative indices.
     return np.uint64(min(max(value, 0.0), length - 1.0))
 
 
 @exact_inlined
 def _axis(position, length, snap):
-    """Lower tap, upper tap and the upper one's share along one axis."""
+    """Compute lower tap, upper tap and the upper tap's share along one axis."""
     index = min(max(position - 0.5, -1.0), float(length))
     nearest = np.floor(index + 0.5)
     if abs(index - nearest) < snap:
@@ -143,7 +143,7 @@ def _axis(position, length, snap):
 
 @exact_inlined
 def _taps(x, y, shape, snap):
-    """Columns and rows of four taps in an image of ``shape``, and their shares along both axes."""
+    """Find columns and rows of four taps in an image of ``shape``, and shares along both axes."""
     x0, x1, fx = _axis(x, shape[1], snap)
     y0, y1, fy = _axis(y, shape[0], snap)
     return x0, x1, y0, y1, fx, fy
@@ -151,7 +151,7 @@ def _taps(x, y, shape, snap):
 
 @exact_inlined
 def _blend_depth(depth, taps, how, spread):
-    """Depth between four taps, NaN where they are undefined or spread too far."""
+    """Interpolate depth between four taps, NaN if taps are undefined or spread too far."""
     x0, x1, y0, y1, fx, fy = taps
     total, largest, smallest = 0.0, -np.inf, np.inf
     for k in range(4):
@@ -170,14 +170,14 @@ def _blend_depth(depth, taps, how, spread):
 
 @exact_inlined
 def _nearest_depth(depth, x, y):
-    """Depth of the pixel that holds the position, NaN where it is undefined."""
+    """Read the depth of the pixel that contains the position, NaN if undefined."""
     value = float(depth[_clamp(np.floor(y), depth.shape[0]), _clamp(np.floor(x), depth.shape[1])])
     return value if _valid(value) else np.nan
 
 
 @exact_inlined
 def _sample(image, taps):
-    """An (h, w) image between four taps."""
+    """Interpolate an (h, w) image between four taps."""
     x0, x1, y0, y1, fx, fy = taps
     total = 0.0
     for k in range(4):
@@ -190,21 +190,21 @@ def _sample(image, taps):
 
 @exact_inlined
 def _step(z, neighbour):
-    """Depth's change to a neighbour, infinite where that is undefined."""
-    # An infinite neighbour is infinitely far: one comparison less.
+    """Compute the depth step to a neighbour, infinite if the neighbour is undefined."""
+    # An infinite neighbour gives an infinite step without an extra comparison.
     return abs(z - neighbour) if neighbour > 0 else np.inf
 
 
 @exact_inlined
 def _smaller(before, after):
-    """The smaller of two steps, 0 if both are infinite."""
+    """Return the smaller of two steps, 0 if both are infinite."""
     smaller = min(before, after)
     return smaller if smaller < np.inf else 0.0
 
 
 @exact_inlined
 def _slope(depth, i, j):
-    """Depth's change per pixel, 0 where it is undefined."""
+    """Compute the depth slope per pixel, 0 if undefined."""
     h, w = depth.shape
     z = float(depth[i, j])
     if not _valid(z):
@@ -219,7 +219,7 @@ def _slope(depth, i, j):
 
 @exact_inlined
 def _scaled(position, length, other, integer):
-    """A position in pixels of an image of ``length``, in one of ``other`` pixels."""
+    """Convert a position from an axis of ``length`` pixels to an axis of ``other`` pixels."""
     if integer:
         return (position - 0.5) * ((other - 1) / max(length - 1, 1.0)) + 0.5
     return position * (other / length)
@@ -227,7 +227,7 @@ def _scaled(position, length, other, integer):
 
 @exact_inlined
 def _in_image(pair, shape, x, y):
-    """A source position in pixels of an image of ``shape``."""
+    """Convert a source position to pixels of an image of ``shape``."""
     u = _scaled(x, pair.source.width, float(shape[1]), pair.integer)
     return u, _scaled(y, pair.source.height, float(shape[0]), pair.integer)
 
@@ -242,7 +242,7 @@ def _inside(x, y, width, height, integer):
 
 @exact_inlined
 def _locate(pair, i, j, depth, positions):
-    """Fill pixel (i, j) of ``positions`` from its depth; whether it has a position."""
+    """Fill pixel (i, j) of ``positions`` from its depth; return True if the position exists."""
     lens, other, pose = pair.target, pair.source, pair.pose
     xy, points = positions.xy, positions.points
     x, y = (j + 0.5, i + 0.5) if not pair.integer else (float(j), float(i))
@@ -260,7 +260,7 @@ def _locate(pair, i, j, depth, positions):
     Y = _turn(pose, 1, px, py, depth) + pose[1, 3]
     z = _turn(pose, 2, px, py, depth) + pose[2, 3]
     points[i, j, 0], points[i, j, 1], points[i, j, 2] = X, Y, z
-    # Tested before the divide: a point in the plane of the camera centre has no position at all.
+    # Tested before the division: a point in the camera centre's plane has no position.
     usable = z > 0 if pair.in_front else z != 0
     u = v = np.nan
     if usable and abs(z) < np.inf:
@@ -276,7 +276,7 @@ def _locate(pair, i, j, depth, positions):
 
 @exact
 def layer(begin, end, pair, depth, how, spread, positions):
-    """Rows ``begin`` to ``end`` of a feature grid's positions, from the image's depth (H, W)."""
+    """Fill rows ``begin`` to ``end`` of a feature grid's positions, from image depth (H, W)."""
     h, w = positions.depth.shape
     step_y, step_x = depth.shape[0] / h, depth.shape[1] / w
     for i in range(begin, end):
@@ -291,7 +291,7 @@ def layer(begin, end, pair, depth, how, spread, positions):
 
 @exact_inlined
 def _angle(ax, ay, az, bx, by, bz):
-    """Degrees between two vectors: :func:`attnwarp.warp.rules.angle_between`."""
+    """Compute the degrees between two vectors, as :func:`attnwarp.warp.rules.angle_between`."""
     a, b = math.sqrt(ax * ax + ay * ay + az * az), math.sqrt(bx * bx + by * by + bz * bz)
     ax, ay, az, bx, by, bz = ax / a, ay / a, az / a, bx / b, by / b, bz / b
     minus = math.sqrt((ax - bx) ** 2 + (ay - by) ** 2 + (az - bz) ** 2)
@@ -328,7 +328,7 @@ def _depth_agrees(pair, target, source, at, limits):
     h, w = source.depth.shape
     d = _blend_depth(source.depth, at.taps, INVERSE, spread)
     error, tolerance = abs(at.z - d), relative * at.z
-    if error <= tolerance:  # most points; the slope only adds
+    if error <= tolerance:  # true for most points; the slope only adds tolerance
         return True
     change = _slope(source.depth, _clamp(np.floor(at.v), h), _clamp(np.floor(at.u), w))
     return error <= tolerance + slope * change
@@ -349,7 +349,7 @@ def _photometric(pair, target, source, at, limits):
 
 @exact_inlined
 def _normal(pair, target, at):
-    """The target's normal in the source's axes, its product with the point, and its use."""
+    """Return the target's normal in the source's axes, its product with the point, and validity."""
     n = target.normal
     x, y, z = float(n[at.i, at.j, 0]), float(n[at.i, at.j, 1]), float(n[at.i, at.j, 2])
     length = x * x + y * y + z * z
@@ -410,13 +410,13 @@ RULES = {
     "source_incidence": _source_incidence,
     "camera_frame": _camera_frame,
 }
-"""Kernels of rules: functions of the pair, a :class:`View` of the target and one of the source, a
-:class:`Pixel` and the rule's limits in the order of its record, infinite for None."""
+"""Rule kernels: functions of the pair, a target :class:`View`, a source :class:`View`, a
+:class:`Pixel` and the rule's limits in the order of its record; None becomes infinity."""
 OPAQUE = list(RULES).index("opaque")
 
 
 def _then(before, k, kernel):
-    """``before``, and then rule ``k``: numba has no loop over functions."""
+    """Chain rule ``k`` after ``before``, since numba cannot loop over functions."""
 
     @exact_pasted
     def passes_all(pair, target, source, at, rows, limits, passes):
@@ -432,7 +432,7 @@ def _then(before, k, kernel):
 
 @exact_pasted
 def _always(pair, target, source, at, rows, limits, passes):
-    """The rules that every view has."""
+    """Apply the rules of every view: defined and in_bounds."""
     bounds = _inside(at.x, at.y, pair.bounds_width, pair.bounds_height, pair.integer)
     passes[0, at.i, at.j] = at.defined
     passes[1, at.i, at.j] = bounds
@@ -446,15 +446,15 @@ for _k, _kernel in enumerate(RULES.values()):
 
 @exact
 def rules_of_pair(begin, end, pair, rows, limits, target, source, positions, passes, mask):
-    """Rows ``begin`` to ``end``: positions, rules and the mask.
+    """Compute positions, rules and the mask of rows ``begin`` to ``end``.
 
     Args:
-        rows: the row of ``passes`` for each of :data:`RULES`, -1 for a rule that is off.
-        limits: a tuple of floats for each.
-        target, source: a :class:`View` each.
-        positions: positions of the target's size.
-        passes: (R, H, W) bool, a row for each rule: defined, in_bounds, then those of ``rows``.
-        mask: (H, W) bool, all rules together.
+        rows: row of ``passes`` for each of :data:`RULES`, -1 for a rule that is off.
+        limits: tuple of floats for each rule.
+        target, source: :class:`View` of each side.
+        positions: output positions at the target's size.
+        passes: (R, H, W) bool, a row per rule: defined, in_bounds, then those of ``rows``.
+        mask: (H, W) bool, the conjunction of all rules.
     """
     image = pair.source
     shape = source.depth.shape
@@ -463,7 +463,7 @@ def rules_of_pair(begin, end, pair, rows, limits, target, source, positions, pas
         for j in range(mask.shape[1]):
             depth = float(target.depth[i, j])
             defined = _locate(pair, i, j, depth, positions)
-            if not _valid(depth):  # the background: every rule but that of alpha fails
+            if not _valid(depth):  # background: every rule except opacity fails
                 for row in range(len(passes)):
                     passes[row, i, j] = False
                 if rows[OPAQUE] >= 0 and source.alpha.shape[0] == 0:
@@ -488,13 +488,13 @@ def rules_of_pair(begin, end, pair, rows, limits, target, source, positions, pas
 
 @exact
 def taps_of(begin, end, xy, source, integer, shape, snap, index, weight):
-    """Rows ``begin`` to ``end``: the four taps of each position in an image of ``shape``.
+    """Compute the four taps of each position of rows ``begin`` to ``end`` in a ``shape`` image.
 
     Args:
         xy: (H, W, 2) positions in pixels of the source's image.
-        source: its :class:`Lens`.
+        source: :class:`Lens` of the source.
         index: (4, H, W) int32, flat indices into the image of ``shape``.
-        weight: (4, H, W) float32 or float64, 0 where a position is undefined.
+        weight: (4, H, W) float32 or float64, 0 for an undefined position.
     """
     w = np.uint64(shape[1])
     for i in range(begin, end):
@@ -514,11 +514,11 @@ def taps_of(begin, end, xy, source, integer, shape, snap, index, weight):
 
 @exact
 def resize_mask(begin, end, mask, rows, columns, defined, result):
-    """Rows ``begin`` to ``end`` of a mask on another grid, where ``defined`` too.
+    """Resize rows ``begin`` to ``end`` of a mask to another grid, intersected with ``defined``.
 
     Args:
-        mask: (H, W) bool.
-        rows, columns: an :class:`Axis` each.
+        mask: (H, W) bool mask.
+        rows, columns: :class:`Axis` of each direction.
         defined, result: (h, w) bool.
     """
     for i in range(begin, end):
@@ -529,5 +529,5 @@ def resize_mask(begin, end, mask, rows, columns, defined, result):
                 for c in range(columns.first[j], columns.last[j]):
                     line += columns.weights[j, c] if mask[r, c] else 0.0
                 share += rows.weights[i, r] * line
-            # Half of a pixel is not more than half, whatever the last bit of the sum says.
+            # Exactly half of a pixel must not count, even if the sum's rounding exceeds a half.
             result[i, j] = share > 0.5 + 1e-9 and defined[i, j]

@@ -1,12 +1,11 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
 """Sampling and blending of features: loops over taps, tokens and channels.
 
-Every product and sum is rounded by itself and in the order of the definition
-(:mod:`attnwarp.warp.sampling`), so both give the same bits: nothing here may be compiled with
-fastmath.
+Every product and sum is rounded separately, in the order of the definition
+(:mod:`attnwarp.warp.sampling`), so both give the same bits: fastmath must stay off here.
 
-Half precision comes as integers, since numba has no such numbers: uint16 holds float16, int16 holds
-bfloat16. ``index`` and ``weight`` are those of :class:`attnwarp.warp.taps.Taps`.
+Half precision is passed as integers, since numba lacks those types: uint16 holds float16, int16
+holds bfloat16. ``index`` and ``weight`` are the fields of :class:`attnwarp.warp.taps.Taps`.
 """
 
 from __future__ import annotations
@@ -20,25 +19,25 @@ from numba.extending import intrinsic
 from attnwarp.render._kernels.compilation import exact
 
 PLANES = 8
-"""Planes of a feature map that are sampled together."""
+"""Number of feature-map planes sampled together."""
 HALF, BRAIN = types.uint16, types.int16
 
 
 def _converts_half(context: Any) -> bool:
-    """Return True if the processor that numba compiles for converts float16: all do but for x86
-    without F16C. LLVM would call functions there that this process need not have.
+    """Return True if numba's target processor converts float16: all but x86 without F16C. LLVM
+    would otherwise call library functions that this process may lack.
     """
     triple, _, features = context.codegen().magic_tuple()
     return not triple.startswith(("x86", "i686", "i386")) or "+f16c" in features.split(",")
 
 
 def _from_half(builder: Any, bits: Any) -> Any:
-    """float16 to float32, by integers; exact."""
+    """Convert float16 to float32 by integer operations, exactly."""
     word, number = ir.IntType(32), ir.FloatType()
     wide = builder.zext(bits, word)
     magnitude = builder.and_(wide, word(0x7FFF))
     shifted = builder.shl(magnitude, word(13))
-    # Exponents are biased by 15 there and by 127 here.
+    # The exponent bias is 15 in float16 and 127 in float32.
     normal = builder.add(shifted, word((127 - 15) << 23))
     tiny = builder.fmul(builder.uitofp(magnitude, number), ir.Constant(number, 2.0**-24))
     value = builder.select(
@@ -51,14 +50,14 @@ def _from_half(builder: Any, bits: Any) -> Any:
 
 
 def _to_half(builder: Any, value: Any) -> Any:
-    """float32 to float16 by integers, rounded to the nearest, ties to even."""
+    """Convert float32 to float16 by integers, rounding to nearest, ties to even."""
     word, number = ir.IntType(32), ir.FloatType()
     bits = builder.bitcast(value, word)
     magnitude = builder.and_(bits, word(0x7FFFFFFF))
     odd = builder.and_(builder.lshr(magnitude, word(13)), word(1))
     rebiased = builder.sub(magnitude, word((127 - 15) << 23))
     normal = builder.lshr(builder.add(rebiased, builder.add(odd, word(0xFFF))), word(13))
-    # A sum with 2^23 has no place for halves, so it is rounded as float16's last bit is.
+    # A float32 sum with 2^23 has no fractional bits, so the addition rounds like float16.
     scaled = builder.fmul(builder.bitcast(magnitude, number), ir.Constant(number, 2.0**24))
     whole = builder.fadd(scaled, ir.Constant(number, 2.0**23))
     tiny = builder.sub(builder.bitcast(whole, word), word(0x4B000000))
@@ -90,7 +89,7 @@ def _to_brain(builder: Any, value: Any) -> Any:
 
 @intrinsic
 def _wide(typing: Any, value: Any) -> Any:
-    """A stored value as a number: float64 of float64, float32 of all else."""
+    """Widen a stored value: float64 stays float64, all other types become float32."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         if value == HALF and not _converts_half(context):
@@ -104,7 +103,7 @@ def _wide(typing: Any, value: Any) -> Any:
 
 @intrinsic
 def _narrow(typing: Any, row: Any, value: Any) -> Any:
-    """A number as ``row`` stores it, rounded to the nearest, ties to even."""
+    """Convert a number to the storage type of ``row``, rounding to nearest, ties to even."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         if row.dtype == HALF and not _converts_half(context):
@@ -123,7 +122,7 @@ def _all_used(weight, n):
 
 @exact
 def _sum_used(plane, index, weight, n, zero):
-    """The weighted sum of one plane's taps. A tap of weight 0 may hold anything."""
+    """Sum one plane's weighted taps. A tap of weight 0 may have any value, even NaN."""
     total = zero
     for k in range(4):
         if weight[k, n] > 0:
@@ -133,11 +132,11 @@ def _sum_used(plane, index, weight, n, zero):
 
 @exact
 def sample_rows(begin, end, source, index, weight, result):
-    """Tokens ``begin`` to ``end`` of ``result``.
+    """Compute tokens ``begin`` to ``end`` of ``result``.
 
     Args:
-        source: (B, h*w, C), result: (B, N, C), of one type.
-        index: (4, N) uint32, weight: (4, N).
+        source, result: (B, h*w, C) and (B, N, C), of one type.
+        index, weight: (4, N) uint32, and (4, N).
     """
     zero = weight.dtype.type(0)
     for b in range(source.shape[0]):
@@ -162,14 +161,14 @@ def sample_rows(begin, end, source, index, weight, result):
 
 @exact
 def sample_maps(begin, end, source, index, weight, result):
-    """Planes ``begin`` to ``end`` of ``result``.
+    """Compute planes ``begin`` to ``end`` of ``result``.
 
     Args:
-        source: (P, h*w), result: (P, N), of one type; index, weight: as in :func:`sample_rows`.
+        source, result: (P, h*w) and (P, N), of one type; index, weight: as in :func:`sample_rows`.
     """
     zero = weight.dtype.type(0)
     for first in range(begin, end, PLANES):
-        # Taps and weights are read once for several planes: they are most of what is read.
+        # Taps and weights, most of the memory traffic, are read once for several planes.
         last = min(first + PLANES, end)
         for n in range(result.shape[1]):
             if _all_used(weight, n):
@@ -186,13 +185,13 @@ def sample_maps(begin, end, source, index, weight, result):
 
 @exact
 def scatter_rows(begin, end, gradient, index, weight, result):
-    """Channels ``begin`` to ``end`` of the gradient in the source's tokens.
+    """Compute channels ``begin`` to ``end`` of the gradient in the source's tokens.
 
-    A thread has channels of its own and adds all positions in their order, so the bits are the same
+    Each thread handles separate channels and adds all positions in order, so the bits are the same
     for any number of threads.
 
     Args:
-        gradient: (B, N, C) in the warped tokens, result: (B, h*w, C) zeros, of the weights' type.
+        gradient, result: (B, N, C) of the warped tokens; (B, h*w, C) zeros of the weights' type.
     """
     for b in range(gradient.shape[0]):
         for n in range(gradient.shape[1]):
@@ -207,10 +206,10 @@ def scatter_rows(begin, end, gradient, index, weight, result):
 
 @exact
 def scatter_maps(begin, end, gradient, index, weight, result):
-    """Planes ``begin`` to ``end`` of the gradient in the source's maps.
+    """Compute planes ``begin`` to ``end`` of the gradient in the source's maps.
 
     Args:
-        gradient: (P, N), result: (P, h*w) zeros, of the weights' type.
+        gradient, result: (P, N); (P, h*w) zeros of the weights' type.
     """
     for p in range(begin, end):
         for n in range(gradient.shape[1]):
