@@ -1,9 +1,9 @@
-"""Likeness of two pictures: MSE, PSNR, SSIM, MS-SSIM, and the Edit PSNR of a set of views.
+"""Similarity of two pictures: MSE, PSNR, SSIM, MS-SSIM, and the Edit PSNR of a set of views.
 
-Pictures are (H, W, 3) float32 or float64 in [0, 1], masks (H, W) bool. The functions take values as
-they come: whether they are sRGB or linear is the caller's to name, and :func:`image_error` names it
-in its figures. Everything is summed in float64. With nothing to measure (an empty mask, a picture
-smaller than the window) a figure is NaN, never 0.
+Pictures are (H, W, 3) float32 or float64 in [0, 1], masks (H, W) bool. The functions do not convert
+values: the caller decides whether they are sRGB or linear, and the figures of :func:`image_error`
+say which. All sums are float64. With nothing to measure (an empty mask, a picture smaller than the
+window) a figure is NaN, never 0.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ over places.
 """
 
 WINDOW = 11
-"""Side of SSIM's window in pixels; that of :data:`attnwarp.losses.SSIM_WINDOW`, not imported since
-it brings torch.
+"""Side of SSIM's window in pixels; equal to :data:`attnwarp.losses.SSIM_WINDOW`, which is not
+imported since it needs torch.
 """
 
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
@@ -38,12 +38,12 @@ def mse(image: Any, target: Any, mask: Any = None) -> float:
     """Mean over the mask's pixels and channels of the squared difference; NaN for an empty mask.
 
     Args:
-        image, target: (H, W, 3) in [0, 1], of one size. What they hold outside the mask does not
+        image, target: (H, W, 3) in [0, 1], of one size. Values outside the mask do not
             count, NaN included.
         mask: (H, W) bool, the pixels that count; all if left out.
 
     Raises:
-        ValueError: another dtype or shape, or in the mask a value that is not finite or outside [0,
+        ValueError: another dtype or shape, or a masked value that is not finite or outside [0,
             1].
 
     Example:
@@ -57,11 +57,11 @@ def mse(image: Any, target: Any, mask: Any = None) -> float:
 
 
 def psnr(image: Any, target: Any, mask: Any = None) -> float:
-    """-10 log10 of :func:`mse`, in dB: +inf where the pictures are equal, NaN for an empty mask.
+    """-10 log10 of :func:`mse`, in dB: +inf if the pictures are equal, NaN for an empty mask.
 
     The error is divided by the pixels of the mask. Dividing by all pixels, with the others set to
-    0, gains -10 log10(coverage): 6.02 dB at 25 %. The PSNR of several views is that of their mean
-    MSE; see :func:`edit_psnr`. A mean of decibels is another figure, which hides bad views.
+    0, would add -10 log10(coverage): 6.02 dB at 25 %. The PSNR of several views is that of their
+    mean MSE; see :func:`edit_psnr`. A mean of decibels is another figure, which hides bad views.
 
     Args:
         image, target: (H, W, 3) float32 or float64, sRGB in [0, 1].
@@ -93,7 +93,7 @@ def ssim(image: Any, target: Any, mask: Any = None) -> float:
         mask: (H, W) bool, True where a pixel counts; all pixels if left out.
 
     Returns:
-        NaN when there is no such window: a picture below 11 x 11 px, or a mask that holds no 11 x
+        NaN without such a window: a picture below 11 x 11 px, or a mask without an 11 x
         11 square.
 
     Raises:
@@ -111,7 +111,7 @@ def ssim(image: Any, target: Any, mask: Any = None) -> float:
 
 
 def ssim_map(image: Any, target: Any, mask: Any = None) -> Array:
-    """(H - 10, W - 10) similarity of each window, a mean over channels; NaN where it is not wholly
+    """(H - 10, W - 10) similarity of each window, a mean over channels; NaN if it is not wholly
     inside the mask.
 
     The window at [i, j] is centred on the pixel [i + 5, j + 5]. Empty for a picture below 11 x 11
@@ -141,7 +141,7 @@ def whole_windows(mask: Mask) -> Mask:
     """(H - 10, W - 10) bool: the 11 x 11 windows that lie wholly inside a mask of at least that
     size.
     """
-    # A window is whole when it holds no pixel outside: sums of an integral image are exact.
+    # A window is whole if it has no pixel outside: sums of an integral image are exact.
     outside = np.pad(np.cumsum(np.cumsum(~mask, axis=0), axis=1), ((1, 0), (1, 0)))
     columns: npt.NDArray[np.int64] = outside[WINDOW:] - outside[:-WINDOW]
     whole: Mask = columns[:, WINDOW:] == columns[:, :-WINDOW]
@@ -153,17 +153,17 @@ def ms_ssim(image: Any, target: Any, mask: Any = None) -> float:
 
     Contrast and structure count at five scales, luminance at the coarsest. Each is averaged over
     windows and channels, then multiplied with the paper's exponents. A scale has means of 2 x 2
-    pixels of the one before; an odd last row or column is dropped. A mean below 0 (pictures that
+    pixels of the previous one; an odd last row or column is dropped. A mean below 0 (pictures that
     are each other's negatives) has no real power and counts as 0.
 
-    Given a mask, a pixel of a coarser scale is inside when its four pixels are, and windows count
+    With a mask, a pixel of a coarser scale is inside if its four pixels are, and windows count
     as in :func:`ssim`.
 
     Args:
         image, target, mask: as :func:`ssim`.
 
     Returns:
-        NaN when some scale has no window: a side below 176 px, or a mask that holds no square of
+        NaN if a scale has no window: a side below 176 px, or a mask without a square of
         about that size.
 
     Raises:
@@ -192,24 +192,24 @@ def ms_ssim(image: Any, target: Any, mask: Any = None) -> float:
 
 
 def perceptual(image_srgb: Any, target_srgb: Any, distance: Distance, mask: Any = None) -> float:
-    """A perceptual distance (LPIPS's kind) of two pictures, or of what a mask leaves of them; NaN
+    """Perceptual distance (such as LPIPS) of two pictures, or of their masked parts; NaN
     for an empty mask.
 
     Outside the mask the picture is replaced by the target. The distance is then divided by the
-    share of the picture that the mask covers. So a distance that is a mean over pixels becomes a
-    mean over those of the mask, except near its border: networks see a neighbourhood of each pixel.
-    Pictures that are equal inside the mask have distance 0.
+    mask's share of the picture. So a mean over pixels becomes a mean over the mask's pixels, except
+    near its border: networks see a neighbourhood of each pixel. Pictures that are equal inside the
+    mask have distance 0.
 
     Args:
-        image_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of one size. What they hold outside the
-            mask may be anything; of the target it is what the network sees around the mask, black
-            where it is NaN or outside [0, 1].
-        distance: takes both pictures in float64. Of an encoder: ``lambda a, b:
+        image_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of one size. Values outside the mask may
+            be anything; there the network sees the target, black where the target is NaN or
+            outside [0, 1].
+        distance: function of both pictures in float64. For an encoder: ``lambda a, b:
             float(encoder.distance([a], [b])[0])``.
         mask: (H, W) bool, the pixels that count; all if left out.
 
     Raises:
-        ValueError: another dtype or shape, or in the mask a value that is not finite or outside [0,
+        ValueError: another dtype or shape, or a masked value that is not finite or outside [0,
             1].
 
     Example:
@@ -232,8 +232,8 @@ def perceptual(image_srgb: Any, target_srgb: Any, distance: Distance, mask: Any 
 def image_error(image_srgb: Any, target_srgb: Any, mask: Any = None) -> dict[str, float]:
     """The ``image.*`` figures of an sRGB picture against its reference.
 
-    All are of the sRGB values, as the field has it, apart from those named ``_linear``, which are
-    of linear light and so weigh bright parts more.
+    All are of the sRGB values, as is usual, except those named ``_linear``, which are of linear
+    light and so weigh bright parts more.
 
     Args:
         image_srgb, target_srgb: (H, W, 3), sRGB-encoded, in [0, 1].
@@ -262,13 +262,13 @@ def image_error(image_srgb: Any, target_srgb: Any, mask: Any = None) -> dict[str
 
 @dataclass(frozen=True)
 class EditPsnr:
-    """Fidelity of an edited scene's views to the edited pictures that it was made from.
+    """Fidelity of an edited scene's views to the edited pictures it was fitted to.
 
     Attributes:
-        views: the views that were measured, by name and in order. Methods that edit different views
-            are not comparable by this figure: fewer edited views are easier to follow.
-        mse: mse of each view; NaN where it is undefined.
-        psnr: psnr of each view in dB; +inf where the pictures are equal, NaN where it is undefined.
+        views: names of the measured views, in order. Methods that edit different views
+            are not comparable by this figure: fewer edited views are easier to fit.
+        mse: MSE of each view; NaN where undefined.
+        psnr: PSNR of each view in dB; +inf for equal pictures, NaN where undefined.
 
     Example:
         >>> import math
@@ -284,21 +284,21 @@ class EditPsnr:
 
     @property
     def pooled(self) -> float:
-        """PSNR of the mean MSE over the views that have one, each counting alike; +inf when all of
+        """PSNR of the mean MSE over the views that have one, with equal weights; +inf if all of
         them are equal, NaN without any.
         """
         return psnr_of_mse(mean(np.array([error for error in self.mse if not math.isnan(error)])))
 
     @property
     def mean_finite(self) -> float:
-        """Mean of the finite PSNRs; identical and undefined views are left out and counted, NaN
-        when none is left.
+        """Mean of the finite PSNRs, without identical and undefined views, which are counted; NaN
+        without any.
         """
         return mean(np.array([value for value in self.psnr if math.isfinite(value)]))
 
     @property
     def identical(self) -> int:
-        """Number of views whose pictures are equal, PSNR +inf."""
+        """Number of views with equal pictures, PSNR +inf."""
         return sum(value == math.inf for value in self.psnr)
 
     @property
@@ -307,7 +307,7 @@ class EditPsnr:
         return sum(math.isnan(value) for value in self.psnr)
 
     def figures(self) -> dict[str, float]:
-        """The ``edit.*`` figures; each view's own as ``edit.psnr.NAME`` and ``edit.mse.NAME``."""
+        """The ``edit.*`` figures; each view's as ``edit.psnr.NAME`` and ``edit.mse.NAME``."""
         return {
             "edit.psnr_pooled": self.pooled,
             "edit.psnr_mean": self.mean_finite,
@@ -328,13 +328,13 @@ def edit_psnr(
     """Edit PSNR: edited pictures against renders of the edited scene, view by view.
 
     Args:
-        edited: (H, W, 3) in [0, 1] by the view's name, all views that were edited, in whatever
+        edited: (H, W, 3) in [0, 1] by the view's name, all edited views, from any
             stage.
-        rendered: the same views of the scene that was fitted on them.
-        masks: (H, W) bool by the view's name, the pixels that count, for all views or none.
+        rendered: the same views of the scene fitted to them.
+        masks: (H, W) bool by the view's name, counted pixels, for all views or none.
 
     Raises:
-        ValueError: the three do not name the same views; a picture that :func:`mse` refuses, with
+        ValueError: the three have different views; a picture that :func:`mse` refuses, with
             the view's name.
 
     Example:

@@ -1,8 +1,8 @@
-"""Agreement of two edited views at correspondences that a depth gives, exact or rendered.
+"""Agreement of two edited views at correspondences from a depth map, exact or rendered.
 
-A person with splats or depth has such correspondences without any truth:
-:func:`attnwarp.warp.warp_view` gives them for each target pixel, with a mask. Pictures are sRGB in
-[0, 1]; positions are px of the source, pixel centres at +0.5.
+Such correspondences need splats or depth but no truth: :func:`attnwarp.warp.warp_view` gives them
+for each target pixel, with a mask. Pictures are sRGB in [0, 1]; positions are px of the source,
+pixel centres at +0.5.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from attnwarp_eval.metrics.embedding import Similarity, unit_rows
 from attnwarp_eval.metrics.image import Distance, perceptual
 
 CHANGED = 2.0
-"""dE00 between a view before and after the edit from which a pixel counts as changed: twice the
-difference that a person just sees, and above the noise of 8 bits."""
+"""dE00 between a view before and after the edit above which a pixel counts as changed: twice the
+just noticeable difference, and above the noise of 8 bits."""
 
 GRID = (slice(None, None, 2), slice(None, None, 2))
-"""Every second row and column of a target: a quarter of the time for nearly the same means."""
+"""Step of the rows and columns compared: 2 takes a quarter of the time for nearly equal means."""
 
 
 def disagreement_at(
     source_srgb: Any, target_srgb: Any, xy: Any, accepted: Any, *, within: Any = None
 ) -> Disagreement:
-    """Disagreement of two pictures at positions that somebody else found.
+    """Compare two pictures at given positions.
 
     Args:
         source_srgb, target_srgb: (h, w, 3) and (H, W, 3) sRGB in [0, 1].
@@ -60,10 +60,10 @@ def disagreement_at(
 def edit_agreement(
     before: tuple[Any, Any], after: tuple[Any, Any], xy: Any, accepted: Any
 ) -> dict[str, float]:
-    """Disagreement that an edit adds, at the pixels that it changed in either view.
+    """Measure the disagreement added by an edit, at pixels changed in either view.
 
-    What differs between two views before the edit, such as highlights, wrong depth and resampling,
-    is taken off pixel by pixel. So neither truth nor a mask of the object is needed.
+    Differences between the two views before the edit, such as highlights, wrong depth and
+    resampling, are subtracted pixel by pixel. So neither truth nor a mask of the object is needed.
 
     Args:
         before, after: source and target, (h, w, 3) and (H, W, 3) sRGB in [0, 1].
@@ -72,8 +72,8 @@ def edit_agreement(
     Returns:
         ``consistency.edit_delta_e``, the mean over the changed pixels of dE00 after the edit minus
         dE00 before it, which may be negative; ``consistency.edit_delta_e_p90``, its 90th
-        percentile; and ``consistency.edit_pixels``, their number. NaN where nothing changed. A
-        pixel is changed from :data:`CHANGED` on.
+        percentile; and ``consistency.edit_pixels``, their number. NaN if nothing changed. A
+        pixel counts as changed from :data:`CHANGED` on.
 
     Raises:
         ValueError: a picture that is not sRGB in [0, 1], or sizes that differ.
@@ -124,7 +124,7 @@ def feature_consistency(
     *,
     seen: float = 1.0,
 ) -> Similarity:
-    """Cosine of the features of two views at the same surface points: MEt3R's scheme, with a known
+    """Cosines of two views' features at the same surface points: MEt3R's scheme, with a known
     geometry in place of the predicted one.
 
     Args:
@@ -134,13 +134,13 @@ def feature_consistency(
         xy, accepted: (H, W, 2) and (H, W) as for :func:`disagreement_at`; read at the centres of
             the target's patches.
         size: (height, width) of the source in px.
-        seen: share of the shorter side that the encoder sees, in (0, 1]: 224 / 256 where it cuts
-            that much out of what it resized.
+        seen: share of the shorter side inside the encoder's crop, in (0, 1]: 224 / 256 for a crop
+            of 224 px from a picture resized to 256 px.
 
     Returns:
-        One cosine for each patch of the target whose centre is trusted and whose point lies in the
-        source's square, in row order. ``1 - mean`` is ``consistency.features``, 0 for equal
-        features. No value where nothing is trusted.
+        One cosine for each patch of the target with a trusted centre and a point in the source's
+        square, in row order. ``1 - mean`` is ``consistency.features``, 0 for equal
+        features. Empty without trusted patches.
 
     Raises:
         ValueError: other shapes, or features that are NaN or infinite.
@@ -173,14 +173,14 @@ def feature_consistency(
     at = (at - corner) * own / side
     with np.errstate(invalid="ignore"):
         kept &= ((at >= 0) & (at <= own)).all(axis=-1)
-    # Within half a patch of the border the nearest patch's centre stands for what is beyond.
+    # Within half a patch of the border, positions are clamped to the nearest patch's centre.
     held = np.clip(at[kept], 0.5, own - 0.5)
     a, b = unit_rows(sampled(source, held)), unit_rows(target[kept])
     return Similarity(np.clip((a * b).sum(axis=1), -1, 1))
 
 
 def _square(size: tuple[int, ...], seen: float) -> tuple[Array, float]:
-    """Upper left corner (x, y) and side in px of the central square that an encoder sees."""
+    """Upper left corner (x, y) and side in px of the encoder's central crop."""
     side = min(size[:2]) * seen
     return (np.array(size[1::-1]) - side) / 2, side
 
@@ -193,7 +193,7 @@ def perceptual_consistency(
 
     Args:
         source_srgb, target_srgb, xy, accepted: as for :func:`disagreement_at`.
-        distance: as for :func:`attnwarp_eval.metrics.perceptual`, which says what a mask does.
+        distance: as for :func:`attnwarp_eval.metrics.perceptual`, which describes the mask.
 
     Raises:
         ValueError: as :func:`disagreement_at`.

@@ -1,4 +1,4 @@
-"""Overlap of a mask with the exact one: over a view, where the source saw it, where it did not."""
+"""Overlap of a mask with the exact one: over a view, where the source saw it, and elsewhere."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from attnwarp_eval.metrics.arrays import mask, share
 
 LEAST_PIXELS = 16
-"""Pixels of a thing below which its overlap is undefined: one pixel would weigh too much."""
+"""Least pixels of a thing for a defined overlap: below, one pixel would weigh too much."""
 
 
 def mask_overlap(
@@ -19,16 +19,16 @@ def mask_overlap(
 
     Args:
         marked: (H, W) bool, the mask to judge.
-        thing: (H, W) bool, the exact one.
-        seen: (H, W) bool, pixels whose surface the source shows; None for no figures of them.
-        unseen: (H, W) bool, pixels with a surface that it does not show; None likewise.
-        least: pixels of the thing from which on figures are defined.
+        thing: (H, W) bool, the exact mask.
+        seen: (H, W) bool, pixels whose surface the source shows; None for no ``.seen`` figures.
+        unseen: (H, W) bool, pixels with a surface hidden from the source; None likewise.
+        least: least pixels of the thing for defined figures.
 
     Returns:
         ``masks.iou``, ``masks.precision``, ``masks.recall`` and the counts ``masks.union``,
-        ``masks.marked`` and ``masks.thing``, of all pixels; with ``.seen`` and ``.unseen`` behind
-        the name, of those alone. NaN where too little of the thing is there; a precision also
-        where nothing is marked.
+        ``masks.marked`` and ``masks.thing``, over all pixels; names with ``.seen`` and ``.unseen``
+        are over those pixels only. NaN if too little of the thing is visible; a precision also if
+        nothing is marked.
 
     Raises:
         ValueError: another shape or type.

@@ -1,4 +1,4 @@
-"""Agreement of an edit's views: disagreement above its floor, one answer, fidelity to it."""
+"""Agreement of an edit's views: disagreement above its floor, answers, fidelity."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from attnwarp_eval.two_view import TwoView
 
 ABOVE_FLOOR = "multiview.delta_e_above"
-"""Beginning of the names of disagreement above its floor."""
+"""Prefix of metrics of disagreement above its floor."""
 
 BELOW_FLOOR = (
     "Disagreement is **below its floor**, so negative, where edited views are more alike than the"
@@ -36,12 +36,12 @@ def above_floor(
     mask: Any = None,
     exclude: Any = None,
 ) -> dict[str, float]:
-    """Disagreement of two edited views about the same surface points, and that of the true edited
+    """Compare the colours of two edited views at the same surface points, and of the true edited
     views at the same pixels.
 
     Args:
         edited: (H, W, 3) sRGB in [0, 1] of source and target after the edit.
-        truth: the same two views of the truly edited scene. For an ambiguous edit: of the answer
+        truth: the same two views of the truly edited scene. For an ambiguous edit: the answer
             that :func:`attnwarp_eval.metrics.nearest_answer` names.
         pair: :func:`attnwarp_eval.truth.two_view` of source and target.
         mask, exclude: as for :func:`attnwarp_eval.metrics.cross_view`.
@@ -49,7 +49,7 @@ def above_floor(
     Returns:
         ``multiview.delta_e`` (mean CIEDE2000), ``multiview.delta_e_floor`` (of the truth),
         ``multiview.delta_e_above`` (their difference, which may be negative),
-        ``multiview.pixels`` and ``multiview.share`` of the pixels asked about. NaN where no pixel
+        ``multiview.pixels`` and ``multiview.share`` of the pixels considered. NaN if no pixel
         is counted.
 
     Example:
@@ -66,7 +66,7 @@ def above_floor(
     """
     difference = cross_view(*edited, pair, mask=mask, exclude=exclude)
     floor = cross_view(*truth, pair, mask=mask, exclude=exclude)
-    # The pixels follow from the geometry alone, so both are means over the same ones.
+    # The pixels follow from the geometry alone, so both means are over the same pixels.
     value, least = mean(difference.delta_e[difference.counted]), mean(floor.delta_e[floor.counted])
     pixels = int(difference.counted.sum())
     return {
@@ -83,15 +83,15 @@ def answers_by_view(
     answers: Mapping[str, Mapping[str, Any]],
     masks: Mapping[str, Any] | None = None,
 ) -> dict[str, str | None]:
-    """The right answer of an ambiguous edit that each view by itself is nearest to, by MSE.
+    """Right answer of an ambiguous edit nearest to each view alone, by MSE.
 
     Args:
         images: (H, W, 3) sRGB in [0, 1] by the view's name, the edited views.
-        answers: by the answer's name, its truth in the same views.
+        answers: truth of each answer in the same views, by name.
         masks: (H, W) bool by the view's name, the edited object.
 
     Returns:
-        By the view's name, the answer's name; None where the view shows nothing of the object. Of
+        Answer's name by the view's name; None if the view shows none of the object. Of
         equally near answers the first.
 
     Raises:
@@ -129,21 +129,21 @@ def edit_fidelity(
     originals: Mapping[str, Any] | None = None,
     distance: Distance | None = None,
 ) -> tuple[str | None, dict[str, dict[str, float]]]:
-    """Fidelity of each view to the answer that all views together are nearest to.
+    """Measure each view's fidelity to the answer nearest to all views together.
 
-    One answer for all views: a view that shows another right answer is wrong there.
+    One answer for all views: a view with another right answer is wrong.
 
     Args:
         images: (H, W, 3) sRGB in [0, 1] by the view's name, the edited views.
-        answers: by the answer's name, its truth in the same views; an edit with one result has one.
-        masks: by the answer's name and the view's, (H, W) bool, the edited object. The nearest
-            answer is decided inside the union of a view's masks, so that every answer is held
-            against the same pixels.
+        answers: truth of each answer in the same views, by name; an unambiguous edit has one.
+        masks: (H, W) bool by the answer's name and the view's, the edited object. The nearest
+            answer is decided inside the union of a view's masks, so that every answer is compared
+            at the same pixels.
         originals: the views before the edit.
         distance: a perceptual distance.
 
     Returns:
-        The answer's name, None where nothing could be measured; and the figures of
+        The answer's name, None if nothing could be measured; and the figures of
         :func:`attnwarp_eval.metrics.fidelity` by the view's name, none without an answer.
 
     Example:

@@ -1,7 +1,7 @@
 """Masks against true visibility from the source: precision, recall and other scores.
 
 A pixel that shows a surface is visible, hidden (occluded, turned away) or ambiguous, or its point
-falls outside the source image or behind its camera. Ambiguous pixels are counted and not scored.
+falls outside the source image or behind its camera. Ambiguous pixels are counted but not scored.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ COUNTS = (
     "ambiguous_accepted",
     "ambiguous_rejected",
 )
-"""The counts :func:`confusion` gives. "outside" is surface whose point is not in the source image,
-points behind the camera included; "behind" those alone. "empty" is background."""
+"""Names of :func:`confusion`'s counts. "outside" is surface with a point outside the source image,
+including points behind the camera; "behind" only those. "empty" is background."""
 
 Counts = dict[str, int]
 Ints = npt.NDArray[np.int64]
@@ -41,14 +41,14 @@ Ints = npt.NDArray[np.int64]
 def confusion(
     accepted: Any, label: Any, surface: Any, behind: Any = None, among: Any = None
 ) -> Counts:
-    """Counts of accepted and rejected pixels by their true class.
+    """Count accepted and rejected pixels by their true class.
 
     Args:
         accepted: (H, W) bool, the mask to judge.
         label: (H, W) 0 none, 1 visible, 2 hidden, 3 ambiguous.
-        surface: (H, W) bool, the target pixel shows a surface at all.
+        surface: (H, W) bool, the target pixel shows a surface.
         behind: (H, W) bool, the surface's point lies behind the source camera.
-        among: (H, W) bool, the pixels to count; all of them if left out.
+        among: (H, W) bool, the pixels to count; by default all.
 
     Returns:
         One integer for each of :data:`COUNTS`.
@@ -78,7 +78,7 @@ def _table(accepted: Any, label: Any, surface: Any, behind: Any, region: Mask | 
     if behind is not None:
         code |= mask(behind, truth.shape, "behind").view(np.uint8) << 3
     code |= mask(accepted, truth.shape, "accepted").view(np.uint8) << 4
-    # Without a region every pixel is in it.
+    # Without a region every pixel counts.
     code |= np.uint8(1 << 5) if region is None else region.view(np.uint8) << 5
     return np.bincount(code.ravel(), minlength=64).reshape(2, 2, 2, 2, 4)
 
@@ -100,13 +100,13 @@ def _counts(table: Ints) -> Counts:
 
 
 def scores(counts: Mapping[str, int]) -> dict[str, float]:
-    """Precision, recall, F1 and both error rates from :func:`confusion`'s counts, summed over as
-    many views as wished.
+    """Precision, recall, F1 and both error rates from :func:`confusion`'s counts, of one view or
+    summed over several.
 
-    A mask that accepts nothing has no precision, and a view in which nothing is visible has no
+    A mask that accepts nothing has no precision, and a view without visible pixels has no
     recall, no false negative rate and no F1: NaN. Accepted background counts against precision and
-    F1, and not in the false positive rate, whose base is surface that the source does not show: a
-    large sky would dilute it.
+    F1, but not in the false positive rate, whose base is surface hidden from the source: a large
+    sky would dilute it.
 
     Example:
         >>> from attnwarp_eval import metrics
@@ -134,8 +134,8 @@ def scores(counts: Mapping[str, int]) -> dict[str, float]:
 def mask_error(
     accepted: Any, label: Any, surface: Any, behind: Any = None, edge: Any = None
 ) -> dict[str, float]:
-    """Scores and counts of a mask; with ``edge`` also for the interior and the band around edges
-    apart.
+    """Scores and counts of a mask; with ``edge`` also for the interior and for the band
+    around edges.
 
     Args:
         accepted, label, surface, behind: as in :func:`confusion`.
@@ -165,12 +165,12 @@ def mask_error(
 
 @dataclass(frozen=True)
 class YawBin:
-    """Views whose yaw lies in [low, high), the last bin with its upper end.
+    """Views whose yaw lies in [low, high), the last bin including its upper end.
 
     Attributes:
         low, high: degrees.
-        views: how many views fell in.
-        counts: their counts, summed.
+        views: number of views in the bin.
+        counts: sums of the views' counts.
         scores: scores of the sums, NaN where undefined.
 
     Example:
@@ -193,7 +193,7 @@ def by_yaw(
     rows: Iterable[tuple[float, Mapping[str, int]]],
     edges: Sequence[float] = (0, 15, 30, 60, 90, 120, 150, 180),
 ) -> list[YawBin]:
-    """Counts of views, summed in bins of yaw.
+    """Sum the counts of views in bins of yaw.
 
     Args:
         rows: yaw in degrees, of either sign and folded to [0, 180], and the counts of

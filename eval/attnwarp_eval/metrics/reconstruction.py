@@ -1,7 +1,7 @@
-"""Can edited views be reconstructed as one scene? COLMAP's structure from motion, whose figures
+"""Reconstruction of edited views as one scene by COLMAP's structure from motion, whose figures
 papers report as consistency.
 
-The scene's cameras are not used, but for their intrinsics: COLMAP finds poses anew, from SIFT
+Only the intrinsics of the scene's cameras are used: COLMAP estimates poses from SIFT
 matches of all pairs of views.
 """
 
@@ -29,8 +29,8 @@ class Reconstruction:
 
     Attributes:
         views: number of pictures.
-        registered: number of them in the model; 0 where none could be made.
-        points: its number of 3D points.
+        registered: number of pictures in the model; 0 without a model.
+        points: number of the model's 3D points.
         track_length: mean number of views that see a point; NaN without a model.
         reprojection_error: mean over the points, in px; NaN without a model.
 
@@ -47,7 +47,7 @@ class Reconstruction:
     reprojection_error: float = math.nan
 
     def figures(self) -> dict[str, float]:
-        """The ``consistency.colmap_*`` figures; a failure has no registered view, and is 1 in
+        """The ``consistency.colmap_*`` figures; a failure has no registered view and gives 1 for
         ``colmap_failed``.
         """
         return {
@@ -68,7 +68,7 @@ def reconstruct(images: Sequence[Any], cameras: Sequence[Camera]) -> Reconstruct
 
     Args:
         images: at least two, (H, W, 3) sRGB in [0, 1].
-        cameras: one a picture, of its size; only their intrinsics are read.
+        cameras: one for each picture, of its size; only the intrinsics are read.
 
     Raises:
         InputError: the package pycolmap crashed, or is missing (MissingExtraError).

@@ -20,25 +20,25 @@ def surface_error(
 ) -> dict[str, float]:
     """Distances between the points of two surfaces, each to the nearest of the other.
 
-    Both are spread evenly over their surface, closer than any distance that is to be told.
+    Both are sampled evenly on their surfaces, more densely than the distances of interest.
     Accuracy, completeness and their mean, the chamfer distance, are those of DTU (Aanaes et al.
     2016, Large-scale data for multiple-view stereopsis); precision, recall and F-score those of
     Tanks and Temples (Knapitsch et al. 2017); normal consistency is that of Mescheder et al. 2019
     (Occupancy networks).
 
     Args:
-        points: (P, 3) of the reconstruction; P may be 0.
-        true_points: (T, 3) of the true surface.
+        points: (P, 3) points of the reconstruction; P may be 0.
+        true_points: (T, 3) points of the true surface.
         threshold: distance below which a point counts as right, in the points' unit.
-        cut: distances from here on are left out of the means, as DTU leaves out those above 20 mm.
+        cut: limit above which distances are left out of the means, as DTU does above 20 mm.
         normal, true_normal: (P, 3) and (T, 3) unit normals, of either sign.
 
     Returns:
-        ``surface.accuracy``, ``completeness``, ``chamfer``, and ``chamfer_uncut`` of all points, in
-        the points' unit; ``surface.precision``, ``recall`` and ``f_score``;
+        ``surface.accuracy``, ``completeness``, ``chamfer``, and ``chamfer_uncut`` over all points,
+        in the points' unit; ``surface.precision``, ``recall`` and ``f_score``;
         ``surface.normal_consistency``, the mean of the absolute cosine between the normals of
-        nearest points, both ways, where normals are given; and the counts ``surface.points`` and
-        ``surface.true_points``. NaN where one side has no point, or none within ``cut``.
+        nearest points, both ways, if normals are given; and the counts ``surface.points`` and
+        ``surface.true_points``. NaN if one side has no point, or none within ``cut``.
 
     Raises:
         ValueError: another shape, one of the two normals without the other, or a point that is not

@@ -19,17 +19,17 @@ def endpoint_error(
     Args:
         xy: (H, W, 2) source positions of the warp, NaN where undefined.
         true_xy: (H, W, 2) exact source positions on the same grid.
-        visible: (H, W) bool, pixels whose surface the source truly shows; only these are scored.
-        edge: (H, W) bool, the band around edges; given, every figure comes for the interior and the
-            band apart too.
+        visible: (H, W) bool, pixels truly visible in the source; only these are scored.
+        edge: (H, W) bool, the band around edges; adds every figure for the interior and
+            for the band.
         image_px: size of one unit of ``xy`` in image pixels, or (x, y) sizes: 8 on the 64 grid of a
             512 image.
 
     Returns:
         Figures of :data:`attnwarp_eval.metrics.registry.METRICS` in image pixels, and ``_layer``
-        ones in the units of ``xy``. The shares are of all visible pixels: one without a position is
-        not within anything. Median, percentile and mean are over those that have one, with
-        ``coverage`` beside them. NaN where there is nothing to measure.
+        ones in the units of ``xy``. The shares are of all visible pixels: a pixel without a
+        position is within no threshold. Median, percentile and mean are over pixels with a
+        position, with ``coverage`` next to them. NaN with nothing to measure.
 
     Raises:
         ValueError: another shape or type, or an exact position that is not finite in a visible
@@ -90,18 +90,18 @@ def feature_error(
     exact^2).
 
     Args:
-        warped: (C, h, w) features as warped; what stands outside ``accepted`` counts in
-            ``feature_visible`` alone.
-        exact: (C, h, w) the field at the target's own surface points
+        warped: (C, h, w) features as warped; values outside ``accepted`` count in
+            ``feature_visible`` only.
+        exact: (C, h, w) the field at the target's surface points
             (:meth:`attnwarp_eval.truth.features.SolidField.on_grid`).
         accepted: (h, w) bool, the warp's mask.
-        visible: (h, w) bool, pixels whose surface the source truly shows.
+        visible: (h, w) bool, pixels truly visible in the source.
         edge: (h, w) bool, the band around edges.
 
     Returns:
         ``feature_accepted`` over accepted and visible pixels, ``feature_visible`` over all visible
-        ones, ``feature_all_accepted`` over accepted ones with a surface, visible or not: what is
-        injected. NaN where there is nothing to measure.
+        ones, ``feature_all_accepted`` over accepted ones with a surface, visible or not, as
+        injected. NaN with nothing to measure.
 
     Example:
         >>> import numpy as np
@@ -118,7 +118,7 @@ def feature_error(
     band = None if edge is None else mask(edge, shape, "edge")
     surface = np.ones(shape, dtype=bool)
     square, power = np.zeros(shape), np.zeros(shape)
-    for ours, true in zip(estimate, truth, strict=True):  # by channels, which fit in a cache
+    for ours, true in zip(estimate, truth, strict=True):  # by channel, to fit in a cache
         surface &= np.isfinite(true)
         square += (ours - true) ** 2
         power += true**2

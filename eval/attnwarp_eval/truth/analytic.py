@@ -19,18 +19,18 @@ def nearest_hit(
 ) -> tuple[Array, npt.NDArray[np.int64]]:
     """First hit of each ray with any sphere or rectangle.
 
-    Spheres use the discriminant r^2 - |oc - (oc.d)d|^2, which keeps its digits for tangent and
+    Spheres use the discriminant r^2 - |oc - (oc.d)d|^2, which keeps its precision for tangent and
     far-away rays where b^2 - 4ac loses them (Haines et al., Ray Tracing Gems, ch. 7), and the near
-    root as a product, c / (b + s), which keeps them when the origin is close to the surface.
+    root as a product, c / (b + s), which keeps precision when the origin is close to the surface.
 
     Args:
         origins: (N, 3).
-        directions: (N, 3), of any length; t counts in units of it.
+        directions: (N, 3), of any length, which is the unit of t.
         spheres: (S, 4): centre and radius.
         rectangles: (R, 12): centre, half edges u and v, unit normal.
 
     Returns:
-        t: (N,) distance in units of the direction's length, infinity on a miss.
+        t: (N,) distance in units of the direction's length, infinite on a miss.
         index: (N,) 0..S-1 for spheres, S..S+R-1 for rectangles, -1 on a miss.
     """
     n = origins.shape[0]
@@ -99,19 +99,19 @@ def meet_triangles(
     corners: Array,
     limit: float,
 ) -> None:
-    """Put the triangles that another tracer found among the first hits, in place.
+    """Merge triangles found by another tracer into the first hits, in place.
 
-    Where a ray meets the plane of its triangle is computed in float64.
+    The intersection of each ray with its triangle's plane is computed in float64.
 
     Args:
-        t, index: (N,) as :func:`nearest_hit` returns them. Where a triangle is nearer they become
-            its own; the indices of all others grow by the number of triangles.
-        face: (N,) the triangle that each ray meets first, or :data:`NO_TRIANGLE`.
-        rough: (N,) the other tracer's distance to it, in units of the direction's length.
+        t, index: (N,) from :func:`nearest_hit`. A nearer triangle replaces the hit; the other
+            indices grow by the number of triangles.
+        face: (N,) first triangle of each ray, or :data:`NO_TRIANGLE`.
+        rough: (N,) the other tracer's distance, in units of the direction's length.
         origins, directions: (N, 3) of the rays.
-        normals, corners: (T, 3) a plane for each triangle.
-        limit: the plane's distance is taken if it differs from ``rough`` by at most this share of
-            it, else ``rough`` is.
+        normals, corners: (T, 3) the plane of each triangle.
+        limit: largest difference from ``rough``, as a share of it, at which the plane's distance
+            is used; beyond, ``rough`` is.
     """
     for i in range(len(t)):
         if index[i] >= 0:
@@ -120,7 +120,7 @@ def meet_triangles(
         if f == NO_TRIANGLE:
             continue
         distance = np.float64(rough[i])
-        # In the order in which numpy.einsum adds three products.
+        # Same order as numpy.einsum's sum of three products.
         above = (
             normals[f, 0] * (corners[f, 0] - origins[i, 0])
             + normals[f, 2] * (corners[f, 2] - origins[i, 2])

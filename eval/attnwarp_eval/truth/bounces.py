@@ -1,11 +1,11 @@
-"""Number of bounces of light that a scene calls for, measured: `attnwarp-eval scenes calibrate`.
+"""Measurement of the bounces of light that a scene needs: `attnwarp-eval scenes calibrate`.
 
-The fewest bounces whose pictures are shown to have, in every view, the light of pictures without
-an end of bounces within :data:`MARGIN`: |d| + t SE of the mean over pairs of pictures of one seed,
-with t the 99 % quantile of Student's distribution (two one-sided tests, Schuirmann 1987). Every
-view must pass, so that no correction for their number is needed; a number that is too small passes
-with a chance of at most 1 % for each of the :data:`SAMPLES` tried. Where noise or light leaves no
-number up to :data:`MOST` that passes, light has no end.
+The result is the fewest bounces whose pictures are shown to have, in every view, the light of
+pictures with unlimited bounces within :data:`MARGIN`: |d| + t SE of the mean over pairs of pictures
+of one seed, with t the 99 % quantile of Student's distribution (two one-sided tests, Schuirmann
+1987). Every view must pass, so no correction for the number of views is needed; a number that is
+too small passes with a chance of at most 1 % for each of the :data:`SAMPLES` tried. If noise or
+light prevents every number up to :data:`MOST` from passing, bounces are unlimited.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from attnwarp_eval.truth.passes import Bounces, convex, plan_passes
 Array = npt.NDArray[np.float64]
 
 MARGIN = 0.01
-"""Light that a cap may take off a view's picture, as a share of its mean: that of the proofs."""
+"""Tolerated loss of light in a view's picture, as a share of its mean: the proofs' margin."""
 
 CONFIDENCE = 0.99
 
@@ -37,35 +37,35 @@ SIZE, BLOCK = 32, 8
 """Pixels along a side of the measured pictures, and of their blocks."""
 
 PAIRS = 16
-"""Pairs of pictures of a view. One rendering makes them all, a cell of each pixel for each, since
-starting a rendering takes longer than so few samples; so it is a square."""
+"""Pairs of pictures of a view. One rendering makes them all, with a cell of each pixel for each
+pair, since starting a rendering takes longer than so few samples; hence a square number."""
 
 SAMPLES = (4, 16, 64, 256)
-"""Samples a pixel, more where fewer cannot tell."""
+"""Samples a pixel, more if fewer cannot decide."""
 
 TEXELS = 512
 """Most texels along a side of a baked texture: four for each cell of the pictures."""
 
 AT_ONCE = 64
-"""Most samples of a rendering: those of more would take gigabytes."""
+"""Most samples of a rendering: more would take gigabytes."""
 
 FIRST, MOST = 2, 12
-"""The number that is tried first, and the most that are tried."""
+"""The first number of bounces tried, and the largest."""
 
 
 @dataclass(frozen=True)
 class Shortfall:
-    """Light that a number of bounces leaves out, in the view where the least certain.
+    """Light that a number of bounces loses, in the least certain view.
 
     Attributes:
-        bounces: the number.
+        bounces: number of bounces.
         view: name of the view.
         spp: samples a pixel.
-        difference, error: light without an end less that of the pictures, and its standard error,
-            as shares of the mean.
+        difference, error: light with unlimited bounces minus that of the pictures, and its standard
+            error, as shares of the mean.
         bound: |difference| + t SE.
         block: the largest difference of the mean of an 8 x 8 block, as a share of the picture's
-            mean; most of it may be noise.
+            mean; may be mostly noise.
     """
 
     bounces: int
@@ -84,15 +84,15 @@ class Shortfall:
 
 @dataclass(frozen=True)
 class Answer:
-    """Number of bounces that hold a scene's pictures, and the evidence.
+    """Number of bounces that a scene needs, and the evidence.
 
     Attributes:
-        bounces: the number; "unlimited" where none up to :data:`MOST` is shown to suffice.
-        held: light that this number leaves out, in the view where its bound is the largest; None
-            where nothing was measured.
-        fewer: light that one bounce fewer leaves out, in the view that refused it; None where there
-            is none.
-        made_by: Mitsuba's version and variant; None where nothing was measured.
+        bounces: number of bounces; "unlimited" if none up to :data:`MOST` is shown to suffice.
+        held: light that this number loses, in the view with the largest bound; None
+            without a measurement.
+        fewer: light that one bounce fewer loses, in the view that refused it; None without such a
+            view.
+        made_by: Mitsuba's version and variant; None without a measurement.
 
     Example:
         >>> held = Shortfall(3, "source", 16, 0.004, 0.0005, 0.0053, 0.02)
@@ -135,13 +135,13 @@ def _leave(shortfall: Shortfall) -> str:
 # --------------------------------------------------------------------------------------------------
 
 Pictures = Callable[[Bounces, Camera, int], Array]
-"""(PAIRS, H, W, 3) pictures of a number of bounces, a view and samples a pixel."""
+"""(PAIRS, H, W, 3) pictures for a number of bounces, a view and samples a pixel."""
 
 
 def search(scene: Scene) -> Answer:
-    """Measure how many bounces ``scene`` calls for, whatever its file says.
+    """Measure how many bounces ``scene`` needs, regardless of its file.
 
-    That renders some hundred pictures of 32 x 32, which takes some ten seconds.
+    Renders about a hundred pictures of 32 x 32 in about ten seconds.
 
     Example:
         A single ball on nothing never lights itself, so nothing is measured.
@@ -169,12 +169,12 @@ def search(scene: Scene) -> Answer:
     views = list(small.cameras)
 
     def try_all(bounces: int) -> Shortfall:
-        """The view where the number is the least certain, or the first that refuses it."""
+        """Shortfall of the least certain view, or of the first that refuses the number."""
         worst: Shortfall | None = None
         for view in list(views):
             tried = shortfall(pictures, bounces, view)
             if not tried.holds:
-                # It is asked first about the next number.
+                # This view is tried first for the next number.
                 views.remove(view)
                 views.insert(0, view)
                 return tried
@@ -186,7 +186,7 @@ def search(scene: Scene) -> Answer:
     least = transport.fewest_bounces(scene.spec)
     number = max(least, FIRST)
     last, fewer = try_all(number), None
-    # Fewer bounces leave out more light, so numbers below one that is refused are not tried.
+    # Fewer bounces leave out more light, so numbers below a refused one are not tried.
     while not last.holds and number < MOST:
         number, fewer, last = number + 1, last, try_all(number + 1)
     if not last.holds:
@@ -201,7 +201,7 @@ def search(scene: Scene) -> Answer:
 
 
 def worlds(scene: Scene) -> Iterator[tuple[Which, Scene]]:
-    """A scene, then everything that its edits make of it."""
+    """The scene, then each of its edited scenes."""
     yield (None, None), scene
     for edit in scene.edits:
         for answer in edit.answers or (None,):
@@ -210,7 +210,7 @@ def worlds(scene: Scene) -> Iterator[tuple[Which, Scene]]:
 
 
 def shortfall(pictures: Pictures, bounces: int, view: Camera) -> Shortfall:
-    """Shortfall of a number of bounces in a view, with as many samples as it takes to tell.
+    """Shortfall of a number of bounces in a view, with as many samples as the decision takes.
 
     Example:
         >>> def pictures(bounces, view, spp):
@@ -236,14 +236,14 @@ def shortfall(pictures: Pictures, bounces: int, view: Camera) -> Shortfall:
 
 
 def pictures_of(scene: Scene, seed: int = 300_000) -> Pictures:
-    """Pictures of ``scene`` for :func:`shortfall`, from ``seed`` on; those made are kept."""
+    """Pictures of ``scene`` for :func:`shortfall`, from ``seed`` on; rendered pictures are kept."""
     made_by = comparable(scene)
     side = math.isqrt(PAIRS)
 
     @functools.cache
     def pictures(bounces: Bounces, name: str, spp: int) -> Array:
-        # Both of a pair have one seed: in a variant that gives each sample random numbers of its
-        # own the light of the first bounces is then the same.
+        # Both of a pair have one seed: in a variant with separate random numbers for each sample
+        # the light of the first bounces is then the same.
         parts = max(1, spp // AT_ONCE)
         planned, camera = plan_passes(scene, spp // parts, bounces), scene.camera(name)
         fine = camera.resize(side * camera.width, side * camera.height)
@@ -259,9 +259,9 @@ def pictures_of(scene: Scene, seed: int = 300_000) -> Pictures:
 def dealt(fine: Array) -> Array:
     """(PAIRS, H, W, 3) pictures from one whose pixels have PAIRS cells each.
 
-    Which cell of a pixel falls to which picture is chance, the same at each call. So all of them
-    expect the same pixels, and the spread of their means overstates the error of their mean a
-    little, if anything: cells of one pixel differ more than samples of it would.
+    The assignment of a pixel's cells to pictures is random but the same at each call. So all
+    pictures have the same expected pixels, and the spread of their means slightly overstates the
+    error of their mean, if at all: cells of one pixel differ more than its samples would.
 
     Args:
         fine: (H * side, W * side, 3), side the square root of PAIRS.

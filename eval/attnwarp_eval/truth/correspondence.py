@@ -1,5 +1,5 @@
-"""Exact correspondences between two views: where each target pixel lies in the source, and whether
-it shows there.
+"""Exact correspondences between two views: each target pixel's position in the source, and its
+visibility there.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 GRAZING_COSINE = 1e-3
-"""Below this cosine of incidence, in either view, a pixel's answer is called ambiguous."""
+"""Below this cosine of incidence, in either view, a pixel counts as ambiguous."""
 
 EDGE_BAND = 2.0
 """Width in pixels, on each side, of the band around depth and object edges."""
@@ -30,12 +30,12 @@ def two_view(
 ) -> TwoView:
     """Exact correspondence and visibility of every target pixel in the source view.
 
-    No step has a length in it: scaling or moving the scene together with its cameras gives the same
-    labels.
+    No step uses an absolute length: scaling or moving the scene together with its cameras gives the
+    same labels.
 
     Args:
         source, target: the cameras. The result has the target's (H, W).
-        bands: :func:`edge_band` of the source and of the target, where they are computed already.
+        bands: :func:`edge_band` of the source and of the target, if already computed.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -84,7 +84,7 @@ def two_view(
 _OUTSIDE, _EMPTY = (
     4,
     5,
-)  # statuses that become NONE; apart from each other when footprints are compared
+)  # statuses that become NONE; distinct in comparisons of footprints
 
 
 def _project(source: Camera, points: Array) -> tuple[Array, Array, Mask]:
@@ -136,12 +136,12 @@ def _corner_status(geometry: Geometry, source: Camera, target: Camera) -> npt.ND
 
 
 def edges(geometry: Geometry, camera: Camera) -> Mask:
-    """Pixels beside a depth or object edge.
+    """Pixels next to a depth or object edge.
 
     Two neighbours (left and right, above and below) have an edge between them if
 
     - they show different objects,
-    - only one of them shows any, or
+    - only one of them shows an object, or
     - neither tangent plane comes within one pixel's footprint (z / f) of the other's depth. So a
       slanted floor is no edge.
 
@@ -174,7 +174,7 @@ def edges(geometry: Geometry, camera: Camera) -> Mask:
 
 
 def edge_band(geometry: Geometry, camera: Camera, width: float = EDGE_BAND) -> Mask:
-    """(H, W) bool: pixels within ``width`` pixels of an edge (see :func:`edges`), those beside it
+    """(H, W) bool: pixels within ``width`` pixels of an edge (see :func:`edges`), adjacent pixels
     included.
 
     Args:
@@ -195,6 +195,6 @@ def edge_band(geometry: Geometry, camera: Camera, width: float = EDGE_BAND) -> M
     edge = edges(geometry, camera)
     if not edge.any():
         return edge
-    # The pixels beside an edge are half a pixel from it, so the band reaches width - 1 px from
+    # The pixels next to an edge are half a pixel from it, so the band reaches width - 1 px beyond
     # them, rounded up.
     return distance_transform_edt(~edge) <= np.ceil(width) - 1

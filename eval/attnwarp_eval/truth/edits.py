@@ -1,4 +1,4 @@
-"""Places where the edits of a scene show: objects and pixels, and in words."""
+"""Objects and pixels that a scene's edits change, and descriptions of the edits."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from attnwarp_eval.truth import Hits
 
 
 def touched(scene: Scene, name: str, answer: str | None = None) -> list[int]:
-    """Object ids whose surfaces an edit changes; other things change by their light alone."""
+    """Ids of objects with edited surfaces; other objects change only in their light."""
     edit = scene.edit(name)
     does = pick(edit, answer) or edit
     return [scene.object_names.index(change.object) for change in does.changes]
@@ -28,7 +28,7 @@ def edit_mask(
     light.
 
     Args:
-        hits: hits of the view, from :meth:`~attnwarp_eval.truth.Geometry.trace`.
+        hits: hits of the view from :meth:`~attnwarp_eval.truth.Geometry.trace`.
     """
     edit = scene.edit(name)
     if (pick(edit, answer) or edit).lights is not None:
@@ -37,7 +37,7 @@ def edit_mask(
 
 
 def describe(scene: Scene) -> str:
-    """A scene's edits in words."""
+    """Description of a scene's edits."""
     if not scene.edits:
         return f"{scene.name} names no edits"
     lines = [f"{scene.name}: {scene.title}"]
@@ -64,7 +64,7 @@ def _kinds(change: ObjectChange) -> Iterator[str]:
 
 
 def to_dict(scene: Scene) -> dict[str, Any]:
-    """A scene's edits as JSON can hold them, with the content hash of each result."""
+    """A scene's edits as JSON, with the content hash of each result."""
     return {
         "scene": scene.name,
         "content": scene.content_hash,

@@ -1,4 +1,4 @@
-"""A solid feature field: features that belong to the 3D point, so that the exact answer of every
+"""Solid feature field: features are a function of the 3D point, so that the exact result of every
 warp is known.
 """
 
@@ -32,7 +32,7 @@ class SolidField:
             4, a scene that fills an image has wavelengths of at least 16 px on its 64 grid, where
             bilinear sampling at the worst place (half way between two taps) errs by 1 - cos(pi/16)
             = 2 % of a channel's amplitude, and 8 % on the 32 grid.
-        terms: sinusoids a channel.
+        terms: number of sinusoids per channel.
         seed: seed of the frequencies (uniform in the ball) and phases.
     """
 
@@ -77,12 +77,12 @@ class SolidField:
         return np.where(np.isfinite(p).all(axis=-1, keepdims=True), value, np.nan)
 
     def on_grid(self, points: npt.ArrayLike, *, background: float = 0.0) -> Array:
-        """A feature map (C, h, w) from the surface points (h, w, 3) that a grid's central rays hit.
+        """A feature map (C, h, w) from the surface points (h, w, 3) hit by a grid's central rays.
 
         Args:
-            background: value where there is no surface. The source's map takes a number, since a
-                network has features there too and bilinear taps reach across the outline; give NaN
-                for the exact answer in the target.
+            background: value without a surface. Use a number for the source's map, since a network
+                has features there too and bilinear taps reach across the outline; use NaN for the
+                exact features of the target.
         """
         features = np.moveaxis(self(points), -1, 0)
         return np.where(np.isnan(features), background, features)

@@ -1,8 +1,8 @@
-"""Choice of Mitsuba's variant on this machine: compiled by LLVM where that works, interpreted
+"""Choice of Mitsuba's variant on this machine: compiled by LLVM if it works, interpreted
 elsewhere.
 
 ``llvm_ad_rgb`` compiles each scene's integrator to vector code and is several times faster
-(docs/truth/truth.md), but with some LLVMs (14 and 15) it ends the whole process
+(docs/truth/truth.md), but some LLVMs (14 and 15) abort the whole process
 instead of raising. So a child process tries it first.
 """
 
@@ -22,7 +22,7 @@ OLDEST = 16
 """LLVMs before this are not tried: 14 is refused by Dr.Jit and 15 aborts in its code generator."""
 
 TRIES = 3
-"""Most libraries that are tried: each costs a process start, and a machine with LLVMs that all fail
+"""Most libraries that are tried: each costs a process start, and a machine where all LLVMs fail
 is rare.
 """
 
@@ -36,8 +36,8 @@ PLACES = (
     "/opt/homebrew/opt/llvm*/lib/libLLVM*",
     "/usr/local/opt/llvm*/lib/libLLVM*",
 )
-"""Patterns of the paths at which distributions, conda and Homebrew put the library. Dr.Jit's own
-search takes the first name that it finds, which may be an old one beside a newer.
+"""Patterns of the paths at which distributions, conda and Homebrew put the library. Dr.Jit's
+search takes the first name found, which may be an old version next to a newer one.
 """
 
 PROBE = """
@@ -63,17 +63,17 @@ print("works" if 0.45 < mean < 0.55 else f"wrong picture: {mean}")
 
 @functools.cache
 def variant() -> str:
-    """The variant that pictures are made with: ``llvm_ad_rgb`` where it works, else ``scalar_rgb``.
+    """Variant that renders pictures: ``llvm_ad_rgb`` if it works, else ``scalar_rgb``.
 
-    Asked once in the life of a process. ``ATTNWARP_MITSUBA`` names the variant and saves the try;
-    ``DRJIT_LIBLLVM_PATH`` names the library, and then no other is tried. What is found here is put
-    into these two, where Dr.Jit and child processes find it.
+    Decided once per process. ``ATTNWARP_MITSUBA`` names the variant and skips the test;
+    ``DRJIT_LIBLLVM_PATH`` names the library, and then no other is tried. The result is written to
+    these two variables, where Dr.Jit and child processes find it.
     """
     named = os.environ.get("ATTNWARP_MITSUBA")
     if named:
         return named
     chosen = os.environ.get("DRJIT_LIBLLVM_PATH")
-    # With nothing found in the usual places Dr.Jit may still know one that is not.
+    # Dr.Jit may still find a library outside the usual places.
     tried: list[str | None] = [chosen] if chosen else [*libraries()[:TRIES]] or [None]
     for library in tried:
         if works(library):
@@ -100,7 +100,7 @@ def version(path: str) -> tuple[int, ...] | None:
     """Version in a library's file name: ``libLLVM-19.so``, ``libLLVM.so.19.1``,
     ``llvm-19/lib/libLLVM.so``.
 
-    None for a name that is none of a shared library of LLVM, or that has no number.
+    None for a name that is not of a shared LLVM library, or has no number.
     """
     name = Path(path).name
     shared = re.fullmatch(
@@ -116,8 +116,8 @@ def version(path: str) -> tuple[int, ...] | None:
 
 
 def works(library: str | None) -> bool:
-    """Return True if a child process rendered a known picture with ``library`` (None: whichever
-    Dr.Jit finds) and lived.
+    """Return True if a child process rendered a known picture with ``library`` (None: Dr.Jit's
+    choice) without crashing.
     """
     environment = os.environ | ({"DRJIT_LIBLLVM_PATH": library} if library else {})
     try:

@@ -1,4 +1,4 @@
-"""A scene as Mitsuba has it: shapes, materials, lights, fog and cameras, loaded and cached."""
+"""Conversion of a scene to Mitsuba: shapes, materials, lights, fog, cameras, loaded and cached."""
 
 from __future__ import annotations
 
@@ -44,23 +44,23 @@ TEXELS = 2048
 """Most texels along the longer side of a baked texture."""
 
 AT_ONCE = 1 << 14
-"""Texels that are baked at a time, so that what is computed of them stays in a core's cache."""
+"""Texels baked at a time, so that intermediate results stay in a core's cache."""
 
 SKY_ROWS = 256
-"""Rows of the map that carries the sky's ramp; the ramp is linear in the sine of the elevation, so
-few would do.
+"""Rows of the sky's environment map; its ramp is linear in the sine of the elevation, so
+few suffice.
 """
 
 TEXEL_SIZE = 0.5
-"""Size of a texel as a share of a pixel's footprint at the distance that the cameras keep from the
-middle.
+"""Size of a texel as a share of a pixel's footprint at the cameras' distance from the
+scene's middle.
 """
 
 
 @contextlib.contextmanager
 def at_most_texels(number: int) -> Iterator[None]:
-    """Bake textures of at most ``number`` texels along the longer side, for pictures so small that
-    more are never seen.
+    """Bake textures of at most ``number`` texels along the longer side, for pictures too small to
+    show more.
     """
     global TEXELS
     former, TEXELS = TEXELS, min(number, TEXELS)
@@ -71,16 +71,16 @@ def at_most_texels(number: int) -> Iterator[None]:
 
 
 def owner_of_number(scene: Scene, world: Any) -> npt.NDArray[np.int64]:
-    """Object by the number that the AOV shape_index has for a shape; -1 for 0, which is none.
+    """Object index by the number of a shape in the AOV shape_index; -1 for 0, which is no shape.
 
-    It is 1 + the place among the shapes in scalar_rgb, the place in a registry of the whole process
-    in the others.
+    The number is 1 + the shape's index in scalar_rgb, and an index in a process-wide registry in
+    the other variants.
     """
     mi = library()
     owners = _owners(scene)
-    # A fog's own box, which comes last, belongs to no object.
+    # A fog's box, which comes last, belongs to no object.
     numbers = list(range(1, len(owners) + 2))
-    if mi.variant() != SCALAR:  # whose shapes must stay unseen, see load_world
+    if mi.variant() != SCALAR:  # its shapes must stay unseen, see load_world
         import drjit
 
         numbers = [
@@ -93,12 +93,12 @@ def owner_of_number(scene: Scene, world: Any) -> npt.NDArray[np.int64]:
 
 
 def use(name: str) -> None:
-    """Load or turn to a variant now, so that no timer has it."""
+    """Load or select a variant now, outside any timer."""
     library(name)
 
 
 def library(name: str | None = None) -> Any:
-    """The library, with the variant ``name``; without a name as the caller's caller has set it.
+    """Mitsuba with the variant ``name``, by default with the current one.
 
     Raises:
         InputError: Mitsuba has no such variant.
@@ -115,7 +115,7 @@ def library(name: str | None = None) -> Any:
     if mi.variant() != wanted:
         mi.set_variant(wanted)
         mi.set_log_level(mi.LogLevel.Warn)
-        # ptracer draws its progress bar whatever the level; what goes wrong is raised, not logged.
+        # ptracer draws its progress bar at any level; errors are raised, not logged.
         mi.logger().clear_appenders()
     return mi
 
@@ -137,14 +137,14 @@ def load_world(
     Args:
         texel: size of a baked texel in scene units; :func:`texel_size` if left out.
         aims_at_sky: see :class:`~attnwarp_eval.truth.passes.Pass`.
-        unseen: load shapes that Python never sees, for the integrator aov. It counts references to
-            every shape at every sample; for a shape that Python knows each count takes the
-            interpreter's lock, and a picture of positions six to eight times as long.
+        unseen: load shapes invisible to Python, for the integrator aov. It counts references to
+            every shape at every sample; for a shape known to Python each count takes the
+            interpreter lock, and a picture of positions takes six to eight times as long.
     """
     mi = library()
     texel = texel_size(scene) if texel is None else texel
     base = (mi.variant(), scene.world_hash, texel, TEXELS)
-    # Asked for or not: what is not there does not make another world.
+    # Requested or not: absent lights do not change the cache key.
     lamps = lamps and any(item.emission for item in scene.spec.objects)
     media = media and (
         scene.spec.medium is not None or any(interior(item) for item in scene.spec.objects)
@@ -204,7 +204,7 @@ def load_world(
                     extra["interior"] = fog
             shapes[key] = form() | extra if extra else shape
         if fog is not None and around is not None:
-            # Last, so that the others' places are those of :func:`_owners`.
+            # Last, so that the other shapes keep the indices of :func:`_owners`.
             pose = np.diag([*((around[1] - around[0]) / 2), 1.0])
             pose[:3, 3] = (around[0] + around[1]) / 2 - center
             shapes["medium"] = {
@@ -213,7 +213,7 @@ def load_world(
                 "bsdf": {"type": "null"},
                 "interior": fog,
             }
-        # optimize=False: the default merges shapes, after which their indices mean something else.
+        # optimize=False: the default merges shapes, which changes their indices.
         return mi.load_dict({"type": "scene"} | shapes | shone, optimize=False), center, fog
 
     cameras = scene.spec.cameras.model_dump_json(exclude={"size"}) if media else ""
@@ -239,7 +239,7 @@ def fog_box(scene: Scene) -> tuple[Array, Array]:
         if isinstance(light, PointSpec | SpotSpec)
     ]
     low, high = np.min(points, axis=0), np.max(points, axis=0)
-    # A wall of fog in the very plane of a floor would be hit before or after it by chance.
+    # A fog boundary in the plane of a floor would be hit before or after it by chance.
     return low - 0.01 * np.max(high - low), high + 0.01 * np.max(high - low)
 
 
@@ -252,7 +252,7 @@ def _within(scene: Scene, owner: int, box: tuple[Array, Array] | None) -> bool:
 
 
 def medium_form(spec: InteriorSpec) -> dict[str, Any]:
-    """A homogeneous medium as Mitsuba reads it."""
+    """Mitsuba dictionary of a homogeneous medium."""
     return {
         "type": "homogeneous",
         "sigma_t": spec.sigma_t,
@@ -268,14 +268,14 @@ def _rgb(scale: float, color: str) -> dict[str, Any]:
 _loaded: dict[Any, Any] = {}
 
 CACHED = 12
-"""Loaded scenes and shapes that are kept: those of a plan with a caustic, a rendering of everything
-on, in two variants.
+"""Loaded scenes and shapes in the cache: enough for a plan with a caustic and a rendering with
+everything on, in two variants.
 """
 
 
 def cached(key: Any, make: Callable[[], Any]) -> Any:
-    """The value of ``make``, kept with the last few others: a scene's views come one after the
-    other.
+    """Cached result of ``make``, with the last few others: a scene's views are rendered one after
+    another.
     """
     if key not in _loaded:
         while len(_loaded) >= CACHED:
@@ -285,10 +285,9 @@ def cached(key: Any, make: Callable[[], Any]) -> Any:
 
 
 def forget() -> None:
-    """Let go of the loaded scenes, which are kept for the next picture, and of the memory of
-    pictures.
+    """Drop the loaded scenes, which are cached for the next picture, and the memory of pictures.
 
-    Dr.Jit keeps every freed array for the next one of its size, and pictures differ in size.
+    Dr.Jit keeps every freed array for the next array of its size, and pictures differ in size.
     """
     _loaded.clear()
     _baked.clear()
@@ -297,7 +296,7 @@ def forget() -> None:
 
 
 Form = tuple[Any, int, Callable[[], dict[str, Any]]]
-"""A shape, the index of its object, and what the shape is loaded from."""
+"""A shape, its object's index, and the source of the shape."""
 
 
 def load_shapes(scene: Scene, texel: float) -> tuple[dict[str, Form], Array, list[tuple[str, str]]]:
@@ -317,7 +316,7 @@ def load_shapes(scene: Scene, texel: float) -> tuple[dict[str, Form], Array, lis
             if item.emission or isinstance(item.material, GlassMaterial):
                 again = functools.partial(dict, form)
             if again is not dict and form["type"] == "ply":
-                # The file is gone by the time a lamp or a filled glass is made of it.
+                # The file is deleted before a lamp or a filled glass is built from it.
                 data = Path(form["filename"]).read_bytes()
                 again = functools.partial(_from_memory, dict(form), data)
             out[name] = (shape, owner, again)
@@ -325,7 +324,7 @@ def load_shapes(scene: Scene, texel: float) -> tuple[dict[str, Form], Array, lis
 
 
 def _middle(shapes: Sequence[Shape]) -> Array:
-    """(3,) middle of the bounding box, in world coordinates; the origin of what is loaded."""
+    """(3,) middle of the bounding box, in world coordinates; the origin of the loaded scene."""
     bounds = np.stack([shape.bounds() for shape in shapes])
     middle: Array = (bounds[:, 0].min(0) + bounds[:, 1].max(0)) / 2
     return middle
@@ -417,7 +416,7 @@ def _shapes(
 
 
 _baked: dict[Any, npt.NDArray[np.float32]] = {}
-"""Texels of the last scene: an edit of it, and each of its answers, has nearly all of them."""
+"""Texels of the last scene: its edits and their answers share nearly all of them."""
 
 
 def _colors(texture: Any, points: Array) -> npt.NDArray[np.float32]:
@@ -478,7 +477,7 @@ def _bsdf(item: ObjectSpec, reflectance: dict[str, Any]) -> dict[str, Any]:
                 "type": "diffuse",
                 "reflectance": {"type": "rgb", "value": 0.0} if item.emission else reflectance,
             }
-    # Two-sided, since splats and warps know no back faces either.
+    # Two-sided, since splats and warps have no back faces either.
     return {"type": "twosided", "bsdf": inner}
 
 
@@ -493,7 +492,7 @@ def _texels(length: float, texel: float) -> int:
 
 
 def _from_memory(form: dict[str, Any], data: bytes) -> dict[str, Any]:
-    """A mesh's form with its file written anew; the file stays until the process ends."""
+    """A mesh's dictionary with its file rewritten; the file stays until the process ends."""
     folder = _files()
     path = Path(folder.name) / f"{content_key(data.hex())}.ply"
     path.write_bytes(data)
@@ -506,22 +505,22 @@ def _files() -> tempfile.TemporaryDirectory[str]:
 
 
 NEEDLE = 2e-3
-"""A triangle whose shortest edge is below this share of its longest is a needle. Mitsuba
-interpolates vertex colours with barycentric coordinates found anew in float32, whose denominator
-falls with the square of this share: 3 % wrong here, and NaN or any number at 3e-4."""
+"""Ratio of a triangle's shortest to its longest edge below which it is a needle. Mitsuba
+interpolates vertex colours with barycentric coordinates recomputed in float32, whose denominator
+falls with the square of this ratio: 3 % wrong here, and NaN or any number at 3e-4."""
 
 
 def without_needles(vertices: Array, faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """The faces with the short edge of every needle drawn together into one vertex, and those gone
-    flat left out.
+    """Faces with the short edge of every needle collapsed to one vertex, and without degenerate
+    faces.
 
     Args:
         vertices: (V, 3).
         faces: (F, 3).
 
     Returns:
-        (G, 3), G <= F. Surfaces stay closed and move by at most the lengths of the edges that are
-        gone.
+        (G, 3), G <= F. Surfaces stay closed and move by at most the lengths of the collapsed
+        edges.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -544,7 +543,7 @@ def without_needles(vertices: Array, faces: npt.NDArray[np.int64]) -> npt.NDArra
 
 
 def _write_ply(path: Path, mesh: Mesh, center: Array, color: Array) -> None:
-    """A binary PLY as Mitsuba reads it: r, g, b become the attribute vertex_color."""
+    """Write a binary PLY for Mitsuba: r, g, b become the attribute vertex_color."""
     columns = [mesh.vertices - center]
     names = ["x", "y", "z"]
     if mesh.normals is not None:
@@ -569,7 +568,7 @@ def _write_ply(path: Path, mesh: Mesh, center: Array, color: Array) -> None:
 
 
 def light_form(light: SunSpec | SkySpec | PointSpec | SpotSpec, center: Array) -> dict[str, Any]:
-    """A light as Mitsuba reads it, relative to ``center``."""
+    """Mitsuba dictionary of a light, relative to ``center``."""
     mi = library()
     if isinstance(light, SunSpec):
         color = (light.irradiance * np.array(linear_rgb(light.color))).tolist()
@@ -606,7 +605,7 @@ def light_form(light: SunSpec | SkySpec | PointSpec | SpotSpec, center: Array) -
 
 
 def _beam(scene: Scene, light: int, center: Array) -> dict[str, Any]:
-    """A point light as a spot upon what is smooth: the same light within the cone, none outside."""
+    """Point light as a spot on the smooth objects: equal light within the cone, none outside."""
     cone, spec = beam(scene, light), scene.spec.lights[light]
     if cone is None or not isinstance(spec, PointSpec):
         raise ValueError(f"lights[{light}]: got a {spec.type} without a beam upon smooth objects")
@@ -632,7 +631,7 @@ def load_sensor(
     plan: Plan,
     fog: Any,
 ) -> Any:
-    """The camera as Mitsuba has it.
+    """Mitsuba sensor of a camera.
 
     Raises:
         ValueError: a camera that Mitsuba cannot express.
@@ -648,7 +647,7 @@ def load_sensor(
     pose = np.linalg.inv(moved.world_to_camera) @ np.diag([-1.0, -1.0, 1.0, 1.0])
     box = world.bbox()
     size = float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
-    # A power of 2: as a constant of the compiled code it should not differ from view to view.
+    # A power of 2: this constant of the compiled code should be the same for all views.
     reach = 2.0 ** math.ceil(math.log2(size + float(np.linalg.norm(moved.position))))
     form: dict[str, Any] = {
         "type": "perspective",
@@ -688,7 +687,7 @@ def load_sensor(
 
 
 def focus_distance(scene: Scene, camera: Camera) -> float:
-    """Distance along the optical axis of the point that the cameras look at; the orbit's radius if
+    """Distance along the optical axis of the cameras' look-at point; the orbit's radius if
     it is behind.
     """
     depth = float((camera.world_to_camera @ np.array([*scene.center, 1.0]))[2])
@@ -696,7 +695,7 @@ def focus_distance(scene: Scene, camera: Camera) -> float:
 
 
 def plugin_names(path: str, form: Any) -> list[tuple[str, str]]:
-    """(place, plugin name) of a form and of all forms in it."""
+    """(place, plugin name) of a dictionary and of all nested ones."""
     if not isinstance(form, dict):
         return []
     out = [(path, str(form["type"]))] if "type" in form else []

@@ -1,4 +1,4 @@
-"""The graph of a scene as Mitsuba parsed and loaded it."""
+"""Graph of a scene as Mitsuba parsed and loaded it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from attnwarp_eval.truth.passes import plan_passes
 
 
 def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
-    """The whole scene as Mitsuba has it: (path, plugin name) as parsed, and (path, object) as
+    """Mitsuba's graph of the whole scene: (path, plugin name) as parsed, and (path, object) as
     loaded.
     """
     mi = library(variant())
@@ -48,7 +48,7 @@ def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
     if scene.spec.medium is not None:
         parsed += plugin_names("medium.interior", medium_form(scene.spec.medium))
     middles = {"type": "stratified", "sample_count": 1, "jitter": False}
-    # A sensor is the same for any number of bounces.
+    # The sensor does not depend on the number of bounces.
     planned = plan_passes(scene, 1, 1)
     sensor = load_sensor(scene, scene.source, center, middles, world, planned, fog)
     parsed.append(
@@ -65,9 +65,7 @@ def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
 
 
 def _walk(thing: Any, path: str = "") -> list[tuple[str, Any]]:
-    """Every object below ``thing``, depth first, with the path that Mitsuba's own traversal gives
-    it.
-    """
+    """Every object below ``thing``, depth first, with the path from Mitsuba's traversal."""
     visit = _visitor(library().variant())(path)
     thing.traverse(visit)
     found: list[tuple[str, Any]] = visit.found
@@ -76,8 +74,8 @@ def _walk(thing: Any, path: str = "") -> list[tuple[str, Any]]:
 
 @functools.cache
 def _visitor(variant_name: str) -> Any:
-    """A class that collects the objects below one; a class made at each object would be a cycle
-    that keeps them alive.
+    """Class that collects the objects below a given one; a class created per object would be a
+    cycle that keeps the objects alive.
     """
     mi = library(variant_name)
 
@@ -95,6 +93,6 @@ def _visitor(variant_name: str) -> Any:
         put_object = put
 
         def put_value(self, name: str, value: Any, *_: Any) -> None:
-            """Numbers are of no interest here."""
+            """Ignore numbers."""
 
     return Visit

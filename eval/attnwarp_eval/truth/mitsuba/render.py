@@ -1,6 +1,6 @@
-"""Pictures of a scene by Mitsuba 3, made as :mod:`attnwarp_eval.truth.passes` plans them.
+"""Pictures of a scene by Mitsuba 3, by the plans of :mod:`attnwarp_eval.truth.passes`.
 
-Variant ``llvm_ad_rgb`` where a child process shows that it works on this machine, else
+Variant ``llvm_ad_rgb`` if a child process shows that it works on this machine, else
 ``scalar_rgb``, which works
 everywhere: see :mod:`attnwarp_eval.truth.llvm`.
 
@@ -34,20 +34,20 @@ Image = npt.NDArray[np.float32]
 
 
 APPEARANCE_PROTOCOL = 2
-"""Raised whenever the same scene, camera, plan and seed would give another picture."""
+"""Version; raised when the same scene, camera, plan and seed would give another picture."""
 
 
 def render_plan(
     scene: Scene, camera: Camera, plan: Plan, seed: int, *, made_by: str | None = None
 ) -> Image:
-    """A picture by a plan: (H, W, 3) float32, linear RGB, every value finite. It is not cached.
+    """Render a plan: (H, W, 3) float32, linear RGB, every value finite. Not cached.
 
     Args:
         camera: camera of the view; (H, W) is its size.
-        plan: plan of :func:`attnwarp_eval.truth.plan.plan`; it has the samples a pixel.
+        plan: plan of :func:`attnwarp_eval.truth.plan.plan`; which has the samples a pixel.
         seed: the same seed and variant give the same bits, except for light paths ("ptracer").
-            Threads add those to pixels in any order, which changes the last bits of float32.
-        made_by: Mitsuba's variant; :func:`~attnwarp_eval.truth.llvm.variant` if left out.
+            Threads add light paths to pixels in any order, which changes the last bits.
+        made_by: Mitsuba's variant, by default :func:`~attnwarp_eval.truth.llvm.variant`.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -70,9 +70,9 @@ def render_plan(
 
 
 ATTEMPTS, OTHER_SEEDS = 4, 1_000_003
-"""A sample that float32 could not compute (such as a ray along a surface) makes its pixel NaN; the
-pixel is then rendered again with other seeds, which biases it by nothing that a rejected sample
-would not."""
+"""Most attempts to render NaN pixels. A sample that float32 could not compute (such as a ray along
+a surface) makes its pixel NaN; the pixel is rendered again with other seeds, with no bias beyond
+that of a rejected sample."""
 
 
 def _render_passes(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
@@ -83,10 +83,10 @@ def _render_passes(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image
         if step.integrator == "direct":
             options |= {"emitter_samples": step.emitter_samples, "bsdf_samples": step.bsdf_samples}
         else:
-            # Without an end a path still needs a number there; Mitsuba's is -1.
+            # Unlimited paths still need a number; Mitsuba's is -1.
             options |= {"max_depth": step.max_depth, "rr_depth": step.rr_depth}
         if step.integrator == "ptracer":
-            # Lamps, seen directly, are the other pass's.
+            # Directly visible lamps belong to the other pass.
             options |= {"hide_emitters": True}
         world, center, fog = load_world(
             scene,
@@ -127,12 +127,11 @@ def _part(
     seed: int,
     loaded: tuple[Any, Array, Any],
 ) -> Image:
-    """Light of the camera rays that meet something smooth, a lamp or nothing first, or of all the
-    others; zero elsewhere.
+    """Light of the camera rays that first meet something smooth, a lamp or nothing, or of the other
+    rays; zero elsewhere.
 
-    Each camera ray gets a pixel of its own in a picture of
-    k x k cells a pixel, so that the index of the shape it met first tells which of the two it
-    belongs to.
+    Each camera ray gets a separate pixel in a picture of k x k cells a pixel, so that the index of
+    its first shape decides which of the two it belongs to.
     """
     mi = library()
     world, center, fog = loaded
@@ -160,12 +159,11 @@ def _part(
 
 
 def comparable(scene: Scene) -> str:
-    """The variant in which renderings of the source by different integrators can be held against
-    each other.
+    """Variant in which renderings of the source by different integrators are comparable.
 
-    Where surfaces coincide it is up to the ray tracer which one is seen. With ``llvm_ad_rgb`` that
-    depends on how an integrator shoots its rays, in packets or one by one; with ``scalar_rgb`` on
-    the scene alone.
+    For coincident surfaces the ray tracer decides which is visible. With ``llvm_ad_rgb`` that
+    depends on how an integrator traces rays, in packets or singly; with ``scalar_rgb`` only on the
+    scene.
     """
     if variant() == SCALAR:
         return SCALAR
@@ -174,19 +172,19 @@ def comparable(scene: Scene) -> str:
 
 
 def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Hits of Mitsuba's own ray tracer at the pixel centres, to hold the exact geometry against.
+    """Hits of Mitsuba's ray tracer at the pixel centres, to compare with the exact geometry.
 
     Returns:
-        position: (H, W, 3) world, float32 precision about the scene's middle; NaN where nothing is
-            hit.
-        object_id: (H, W) index of the object, -1 where nothing is hit.
+        position: (H, W, 3) world, float32 precision about the scene's middle; NaN on a
+            miss.
+        object_id: (H, W) index of the object, -1 on a miss.
     """
     mi = library(variant())
-    # Textures show in no position: of the fewest texels.
+    # Textures do not affect positions: bake the fewest texels.
     world, center, _ = load_world(scene, (), False, False, texel=math.inf, unseen=True)
     integrator = mi.load_dict({"type": "aov", "aovs": "position:position,shape:shape_index"})
-    # One sample in the middle of each pixel: stratified without jitter. Averaged positions would
-    # lie nowhere.
+    # One sample in the middle of each pixel: stratified without jitter. Averaged positions would be
+    # on no surface.
     middles = {"type": "stratified", "sample_count": 1, "jitter": False}
     sensor = load_sensor(scene, camera, center, middles, world, Plan((), ()), None)
     picture = np.array(
