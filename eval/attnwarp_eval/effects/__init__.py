@@ -1,3 +1,3 @@
-"""Light transport: which effects a scene calls for, the cheapest plan that shows them, and its
+"""Light transport: effects that a scene needs, the cheapest plan that shows them, and its
 proof.
 """

@@ -1,8 +1,8 @@
 """Light transport that a scene needs.
 
 :func:`detect` compares the file with the graph handed to Mitsuba (plugin names) and with Mitsuba's
-scene (BSDF flags, emitter flags, media, textures by class name). An effect in one that another
-lacks is an error. :mod:`attnwarp_eval.effects.proof` compares a plan with a rendering with
+scene (BSDF flags, emitter flags, media, textures by class name). An effect present in one that
+another lacks is an error. :mod:`attnwarp_eval.effects.proof` compares a plan with a rendering with
 everything on. docs/truth/truth.md has the reasons.
 """
 
@@ -28,9 +28,9 @@ class Finding:
     """Need of a scene for an effect.
 
     Attributes:
-        needed: whether the scene calls for it.
-        simulated: whether pictures show it.
-        source: "detected", "pinned", "said" (the scene's own cap on bounces leaves it out) or
+        needed: whether the scene needs the effect.
+        simulated: whether pictures show the effect.
+        source: "detected", "pinned", "said" (excluded by the scene's cap on bounces) or
             "absent".
         evidence: signs in the file, in Mitsuba's graph and in the loaded scene.
 
@@ -47,11 +47,11 @@ class Finding:
 
 
 def detect(scene: Scene) -> dict[Effect, Finding]:
-    """Every effect, needed or not, with the evidence from the file, the parsed graph and the loaded
+    """Classify every effect, with the evidence from the file, the parsed graph and the loaded
     scene.
 
     Raises:
-        SceneError: they disagree, so that a plan made from the file would be wrong.
+        SceneError: the sources disagree, so a plan from the file would be wrong.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -109,7 +109,7 @@ def detect(scene: Scene) -> dict[Effect, Finding]:
 
 def _caustic_simulated(scene: Scene) -> bool:
     """Return True if the plan renders the caustic. Camera paths miss it for small lights, and
-    ptracer has neither media nor our lens.
+    ptracer supports neither media nor the lens.
     """
     if small_lights(scene) is None:
         return True
@@ -144,7 +144,7 @@ def _checked_textures(scene: Scene) -> bool:
 def _in_graphs(
     plugins: list[tuple[str, str]], objects: list[tuple[str, Any]]
 ) -> dict[Effect, tuple[str, ...]]:
-    """Effects that Mitsuba's own graphs have, with the evidence.
+    """Effects in Mitsuba's graphs, with the evidence.
 
     Args:
         plugins: (path, plugin name) of the graph as parsed.
@@ -187,7 +187,7 @@ def _in_graphs(
     for path, thing in objects:
         if isinstance(thing, mitsuba.BSDF):
             if thing.class_name() == "Null":
-                continue  # the walls of the fog
+                continue  # the boundary of the fog
             flags = int(thing.flags())
             if flags & int(F.Delta):
                 note("specular", f"BSDF flag Delta of {thing.class_name()} at {path}")
@@ -207,7 +207,7 @@ def _in_graphs(
             and thing.class_name().startswith("Bitmap")
             and _varies(thing)
         ):
-            # A mesh's attributes are left out: the file and its tint tell whether they vary.
+            # Skip a mesh's attributes: the file and its tint show whether they vary.
             note("textures", f"texture {thing.class_name()} at {path} varies")
     return {
         effect: tuple(dict.fromkeys(evidence[:1] + evidence[-1:]))
@@ -219,7 +219,7 @@ def _varies(texture: Any) -> bool:
     import mitsuba
 
     data = np.array(mitsuba.traverse(texture)["data"])
-    # Over rows first, which are contiguous: 10 times as fast as over all texels of a channel.
+    # Reduce contiguous rows first: 10 times as fast as over all texels of a channel.
     low, high = data.min(axis=0).min(axis=0), data.max(axis=0).max(axis=0)
     return bool((high - low).max() > 1e-6)
 
@@ -229,7 +229,7 @@ def _varies(texture: Any) -> bool:
 
 
 def report(scene: Scene, *, cost: Cost | None = None) -> dict[str, Any]:
-    """Everything about a scene's effects as JSON: ``effects``, ``plan``, ``geometry``,
+    """Report on a scene's effects as JSON: ``effects``, ``plan``, ``geometry``,
     ``everything_on``, ``cost``.
 
     Example:
@@ -252,7 +252,7 @@ def report(scene: Scene, *, cost: Cost | None = None) -> dict[str, Any]:
 
 
 def describe(scene: Scene, about: dict[str, Any]) -> Iterator[str]:
-    """The lines of :func:`report` for a person.
+    """Text lines of :func:`report`.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene

@@ -1,15 +1,15 @@
-"""Proof that a plan leaves out nothing visible: a ladder of tests that refuse it or certify it.
+"""Proof that a plan omits nothing visible: a ladder of tests that refuse or certify it.
 
-1. Structural: what the plan leaves out is nowhere in the file, in Mitsuba's parsed graph or in the
+1. Structural: omitted effects are absent from the file, Mitsuba's parsed graph and the
    loaded scene.
-2. The same seed gives the same picture, bit for bit, where both take the same paths: certified, no
+2. The same seed gives the same picture, bit for bit, if both trace the same paths: certified, no
    statistics needed.
 3. Paired bias: the same seeds at one sample a pixel, a t-test on the differences of their means.
 4. Fresh seeds: Welch's test with Satterthwaite's degrees of freedom on every pixel, every 8 x 8
    block and the whole picture, with Sidak's correction over all of them, AND equivalence of the
    whole (two one-sided tests within 1 %).
 
-A difference that is not significant does not show equality: the equivalence test must hold, which
+An insignificant difference does not show equality: the equivalence test must hold, which
 noise prevents. An effect that neither side simulates is invisible to every comparison, so a scene
 that needs one is never certified. The tests are in :mod:`attnwarp_eval.statistics.equivalence`.
 """
@@ -47,7 +47,7 @@ MARGIN = 0.01
 """Two pictures count as equal when their means differ by less than this share of the mean."""
 
 ALPHA = 0.01
-"""Chance that the whole ladder refuses a plan that drops nothing; the rungs share it."""
+"""Probability that the ladder refuses a complete plan, split among the rungs."""
 
 BLOCK = 8
 
@@ -81,9 +81,9 @@ class Level:
 
     Attributes:
         name: "pixel", "block" or "picture".
-        tests: how many values were compared.
+        tests: number of values compared.
         least: the smallest p.
-        threshold: bound that p must stay above, after Sidak over the values and over the three
+        threshold: lower bound for p, after Sidak's correction over the values and the three
             levels.
         worst: the largest difference in standard errors, as a share of the picture's mean.
         detectable: the difference, as a share of the picture's mean, that a value of median noise
@@ -104,13 +104,13 @@ class Level:
 
     @property
     def differs(self) -> bool:
-        """True if this level refuses."""
+        """True if this level refuses equality."""
         return self.least < self.threshold
 
 
 def levels(a: npt.ArrayLike, b: npt.ArrayLike, *, alpha: float = ALPHA) -> list[Level]:
-    """Welch's test on pixels, blocks and the whole picture, refusing a true null with chance
-    ``alpha`` in all.
+    """Welch's test on pixels, blocks and the whole picture, with a false refusal rate of
+    ``alpha`` overall.
 
     Args:
         a, b: (n, H, W, C) and (m, H, W, C) pictures of independent seeds. Channels, which share
@@ -174,15 +174,15 @@ class Proof:
     """The outcome of the ladder for a plan.
 
     Attributes:
-        verdict: "certified" only when bits are equal or the equivalence test holds, nothing else
-            refused, and all that the scene calls for is simulated; "refused" when a difference was
+        verdict: "certified" only if bits are equal or the equivalence test holds, nothing else
+            refused, and all needed effects are simulated; "refused" if a difference was
             found; "can't tell" otherwise.
-        of_simulated: the verdict of the comparison alone; it differs from ``verdict`` only where an
+        of_simulated: the verdict of the comparison alone; it differs from ``verdict`` only if an
             effect is not simulated.
         not_simulated: effects that the scene needs and that neither side simulates.
         rungs: the tests, in order.
         detectable: the smallest detectable difference, as a share of the mean, by level.
-        seconds: spent.
+        seconds: seconds spent.
 
     Example:
         >>> print(Proof("can't tell", (), {}, 1.0, "certified", ("dispersion",)).words)
@@ -198,7 +198,7 @@ class Proof:
 
     @property
     def words(self) -> str:
-        """The verdict, with the reason where it is not that of the comparison."""
+        """The verdict, with the reason if it differs from the comparison's."""
         if self.verdict == self.of_simulated:
             return self.verdict
         return (
@@ -211,7 +211,7 @@ class Proof:
         return asdict(self)
 
     def lines(self) -> Iterator[str]:
-        """Lines for a person."""
+        """Text lines of the proof."""
         yield f"proof: {self.words} ({self.seconds:.1f} s)"
         for rung in self.rungs:
             word = {None: "-", True: "ok", False: "REFUSED"}[rung.passed]
@@ -232,16 +232,16 @@ def prove(
     seed: int = 1000,
     structure: bool = True,
 ) -> Proof:
-    """Hold ``ours`` (the scene's own plan if left out) against a rendering with everything on.
+    """Compare ``ours`` (by default the scene's plan) with a rendering with everything on.
 
     Args:
         size: size of the square picture of the source view.
-        seeds: pictures a side for the last rung, at least 10.
-        seconds: seconds that rendering may take. Samples a pixel are chosen from a few trial
-            pictures so that the equivalence test can succeed, if that fits; if it does not, the
+        seeds: number of pictures per side for the last rung, at least 10.
+        seconds: time limit of rendering. Samples a pixel are chosen from a few trial
+            pictures so that the equivalence test can succeed within it; if they do not fit, the
             verdict is "can't tell".
-        seed: the first of those used.
-        structure: without it the first rung is left out, so that the statistics stand alone (to
+        seed: the first seed.
+        structure: whether to run the first rung; False leaves only the statistics (to
             test them).
 
     Raises:
@@ -278,8 +278,8 @@ def prove(
         ).astype(np.float64)
 
     def finish(verdict: Verdict, detectable: dict[str, float] | None = None) -> Proof:
-        # Neither side has what is not simulated: equal pictures do not certify it, and unequal ones
-        # still refuse.
+        # Neither side has effects that are not simulated: equal pictures do not certify them, and
+        # unequal ones still refuse.
         capped: Verdict = "can't tell" if blind and verdict == "certified" else verdict
         return Proof(
             capped, tuple(rungs), detectable or {}, time.perf_counter() - start, verdict, blind
@@ -323,18 +323,18 @@ def climb(
     seed: int = 1000,
     alpha: float = ALPHA,
 ) -> Climb:
-    """The rungs that compare pictures; together they refuse two equal sides with probability
+    """Run the rungs that compare pictures; together they refuse two equal sides with probability
     ``alpha``.
 
     Two of them can refuse: paired bias and Welch's test. Their pictures have different seeds, so
     each has Sidak's share of ``alpha``.
 
     Args:
-        pictures: renders stacks of a side; see :data:`Pictures`.
+        pictures: renderer of a side's stacks; see :data:`Pictures`.
         seeds: seeds of each side in Welch's test.
-        seconds: that Welch's pictures may take; fewer samples a pixel are the consequence.
-        seed: the first; the rungs take the next ones.
-        alpha: chance that two equal sides are refused.
+        seconds: time limit of Welch's pictures, which limits the samples a pixel.
+        seed: the first seed; the rungs use the next ones.
+        alpha: probability that two equal sides are refused.
 
     Example:
         >>> def pictures(side, spp, first, count):
@@ -432,7 +432,7 @@ def _samples(pictures: Pictures, seed: int, seeds: int, seconds: float) -> int:
 
 
 def _structural(scene: Scene, ours: Plan) -> Rung:
-    """Check that the file and Mitsuba's graphs lack what the plan leaves out."""
+    """Check that the file and Mitsuba's graphs lack the effects that the plan omits."""
     findings = detect(scene)
     blind: list[str] = [
         name for name in findings if findings[name].needed and not findings[name].simulated
@@ -477,7 +477,7 @@ def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
     elif lens is None and ours.lens is not None:
         yield "the scene says no lens, but the plan has one"
 
-    # A light needs passes for both: the first surface is rough, or it is smooth, a lamp or nothing.
+    # A light needs passes for both kinds of first surface: rough, or smooth, a lamp or nothing.
     both = {"smooth", "rough"}
     for name, shines in _shining(scene):
         covered: set[str] = set()
@@ -499,8 +499,8 @@ def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
         if taken > given:
             yield f"the beam of {name} is taken away and no paths from the light put it back"
 
-    # A surface that nothing else faces is lit once; everywhere else any bounce below the scene's
-    # own cap may show.
+    # A surface that no other surface faces is lit once; elsewhere any bounce below the scene's cap
+    # may be visible.
     cap = 1 if convex(scene) and not ours.media else bounces_of(scene)
     depth = -1 if cap == "unlimited" else cap + 1
     longer = [

@@ -24,19 +24,19 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Cap:
-    """Loss by a scene's cap on bounces, and cost of everything on.
+    """Loss due to a scene's cap on bounces, and cost of everything on.
 
     Attributes:
         bounces: the cap.
         bias: mean light of the plan's pictures over that of everything on without a cap, less 1.
-        bias_interval: its 95 %, by Welch's test on the logarithms of the rounds' means; both None
-            for a black picture.
-        seconds, variance: seconds and variance of everything on within the cap, as :class:`Cost`
-            has them.
-        faster: how many times longer it takes for the same samples.
-        at_equal_error: how many times longer for the same noise, which is the same error, since its
-            pictures have the plan's mean; infinite where the plan has no noise.
-        interval: 95 % of that; None where the plan has no noise.
+        bias_interval: 95 % interval of ``bias``, by Welch's test on the logarithms of the rounds'
+            means; both None for a black picture.
+        seconds, variance: seconds and variance of everything on within the cap, as in
+            :class:`Cost`.
+        faster: time ratio to the plan at equal samples.
+        at_equal_error: time ratio at equal noise, which is equal error, since its
+            pictures have the plan's mean; infinite if the plan has no noise.
+        interval: 95 % interval of ``at_equal_error``; None if the plan has no noise.
 
     Example:
         >>> cap = Cap(1, -0.06, (-0.08, -0.04), 0.2, 0.01, 1.5, 1.4, (1.3, 1.5))
@@ -58,23 +58,24 @@ class Cap:
 class Cost:
     """Cost of everything on against the plan, measured on one small picture of the source.
 
-    Everything on follows light until roulette ends it. Where the scene caps its bounces that is
-    light that the plan leaves out, so that the two pictures have other means: equal noise is not
-    equal error there, and ``cap`` says what is.
+    Everything on follows light until roulette ends it. If the scene caps its bounces, the plan
+    omits
+    that light and the two pictures have different means: then equal noise is not equal error, and
+    ``cap`` has the loss.
 
     Attributes:
         size, spp: size in px and samples a pixel of the measurement.
         seconds: (plan, everything on) medians.
-        faster: how many times longer everything on takes for the same samples: the median over
-            rounds, in each of which both were rendered one after the other.
+        faster: time ratio of everything on at equal samples: the median over rounds, in
+            each of which both were rendered one after the other.
         variance: (plan, everything on), mean over pixels and channels, relative to the squared
             mean.
-        rounds: pictures of each, taken in turn.
-        interval: 95 % of :attr:`at_equal_noise`, by resampling the rounds; None where the plan has
+        rounds: number of pictures of each, taken in turn.
+        interval: 95 % of :attr:`at_equal_noise`, by resampling the rounds; None if the plan has
             no noise.
-        again: 95 % of the ratio of the plan's seconds to its own, as it ran twice a round: inside
-            this band nothing is faster or slower. None from too few rounds.
-        cap: None where the scene has no cap.
+        again: 95 % interval of the ratio of the plan's seconds between its two runs of a round:
+            inside this band nothing is faster or slower. None with too few rounds.
+        cap: cap on bounces and its loss; None without a cap.
 
     Example:
         >>> cost = Cost(48, 16, 7, (0.1, 0.2), 2.0, (0.01, 0.03), (5.0, 7.0), (0.9, 1.1))
@@ -94,7 +95,7 @@ class Cost:
 
     @property
     def at_equal_noise(self) -> float:
-        """Factor by which everything on takes longer for the same noise; infinite where the plan
+        """Factor by which everything on takes longer for the same noise; infinite if the plan
         has none.
         """
         return (
@@ -119,12 +120,12 @@ def measure(
 ) -> Cost:
     """Render plan and everything on in turn and time both, after one unmeasured picture each.
 
-    Where the scene caps its bounces, everything on within the cap is a third, unless it is what the
-    plan says.
+    If the scene caps its bounces, everything on within the cap is a third contestant, unless it
+    equals the plan.
 
     Args:
-        size, spp: size in px and samples a pixel of the picture; if left out as large as needed for
-            tracing, not starting, to take most of the time.
+        size, spp: size in px and samples a pixel of the picture; by default large enough that
+            tracing, not starting, takes most of the time.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -149,7 +150,7 @@ def measure(
     turns = in_turn([rendered(made) for made in contestants], rounds, seed=seed)
     pictures, seconds = turns.results, turns.seconds
     again = time_ratio([turns.again], [seconds[0]])
-    scale = float(np.mean(pictures[1])) ** 2 or 1.0  # a black picture has no noise to scale
+    scale = float(np.mean(pictures[1])) ** 2 or 1.0  # a black picture has no noise
     taken = [np.array(p, np.float64).reshape(rounds, -1) for p in pictures]
     variance = [float(p.var(0, ddof=1).mean()) / scale for p in taken]
     medians = [float(np.median(s)) for s in seconds]
@@ -181,7 +182,7 @@ def measure(
 
 
 def _slower(ours: list[float], other: list[float]) -> float:
-    """Median of the ratios of rounds, as the interval of :func:`_ratio_interval` has it: two rounds
+    """Median of the ratios of rounds, consistent with :func:`_ratio_interval`: two rounds
     are paired in time.
     """
     return float(np.median(np.array(other) / np.array(ours)))
@@ -193,7 +194,7 @@ def _cut(ours: Array, full: Array) -> tuple[float | None, tuple[float, float] | 
     """
     if min(ours.min(), full.min()) <= 0 or len(ours) < 2:
         return None, None
-    # Logarithms, so that the noise of the reference counts as well.
+    # Logarithms, which include the noise of the reference.
     bias, low, high = np.expm1(welch_interval(np.log(full), np.log(ours))).tolist()
     return bias, (low, high)
 
@@ -201,13 +202,13 @@ def _cut(ours: Array, full: Array) -> tuple[float | None, tuple[float, float] | 
 def _ratio_interval(
     ours: Array, other: Array, ours_seconds: list[float], other_seconds: list[float]
 ) -> tuple[float, float] | None:
-    """95 % of the ratio of variance times time, by resampling rounds; None where ``ours`` has no
+    """95 % of the ratio of variance times time, by resampling rounds; None if ``ours`` has no
     noise.
     """
     rounds = len(ours)
     if not ours.var(0).any():
         return None
-    # What else the machine does slows both of a round.
+    # Other load on the machine slows both runs of a round.
     ratio = np.array(other_seconds) / np.array(ours_seconds)
     # Squared distances between rounds: the variance of a resample is the mean over its pairs of
     # different rounds.
@@ -225,6 +226,6 @@ def _ratio_interval(
 
 
 def _between(apart: Array, drawn: npt.NDArray[np.int64]) -> float:
-    """Mean of ``apart`` over the pairs of different rounds among those drawn."""
+    """Mean of ``apart`` over the pairs of different rounds in the resample."""
     different = drawn[:, None] != drawn[None]
     return float(apart[np.ix_(drawn, drawn)][different].mean()) if different.any() else 0.0

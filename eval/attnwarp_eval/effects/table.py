@@ -1,6 +1,4 @@
-"""The table of all scenes: which effects each one needs, the plan, its proof, what it saves, and
-what it looks like.
-"""
+"""Table of all scenes: needed effects, plan, proof, saving, and pictures."""
 
 from __future__ import annotations
 
@@ -23,7 +21,7 @@ from attnwarp_eval.statistics.equivalence import Equivalence
 from attnwarp_eval.truth.plan import everything_on, plan
 
 USUAL = ("geometry", "direct", "shadows", "textures")
-"""Effects that nearly every scene calls for, and that no plan leaves out."""
+"""Effects that nearly every scene needs, and that no plan omits."""
 
 TIMED = (
     "time, everything on / plan",
@@ -38,7 +36,7 @@ AMPLIFIED = 8.0
 """Factor that amplifies the shown difference of two pictures."""
 
 PICTURE_SIZE, PLAN_SAMPLES, FULL_SAMPLES = 160, 64, 256
-"""Width and samples of the pictures side by side. Enough samples that the difference shows more
+"""Width and samples of the pictures side by side. Enough samples for the difference to show more
 than noise.
 """
 
@@ -48,8 +46,8 @@ class Settings:
     """Settings of an entry.
 
     Attributes:
-        prove: climb the ladder of :mod:`attnwarp_eval.effects.proof`.
-        budget: seconds that a proof may render.
+        prove: whether to climb the ladder of :mod:`attnwarp_eval.effects.proof`.
+        budget: seconds of rendering per proof.
         rounds: number of rounds of the timing against everything on; 0 for none.
         pictures: whether plan, everything on and their difference are drawn.
     """
@@ -61,10 +59,10 @@ class Settings:
 
 
 def measure_entry(scene: Scene, settings: Settings, report: Reporter = SILENT) -> dict[str, Any]:
-    """A scene's effects, the cost of its plan, and the proof, as JSON.
+    """Measure a scene's effects, the cost of its plan, and the proof, as JSON.
 
     Args:
-        settings: how the entry is made; pictures are apart, see :func:`side_by_side`.
+        settings: settings of the entry; :func:`side_by_side` makes the pictures.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -105,7 +103,7 @@ def side_by_side(scene: Scene, path: Path) -> dict[str, Any]:
     JPEG.
 
     Returns:
-        "largest_difference": of an 8 x 8 block of the displayed pictures, in [0, 1].
+        "largest_difference": largest, over 8 x 8 blocks, of the displayed pictures, in [0, 1].
     """
     from attnwarp_eval.colors import to_srgb
     from attnwarp_eval.effects.proof import blocks
@@ -169,7 +167,7 @@ def table(entries: Iterable[Mapping[str, Any]]) -> Table:
 
 
 def plan_words(planned: Mapping[str, Any]) -> str:
-    """A plan in a few words: integrator, and the camera where it is not a pinhole.
+    """A plan in a few words: integrator, and the camera unless it is a pinhole.
 
     Example:
         >>> plan_words({"integrator": "path", "sensor": {"type": "thinlens"}})
@@ -181,7 +179,7 @@ def plan_words(planned: Mapping[str, Any]) -> str:
 
 
 def proof_words(proof: Mapping[str, Any]) -> str:
-    """A verdict in a few words, with what the comparison alone came to where something is not
+    """A verdict in a few words, with the comparison's verdict if an effect is not
     simulated.
 
     Example:
@@ -225,7 +223,7 @@ def _times(cost: Mapping[str, Any] | None) -> list[str]:
 
     noise, cap = ratio(cost["at_equal_noise"], cost["interval"]), cost["cap"]
     if cap is None:
-        # Both pictures have the same mean, so that equal noise is equal error.
+        # Both pictures have the same mean, so equal noise is equal error.
         return [number(cost["faster"]), noise, "no cap", number(cost["faster"]), noise]
     bias = "–"
     if cap["bias"] is not None:
@@ -245,7 +243,7 @@ def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Re
     """The table, and the pictures side by side; ``about`` is the environment.
 
     Raises:
-        InputError: the entries were not timed alike.
+        InputError: the entries were timed differently.
     """
     certified = sum(entry.get("proof", {}).get("verdict") == "certified" for entry in entries)
     partly = (
@@ -253,7 +251,7 @@ def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Re
         - certified
     )
     variants = ", ".join(sorted({f"`{entry['variant']}`" for entry in entries}))
-    # The lead describes one: it follows from the rounds and Mitsuba's variant.
+    # The lead describes one way of timing, given by the rounds and Mitsuba's variant.
     costs = {
         tuple(e["cost"][key] for key in ("size", "spp", "rounds")) for e in entries if "cost" in e
     }

@@ -1,4 +1,4 @@
-"""Scenes of a table whose rows, cells and pictures carry their names."""
+"""Scenes of a table whose rows, cells and pictures are named by scene."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from attnwarp_eval.scene.scene import Scene
 
 
 def distinct_scenes(names: Sequence[str]) -> list[Scene]:
-    """Load scenes of which no two have one name; one that is named twice is loaded once.
+    """Load scenes with distinct names; a repeated scene is loaded once.
 
     Args:
         names: scenes' names or paths.
 
     Raises:
-        InputError: a scene that cannot be used, or two scenes of one name.
+        InputError: a scene that cannot be used, or two scenes with the same name.
     """
     from attnwarp_eval.scene.file import load_scene
 

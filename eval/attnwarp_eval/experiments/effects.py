@@ -1,4 +1,4 @@
-"""The table of effects as a run that can be interrupted: every scene has two cells."""
+"""Table of effects as a resumable run with two cells for every scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.task import Task, results
 
 PROTOCOL = 2
-"""Raised whenever an entry would come out otherwise."""
+"""Version; raised when an entry's content changes."""
 
 Part = tuple[str, dict[str, Any]]
 """A scene's name, and some fields of its entry."""
@@ -29,18 +29,18 @@ Part = tuple[str, dict[str, Any]]
 def collect(
     names: Sequence[str], out: Path, settings: Settings, report: Reporter = SILENT
 ) -> list[dict[str, Any]]:
-    """Make the table's entries and write them, with their pictures, below ``out``.
+    """Compute the table's entries and write them, with their pictures, below ``out``.
 
     Each entry is a cell of the run's folder, and so are its pictures. After an interruption, or
-    when one scene has changed, only what is missing is made. A table that is there stays until all
-    of its rows are made again.
+    when one scene has changed, only missing cells are computed. An existing table stays until all
+    of its rows are computed again.
 
     Args:
         names: scenes' names or paths.
         out: folder of ``effects.json``, the report, ``<scene>.jpg`` and ``cells/``.
 
     Returns:
-        The entries, as they stand in ``effects.json``.
+        The entries, as in ``effects.json``.
 
     Raises:
         InputError: a scene that is unknown or contradicts itself, two scenes of one name, another
@@ -58,7 +58,7 @@ def collect(
         entries.setdefault(name, {}).update(part)
         if not stored <= {(scene.name,) for scene in scenes[: done // parts]}:
             continue
-        # What is done can be read while the rest is at work.
+        # Finished entries can be read while the others are computed.
         about = environment()
         data = {"environment": about, "scenes": [entries[name] for name in sorted(entries)]}
         write_json(out / "effects.json", data, sort_keys=False)

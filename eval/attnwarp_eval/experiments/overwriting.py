@@ -1,4 +1,4 @@
-"""Tables that a later call overwrites: what only they hold must not be lost."""
+"""Check that overwriting a table loses no rows."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ Key = tuple[str, ...]
 def check_nothing_is_lost(
     path: Path, table: str | None, fields: Sequence[str], available: Collection[Key]
 ) -> set[Key]:
-    """Check that a table can be overwritten: its folder has cells, and each row will be there.
+    """Check that a table can be overwritten: its folder has cells, and each row will be rewritten.
 
-    A folder without cells has results from elsewhere, such as a published report. Made again they
-    would be others, so none of them is overwritten.
+    A folder without cells has results from elsewhere, such as a published report. Recomputed
+    results would differ, so such a table is not overwritten.
 
     Args:
-        path: path of the table's JSON, in the run's folder; there may be none yet.
-        table: the key of the list of rows; None where the list is all there is.
-        fields: the keys of a row that name it.
-        available: the rows that the call makes.
+        path: path of the table's JSON, in the run's folder; may be missing.
+        table: key of the list of rows; None if the file is only the list.
+        fields: keys of a row that identify it.
+        available: keys of the rows that the call computes.
 
     Returns:
         The rows of the table.

@@ -20,14 +20,14 @@ STAGES = ("meshes", "geometry", "first picture", "other pictures")
 
 @dataclass(frozen=True)
 class SceneTime:
-    """Seconds that one scene's truth took, by stage.
+    """Seconds of one scene's truth, by stage.
 
     Attributes:
-        scene: its name.
-        views: how many cameras were traced and rendered.
+        scene: name of the scene.
+        views: number of cameras traced and rendered.
         wall, cpu: stage -> seconds; "meshes" reads the file and meshes its bodies, "first picture"
             also loads the scene into Mitsuba and compiles its integrators.
-        variant: Mitsuba's.
+        variant: Mitsuba's variant.
     """
 
     scene: str
@@ -61,24 +61,24 @@ def measure(
     spp: int = 64,
     report: Reporter = SILENT,
 ) -> Iterator[SceneTime]:
-    """Make each scene's truth from an empty cache, one after the other, and time it.
+    """Compute each scene's truth from an empty cache, one after the other, and time it.
 
     Args:
         names: scenes' names or paths.
-        views: the source and the targets that come first in the file, fewer where a scene has
-            fewer.
+        views: number of views: the source and the first targets of the file, fewer if a scene
+            has fewer.
         geometry_size, size: sizes of the square images of depth and ids, and of
             the pictures.
 
     Raises:
-        InputError: a scene that cannot be used, or two scenes of one name.
+        InputError: a scene that cannot be used, or two scenes with the same name.
     """
     from attnwarp_eval.truth import Geometry, appearance
     from attnwarp_eval.truth.llvm import variant
     from attnwarp_eval.truth.mitsuba import forget
 
-    distinct_scenes(names)  # refused before the first is timed
-    # What a process pays once (imports, the probe, compiled numba kernels) belongs to no scene.
+    distinct_scenes(names)  # refuse before the first is timed
+    # One-time costs of a process (imports, the probe, compiled numba kernels) belong to no scene.
     warm = load_scene("spheres").with_size(16, 16)
     Geometry(warm).trace(warm.source)
     appearance(warm, warm.source, spp=1)

@@ -19,17 +19,17 @@ from attnwarp_eval.colors import to_linear
 
 FARTHEST = 1e9
 """Largest coordinate or length, in scene units. Float64 resolves 1e-7 there; the squares and
-products of much larger ones overflow the float32 of what renders them."""
+products of much larger values overflow float32 renderers."""
 
 
 class SceneNotice(InputWarning):
-    """Notice on a scene that can be used all the same."""
+    """Notice on a scene that is still usable."""
 
 
 def silence_notices() -> None:
-    """Let this process warn of no :class:`SceneNotice` any more, where something else says them.
+    """Silence :class:`SceneNotice` warnings in this process, for callers that report them.
 
-    The filter is set once: each change of it has Python print every other warning anew.
+    The filter is set once: each change makes Python print every other warning again.
     """
     if not any(
         action == "ignore" and kind is SceneNotice for action, _, kind, *_ in warnings.filters
@@ -44,10 +44,10 @@ def _no_truth(value: Any) -> Any:
 
 
 Number = Annotated[float, BeforeValidator(_no_truth)]
-"""A number, which true is not."""
+"""A number; booleans are refused."""
 
 Seed = Annotated[int, Field(ge=-(2**62), le=2**62)]
-"""Seed that the noise is hashed with: a 64-bit number, with room for octaves."""
+"""Seed of the noise's hash: a 64-bit number, minus the range of octaves."""
 
 Coordinate = Annotated[Number, Field(ge=-FARTHEST, le=FARTHEST)]
 
@@ -89,7 +89,7 @@ def linear_rgb(color: str) -> tuple[float, float, float]:
 
 
 class Spec(BaseModel):
-    """Base of everything a scene file says: unknown keys and numbers that are not finite are
+    """Base of all models of a scene file: unknown keys and numbers that are not finite are
     refused.
     """
 

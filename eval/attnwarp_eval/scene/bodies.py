@@ -1,4 +1,4 @@
-"""Bodies: what a scene file says about a shape of blended parts, and the parts that it means."""
+"""Bodies: models of a scene file's shapes of blended parts, and their conversion to parts."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from attnwarp_eval.scene.textures import lattice_noise
 
 
 class RingSpec(Spec):
-    """``count`` copies of a part about the upright through ``about``, over ``sweep`` degrees from
-    where it stands.
+    """``count`` copies of a part about the vertical axis through ``about``, over ``sweep`` degrees
+    from its position.
 
     ``jitter`` (0 to 1) turns each by up to that share of the step, and makes ellipsoids, capsules
     and tubes thinner by up to half that share; ``lift`` raises each above the one before.
@@ -59,7 +59,7 @@ class _PartSpec(Spec):
 
 
 class _TurnedPart(_PartSpec):
-    """A part with axes of its own: rolled about x, pitched about y, then turned about z."""
+    """A part with local axes: rolled about x, pitched about y, then turned about z."""
 
     center: Vector
     pitch: float = 0.0
@@ -68,14 +68,14 @@ class _TurnedPart(_PartSpec):
 
 
 class EllipsoidPart(_TurnedPart):
-    """An ellipsoid with radii along its own x, y, z."""
+    """An ellipsoid with radii along its local x, y, z."""
 
     type: Literal["ellipsoid"]
     radii: tuple[Positive, Positive, Positive]
 
 
 class TorusPart(_TurnedPart):
-    """A ring about its own z: radii of the ring and of its thickness."""
+    """A ring about its local z: radii of the ring and of its thickness."""
 
     type: Literal["torus"]
     radii: tuple[Positive, Positive]
@@ -99,7 +99,7 @@ class BlockPart(_TurnedPart):
 
 
 class DiscPart(_TurnedPart):
-    """A cylinder along its own z with edges rounded by ``round``."""
+    """A cylinder along its local z with edges rounded by ``round``."""
 
     type: Literal["disc"]
     radius: Positive
@@ -189,11 +189,11 @@ class BodySpec(Spec):
         return solids.Relief(**self.relief.model_dump()) if self.relief else None
 
     def mesh(self) -> Mesh:
-        """The surface as triangles, in the body's own coordinates."""
+        """The surface as triangles, in the body's coordinates."""
         return solids.mesh_body(self.solid(), self.blend, self.resolution, self.surface())
 
     def contains(self, point: npt.NDArray[np.float64]) -> bool:
-        """Return True if a (3,) point in the body's own coordinates is inside; needs no meshing."""
+        """Return True if a (3,) point in the body's coordinates is inside; needs no meshing."""
         return bool(
             solids.body_distance(self.solid(), self.blend, point[None], self.surface())[0] < 0
         )

@@ -1,4 +1,4 @@
-"""Edits with truth: what an instruction does to a scene, so that the edited scene can be rendered
+"""Edits with truth: an instruction's effect on a scene, so that the edited scene can be rendered
 from everywhere.
 """
 
@@ -24,10 +24,10 @@ WHITE = "#ffffff"
 
 
 def pick(edit: EditSpec, answer: str | None = None) -> AnswerSpec | None:
-    """The answer of that name; the first if left out; None for an edit with one result.
+    """The named answer, by default the first; None for an edit with one result.
 
     Raises:
-        ValueError: there is no such answer.
+        ValueError: no such answer.
     """
     if answer is None:
         return edit.answers[0] if edit.answers else None
@@ -39,10 +39,10 @@ def pick(edit: EditSpec, answer: str | None = None) -> AnswerSpec | None:
 
 
 def apply(spec: SceneSpec, edit: EditSpec, answer: AnswerSpec | None = None) -> SceneSpec:
-    """The scene that an edit means, without edits of its own.
+    """Apply an edit; the resulting scene has no edits.
 
     Raises:
-        ValueError: it changes what is not there, or what it makes is no scene.
+        ValueError: the edit changes an unknown object, or its result is not a valid scene.
     """
     does = answer or edit
     objects = list(spec.objects)
@@ -132,7 +132,7 @@ def _colors(node: Any) -> list[str]:
 
 
 def _painted(texture: dict[str, Any], paint: str) -> dict[str, Any]:
-    """The texture in shades of one colour: each of its colours keeps its lightness relative to the
+    """The texture in shades of one colour: each colour keeps its lightness relative to the
     lightest.
     """
     colors = _colors(texture)

@@ -1,5 +1,5 @@
-"""Pydantic's errors as lines that a person can act on: the key as YAML has it, what came, what was
-expected, and the nearest real key.
+"""Pydantic's errors as actionable lines: the key in YAML's notation, the value, the expected value,
+and the nearest valid key.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from attnwarp.errors import suggest
 
 
 def explain(problem: Any, model: type[BaseModel], file: str) -> str:
-    """One of a ValidationError's errors in one line.
+    """Format one of a ValidationError's errors in one line.
 
     Args:
         problem: an item of ``ValidationError.errors()``.
-        file: that says what each key means.
+        file: name of the documentation of the keys.
 
     Example:
         >>> from pydantic import BaseModel, Field, ValidationError
@@ -54,7 +54,7 @@ def explain(problem: Any, model: type[BaseModel], file: str) -> str:
         )
     if kind == "union_tag_not_found":
         return f"{place}: says no type; add 'type: ...' (docs/truth/scenes.md lists the types)"
-    if kind == "value_error":  # of our own validators, whose messages are whole
+    if kind == "value_error":  # from this package's validators, whose messages are complete
         message = problem["msg"].removeprefix("Value error, ")
         return f"{place}: {message}" if place else message
     message = problem["msg"]
@@ -62,9 +62,9 @@ def explain(problem: Any, model: type[BaseModel], file: str) -> str:
 
 
 def _follow(loc: Sequence[int | str], model: type[BaseModel]) -> tuple[str, type[BaseModel] | None]:
-    """A pydantic location as a person would write it, and the model at its end.
+    """A pydantic location as a YAML key path, and the model at its end.
 
-    Unions put the tag of the member they chose into the location; it picks the model and is left
+    Unions put the tag of the chosen member into the location; it selects the model and is left
     out of the path.
     """
     place = ""
@@ -79,7 +79,7 @@ def _follow(loc: Sequence[int | str], model: type[BaseModel]) -> tuple[str, type
             annotation = tagged[0]
             continue
         if not models and get_origin(annotation) in (Union, UnionType):
-            continue  # pydantic's own name of a member, such as constrained-int
+            continue  # pydantic's name of a member, such as constrained-int
         place += f".{step}" if place else step
         if get_origin(annotation) is dict:
             annotation = get_args(annotation)[1]
@@ -98,7 +98,7 @@ def _tags(model: type[BaseModel]) -> tuple[Any, ...]:
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
-    """The models that may stand where an annotation does."""
+    """The models in an annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for part in get_args(annotation) for model in _models(part)]

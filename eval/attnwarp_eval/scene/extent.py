@@ -1,4 +1,4 @@
-"""Extent of a scene, and the objects that set it."""
+"""Extent of a scene, and the objects that determine it."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.shapes import Array, Box, Mesh, Rectangle, Shape, Sphere
 
 FEW = 1e-3
-"""Share of the surface that should not decide the extent of a scene."""
+"""Share of the surface that should not determine the extent of a scene."""
 
 SHRINK = 2.0
-"""Leaving out that share may make the extent at most this many times smaller without a warning."""
+"""Factor by which leaving out that share may shrink the extent without a warning."""
 
 
 class ExtentNotice(SceneNotice):
-    """A tiny part of a scene makes its extent."""
+    """A tiny part of a scene determines its extent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class Extent:
 
     @property
     def notice(self) -> str | None:
-        """A warning where a thousandth of the surface makes the extent, else None."""
+        """A warning if a thousandth of the surface determines the extent, else None."""
         if self.size <= SHRINK * self.core:
             return None
         return (
@@ -59,7 +59,7 @@ def extent(scene: Scene, shapes: Sequence[Shape] | None = None) -> Extent:
     """The extent of a scene.
 
     Args:
-        shapes: ``scene.shapes()``, where the caller has them already.
+        shapes: ``scene.shapes()``, if the caller already has them.
     """
     shapes = scene.shapes() if shapes is None else shapes
     pieces = [_pieces(shape) for shape in shapes]
@@ -78,14 +78,14 @@ def extent(scene: Scene, shapes: Sequence[Shape] | None = None) -> Extent:
 
 
 def warn_of_strays(scene: Scene, shapes: Sequence[Shape]) -> None:
-    """An :class:`ExtentNotice` where a thousandth of the surface makes the extent."""
+    """Warn (:class:`ExtentNotice`) if a thousandth of the surface determines the extent."""
     notice = extent(scene, shapes).notice
     if notice:
         warnings.warn(f"{scene.name}: {notice}", ExtentNotice, stacklevel=3)
 
 
 def _beyond_few(values: Array, area: Array) -> float:
-    """The least value of a piece when the pieces of the lowest values are left out, up to
+    """The least value of a piece without the pieces of the lowest values, up to
     :data:`FEW` of the area.
     """
     order = np.argsort(values)

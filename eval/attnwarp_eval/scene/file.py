@@ -1,4 +1,4 @@
-"""Scene files: finding, reading and checking them, with messages a person can act on."""
+"""Scene files: finding, reading and checking them, with actionable messages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from attnwarp_eval.scene.yaml import Place, YamlError, line_of, read_yaml
 
 
 def scene_folders() -> list[Path]:
-    """Folders in which scenes are looked for by name: ``./scenes``, then those of the package (in a
+    """Folders searched for scenes by name: ``./scenes``, then those of the package (in a
     checkout: its ``scenes``).
 
     Example:
@@ -45,7 +45,7 @@ def list_scenes() -> list[str]:
 
 
 def is_scene_file(name: object) -> bool:
-    """Return True if :func:`load_scene` takes this for a file, not for a name to look up.
+    """Return True if :func:`load_scene` treats this as a file, not as a name.
 
     Example:
         >>> is_scene_file("my/scene.yaml"), is_scene_file("bear")
@@ -57,7 +57,7 @@ def is_scene_file(name: object) -> bool:
 
 
 def scene_name(name_or_path: str) -> str:
-    """Name of a scene wherever its file may lie: the name itself, or its file's without a suffix.
+    """Name of a scene independent of its folder: the name, or the file's without a suffix.
 
     Example:
         >>> scene_name("my/room.yaml"), scene_name("bear")
@@ -67,10 +67,10 @@ def scene_name(name_or_path: str) -> str:
 
 
 def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
-    """A scene by name (``"bear"``) or by file (``"my/scene.yaml"``).
+    """Load a scene by name (``"bear"``) or by file (``"my/scene.yaml"``).
 
     Args:
-        name_or_path: a name is looked up in ``./scenes``, then in the package.
+        name_or_path: a path, or a name, searched in ``./scenes``, then in the package.
 
     Raises:
         SceneError: the file is missing, or an entry cannot be used. The message names the file, the
@@ -91,7 +91,7 @@ def scene_file(name_or_path: str | os.PathLike[str]) -> Path:
     """The file of a scene by name or by file.
 
     Raises:
-        SceneError: there is none.
+        SceneError: no such scene.
 
     Example:
         >>> scene_file("spheres").name
@@ -136,7 +136,7 @@ def _read(path: Path) -> Scene:
     try:
         spec = SceneSpec.model_validate(data)
     except ValidationError as error:
-        # A misspelt key comes first: what is missing then is often only its right spelling.
+        # Misspelt keys first: a missing key is often only misspelt.
         problems = sorted(
             error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden"
         )
@@ -152,9 +152,7 @@ def _read(path: Path) -> Scene:
 
 
 def _check(scene: Scene, lines: dict[Place, int]) -> None:
-    """Check what no single field can tell: names that clash, files that are missing, cameras that
-    cannot be.
-    """
+    """Check conditions across fields: clashing names, missing files, impossible cameras."""
 
     def refuse(message: str, *loc: int | str) -> None:
         raise SceneError(message, scene.path, line_of(lines, loc))

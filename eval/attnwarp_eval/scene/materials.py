@@ -1,8 +1,8 @@
 """Parts of a scene file about light beyond sun, sky and diffuse surfaces: materials, lamps, fog,
 lens, effects.
 
-All of it is a description; :mod:`attnwarp_eval.scene.transport` says what light transport it calls
-for.
+These are only descriptions; :mod:`attnwarp_eval.scene.transport` derives the light transport that
+they need.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from attnwarp_eval.scene.base import Color, Positive, Spec, Vector
 
 
 class DiffuseMaterial(Spec):
-    """Scatters light evenly; its colour is the object's texture. What an object is unless it says
-    otherwise.
+    """Scatters light evenly; its colour is the object's texture. The default
+    material.
     """
 
     type: Literal["diffuse"] = "diffuse"
 
 
 class MirrorMaterial(Spec):
-    """Reflects all light that meets it, times ``tint``."""
+    """Reflects all incident light, times ``tint``."""
 
     type: Literal["mirror"]
     tint: Color = "#ffffff"
@@ -50,8 +50,8 @@ class MetalMaterial(Spec):
 class PlasticMaterial(Spec):
     """A diffuse base in the object's texture under a rough (GGX) dielectric coat.
 
-    A smooth coat would be diffuse and specular at once, and light through it could not be counted
-    once: see docs/truth/scenes.md.
+    A smooth coat would be diffuse and specular at once, and light through it would be counted
+    twice: see docs/truth/scenes.md.
     """
 
     type: Literal["plastic"]
@@ -60,7 +60,7 @@ class PlasticMaterial(Spec):
 
 
 class InteriorSpec(Spec):
-    """Filling of a glass object: light is scattered and absorbed inside (subsurface scattering).
+    """Filling of a glass object: scatters and absorbs light inside (subsurface scattering).
 
     ``sigma_t`` is the extinction per scene unit, ``albedo`` times ``tint`` the share that is
     scattered, ``g`` the mean cosine of the scattering angle (Henyey-Greenstein).
@@ -76,8 +76,8 @@ class GlassMaterial(Spec):
     """A dielectric. ``thin`` means a pane without thickness, which shifts nothing; ``roughness``
     above 0 is frosted.
 
-    ``abbe`` tells how strongly real glass of this kind disperses. Dispersion is not simulated; it
-    is named.
+    ``abbe`` is the Abbe number of real glass of this kind. Dispersion is not simulated, only
+    named.
     """
 
     type: Literal["glass"]
@@ -122,7 +122,7 @@ TEXTURED = (DiffuseMaterial, PlasticMaterial)
 
 
 class EmissionSpec(Spec):
-    """Light that a surface sends out evenly, in radiance. Rectangles shine where they face, closed
+    """Uniform radiance emitted by a surface. Rectangles emit along their normal, closed
     shapes outward.
     """
 
@@ -135,7 +135,7 @@ class EmissionSpec(Spec):
 
 
 class PointSpec(Spec):
-    """A lamp without size. ``intensity`` in power per solid angle: at distance d it gives intensity
+    """A point lamp. ``intensity`` in power per solid angle: at distance d it gives intensity
     / d^2.
     """
 
@@ -146,7 +146,7 @@ class PointSpec(Spec):
 
 
 class SpotSpec(Spec):
-    """A lamp without size that shines into a cone about ``target``, falling off from ``beam`` to
+    """A point lamp that shines into a cone about ``target``, falling off from ``beam`` to
     ``cutoff`` degrees.
     """
 
@@ -171,7 +171,7 @@ class SpotSpec(Spec):
 
 
 class BoundsSpec(Spec):
-    """An upright box."""
+    """An axis-aligned box."""
 
     center: Vector
     size: tuple[Positive, Positive, Positive]
@@ -186,10 +186,10 @@ class MediumSpec(InteriorSpec):
 
 
 class LensSpec(Spec):
-    """A thin lens. ``aperture`` is its radius; sharp is what lies ``focus`` away along the optical
-    axis.
+    """A thin lens. ``aperture`` is its radius; points at ``focus`` along the optical
+    axis are sharp.
 
-    Without ``focus`` that is ``cameras.look_at``, also in views that look elsewhere.
+    ``focus`` defaults to the distance of ``cameras.look_at``, also in views that look elsewhere.
     """
 
     aperture: Positive
@@ -214,16 +214,16 @@ Effect = Literal[
     "polarisation",
     "dispersion",
 ]
-"""Everything that light may do and a scene may call for, simulated or not."""
+"""All light-transport effects that a scene may need, simulated or not."""
 
 EFFECTS: tuple[Effect, ...] = get_args(Effect)
 
 NOT_SIMULATED: tuple[Effect, ...] = ("motion", "polarisation", "dispersion")
-"""Effects that pictures never show; a scene that calls for one is told so."""
+"""Effects that are never simulated; a scene that needs one is reported."""
 
 
 class EffectsSpec(Spec):
-    """``pin``: what the scene is about, so it must be there and is simulated. ``forbid``: what it
+    """``pin``: effects that must occur and are simulated. ``forbid``: effects that the scene
     must not need.
     """
 

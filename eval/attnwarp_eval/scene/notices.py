@@ -15,14 +15,14 @@ from attnwarp_eval.scene.spec import MeshSpec, ObjectSpec
 from attnwarp_eval.scene.textures import albedo
 
 LOST = 0.02
-"""Albedo by which the texture between the vertices of a mesh may differ from its vertices' own, on
-average, without a warning."""
+"""Albedo by which the texture between the vertices of a mesh may differ from that at its vertices,
+on average, without a warning."""
 
 
 def notices(scene: Scene) -> list[str]:
-    """A line for each thing that was left out of a scene's mesh files, or that spoils its pictures.
+    """One line for each dropped part of a scene's mesh files, or fault that spoils its pictures.
 
-    Everything that building the scene later warns of as well. A scene without mesh files has none.
+    Building the scene later gives the same warnings. A scene without mesh files has none.
 
     Raises:
         SceneError: the scene cannot be built.
@@ -37,7 +37,7 @@ def notices(scene: Scene) -> list[str]:
         return []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        # Built anew: shapes that are there already give no notice again.
+        # Built again: cached shapes give no notice.
         shapes = Scene(scene.spec, scene.path).shapes()
         warn_of_strays(scene, shapes)
         for shape in shapes:
@@ -54,7 +54,7 @@ def notices(scene: Scene) -> list[str]:
 
 
 def warn_of_lost_texture(item: ObjectSpec, mesh: Mesh) -> None:
-    """A :class:`~attnwarp_eval.scene.shapes.MeshNotice` where triangles are too large for a texture
+    """Warn (:class:`~attnwarp_eval.scene.shapes.MeshNotice`) of triangles too large for a texture
     baked into vertices.
     """
     if not isinstance(item.material, TEXTURED) or item.emission:

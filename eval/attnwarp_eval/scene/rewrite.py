@@ -1,4 +1,4 @@
-"""Numbers of bounces written into a scene's file, whose other text and comments stay."""
+"""Numbers of bounces written into a scene's file without changing other text and comments."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any, Literal
 import yaml
 
 Which = tuple[str | None, str | None]
-"""An edit and an answer of it, each by its name; (None, None) is the scene itself."""
+"""Names of an edit and one of its answers; (None, None) is the scene."""
 
 
 def with_bounces(text: str, numbers: Mapping[Which, int | Literal["unlimited"]]) -> str:
     """Write numbers of bounces into the text of a scene file.
 
-    An edit gets a number where it has another than the scene, or has one already.
+    An edit gets a number if it differs from the scene's, or if the edit already has one.
 
     Args:
         text: text of a file that :func:`~attnwarp_eval.scene.file.load_scene` reads.
-        numbers: numbers of the scene and of everything that its edits make of it.
+        numbers: numbers of the scene and of its edited scenes.
 
     Example:
         >>> print(with_bounces("name: room\\nappearance: {spp: 8}  # few", {(None, None): 3}))
@@ -35,7 +35,7 @@ def with_bounces(text: str, numbers: Mapping[Which, int | Literal["unlimited"]])
     for which, node in _edits(root):
         if which in numbers and (numbers[which] != own or _find(node, "bounces") is not None):
             changes.append(_set(node, "bounces", numbers[which]))
-    # An alias repeats a node, which is changed once. From the end on, so that places stay true.
+    # An alias repeats a node, which is changed once. From the end, so that offsets stay valid.
     places = {(start, end): new for start, end, new in changes}
     for start, end in sorted(places, reverse=True):
         text = text[:start] + places[start, end] + text[end:]
@@ -52,18 +52,18 @@ def _edits(root: Any) -> Iterator[tuple[Which, Any]]:
 
 
 def _find(node: Any, name: str) -> Any:
-    """The value of a key; None where there is none."""
+    """The value of a key; None if absent."""
     return next((value for key, value in node.value if key.value == name), None)
 
 
 def _set(node: Any, name: str, value: object) -> tuple[int, int, str]:
-    """First and last place of the text that a key of a mapping replaces, and the new text."""
+    """Start and end of the text that a key of a mapping replaces, and the new text."""
     there = _find(node, name)
     if there is not None:
         return there.start_mark.index, there.end_mark.index, str(value)
     if not node.value:
         return node.start_mark.index, node.end_mark.index, f"{{{name}: {value}}}"
-    # Before the second key, as the first is what the entry is called by.
+    # Before the second key, since the first key names the entry.
     before = node.value[min(1, len(node.value) - 1)][0].start_mark
     end = ", " if node.flow_style else "\n" + " " * before.column
     return before.index, before.index, f"{name}: {value}{end}"

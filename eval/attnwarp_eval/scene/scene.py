@@ -1,4 +1,4 @@
-"""A scene: what its file says, as cameras, shapes and hashes."""
+"""A scene: the content of its file as cameras, shapes and hashes."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
 Array = npt.NDArray[np.float64]
 
 SCENE_PROTOCOL = 1
-"""Raised whenever the same file would mean another world (shapes, textures, lights, defaults); part
+"""Version; raised when the same file would mean another world (shapes, lights, defaults); part
 of every content hash.
 """
 
 
 class SceneError(InputError):
-    """A scene file that cannot be used: names the file, the line where it can, what came, and the
-    remedy.
+    """A scene file that cannot be used: the message has the file, the line if known, the value, and
+    the remedy.
 
     Example:
         >>> print(SceneError("objects: got none, expected at least one", "my.yaml", 3))
@@ -67,7 +67,7 @@ class Scene:
 
     Attributes:
         spec: contents of the file.
-        path: the file, or None for one made in code; mesh files are relative to its folder.
+        path: the file, or None for a scene made in code; mesh paths are relative to its folder.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -91,12 +91,12 @@ class Scene:
 
     @property
     def name(self) -> str:
-        """Short name, also the file's."""
+        """Short name, equal to the file's."""
         return self.spec.name
 
     @property
     def title(self) -> str:
-        """A line for people."""
+        """Title in one line."""
         return self.spec.title
 
     @property
@@ -111,7 +111,7 @@ class Scene:
 
     @property
     def center(self) -> Array:
-        """(3,) float64 the point that the cameras look at."""
+        """(3,) float64 the look-at point of the cameras."""
         return np.array(self.spec.cameras.look_at)
 
     @functools.cached_property
@@ -133,10 +133,10 @@ class Scene:
         return self.cameras[1:]
 
     def camera(self, name: str) -> Camera:
-        """The camera of that name.
+        """Find a camera by name.
 
         Raises:
-            SceneError: there is none.
+            SceneError: no such camera.
         """
         for camera in self.cameras:
             if camera.name == name:
@@ -151,10 +151,10 @@ class Scene:
         return self.spec.edits
 
     def edit(self, name: str) -> EditSpec:
-        """The edit of that name.
+        """Find an edit by name.
 
         Raises:
-            SceneError: there is none.
+            SceneError: no such edit.
         """
         for edit in self.edits:
             if edit.name == name:
@@ -171,10 +171,10 @@ class Scene:
 
         Args:
             name: an edit of :attr:`edits`.
-            answer: which of an ambiguous edit's answers; its first if left out.
+            answer: answer of an ambiguous edit, by default the first.
 
         Raises:
-            SceneError: there is no such edit or answer.
+            SceneError: no such edit or answer.
         """
         edit = self.edit(name)
         try:
@@ -193,11 +193,11 @@ class Scene:
         return copy
 
     def shapes(self) -> tuple[Shape, ...]:
-        """Everything that has a surface, in world coordinates, each with its object's index as
+        """All surfaces in world coordinates, each with its object's index as
         ``object_id``. Built at the first call; notices of meshes are given then.
 
         Raises:
-            SceneError: an object reaches farther than coordinates may, a mesh file is damaged, or a
+            SceneError: an object exceeds the limit of coordinates, a mesh file is damaged, or a
                 body cannot be meshed.
         """
         return self._shapes
@@ -265,7 +265,7 @@ class Scene:
                 yield replace(spec.mesh(self._ground(spec)), object_id=object_id)
 
     def _ground(self, spec: ScatterSpec) -> Callable[[Array], Array]:
-        """Height of what things are strewn on."""
+        """Height function of the ground under scattered things."""
         for item in self.spec.objects:
             if item.name == spec.on and isinstance(item.shape, TerrainSpec):
                 return item.shape.height_at
@@ -281,7 +281,7 @@ class Scene:
 
     @functools.cached_property
     def world_hash(self) -> str:
-        """SHA-256 of all that decides what a camera would see: objects, mesh files, lights, fog,
+        """SHA-256 of everything that affects a camera's view: objects, mesh files, lights, fog,
         protocol versions.
         """
         files = {
@@ -293,17 +293,17 @@ class Scene:
         return content_key("world", protocols, self._said("objects", "lights", "medium"), files)
 
     def _said(self, *keys: str) -> dict[str, Any]:
-        """Entries of the file, as JSON, without what has its default: with and without it, a file
-        says the same, and a key that the format gains later renames no scene.
+        """Entries of the file, as JSON, without default values: files with and without them are
+        equal, and a new key of the format changes no scene's hash.
         """
         return self.spec.model_dump(mode="json", include={*keys}, exclude_defaults=True)
 
     @functools.cached_property
     def content_hash(self) -> str:
-        """SHA-256 of everything the scene says (canonical JSON), the mesh files' bytes and the
+        """SHA-256 of the scene's content (canonical JSON), the mesh files' bytes and the
         protocol versions.
 
-        Edits are left out: they are other scenes, with hashes of their own.
+        Edits are left out: they are other scenes, with separate hashes.
         """
         own = type(self.spec).model_fields.keys() - {"edits"}
         return content_key("scene", self.world_hash, self._said(*own))
@@ -325,7 +325,7 @@ def _placed(mesh: Mesh, R: Array, scale: float, position: Vector, object_id: int
 
 
 def view_name(view: ViewSpec, index: int) -> str:
-    """The camera's name: its own, else 'source' for the first and 'yaw030' for the others.
+    """The camera's name: as given, else 'source' for the first and 'yaw030' for the others.
 
     Example:
         >>> from attnwarp_eval.scene.spec import ViewSpec
@@ -366,7 +366,7 @@ def orbit_camera(orbit: CamerasSpec, view: ViewSpec, index: int) -> Camera:
 
 
 def inside(scene: Scene, item: ObjectSpec) -> Callable[[Array], bool]:
-    """A test whether a point is inside the object. A body is asked by its distance, which needs no
+    """Predicate of points inside the object. A body uses its distance, which needs no
     meshing.
 
     Example:
@@ -384,6 +384,6 @@ def inside(scene: Scene, item: ObjectSpec) -> Callable[[Array], bool]:
     if isinstance(spec, TerrainSpec):
         return spec.below
     if isinstance(spec, ScatterSpec):
-        return lambda point: False  # blades and leaves have no inside, and stones are small
+        return lambda point: False  # blades and leaves have no interior, and stones are small
     solids = list(scene._build(item, 0))
     return lambda point: any(solid.contains(point) for solid in solids)

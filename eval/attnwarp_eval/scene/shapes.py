@@ -24,7 +24,7 @@ dropped.
 """
 
 MOST_DIVIDED = 5_000_000
-"""Triangles into which a mesh is divided at the most."""
+"""Most triangles of a divided mesh."""
 
 
 class MeshNotice(SceneNotice):
@@ -174,10 +174,10 @@ class Mesh:
         )
 
     def divided(self, longest: float) -> Mesh:
-        """Halve edges until none is longer than ``longest``, for textures, which have their colours
-        at vertices. The surface stays as it is.
+        """Halve edges until none is longer than ``longest``, since textures have their colours
+        at vertices. The surface does not change.
 
-        Neighbours share the vertices between them, so no crack opens.
+        Neighbours share the new vertices, so no crack opens.
 
         Raises:
             ValueError: there would be more than :data:`MOST_DIVIDED` triangles.
@@ -250,7 +250,7 @@ class Mesh:
     def cleaned(self, name: str) -> Mesh:
         """The mesh without degenerate triangles; a :class:`MeshNotice` says how many were dropped.
 
-        Duplicated faces and holes stay: ray casting and rendering take them as they are.
+        Duplicated faces and holes stay: ray casting and rendering accept them.
 
         Raises:
             ValueError: no triangle is left, a vertex is not finite, or a face names a vertex that
@@ -293,7 +293,7 @@ def _halved(faces: Indices, middle: Indices) -> Iterator[Indices]:
     split = middle >= 0
     count = split.sum(axis=1)
     yield faces[count == 0]
-    # Turned so that the only new vertex is on the first edge, or the only edge without one is last.
+    # Rotate so that the only new vertex is on the first edge, or the only unsplit edge is last.
     for n, first, parts in (
         (1, split.argmax(axis=1), [(0, 3, 2), (3, 1, 2)]),
         (2, split.argmin(axis=1) + 1, [(3, 1, 4), (0, 3, 4), (0, 4, 2)]),

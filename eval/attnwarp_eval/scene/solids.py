@@ -1,6 +1,6 @@
-"""Signed-distance bodies: their parts, the distance, and the mesh that a body becomes.
+"""Signed-distance bodies: their parts, distance and mesh.
 
-A body's mesh, not its distance function, is the truth that everything is measured against.
+A body's mesh, not its distance function, is the ground truth.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ Array = npt.NDArray[np.float64]
 Point = tuple[float, float, float]
 
 MESHING_PROTOCOL = 2
-"""Raised whenever the same description of a body would give other vertices; part of every cache
-key.
+"""Version; raised when the same description of a body would give other vertices; part of every
+cache key.
 """
 
 MOST_POINTS = 10**9
@@ -40,9 +40,9 @@ class _Part:
 
     Attributes:
         color: linear RGB.
-        blend: True to join it to the parts before it in the body's own width, False for a sharp
+        blend: True to join it to the parts before it with the body's width, False for a sharp
             joint, or a width.
-        carve: it is taken away from the blended parts before it.
+        carve: whether it is subtracted from the blended parts before it.
     """
 
     color: tuple[float, float, float] = field(default=(1.0, 1.0, 1.0), kw_only=True)
@@ -61,7 +61,7 @@ class Capsule(_Part):
 
 @dataclass(frozen=True)
 class _Turned(_Part):
-    """A part with axes of its own: rolled about x, pitched about y, then turned about z."""
+    """A part with local axes: rolled about x, pitched about y, then turned about z."""
 
     center: Point
     pitch: float = field(default=0.0, kw_only=True)
@@ -71,21 +71,21 @@ class _Turned(_Part):
 
 @dataclass(frozen=True)
 class Ellipsoid(_Turned):
-    """An ellipsoid with its ``radii`` along its own x, y, z."""
+    """An ellipsoid with its ``radii`` along its local x, y, z."""
 
     radii: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Torus(_Turned):
-    """A ring of radius ``radii[0]``, ``radii[1]`` thick, about its own z."""
+    """A ring of radius ``radii[0]``, ``radii[1]`` thick, about its local z."""
 
     radii: tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Block(_Turned):
-    """A box of ``size`` along its own x, y, z with edges rounded by ``round``."""
+    """A box of ``size`` along its local x, y, z with edges rounded by ``round``."""
 
     size: tuple[float, float, float]
     round: float = 0.0
@@ -93,7 +93,7 @@ class Block(_Turned):
 
 @dataclass(frozen=True)
 class Disc(_Turned):
-    """A cylinder of ``radius`` and ``height`` along its own z, edges rounded by ``round``."""
+    """A cylinder of ``radius`` and ``height`` along its local z, edges rounded by ``round``."""
 
     radius: float
     height: float
@@ -104,7 +104,7 @@ Part = Ellipsoid | Capsule | Torus | Block | Disc
 
 
 def _measured(part: Part) -> tuple[float, list[Point], float, list[float]]:
-    """Kind of a part, the points that it lies around, how far it reaches from them, its shape."""
+    """Kind of a part, its skeleton points, its largest distance from them, its shape."""
     match part:
         case Capsule(start=start, end=end, radii=ends):
             return 1.0, [start, end], max(ends), [*start, *end, *ends]
@@ -124,13 +124,13 @@ def _measured(part: Part) -> tuple[float, list[Point], float, list[float]]:
 
 
 def reach(part: Part) -> Array:
-    """(2, 3) box that holds a part."""
+    """(2, 3) bounding box of a part."""
     _, points, far, _ = _measured(part)
     return np.stack([np.min(points, 0) - far, np.max(points, 0) + far])
 
 
 def _row(part: Part) -> list[float]:
-    """Row that the kernels read: kind, mode (0 sharp, 1 blended, 2 carved), width (negative for the
+    """Row for the kernels: kind, mode (0 sharp, 1 blended, 2 carved), width (negative for the
     body's), shape.
     """
     kind, _, _, shape = _measured(part)
@@ -160,7 +160,7 @@ def _part_distance(x: float, y: float, z: float, part: Array) -> float:
         along = min(max((x * bx + y * by + z * bz) / length, 0.0), 1.0) if length > 0 else 0.0
         gap = math.sqrt((x - along * bx) ** 2 + (y - along * by) ** 2 + (z - along * bz) ** 2)
         return gap - (part[9] + along * (part[10] - part[9]))
-    # Into the part's own axes: back by the yaw, the pitch and the roll.
+    # Into the part's local axes: inverse yaw, pitch and roll.
     x, y = part[11] * x + part[12] * y, part[11] * y - part[12] * x
     x, z = part[9] * x - part[10] * z, part[10] * x + part[9] * z
     y, z = part[13] * y + part[14] * z, part[13] * z - part[14] * y
@@ -192,7 +192,7 @@ def _body_distance(points: Array, parts: Array, blend: float) -> Array:
             if parts[k, 1] == 0.0:
                 hard = min(hard, d)
             elif parts[k, 1] == 2.0:
-                # What is carved is the smooth maximum with the part turned inside out.
+                # Carving is the smooth maximum with the negated part.
                 if width > 0 and soft < np.inf:
                     h = min(max(0.5 + 0.5 * (-soft - d) / width, 0.0), 1.0)
                     soft = -(-soft + h * (d + soft) - width * h * (1 - h))
@@ -228,7 +228,7 @@ def body_distance(
     """Signed distance bound of a body, negative inside.
 
     Parts with ``blend`` are joined by Quilez' polynomial smooth minimum of width ``blend`` or their
-    own; the others (eyes, a nose) are joined sharply. A part that carves is taken away from the
+    part's width; others (eyes, a nose) are joined sharply. A carving part is subtracted from the
     blended ones before it.
 
     Args:
@@ -251,14 +251,14 @@ def body_distance(
 
 def _part_colors(parts: Sequence[Part], width: float, points: Array) -> Array:
     distances = _part_distances(points, _table(parts))
-    # A sharp part owns its whole surface; blended parts share their colours across the joint.
+    # A sharp part colours its whole surface; blended parts share their colours across the joint.
     solid = [not part.carve for part in parts]
     nearest = distances[solid].min(0)
     weights = np.exp(-np.clip(distances - nearest, 0, None) / max(width, 1e-12))
     for k, part in enumerate(parts):
         if part.carve:
             weights[k] = 0
-        # A cut without a colour of its own shows that of what was cut.
+        # A cut without a colour shows the colour of the part that was cut.
         if not part.blend or (part.carve and part.color != (1.0, 1.0, 1.0)):
             inside = (np.abs(distances[k]) if part.carve else distances[k]) < 1e-3 * width + 1e-9
             weights[:, inside] = 0
@@ -274,7 +274,7 @@ def mesh_body(
     distance.
 
     Args:
-        parts, blend, relief: see :func:`body_distance`.
+        parts, blend, relief: as for :func:`body_distance`.
         resolution: cells along the longest side of the bounding box.
 
     Returns:
@@ -282,11 +282,11 @@ def mesh_body(
         content.
 
     Raises:
-        ValueError: the parts are too thin for the resolution, or blend or relief are so much wider
-            than they are that the lattice would not fit into memory.
+        ValueError: the parts are too thin for the resolution, or blend or relief so wide compared
+            with the parts that the lattice would not fit into memory.
     """
-    # repr of frozen dataclasses of floats is exact and readable, which makes it a good key. Colours
-    # are no part of it: a body painted otherwise is the same mesh.
+    # repr of frozen dataclasses of floats is exact and readable, hence a good key. Colours are left
+    # out: a body in other colours has the same mesh.
     bare = [replace(part, color=(1.0, 1.0, 1.0)) for part in parts]
     key = content_key(
         "body", MESHING_PROTOCOL, [repr(part) for part in bare], blend, resolution, repr(relief)
@@ -369,8 +369,8 @@ def _march(
 def _sample(axes: list[Array], distance: Callable[[Array], Array], depth: float) -> Array:
     """The distance at every point of a lattice near its zero; farther off, the right sign.
 
-    Blocks of the lattice whose middle is farther from the surface than they reach, with half as
-    much to spare since the distance is only a bound, take the middle's value: no triangle comes
+    Blocks whose middle is farther from the surface than their radius, with half as much margin
+    since the distance is only a bound, take the middle's value: no triangle comes
     from them.
     """
     step = float(axes[0][1] - axes[0][0])

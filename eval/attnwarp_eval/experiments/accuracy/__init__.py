@@ -1,9 +1,9 @@
 """Cost in time of the accuracy of the truth itself: error against seconds of pictures, depth and
 visibility.
 
-Every contestant is held against an answer that it does not share: pictures against the mean of many
-others at far more samples, depth and visibility against every triangle of the scene met one by one
-in float64. Seconds are taken in turn, see :func:`attnwarp_eval.cost.in_turn`.
+Every contestant is compared with an independent reference: pictures with the mean of many others at
+far more samples, depth and visibility with a brute-force test of every triangle in float64. Seconds
+are taken in turn, see :func:`attnwarp_eval.cost.in_turn`.
 """
 
 from __future__ import annotations
@@ -35,13 +35,14 @@ Question = Callable[..., Panel]
 def measure(
     names: Sequence[str] = (), *, out: Path, rounds: int = 7, report: Reporter = SILENT
 ) -> Iterator[Panel]:
-    """Every question on every scene that it makes sense for.
+    """Measure every question on every scene where it applies.
 
-    Each panel is a cell of the run's folder: a call that was killed goes on where it was.
+    Each panel is a cell of the run's folder: an interrupted call is resumed.
 
     Args:
-        names: scenes' names or paths; :data:`PICTURE_SCENES` and :data:`GEOMETRY_SCENES` if left
-            out. Of those without a triangle depth and visibility are closed forms, and left out.
+        names: scenes' names or paths; by default :data:`PICTURE_SCENES` and
+            :data:`GEOMETRY_SCENES`. Scenes without triangles have closed-form geometry, and are
+            skipped.
 
     Raises:
         InputError: a scene that cannot be used, or two of one name; another run is writing to

@@ -1,4 +1,4 @@
-"""Error of depth and visibility against every triangle of a scene, one by one in float64."""
+"""Error of depth and visibility against a brute-force test of every triangle in float64."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from attnwarp_eval.scene.shapes import Box, Mesh
 Array = npt.NDArray[np.float64]
 
 WRONG = 1e-3
-"""Relative errors of depth above this are those of another surface; they are counted apart."""
+"""Relative errors of depth above this mean another surface; they are counted separately."""
 
 
 @numba.njit(cache=CACHE, nogil=True, error_model="numpy")
 def every_triangle(origins: Array, directions: Array, corners: Array, limit: Array) -> Array:
-    """First hit of each ray with any of the triangles, all of them tried in float64 (Moeller &
+    """First hit of each ray with any of the triangles, all tested in float64 (Moeller &
     Trumbore 1997).
 
     Args:
         origins, directions: (N, 3); directions of any length, t counts in units of it.
         corners: (T, 3, 3).
-        limit: (N,) hits from here on do not count.
+        limit: (N,) upper limit of hits.
 
     Returns:
         (N,) t, infinity where nothing is hit before ``limit``.
@@ -61,7 +61,7 @@ def every_triangle(origins: Array, directions: Array, corners: Array, limit: Arr
 
 
 def triangles(scene: Scene) -> list[Mesh]:
-    """The scene's triangles alone: spheres and rectangles are closed forms, where there is nothing
+    """The scene's triangles only: spheres and rectangles are closed forms, with nothing
     to refine.
     """
     meshes = [shape.mesh() if isinstance(shape, Box) else shape for shape in scene.shapes()]
@@ -82,18 +82,18 @@ def depth(
     rounds: int = 9,
     report: Reporter = SILENT,
 ) -> Panel:
-    """Error of depth with the hit as Open3D has it (float32) and refined on its triangle's plane in
+    """Error of depth for Open3D's hit (float32) and for the hit refined on its triangle's plane in
     float64.
 
     Args:
-        size: size of the square image that is traced.
-        rays: pixels held against every triangle in float64.
+        size: size of the traced square image.
+        rays: number of pixels compared with every triangle in float64.
     """
     from attnwarp_eval._open3d import open3d
     from attnwarp_eval.truth.raycast import Geometry
 
     class Unrefined(Geometry):
-        """Open3D's own hits, in the recentred and rescaled world."""
+        """Open3D's unrefined hits, in the recentred and rescaled world."""
 
         refinement_limit = 0.0
 
@@ -131,7 +131,7 @@ def depth(
     valid = np.flatnonzero(refined.trace(camera).valid.ravel())
     chosen = np.sort(np.random.default_rng(0).choice(valid, min(rays, len(valid)), replace=False))
     directions = (camera.directions() @ camera.rotation).reshape(-1, 3)[chosen]
-    # Seen from the camera, so that its place takes no digits.
+    # Relative to the camera, so that its position costs no precision.
     corners = np.concatenate([(m.vertices - camera.position)[m.faces] for m in meshes])
     limit = np.full(len(chosen), np.inf)
     exact = every_triangle(

@@ -29,10 +29,10 @@ def pictures(
 
     Args:
         size: size of the square picture.
-        samples: a pixel.
-        rounds: pictures of each contestant.
-        reference: how many pictures of how many samples the converged one is the mean of. Its own
-            noise is estimated from their spread and taken out of the errors.
+        samples: numbers of samples a pixel.
+        rounds: number of pictures of each contestant.
+        reference: number of pictures, and their samples a pixel, in the mean of the converged
+            picture. Its noise is estimated from their spread and subtracted from the errors.
     """
     from attnwarp_eval.truth.llvm import LLVM, SCALAR, variant
     from attnwarp_eval.truth.mitsuba import render_plan, use

@@ -10,17 +10,17 @@ from attnwarp_eval.statistics.intervals import Ratio, time_ratio
 from attnwarp_eval.study.record import Json, with_nan
 
 PROTOCOL = 1
-"""Raised whenever a panel would come out otherwise."""
+"""Version; raised when a panel's figures change."""
 
 
 @dataclass(frozen=True)
 class Contestant:
-    """Error and time of one way to the truth.
+    """Error and time of one method of computing the truth.
 
     Attributes:
-        name: for a person.
-        error: in the panel's unit, with a 95 % interval where rounds differ (bootstrap over
-            rounds), else three times itself.
+        name: name for display.
+        error: error in the panel's unit, with a 95 % interval if rounds differ (bootstrap over
+            rounds), else the same value three times.
         seconds: seconds of each round.
         more: further figures by name.
     """
@@ -37,9 +37,9 @@ class Panel:
 
     Attributes:
         question: "pictures", "depth" or "visibility".
-        scene: its name.
+        scene: name of the scene.
         unit: unit of the error.
-        contestants: the baseline first; none where the scene leaves nothing to measure.
+        contestants: the baseline first; none if the scene has nothing to measure.
         again: seconds of the baseline's second run of each round.
         squares: squared error of each round, by contestant ("pictures" only).
     """
@@ -67,7 +67,7 @@ class Panel:
 
     @classmethod
     def from_record(cls, record: Json) -> Panel:
-        """The panel of a cell.
+        """Read the panel of a cell.
 
         Raises:
             LookupError, TypeError, ValueError: the record is of another kind or protocol.
@@ -92,11 +92,11 @@ class Panel:
 
 
 def panel_spec(question: str, name: str, content: str, rounds: int) -> Json:
-    """Spec of a panel: everything that decides its figures.
+    """Spec of a panel: all inputs that decide its figures.
 
     Args:
         question: "pictures", "depth" or "visibility".
-        content: its hash.
+        content: content hash of the scene.
     """
     spec: Json = {
         "probe": "accuracy",

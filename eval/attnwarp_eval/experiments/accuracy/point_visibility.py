@@ -20,7 +20,7 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 MAPS = (32, 128, 512)
-"""Sizes of the depth maps whose test of visibility is held against rays."""
+"""Sizes of the depth maps whose visibility test is compared with rays."""
 
 
 def visibility(
@@ -35,20 +35,20 @@ def visibility(
     """Visibility of the middle target's surface points from the source: by rays, and by depth maps
     of the source.
 
-    A point is asked about when it faces the source and falls inside its image. A depth map answers
-    with its nearest pixel (visible when not more than 1 % behind it), or bilinearly in 1 / z (and
-    then not where its four pixels spread by more than 2 %). What a ray from the source meets first,
-    of all triangles in float64, is right.
+    Points that face the source and fall inside its image are tested. A depth map answers with its
+    nearest pixel (visible when not more than 1 % behind it), or bilinearly in 1 / z (undefined if
+    its four pixels spread by more than 2 %). The reference is the first hit, among all triangles
+    in float64, of a ray from the source.
 
     Args:
-        size: size of the target, whose every pixel is a point.
-        points: how many of them are held against every triangle.
-        rounds: number of rounds of the timing, which covers all points and the making of the depth
-            map.
+        size: size of the target; every pixel is a point.
+        points: number of points compared with every triangle.
+        rounds: number of rounds of the timing, which covers all points and the rendering of the
+            depth map.
         maps: sizes of the depth maps.
 
     Returns:
-        A panel without contestants where no point can be asked about.
+        A panel without contestants if no point can be tested.
     """
     from attnwarp_eval.truth.raycast import Geometry
 
@@ -92,7 +92,7 @@ def visibility(
     )
     away = points_asked[chosen] - source.position
     corners = np.concatenate([(m.vertices - source.position)[m.faces] for m in meshes])
-    # What lies within 1e-7 of the way before the point is its own surface, or one glued to it.
+    # A hit within 1e-7 of the way before the point is its own or a coincident surface.
     first = every_triangle(
         np.zeros_like(away), np.ascontiguousarray(away), corners, np.full(len(away), 1 - 1e-7)
     )
@@ -154,8 +154,8 @@ def _faces_and_falls_in(hits: Hits, source: Camera) -> Mask:
 
 
 def _seen_in_map(depth: Array, camera: Camera, points: Array, bilinear: bool) -> Array:
-    """1 where a point is not behind the depth map, 0 where it is, NaN where the map has no
-    answer."""
+    """1 if a point is not behind the depth map, 0 if it is, NaN if the map has no
+    depth."""
     local = (points - camera.position) @ camera.rotation.T
     z = local[:, 2]
     x, y = ((local @ camera.K.T)[:, k] / z for k in (0, 1))
@@ -172,5 +172,5 @@ def _seen_in_map(depth: Array, camera: Camera, points: Array, bilinear: bool) ->
     with np.errstate(invalid="ignore"):
         surface = 1 / (weights / taps).sum(0)
         steady = taps.max(0) <= 1.02 * taps.min(0)
-        # A threshold of 1 % again; interpolated depth needs less, but then slants decide.
+        # A threshold of 1 % again; interpolated depth allows less, but then slants decide.
         return np.where(steady, (z <= 1.01 * surface).astype(float), np.nan)

@@ -32,8 +32,8 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
         base, ratio = float(np.median(panel.contestants[0].seconds)), panel.ratio(k)
         mean, low, high = panel.contestants[k].error
         if mean == 0 and high > 0:
-            # None wrong has no place on a logarithmic axis: shown at half a point, up to what none
-            # of so many excludes.
+            # Zero wrong points have no place on a logarithmic axis: shown at half a point, with a
+            # bar up to the upper bound of the interval.
             mean = 0.5 / panel.contestants[k].more["points"]
         seconds = Interval(
             base * ratio.ratio, base * ratio.low, base * ratio.high, 1, 1, 0, nan, nan

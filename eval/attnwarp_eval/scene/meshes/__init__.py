@@ -1,7 +1,7 @@
 """Triangle meshes from files: one reader for each format, and polygons cut into triangles.
 
-The readers are this package's own because damage must not pass: Open3D ends the process on some
-damaged .off files and drops the polygons of an .obj, and trimesh takes a face line with fewer
+The package has its own readers so that damaged files are refused: Open3D aborts the process on some
+damaged .off files and drops the polygons of an .obj, and trimesh accepts a face line with fewer
 corners than it announces.
 """
 

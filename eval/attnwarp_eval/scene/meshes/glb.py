@@ -1,4 +1,4 @@
-"""glTF 2.0 in one binary file (.glb): the triangles of its scene, and what of it is not used."""
+"""glTF 2.0 in one binary file (.glb): the triangles of its scene, and its unused contents."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ READ = ("KHR_mesh_quantization",)
 """Required extensions that change the geometry and are read."""
 
 LOOKS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_animation_")
-"""Beginnings of the names of extensions that no geometry depends on."""
+"""Name prefixes of extensions that do not affect geometry."""
 
 POSE = frozenset(("matrix", "translation", "rotation", "scale"))
 
@@ -29,7 +29,7 @@ POINTS, LINES, TRIANGLES, STRIP, FAN = 0, (1, 2, 3), 4, 5, 6
 
 
 class _Part(BaseModel):
-    """Part of a glTF file; what is not listed plays no part for the geometry."""
+    """Part of a glTF file; unlisted fields do not affect the geometry."""
 
     model_config = ConfigDict(strict=True, extra="ignore", frozen=True)
 
@@ -101,12 +101,12 @@ class _Document(_Part):
 
 
 def read_glb(data: bytes) -> Surface:
-    """The triangles of a .glb file's scene, with the transforms of its nodes (glTF 2.0, chapters
-    3 and 4).
+    """Read the triangles of a .glb file's scene, with the transforms of its nodes (glTF 2.0,
+    chapters 3 and 4).
 
     Raises:
-        ValueError: lengths or indices that cannot be, data outside the file, or a required
-            extension that is not read, which is named.
+        ValueError: invalid lengths or indices, data outside the file, or a required
+            extension that is not supported, which is named.
     """
     head, binary = _chunks(data)
     try:
@@ -120,7 +120,7 @@ def read_glb(data: bytes) -> Surface:
 
 
 def _chunks(data: bytes) -> tuple[bytes, bytes]:
-    """The document, and the bytes that it names."""
+    """The document, and the binary chunk that it refers to."""
     if len(data) < 20 or data[:4] != b"glTF":
         raise ValueError("begins with no glTF header")
     version, length, size = struct.unpack("<III", data[4:16])
@@ -184,7 +184,7 @@ class _Reader:
 
     def _check_extensions(self) -> None:
         required = set(self.document.extensionsRequired)
-        # Copies of a mesh are geometry, whether or not a reader has to know them.
+        # Copies of a mesh are geometry, even in an optional extension.
         required |= {"EXT_mesh_gpu_instancing"} & set(self.document.extensionsUsed)
         for name in sorted(required):
             if name not in READ and not name.startswith(LOOKS):
@@ -238,7 +238,7 @@ class _Reader:
                 raise ValueError("glTF: COLOR_0 is not a colour for each vertex")
             tint = tint.clip(0, 1)  # section 3.7.2.1
         if np.linalg.det(pose[:3, :3]) < 0:
-            triangles = triangles[:, ::-1]  # a mirror turns triangles over
+            triangles = triangles[:, ::-1]  # a mirror reverses the winding
         return points @ pose[:3, :3].T + pose[:3, 3], triangles, tint
 
     def _indices(self, index: int, vertices: int) -> Indices:

@@ -22,21 +22,21 @@ UNUSED = frozenset([
     "c_interp", "d_interp", "shadow_obj", "trace_obj", "ctech", "stech", "deg", "cstype", "bmat",
     "step", "parm", "trim", "hole", "scrv", "sp", "end", "con", "call", "csh",
 ])  # fmt: skip
-"""Keywords that move no polygon."""
+"""Keywords that do not affect polygons."""
 
 NOT_SURFACES = {"l": "lines", "p": "points", "curv": "curves", "curv2": "curves",
                 "surf": "free-form surfaces"}  # fmt: skip
 
 
 def read_obj(data: bytes) -> Surface:
-    """The polygons of an OBJ file (Wavefront's Advanced Visualizer manual, appendix B).
+    """Read the polygons of an OBJ file (Wavefront's Advanced Visualizer manual, appendix B).
 
     Raises:
-        ValueError: text in UTF-16, a line that cannot be read, or a vertex that is not there.
+        ValueError: text in UTF-16, a line that cannot be read, or an undefined vertex.
     """
     if data[:2] in (b"\xfe\xff", b"\xff\xfe"):
         raise ValueError("is text in UTF-16, expected ASCII or UTF-8; save it as UTF-8")
-    data = data.removeprefix(codecs.BOM_UTF8)  # editors of Windows write it
+    data = data.removeprefix(codecs.BOM_UTF8)  # written by Windows editors
     vertices: list[list[float]] = []
     colors: list[list[float]] = []
     faces: list[list[int]] = []

@@ -20,11 +20,11 @@ HEADER = re.compile(r"(ST)?(C)?(N)?(4)?(n)?OFF")
 
 
 def read_off(data: bytes) -> Surface:
-    """The polygons of a text OFF file (Geomview manual, section 4.2.5).
+    """Read the polygons of a text OFF file (Geomview manual, section 4.2.5).
 
     Raises:
-        ValueError: another dimension, a binary file, or other numbers of vertices, faces and
-            corners than the file announces.
+        ValueError: another dimension, a binary file, or numbers of vertices, faces and
+            corners that differ from the header's.
     """
     rows = [
         (number, words) for number, line in lines(data) if (words := line.partition("#")[0].split())

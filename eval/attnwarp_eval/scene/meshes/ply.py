@@ -11,7 +11,7 @@ from attnwarp_eval.scene.meshes.surface import Surface, unit_colors
 
 
 def read_ply(data: bytes) -> Surface:
-    """The polygons of a PLY file, by plyfile.
+    """Read the polygons of a PLY file with plyfile.
 
     Raises:
         ValueError: a damaged header, fewer or more bytes than the header announces, or no faces.

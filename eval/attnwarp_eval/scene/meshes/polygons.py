@@ -12,13 +12,13 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 MOST_CORNERS = 5000
-"""Concave polygons with more corners are refused: cutting ears takes the square of their number."""
+"""Concave polygons with more corners are refused: ear clipping takes the square of their number."""
 
 
 def triangulate(vertices: Array, corners: Indices, sizes: Indices) -> tuple[Indices, Indices]:
-    """The triangles of polygons, in the polygons' order and turning their way.
+    """Triangulate polygons, in the polygons' order and with their winding.
 
-    A convex polygon becomes a fan about its first corner; of any other, ears are cut (Meisters
+    A convex polygon becomes a fan about its first corner; other polygons are ear-clipped (Meisters
     1975) in the plane of its mean normal (Newell's method).
 
     Args:
@@ -57,7 +57,7 @@ def triangulate(vertices: Array, corners: Indices, sizes: Indices) -> tuple[Indi
         normal = _newell(points)
         spoke = points[:, 1:] - points[:, :1]
         area = np.linalg.norm(np.cross(spoke[:, :-1], spoke[:, 1:]), axis=-1).sum(1)
-        # What turns both ways by as much, as a bow tie does, has no normal but triangles with area.
+        # A polygon with zero net turning, such as a bow tie, has no normal but triangles with area.
         whole = np.linalg.norm(normal, axis=-1) >= 1e-9 * area
         for k in np.flatnonzero(~(_convex(points, normal) & whole)).tolist():
             if size > MOST_CORNERS:
@@ -79,14 +79,14 @@ def triangulate(vertices: Array, corners: Indices, sizes: Indices) -> tuple[Indi
 
 
 def _newell(points: Array) -> Array:
-    """(G, 3) sum of the cross products of consecutive corners, of twice the polygon's area."""
+    """(G, 3) sum of the cross products of consecutive corners, as long as twice its area."""
     local = points - points.mean(axis=1, keepdims=True)
     return np.cross(local, np.roll(local, -1, axis=1)).sum(axis=1)
 
 
 def _convex(points: Array, normal: Array) -> npt.NDArray[np.bool_]:
-    """(G,) whether no corner turns back and no triangle of the fan is turned over. Polygons
-    without an area pass: their triangles have none either.
+    """(G,) whether no corner is reflex and no triangle of the fan is flipped. Polygons
+    without an area pass: their triangles have no area either.
     """
     edge = np.roll(points, -1, axis=1) - points
     turn = np.einsum("gki,gi->gk", np.cross(edge, np.roll(edge, -1, axis=1)), normal)
@@ -98,7 +98,7 @@ def _convex(points: Array, normal: Array) -> npt.NDArray[np.bool_]:
 
 
 def _flat(points: Array, normal: Array) -> Array:
-    """(n, 2) the polygon in its own plane, turning counterclockwise, about 1 in size."""
+    """(n, 2) the polygon in its plane, turning counterclockwise, about 1 in size."""
     drop = int(np.argmax(np.abs(normal)))
     u, v = (drop + 1) % 3, (drop + 2) % 3
     flat = points[:, [u, v]] if normal[drop] > 0 else points[:, [v, u]]
@@ -124,7 +124,7 @@ def _ears(points: Array) -> Indices:
     count, here, left = 0, 0, n
     while left > 3:
         cut = -1
-        # Ears with an area first, so that a corner on a straight line becomes a corner of theirs.
+        # Ears with an area first, so that a collinear corner becomes a corner of such an ear.
         for flat in (False, True):
             k = here
             for _ in range(left):
@@ -135,7 +135,7 @@ def _ears(points: Array) -> Indices:
                     j = after[c]
                     while j != a:
                         p = points[j]
-                        # A bridge to a hole visits its ends twice; they are in nobody's way.
+                        # A bridge to a hole visits its ends twice; these do not block an ear.
                         same = (
                             (p[0] == points[a, 0] and p[1] == points[a, 1])
                             or (p[0] == points[k, 0] and p[1] == points[k, 1])

@@ -1,4 +1,4 @@
-"""The door for mesh files: the format by its suffix, checks that all formats share, and counts."""
+"""Reader of mesh files: format by suffix, checks shared by all formats, and counts."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from attnwarp_eval.scene.meshes.surface import Surface
 from attnwarp_eval.scene.shapes import Mesh, MeshNotice
 
 READER_PROTOCOL = 2
-"""Raised whenever the same file would give other triangles or colours; part of the hash of scenes
-with mesh files."""
+"""Version; raised when the same file would give other triangles or colours; part of the hash of
+scenes with mesh files."""
 
-# No .gltf: it keeps its vertices in another file, which a hash of its own bytes would not see.
+# No .gltf: it keeps its vertices in another file, which a hash of the .gltf would miss.
 READERS = {
     ".ply": read_ply,
     ".obj": read_obj,
@@ -43,16 +43,16 @@ INSIDE_OUT = (
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """A mesh with what became of its file.
+    """A mesh with statistics of its file.
 
     Attributes:
         mesh: the triangles.
-        polygons: how many the file holds.
-        crossed: polygons left out because they cross themselves.
-        flat: triangles left out because they have no area.
-        unused: vertices that no polygon names.
+        polygons: number of polygons in the file.
+        crossed: number of polygons dropped because they cross themselves.
+        flat: number of triangles dropped because they have no area.
+        unused: number of vertices that no polygon uses.
         ignored: unused contents of the file, in words.
-        cut_off: why polygons may be missing at the file's end, or None.
+        cut_off: reason why polygons may be missing at the file's end, or None.
         inside_out: whether the faces of a closed surface look inward.
     """
 
@@ -87,8 +87,8 @@ class MeshFile:
 def read_mesh(path: Path) -> Mesh:
     """A triangle mesh from a file (.ply, .obj, .glb, .stl, .off), all its parts joined.
 
-    Vertex colours, where the file has them, become the tint (taken as sRGB, but linear in .glb, as
-    that format defines). What is left out is said by a :class:`~attnwarp_eval.scene.shapes
+    Vertex colours, if present, become the tint (taken as sRGB, but linear in .glb, as
+    that format defines). Dropped parts are reported by a :class:`~attnwarp_eval.scene.shapes
     .MeshNotice`, with its number.
 
     Raises:
@@ -98,7 +98,7 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def read_mesh_file(path: Path) -> MeshFile:
-    """:func:`read_mesh` with the counts of what came in and out."""
+    """:func:`read_mesh` with the counts of read and dropped elements."""
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise ValueError(
@@ -129,14 +129,14 @@ def read_mesh_file(path: Path) -> MeshFile:
 
 
 MOST_RECENT = 2
-"""Meshes that are kept: a scene is built more than once, and a large one takes seconds to read."""
+"""Cached meshes: a scene is built more than once, and a large one takes seconds to read."""
 
 _recent: dict[tuple[str, str], MeshFile] = {}
 """Meshes by path and SHA-256 of the file."""
 
 
 def _read(path: Path, reader: Callable[[bytes], Surface], data: bytes) -> MeshFile:
-    """Mesh that a file holds."""
+    """Read the mesh in a file."""
     try:
         surface = reader(data)
         if not len(surface.sizes):
@@ -171,7 +171,7 @@ def _read(path: Path, reader: Callable[[bytes], Surface], data: bytes) -> MeshFi
     if not len(faces):
         raise ValueError(f"{path}: all {len(crossed)} polygons cross themselves; repair the file")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MeshNotice)  # said below, with all else
+        warnings.simplefilter("ignore", MeshNotice)  # reported below, with the rest
         mesh = Mesh(surface.vertices, faces, None, surface.tint).cleaned(str(path))
     result = MeshFile(
         mesh,
@@ -184,12 +184,12 @@ def _read(path: Path, reader: Callable[[bytes], Surface], data: bytes) -> MeshFi
         _inside_out(mesh),
     )
     for array in (mesh.vertices, mesh.faces):
-        array.setflags(write=False)  # the next caller has the same ones
+        array.setflags(write=False)  # shared with later callers
     return result
 
 
 def _inside_out(mesh: Mesh) -> bool:
-    """Return True if a surface is closed but for small holes, and its volume by the divergence
+    """Return True if a surface is closed except for small holes, and its volume by the divergence
     theorem is negative by more than a thousandth of a ball's of the same area.
     """
     corners = mesh.vertices[mesh.faces]

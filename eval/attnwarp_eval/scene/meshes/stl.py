@@ -19,10 +19,10 @@ FACET = [
 
 
 def read_stl(data: bytes) -> Surface:
-    """The triangles of an STL file, three vertices for each.
+    """Read the triangles of an STL file, three vertices for each.
 
     Raises:
-        ValueError: another size than the file announces, or a facet that is not whole.
+        ValueError: a size that differs from the header's, or an incomplete facet.
     """
     count = struct.unpack("<I", data[80:84])[0] if len(data) >= 84 else -1
     if len(data) == 84 + RECORD.itemsize * count:
@@ -44,7 +44,7 @@ def _text(data: bytes) -> np.ndarray:
     values: list[float] = []
     inside, facet = False, 0
     for line, raw in lines(data):
-        # What stands after solid and endsolid is a name.
+        # The rest of the line after solid and endsolid is a name.
         words = re.split(r"\s+", raw.strip()) if raw.strip() else []
         while words:
             if facet == 0 and words[0].lower() == ("endsolid" if inside else "solid"):

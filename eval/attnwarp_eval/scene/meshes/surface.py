@@ -1,4 +1,4 @@
-"""Surface that a reader of one format hands over, and parsing that all text formats share."""
+"""Surface returned by the readers, and parsing shared by all text formats."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def lines(data: bytes) -> Iterator[tuple[int, str]]:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Polygons as a file holds them.
+    """Polygons in the layout of a file.
 
     Args:
         vertices: (V, 3).
@@ -30,8 +30,8 @@ class Surface:
         sizes: (P,) corners of each polygon; they sum to C.
         tint: (V, 3) linear RGB, or None.
         ignored: unused contents of the file, with its number, such as "3 lines".
-        cut_off: why the file may lack its end although its syntax is right, or None.
-        first: number of the first vertex in the file's own counting, for messages.
+        cut_off: reason why the file's end may be missing despite valid syntax, or None.
+        first: number of the first vertex in the file's numbering, for messages.
     """
 
     vertices: Array
@@ -51,10 +51,10 @@ def polygons(faces: Sequence[Sequence[int]]) -> tuple[Indices, Indices]:
 
 
 def decimal(token: str, line: int) -> float:
-    """A number of a text file.
+    """Parse a number of a text file.
 
     Raises:
-        ValueError: it is none, or not finite.
+        ValueError: not a number, or not finite.
     """
     try:
         value = float(token)
@@ -67,10 +67,10 @@ def decimal(token: str, line: int) -> float:
 
 
 def whole(token: str, line: int) -> int:
-    """A whole number of a text file, of at most 18 digits.
+    """Parse a whole number of a text file, of at most 18 digits.
 
     Raises:
-        ValueError: it is none.
+        ValueError: not a whole number.
     """
     digits = token.removeprefix("-")
     if not (digits.isascii() and digits.isdigit() and len(digits) <= 18):
@@ -79,7 +79,7 @@ def whole(token: str, line: int) -> int:
 
 
 def clip(token: str) -> str:
-    """A token for a message: quoted, on one line, not longer than a person reads."""
+    """Format a token for a message: quoted, on one line, shortened."""
     return ascii(token if len(token) <= 40 else token[:37] + "...")
 
 
