@@ -1,3 +1,3 @@
-"""Experiments about the instrument itself: what truth costs, what optical flow misses, how long the
-suite takes.
+"""Experiments about the instrument itself: what truth costs, what effects of light change, how long
+the suite takes.
 """
