@@ -25,8 +25,8 @@ def to_lab(srgb: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
 
     Example:
         >>> import numpy as np
-        >>> to_lab(np.array([[255, 255, 255], [255, 0, 0]], np.uint8)).round().tolist()
-        [[100.0, 0.0, 0.0], [53.0, 80.0, 67.0]]
+        >>> to_lab(np.array([[255, 255, 0], [255, 0, 0]], np.uint8)).round().tolist()
+        [[97.0, -22.0, 94.0], [53.0, 80.0, 67.0]]
     """
     value = np.asarray(srgb, np.float64) / (255 if srgb.dtype == np.uint8 else 1)
     linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
