@@ -10,10 +10,9 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter, map_coordinates
+import textured_corner
 from typer.testing import CliRunner
 
-from attnwarp import Camera
 from attnwarp.errors import InputError
 from attnwarp.io import Dataset, write_transforms
 from attnwarp_eval import metrics
@@ -50,50 +49,28 @@ def test_figures_of_a_reconstruction_are_sums_over_its_points():
     assert 0.3 < found["reprojection_error"] < 1.5
 
 
-def corner(seed, camera):
-    """(H, W, 3) picture of three walls that meet at the origin, each with a texture of its own."""
-    rng = np.random.default_rng(seed)
-    directions = camera.unproject(
-        np.stack(np.meshgrid(np.arange(256) + 0.5, np.arange(256) + 0.5), -1).reshape(-1, 2),
-        np.ones(256 * 256),
-    ) - np.asarray(camera.position)
-    reach, shown = np.full(len(directions), np.inf), np.zeros(len(directions))
-    for axis in range(3):
-        texture = gaussian_filter(rng.random((300, 300)), 1.5)
-        texture = (texture - texture.min()) / np.ptp(texture)
-        length = -camera.position[axis] / directions[:, axis]
-        place = camera.position + length[:, None] * directions
-        across = np.delete(place, axis, axis=1).T * 100
-        hit = (length > 0) & (length < reach) & (across >= 0).all(0) & (across < 299).all(0)
-        reach[hit] = length[hit]
-        shown[hit] = map_coordinates(texture, across[:, hit], order=1)
-    return np.repeat(np.clip(shown, 0, 1).reshape(256, 256, 1), 3, axis=2)
-
-
 @pytest.fixture(scope="module")
 def cameras():
-    places = [(3 + 0.5 * np.cos(t), 3 + 0.5 * np.sin(t), 2.5) for t in np.linspace(0, 5, 6)]
-    view = {"width": 256, "height": 256, "fov_y": 45, "up": (0, 0, 1)}
-    return [Camera.look_at(place, (0.7, 0.7, 0.7), **view) for place in places]
+    return textured_corner.cameras()
 
 
 @pytest.mark.door
 def test_right_views_are_all_registered_and_those_of_another_scene_are_not(cameras):
-    right = [corner(0, camera) for camera in cameras]
+    right = [textured_corner.picture(0, camera) for camera in cameras]
     found = metrics.reconstruct(right, cameras)
     assert found.registered == found.views == 6
     assert found.points > 100
     assert 2 < found.track_length <= 6
     assert found.reprojection_error < 1
     assert metrics.reconstruct(right, cameras) == found
-    other = [corner(k % 2, camera) for k, camera in enumerate(cameras)]
+    other = [textured_corner.picture(k % 2, camera) for k, camera in enumerate(cameras)]
     assert metrics.reconstruct(other, cameras).registered <= 3
 
 
 def test_the_command_reconstructs_the_edited_pictures_of_a_person(cameras, tmp_path, monkeypatch):
     paths = [tmp_path / f"{k}.png" for k in range(6)]
     for path, camera in zip(paths, cameras, strict=True):
-        cv2.imwrite(str(path), np.rint(255 * corner(0, camera)))
+        cv2.imwrite(str(path), np.rint(255 * textured_corner.picture(0, camera)))
     write_transforms(tmp_path / "transforms.json", Dataset(cameras, paths))
     options = ["metrics", "--consistency", str(tmp_path), "--out", str(tmp_path / "out")]
     done = CliRunner().invoke(app, [*options, "--colmap"])

@@ -3,12 +3,11 @@ of a corner of three walls.
 """
 
 import json
-import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import textured_corner
 import torch
 from typer.testing import CliRunner
 
@@ -17,8 +16,6 @@ from attnwarp.io import Dataset, write_ply, write_transforms
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.tracks.find import Tracks, halve, world_points
 from attnwarp_eval.tracks.measure import OFF, RESAMPLES, measure, summarise
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "metrics"))
 
 
 def disc(center, quat, size, count=1):
@@ -155,16 +152,10 @@ def test_bad_input_is_one_line(tmp_path):
 
 def test_tracks_of_colmap_judge_the_walls_that_they_lie_on(tmp_path):
     pytest.importorskip("pycolmap")
-    from test_reconstruction import corner
-
-    places = [(3 + 0.5 * np.cos(t), 3 + 0.5 * np.sin(t), 2.5) for t in np.linspace(0, 5, 6)]
-    cameras = [
-        Camera.look_at(p, (0.7, 0.7, 0.7), width=256, height=256, fov_y=45, up=(0, 0, 1))
-        for p in places
-    ]
+    cameras = textured_corner.cameras()
     paths = [tmp_path / f"{k}.png" for k in range(6)]
     for path, camera in zip(paths, cameras, strict=True):
-        cv2.imwrite(str(path), np.rint(255 * corner(0, camera)))
+        cv2.imwrite(str(path), np.rint(255 * textured_corner.picture(0, camera)))
     write_transforms(tmp_path, Dataset(cameras, paths))
     steps = np.arange(0.02, 3, 0.06)
     across = np.stack(np.meshgrid(steps, steps), -1).reshape(-1, 2)
