@@ -1,6 +1,7 @@
 import functools
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,16 @@ if _WORKERS > 1:
 
 # A test calls a command many times; its options are read from the function's signature once.
 typer.testing._get_command = functools.cache(typer.testing._get_command)
+
+
+@pytest.fixture(autouse=True)
+def stops_are_forgotten():
+    """A stop that a test raises in this process is remembered (process.interrupted), and errors of
+    the next test's command would be taken for its consequence.
+    """
+    yield
+    if process := sys.modules.get("attnwarp.process"):
+        process.interrupted = False
 
 
 @pytest.fixture(scope="module")
