@@ -215,15 +215,15 @@ def _with_features_of(job: Job, donor: Donor) -> EditedScene:
     settings = AttentionWarpingSettings.from_dict(job.settings)
     run(
         "attention_warping", lambda work, s: Swapping(work, s, 0, None, None, "cpu"),
-        AttentionWarpingSettings, job.gaussians, job.cameras[:1], [donor.picture], donor.editor,
-        job.instruction, replace(settings, iterations=0),
+        AttentionWarpingSettings, job.gaussians, [job.cameras[job.source]], [donor.picture],
+        donor.editor, job.instruction, replace(settings, iterations=0), load=job.load,
     )  # fmt: skip
     return _edited(
         run(
             "attention_warping",
-            lambda work, s: Swapping(work, s, 0, None, job.warps, "cpu"),
+            lambda work, s: Swapping(work, s, job.source, None, job.warps, "cpu"),
             AttentionWarpingSettings, job.gaussians, job.cameras, job.images, job.editor,
-            job.instruction, settings, folder=job.folder, budget=job.budget,
+            job.instruction, settings, **job.options,
         )
     )  # fmt: skip
 
@@ -238,11 +238,17 @@ def _true_pictures(job: Job) -> EditedScene:
     """The first answer's true pictures in every view, and splats tuned on them: the ceiling.
 
     Stages, their views and their tuning are those of ``attention_warping``.
+
+    Raises:
+        ValueError: a budget or a donor, neither of which means anything here.
     """
     from attnwarp.methods import AttentionWarpingSettings
     from attnwarp.methods.attention_warping import AttentionWarping
     from attnwarp.methods.base import ViewEdit, run
 
+    for name in ("budget", "donor"):
+        if getattr(job, name) is not None:
+            raise ValueError(f"{name}: got one, but 'true pictures' edits nothing; leave it out")
     pictures = next(iter(job.truth.values()))
 
     class TruePictures(AttentionWarping):
@@ -255,13 +261,13 @@ def _true_pictures(job: Job) -> EditedScene:
             return [ViewEdit(pictures[view], {"injected": 0.0}) for view in batch]
 
     def make(work: Any, settings: Any) -> TruePictures:
-        return TruePictures(work, settings, 0, None, None, "cpu")
+        return TruePictures(work, settings, job.source, None, None, "cpu")
 
     result = _edited(
         run(
             "true pictures", make, AttentionWarpingSettings,
             job.gaussians, job.cameras, job.images, job.editor, job.instruction,
-            AttentionWarpingSettings.from_dict(job.settings), folder=job.folder,
+            AttentionWarpingSettings.from_dict(job.settings), **job.options,
         )
     )  # fmt: skip
     return replace(result, counters={**result.counters, "network_rows": 0})

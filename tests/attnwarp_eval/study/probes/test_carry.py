@@ -110,6 +110,15 @@ def test_words_for_a_scene_that_is_not_there_are_refused(folder, monkeypatch):
         load(folder, carry={"size": 32})
 
 
+def test_features_of_another_scene_are_taken_and_true_pictures_are_refused(folder):
+    controlled = {"other": {"control": "another scene"}}
+    (cell,) = cells(load(folder, variants=controlled, probes={"carry": ["other"]}))
+    assert cell.spec["other"]["scene"] == load_scene("spheres").content_hash
+    bound = {"bound": {"method": "true pictures"}}
+    with pytest.raises(StudyError, match="'bound' takes the true pictures of an edit"):
+        load(folder, variants=bound, probes={"carry": ["bound"]})
+
+
 def test_the_shipped_quick_study_edits_the_bear_alone():
     study = load_study("quick")
     assert {cell.scene for cell in cells(study)} == {"bear"}

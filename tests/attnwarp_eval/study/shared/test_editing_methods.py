@@ -5,9 +5,11 @@ import pytest
 from tiny_scenes import cameras, pictures, splats
 
 from attnwarp.editing.small import load_editor
+from attnwarp.encoders import load_encoder
+from attnwarp.methods import Budget
 from attnwarp_eval.study import parse_study
 from attnwarp_eval.study.shared import edits
-from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, Job
+from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, Donor, Job
 
 
 def test_true_pictures_are_the_edits_of_their_views(tmp_path):
@@ -23,6 +25,41 @@ def test_true_pictures_are_the_edits_of_their_views(tmp_path):
     assert len(done.edited) == 3
     for view, edited in done.edited.items():
         assert np.abs(edited / 255.0 - truth[view].clip(0, 1)).max() <= 0.5 / 255 + 1e-6
+
+
+@pytest.mark.parametrize("name", ["true pictures", "attention_warping"])
+def test_a_bound_and_a_control_keep_to_the_mask_and_start_at_the_source(name, tmp_path):
+    """By attention warping with features of another picture, and with true pictures."""
+    model, views = splats(), cameras(3)
+    images, editor, half = pictures(model, views), load_editor("small-plain"), np.zeros((32, 32))
+    half[:, :16] = 1
+    loaded = []
+
+    def load(*names, **more):
+        loaded.append(names)
+        return load_encoder(*names, **more)
+
+    method = EDITING_METHODS[name]
+    settings = method.settings(None, {"stages": 1, "steps": 1, "iterations": 1}, 0)
+    job = Job(
+        model, views, images, editor, "red", settings, tmp_path, None,
+        {"red": [1 - image for image in images]},
+        donor=Donor(editor, images[0]) if name == "attention_warping" else None,
+        segments=[half > 0] * 3, source=1, load=load,
+    )  # fmt: skip
+    done = method.run(job)
+    assert next(iter(done.edited)) == 1 and len(done.edited) == 3 and loaded
+    for view, edited in done.edited.items():
+        before = np.rint(255 * images[view])
+        assert np.abs(edited - before)[:, 16:].max() <= 1 < np.abs(edited - before)[:, :16].max()
+
+
+@pytest.mark.parametrize("name", ["budget", "donor"])
+def test_true_pictures_refuse_what_they_make_nothing_of(name, tmp_path):
+    given = {"budget": Budget(seconds=1), "donor": Donor(None, None)}
+    job = Job(None, [], [], None, "red", {}, tmp_path, None, {"red": []}, **{name: given[name]})
+    with pytest.raises(ValueError, match=f"{name}: got one, but 'true pictures' edits nothing"):
+        EDITING_METHODS["true pictures"].run(job)
 
 
 @pytest.mark.parametrize(

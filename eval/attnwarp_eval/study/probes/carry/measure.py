@@ -25,7 +25,13 @@ from attnwarp_eval.study.record import NoExtra
 from attnwarp_eval.study.schema import Part, Study, Whole
 from attnwarp_eval.study.shared import pictures
 from attnwarp_eval.study.shared.edit_truth import EditTruth
-from attnwarp_eval.study.shared.edits import LEAST_PIXELS, MethodProbe, editor_of
+from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS
+from attnwarp_eval.study.shared.edits import (
+    LEAST_PIXELS,
+    MethodProbe,
+    VariantPart,
+    editor_of,
+)
 from attnwarp_eval.study.shared.method_run import own_seconds, run_method
 from attnwarp_eval.study.shared.splats import splats_of
 from attnwarp_eval.study.shared.things import thing_of
@@ -73,6 +79,12 @@ class CarryProbe(MethodProbe[NoExtra]):
             raise ValueError("carry.edits: got none, expected a scene and the words for its edit")
         for name in study.probes[self.name]:
             variant = study.variants[name]
+            method = EDITING_METHODS.get(variant.part(VariantPart).method)
+            if method is not None and method.needs_truth:
+                raise ValueError(
+                    f"probes.carry: {name!r} takes the true pictures of an edit, and here are none;"
+                    " leave it out"
+                )
             if editor_of(study, variant).ideal is not None:
                 raise ValueError(
                     f"probes.carry: {name!r} has the ideal editor, which reads no words"
@@ -94,10 +106,12 @@ class CarryProbe(MethodProbe[NoExtra]):
             views = study.model_copy(update={"views": part.views or study.views}).views_of(scene)
             for label in names:
                 variant = study.variants[label]
+                donor, files = self.other_scene(study, variant, name, scenes)
                 for seed in study.seeds:
                     spec = {
                         **self.common_spec(study, scene, seed),
                         **self.variant_spec(study, variant, seed),
+                        **donor,
                         "size": size,
                         "views": views,
                         "thing": thing_of(study, scene),
@@ -108,7 +122,7 @@ class CarryProbe(MethodProbe[NoExtra]):
                             "source": scene.title,
                         },
                     }
-                    sources = {"editor": editor_of(study, variant).name}
+                    sources = {"editor": editor_of(study, variant).name, **files}
                     yield Cell(
                         spec,
                         name,
