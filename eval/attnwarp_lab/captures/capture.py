@@ -1,4 +1,4 @@
-"""The captures of a manifest as methods take them: pictures, cameras, splats, segments."""
+"""Captures of a manifest as inputs of methods: pictures, cameras, splats, segments."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from attnwarp.reporting import SILENT, Reporter
 from attnwarp_lab.captures.manifest import Loaded, MaskPart
 
 LEAST_PSNR = 15.0
-"""dB below which renders of splats are of something else than the pictures."""
+"""dB below which renders of splats show another scene than the pictures."""
 
 MARKS, FITS, ORIGINALS, MADE = "marks", "fits", "originals", "made"
-"""Folders of a run: masks by words, and fits by the capture's name; pictures; files of cells."""
+"""Folders of a run: masks from words, fits by the capture's name, pictures, files of cells."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ready:
-    """A capture that was read.
+    """A loaded capture.
 
     Attributes:
-        dataset: its views.
-        views: pictures and cameras at the size of the manifest.
+        dataset: views of the capture.
+        views: pictures and cameras at the manifest's size.
         images: (H, W, 3) of each view, over black.
         source: number of the source view.
         content: SHA-256 of the pictures, the cameras and their names, and the source's number.
@@ -60,10 +60,10 @@ class Ready:
 
 
 def ready(loaded: Loaded, name: str) -> Ready:
-    """Read a capture; the last one that a process read is kept.
+    """Read a capture; each process caches the last one.
 
     Raises:
-        InputError: it cannot be used; the message begins with its key in the manifest.
+        InputError: the capture cannot be used; the message begins with its key in the manifest.
     """
     c = loaded.manifest.captures[name]
     images = None if c.images is None else loaded.path(c.images)
@@ -86,10 +86,10 @@ def _read(
 
 
 def check_likeness(place: str, path: Path, capture: Ready, splats: Gaussians) -> None:
-    """Refuse splats that no view sees, or whose renders are unlike the pictures.
+    """Refuse splats that no view sees, or whose renders differ from the pictures.
 
     Raises:
-        InputError: they are under :data:`LEAST_PSNR`; the message begins with ``place``.
+        InputError: the PSNR is below :data:`LEAST_PSNR`; the message begins with ``place``.
     """
     check_seen(path, splats, capture.cameras, SILENT)
     psnr, _ = likeness(splats, capture.dataset)
@@ -103,13 +103,13 @@ def check_likeness(place: str, path: Path, capture: Ready, splats: Gaussians) ->
 
 
 def splats_file(loaded: Loaded, run: Path, name: str, kind: Any) -> Path:
-    """File of a capture's splats: the manifest's, or that of their fit in the run's folder."""
+    """File of a capture's splats: the manifest's, or the fit's in the run's folder."""
     given = loaded.manifest.captures[name].splats.get(kind)
     return loaded.path(given) if given else run / FITS / f"{name}-{kind}" / "splats.ply"
 
 
 def read_splats(path: Path, kind: str) -> Gaussians:
-    """Splats of a file.
+    """Read splats from a file.
 
     Raises:
         InputError: no such file, or splats of another kind.
@@ -126,7 +126,7 @@ def marks_of(loaded: Loaded, name: str) -> Marks:
     """Marks of a capture.
 
     Raises:
-        InputError: several ways at once.
+        InputError: several kinds of marks at once.
     """
     part = loaded.manifest.captures[name].mask or MaskPart()
     folder, source = (p and loaded.path(p) for p in (part.folder, part.source))
@@ -136,11 +136,11 @@ def marks_of(loaded: Loaded, name: str) -> Marks:
 def segments(
     loaded: Loaded, name: str, run: Path, device: str, report: Reporter
 ) -> Callable[[Gaussians], list[Segment] | None]:
-    """(H, W) shares of each view that are edited, as a function of the splats, None where a capture
-    marks nothing; marks are read, and words looked for, at once.
+    """(H, W) edited shares of each view, as a function of the splats, None for a capture without
+    marks; marks are read, and words searched for, at once.
 
     Raises:
-        InputError: marks that are missing, lie beside the picture, or find nothing.
+        InputError: marks that are missing, lie outside the picture, or find nothing.
     """
     capture, marks = ready(loaded, name), marks_of(loaded, name)
     return marked(

@@ -1,7 +1,7 @@
 """Cells of a run on captures: fits, edits with their figures, and warps of the source.
 
-A cell is one capture x edit x variant x seed. Its id is the hash of what decides its figures; its
-files lie in the run's folder, so that workers have to see that folder and the manifest's.
+A cell is one capture x edit x variant x seed. Its id is the hash of its inputs. Its files are in
+the run's folder, so workers must be able to read that folder and the manifest's.
 """
 
 from __future__ import annotations
@@ -57,28 +57,28 @@ from attnwarp_lab.captures.check import Checked
 from attnwarp_lab.captures.manifest import Loaded, Manifest, Row
 
 PROTOCOL = 1
-"""Raised whenever the same inputs would give other figures."""
+"""Version; raised when the same inputs would give other figures."""
 
 COUNTED = ("network_rows", "edits", "iterations", "splats", "feature_bytes")
-"""Counters of a method that a record keeps."""
+"""Counters of a method kept in records."""
 
 AUTHORS = {"clip": "clip-whole", "dinov2": "dinov2-518"}
-"""Encoders that see pictures as the paper's authors show them, by the published one."""
+"""Encoders with the preprocessing of the paper's authors, by the published encoder."""
 
 
 @dataclass(frozen=True)
 class Made:
-    """The result of a cell beside its record's usual entries.
+    """Result of a cell besides its record's usual entries.
 
     Attributes:
-        figures: by their title, with the encoders' published preprocessing.
-        authors: the same with that of the paper's authors.
+        figures: figures by title, with the encoders' published preprocessing.
+        authors: figures by title, with the preprocessing of the paper's authors.
         counts: counts of views, edited views, network rows, iterations and splats.
         cut: the limit of the budget that ended the method; None for a whole run.
-        page: path of the method's page in the run's folder; None for a method that leaves none.
+        page: path of the method's page in the run's folder; None for a method without one.
         seconds: seconds of the method, by part.
-        gpu: GiB of a GPU at most; NaN without one.
-        files: path in the run's folder, and SHA-256.
+        gpu: peak GiB of a GPU; NaN without one.
+        files: paths in the run's folder, with SHA-256.
     """
 
     figures: Mapping[str, float] = field(default_factory=dict)
@@ -91,7 +91,7 @@ class Made:
     files: Sequence[Mapping[str, str]] = ()
 
     def to_json(self) -> Json:
-        """Entries of a record; what was measured in seconds and bytes is of its cost."""
+        """Entries of a record; seconds and bytes are entries of its cost."""
         data = asdict(self)
         cost = {"method": data.pop("seconds"), "gpu_gib": data.pop("gpu")}
         return {**without_nan(data), "cost": without_nan(cost)}
@@ -108,7 +108,7 @@ class Made:
 
 
 class Captured(Probe[Made]):
-    """Probe whose cells are of captures; no study names it, so it is registered while it runs."""
+    """Probe of captures; no study names it, so it is registered during a run."""
 
     name: ClassVar[str] = "captures"
     protocol: ClassVar[int] = PROTOCOL
@@ -117,7 +117,7 @@ class Captured(Probe[Made]):
     draws: ClassVar[bool] = False
 
     def compute(self, work: Work) -> Made:
-        """Fit, edit or warp, as the cell's spec says."""
+        """Fit, edit or warp, by the cell's spec."""
         s = work.cell.sources
         loaded = Loaded(Manifest.model_validate_json(s["manifest"]), Path(s["folder"]))
         job = Job(loaded, Path(s["run"]), _own_device(s["devices"].split(",")), work.cell)
@@ -129,21 +129,21 @@ class Captured(Probe[Made]):
 
 
 def _own_device(devices: Sequence[str]) -> str:
-    """The device of this process: the one with the number of its worker, in turn."""
-    if "distributed" not in sys.modules:  # the command itself, which needs no dask
+    """The device of this process, assigned by the worker's number in turn."""
+    if "distributed" not in sys.modules:  # the command's process, which needs no dask
         return devices[0]
     from distributed import get_worker
 
     try:
         number = str(get_worker().name)
-    except ValueError:  # no worker
+    except ValueError:  # not a worker
         number = "0"
     return devices[int(number) % len(devices) if number.isdecimal() else 0]
 
 
 @lru_cache(maxsize=1)
 def editor_of(name: str, device: str) -> Any:
-    """An editor; the last one that a process loaded is kept."""
+    """Load an editor; each process caches the last one."""
     from attnwarp.devices import type_of
 
     return load_editor(name, device=device, dtype=type_of("auto", device))
@@ -151,21 +151,21 @@ def editor_of(name: str, device: str) -> Any:
 
 @cache
 def encoder_of(name: str, kind: Kind, *, device: str) -> Any:
-    """An encoder, which a process keeps: its cells are tuned and measured with the same few."""
+    """Load an encoder, cached per process: cells are tuned and measured with the same few."""
     return load_encoder(name, kind, device=device)
 
 
 @dataclass(frozen=True)
 class Job:
-    """A cell at work.
+    """A running cell.
 
     Attributes:
         loaded, cell: the manifest and the cell.
         run: the run's folder.
         device: "cpu" or "cuda", with a number or without.
-        report: receives how far it is.
+        report: callback for progress.
         budget: limits of the method; None for a whole cell.
-        first_splats: take those that a fit begins with, where it has not ended.
+        first_splats: whether to use a fit's initial splats if the fit has not ended.
     """
 
     loaded: Loaded
@@ -190,7 +190,7 @@ class Job:
         return [Store(self.run).keep_picture(p) for p in paths if p.suffix in (".png", ".ply")]
 
     def fit(self) -> Made:
-        """Fit splats to all views; a fit that was killed goes on."""
+        """Fit splats to all views; an interrupted fit is resumed."""
         from attnwarp.fit import FitSettings, first_splats, fit
 
         capture, kind = self.capture, self.cell.spec["settings"]["kind"]
@@ -208,7 +208,7 @@ class Job:
         )  # fmt: skip
 
     def edit(self) -> Made:
-        """Edit a capture by a variant's method, and measure what came out."""
+        """Edit a capture by a variant's method, and measure the result."""
         capture, folder = self.capture, self.folder()
         _reset_gpu(self.device)
         result, before = self.run_method()
@@ -222,7 +222,7 @@ class Job:
             _write(folder / "edited", k, enlarged_change(images[k], to_float(pixels)))
         page = None
         method = workdir_of(folder / "run")
-        if method.has(MANIFEST):  # a method from outside leaves no such folder
+        if method.has(MANIFEST):  # an external method leaves no such folder
             page = (method.path / PAGE).relative_to(self.run).as_posix()
             if not method.has(PAGE):
                 show_edit(method, before, capture.cameras, images)
@@ -272,7 +272,7 @@ class Job:
     def figures(
         self, result: EditedScene, originals: Path, authors: bool = False
     ) -> dict[str, float]:
-        """Figures by their title; those of bundled encoders have no version of the authors."""
+        """Figures by title; bundled encoders have no version of the authors."""
         folder, words = self.folder(), self.cell.spec["words"]
         source = folder / "edited" / picture_name(self.capture.source)
         kinds: tuple[Kind, ...] = ("clip", "dino", "perceptual")
@@ -320,7 +320,7 @@ class Job:
 
 
 def picture_name(view: int) -> str:
-    """File of a view's picture in each folder of them."""
+    """File name of a view's picture."""
     return f"view-{view:04d}.png"
 
 
@@ -335,7 +335,7 @@ def cell_folder(run: Path, cell_id: str) -> Path:
 
 
 def rests_on(cell: Cell, name: str) -> bool:
-    """Return True for a cell that made a file or reads it.
+    """Return True if a cell wrote or reads a file.
 
     Args:
         cell: a cell of the run.
@@ -356,7 +356,7 @@ def _gpu(device: str) -> float:
 
 
 def authors_version(name: str) -> str | None:
-    """The encoder that sees pictures as the authors show them; None for one that has none.
+    """The encoder with the authors' preprocessing; None if there is none.
 
     Example:
         >>> authors_version("clip:/models/clip"), authors_version("clip-small")
@@ -368,8 +368,8 @@ def authors_version(name: str) -> str | None:
 
 @dataclass(frozen=True)
 class Planned:
-    """Cells of a manifest in the order of their running: all of a wave may run at once; and notes
-    on what is left out and what is not equal."""
+    """Cells of a manifest in running order: all cells of a wave may run at once; and notes on
+    omitted and unequal cells."""
 
     loaded: Loaded
     checked: Checked
@@ -380,17 +380,17 @@ class Planned:
 
     @property
     def waves(self) -> tuple[list[Cell], list[Cell]]:
-        """Fits, then what needs them."""
+        """Fits, then the cells that need them."""
         return self.fits, [*self.edits, *self.warps]
 
     @property
     def cells(self) -> list[Cell]:
-        """All of them."""
+        """All cells."""
         return [*self.fits, *self.edits, *self.warps]
 
 
 def plan(loaded: Loaded, checked: Checked, run: Path, devices: Sequence[str]) -> Planned:
-    """The cells of a manifest whose inputs were checked."""
+    """Plan the cells of a manifest with checked inputs."""
     m = loaded.manifest
     sources = {
         "manifest": m.model_dump_json(), "folder": str(loaded.folder.resolve()),
@@ -512,11 +512,11 @@ def todo(cells: Sequence[Cell], store: Store) -> list[Cell]:
 def execute(
     planned: Planned, store: Store, *, jobs: int, scheduler: str | None, report: Reporter
 ) -> list[Failure]:
-    """Compute what is still to do, fits first, and return what failed.
+    """Compute the cells to do, fits first, and return the failures.
 
     Args:
-        jobs: worker processes; 1 stays in this process.
-        scheduler: a dask scheduler whose workers see the run's folder and the manifest's.
+        jobs: worker processes; 1 computes in this process.
+        scheduler: a dask scheduler whose workers can read the run's folder and the manifest's.
     """
     from attnwarp_eval.study.reporting import CellReporter
     from attnwarp_eval.study.run import compute_cells
@@ -539,7 +539,7 @@ def execute(
 
 
 def made_of(planned: Planned, store: Store) -> Iterator[tuple[Cell, Any]]:
-    """Cells with their records, those that are there."""
+    """Finished cells with their records."""
     for cell in planned.cells:
         record = store.whole(cell.id, Captured().read)
         if record is not None:
@@ -564,6 +564,6 @@ def expected(planned: Planned) -> Json:
 
 
 def title(cell: Cell) -> str:
-    """A cell in words."""
+    """Description of a cell."""
     edit = f" / {cell.spec['edit']}" if "edit" in cell.spec else ""
     return f"{cell.scene}{edit} / {cell.variant}" + (f" / seed {cell.seed}" if cell.seed else "")

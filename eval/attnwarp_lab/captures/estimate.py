@@ -18,10 +18,10 @@ from attnwarp_lab.captures.capture import ready
 from attnwarp_lab.captures.cells import Job, Made, Planned
 
 STEPS = (1, 3)
-"""Steps of denoising of the two pilots of a method: their difference is what a step takes."""
+"""Denoising steps of a method's two pilots: their difference gives the cost of a step."""
 
 EDITS, BRANCHES, ITERATIONS = 8, 3, 8
-"""Edits of a pilot, as far as a budget for so many branches goes, and iterations of its tuning."""
+"""Edits of a pilot, limited by a budget for its branches, and iterations of its tuning."""
 
 EDITING = ("source", "warp", "edit", "write")
 """Parts of a method's seconds that grow with its edits."""
@@ -32,14 +32,14 @@ class Unit:
     """Measured costs of a method on one capture.
 
     Attributes:
-        whole: seconds of a cell beside edits and tuning: renders, files, figures.
+        whole: seconds of a cell besides edits and tuning: renders, files, figures.
         edit: seconds of an edit with all its steps.
-        iteration: seconds of one of tuning.
+        iteration: seconds of a tuning iteration.
         rows, edits, iterations, rounds: rows, edits, iterations and rounds of a whole run on this
             capture; rows through the UNet.
         views: views of the capture.
-        files, state, picture: bytes of a cell's other files, the capture's pictures among them; of
-            a round's end; of an edit.
+        files, state, picture: bytes of a cell's other files, including the capture's pictures; of a
+            round's end; of an edit.
         memory: GiB of the process, with the features of all steps.
         gpu: GiB of a GPU; NaN without one.
     """
@@ -59,16 +59,16 @@ class Unit:
     gpu: float
 
     def seconds(self, views: int) -> float:
-        """Seconds of a cell on a capture of so many views."""
+        """Seconds of a cell on a capture of ``views`` views."""
         whole = self.whole * views / self.views
         return whole + self._edits(views) * self.edit + self.iterations * self.iteration
 
     def network_rows(self, views: int) -> float:
-        """Rows through the UNet of a cell on a capture of so many views."""
+        """Rows through the UNet of a cell on a capture of ``views`` views."""
         return self.rows * self._edits(views) / self.edits
 
     def gigabytes(self, views: int) -> float:
-        """Files of a cell on a capture of so many views."""
+        """Gigabytes of a cell's files on a capture of ``views`` views."""
         files = self.files * views / self.views
         return (files + self.rounds * self.state + self._edits(views) * self.picture) / 1e9
 
@@ -80,7 +80,7 @@ class Unit:
 def estimate(
     planned: Planned, left: Sequence[Cell], devices: Sequence[str], report: Reporter
 ) -> Iterator[str]:
-    """Lines about each method and about all cells that are left.
+    """Yield lines about each method and about all cells to do.
 
     A capture whose splats are not fitted yet is piloted with first splats.
     """
@@ -94,7 +94,7 @@ def estimate(
         for name, cell in reversed(firsts.items()):
             report.log(f"measuring a few edits of {name}")
             folder = Path(place) / str(len(units))
-            if warm:  # kernels, networks and caches that a first call waits for
+            if warm:  # warm up kernels, networks and caches
                 _pilot(planned, cell, folder / "warm", devices[0], STEPS[0])
                 warm = False
             units[name] = _measured(planned, cell, folder, devices[0])
@@ -171,7 +171,7 @@ def _job(planned: Planned, cell: Cell, run: Path, device: str, rows: int) -> Job
 def _pilot(
     planned: Planned, cell: Cell, run: Path, device: str, steps: int
 ) -> tuple[Made, Path, float]:
-    """Result and folder of a short cell, and its seconds but for edits and tuning."""
+    """Result and folder of a short cell, and its seconds without edits and tuning."""
     settings = {**cell.spec["settings"], "steps": steps}
     settings["iterations"] = min(ITERATIONS, settings["iterations"])
     pilot = replace(cell, spec={**cell.spec, "settings": settings})

@@ -24,7 +24,7 @@ from attnwarp_eval.study.schema import Part, Whole
 from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS
 
 SHIPPED = Path(__file__).parent / "shipped"
-"""Folder of the manifests that ship with the package."""
+"""Folder of the bundled manifests."""
 
 FIGURES = {
     "Edit PSNR": "Edit PSNR, mean of the views",
@@ -33,10 +33,10 @@ FIGURES = {
     "DINO img": "DINO single-image similarity",
     "CLIP img": "CLIP single-image similarity",
 }
-"""Columns of the paper's tables: their heads -> titles of :mod:`attnwarp_eval.user_images`."""
+"""Columns of the paper's tables: heading -> title of :mod:`attnwarp_eval.user_images`."""
 
 KEYS = "docs/measuring/captures.md"
-"""File that says what each key means."""
+"""File that documents the keys."""
 
 Words = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]
 
@@ -50,15 +50,15 @@ def _file_name(name: str) -> str:
 
 
 Name = Annotated[str, AfterValidator(_file_name)]
-"""Name that becomes part of the paths of files."""
+"""Name used in file paths."""
 
 
 class Edit(Part):
     """Descriptions of an edit.
 
-    ``instruction`` is what InstructPix2Pix is told, ``controlnet`` what a ControlNet is told;
+    ``instruction`` is for InstructPix2Pix, ``controlnet`` for a ControlNet;
     ``source`` and ``target`` describe the scene before and after, for CLIP and for inversions.
-    ``ours`` names those that were not published.
+    ``ours`` names the unpublished descriptions.
     """
 
     instruction: Words
@@ -70,15 +70,15 @@ class Edit(Part):
     )
 
     def text(self, guide: str) -> str:
-        """The words that an editor of a guide, "picture" or "depth", is told."""
+        """The words for an editor with a guide, "picture" or "depth"."""
         if guide == "picture":
             return self.instruction
         return self.controlnet or self.target or self.instruction
 
 
 class MaskPart(Part):
-    """Marks of what is edited, one of these: a folder of masks by the views' names; or of the
-    source view a mask, a box, a point, or words and the segmenter that looks for them."""
+    """Marks of the edited part, one of these: a folder of masks by the views' names; or, for the
+    source view, a mask, a box, a point, or words with the segmenter that finds them."""
 
     folder: str | None = None
     source: str | None = None
@@ -91,8 +91,8 @@ class MaskPart(Part):
 class Capture(Part):
     """A scene: posed pictures, splats of it, and edits.
 
-    ``data`` is a transforms.json, or a folder of one, of COLMAP or of BlendedMVS; ``splats`` are
-    files by their kind, and a kind that is left out is fitted.
+    ``data`` is a transforms.json, or a folder with one, of COLMAP or of BlendedMVS; ``splats`` are
+    files by kind; a missing kind is fitted.
     """
 
     data: str
@@ -105,10 +105,10 @@ class Capture(Part):
 
 
 class Weights(Part):
-    """Bundled weights, or some in a folder, and what tells them from others.
+    """Bundled weights or weights in a folder, and checks of their identity.
 
-    ``shapes`` are of some tensors by name; ``probe`` is the value that ``--dry-run`` prints, and
-    ``sha256`` the hash of the files. The latter two are recorded where they are left out.
+    ``shapes`` are shapes of some tensors by name; ``probe`` is the value that ``--dry-run`` prints,
+    and ``sha256`` the hash of the files. Missing ones of the latter two are recorded.
     """
 
     folder: str
@@ -121,11 +121,11 @@ class Weights(Part):
 AnyWeights = Annotated[
     Weights, BeforeValidator(lambda v: {"folder": v} if isinstance(v, str) else v)
 ]
-"""Weights, or their name or folder alone."""
+"""Weights, or only their name or folder."""
 
 
 class Encoders(Part):
-    """Encoders of the figures, and the perceptual distance that splats are tuned with too."""
+    """Encoders of the figures, and the perceptual distance, which also tunes splats."""
 
     clip: AnyWeights = Weights(folder="clip-small")
     dino: AnyWeights = Weights(folder="dino-small")
@@ -135,7 +135,7 @@ class Encoders(Part):
 class Row(Part):
     """A variant: a method with its settings, a row of a table.
 
-    ``budget`` cuts the method short; ``paper`` are its published figures in the order of
+    ``budget`` limits the method; ``paper`` has its published figures in the order of
     :data:`FIGURES`.
     """
 
@@ -183,7 +183,7 @@ class Manifest(Part):
 
 @dataclass(frozen=True)
 class Loaded:
-    """A manifest, and the folder that its paths count from."""
+    """A manifest, and the folder that its paths are relative to."""
 
     manifest: Manifest
     folder: Path
@@ -193,7 +193,7 @@ class Loaded:
         return self.folder / Path(name).expanduser()
 
     def paths(self) -> list[Path]:
-        """Paths of captures, splats, masks and weights; what is bundled has none."""
+        """Paths of captures, splats, masks and weights; bundled inputs have none."""
         names: list[str | None] = []
         for c in self.manifest.captures.values():
             mask = c.mask or MaskPart()
@@ -219,13 +219,13 @@ class Loaded:
         return self.manifest.seeds if row.seeds is None else row.seeds
 
     def edits(self) -> Iterator[tuple[str, str]]:
-        """Every capture with each of its edits, by name."""
+        """Yield every capture with each of its edits, by name."""
         for name, capture in self.manifest.captures.items():
             for edit in capture.edits:
                 yield name, edit
 
     def tables(self) -> list[TablePart]:
-        """The tables; one of all variants where none is named."""
+        """The tables; by default one of all variants."""
         m = self.manifest
         return m.tables or [TablePart(title="Figures", rows=list(m.variants))]
 
@@ -239,10 +239,10 @@ class Loaded:
         return self.changed(variants={k: row.model_copy(update=changes) for k, row in rows})
 
     def only(self, names: Sequence[str]) -> Loaded:
-        """These variants alone, with their editors, and tables without the other rows.
+        """Restrict to some variants, with their editors, and tables without the other rows.
 
         Raises:
-            InputError: there is no such variant.
+            InputError: no such variant.
         """
         m = self.manifest
         for name in names:
@@ -266,7 +266,7 @@ class Loaded:
         """The variants whose editors are of the kinds of some others, which take their places.
 
         Raises:
-            InputError: there is no such editor, or no variant takes one of its kind.
+            InputError: no such editor, or no variant uses its kind.
         """
         from attnwarp.editing.small import guide_of
 
@@ -286,8 +286,8 @@ class Loaded:
         return self.changed(editors={**m.editors, **editors}).only(kept)
 
     def quick(self) -> Loaded:
-        """The first capture with its first edit, the first seed, and two variants: the row that
-        the first table compares with, and another of the same editor."""
+        """Restrict to the first capture, edit and seed, and two variants: the baseline row of
+        the first table, and another row with the same editor."""
         m, table = self.manifest, self.tables()[0]
         against = table.against or table.rows[0]
         editor = m.variants[against].editor
@@ -304,7 +304,7 @@ class Loaded:
 
 
 def _from(place: Path, editor: str) -> str:
-    """A bundled editor's name, or its folders from a place on."""
+    """A bundled editor's name, or its folders resolved from ``place``."""
     from attnwarp.editing.small import bundled
 
     if editor in bundled():
@@ -313,7 +313,7 @@ def _from(place: Path, editor: str) -> str:
 
 
 def shipped() -> dict[str, Path]:
-    """Manifests that ship with the package, by name.
+    """Bundled manifests by name.
 
     Example:
         >>> list(shipped())
@@ -325,16 +325,16 @@ def shipped() -> dict[str, Path]:
 def load_manifest(name_or_path: str, one: Mapping[str, Any] | None = None) -> Loaded:
     """Read a manifest by the name of a shipped one or by a file's path.
 
-    Paths in it count from the file's folder; those of a shipped one from the current folder.
+    Its paths are relative to the file's folder; those of a bundled one to the current folder.
 
     Args:
         name_or_path: name or path of the manifest.
-        one: keys that stand in place of the manifest's, such as the one capture of a command line,
-            with which no published figure is compared.
+        one: keys that replace the manifest's, such as the capture of a command line; published
+            figures are then not compared.
 
     Raises:
-        InputError: no such file, no YAML, another version, a key that stands twice, is missing or
-            unknown, or a value out of range; the message names the place and what to do.
+        InputError: no such file, invalid YAML, another version, a duplicate, missing or
+            unknown key, or a value out of range; the message names the place and the remedy.
 
     Example:
         >>> try:
@@ -388,14 +388,14 @@ def in_folders(manifest: Manifest) -> dict[str, Weights]:
 
 
 def lacking(manifest: Manifest) -> list[str]:
-    """Keys of weights in folders that neither a probe value nor a hash tells from others."""
+    """Keys of weights in folders without a probe value or a hash."""
     weights = in_folders(manifest).items()
     return [key for key, w in weights if w.probe is None and w.sha256 is None]
 
 
 def _check_names(path: Path, lines: dict[Place, int], manifest: Manifest) -> None:
-    """Refuse names that nothing has, settings that no method takes, and prompts that published
-    figures need and an edit lacks."""
+    """Refuse unknown names, settings that no method has, and edits without prompts that published
+    figures need."""
     from attnwarp.fit import FitSettings
     from attnwarp.methods import Budget
 

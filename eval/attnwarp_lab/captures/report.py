@@ -1,4 +1,4 @@
-"""The tables of a run on captures, with published figures beside its own where there are some."""
+"""Tables of a run on captures, next to published figures where available."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from attnwarp_lab.captures.manifest import FIGURES, Row, TablePart, lacking
 from attnwarp_lab.userstudy.material import RESULTS
 
 NOT_AT_HAND = "not at hand"
-"""Stands for a published figure that this package does not know."""
+"""Mark of an unknown published figure."""
 
 NAME, ASKING = "report", "userstudy.html"
-"""Files of the run's folder: the report without its suffix, and the page that asks people."""
+"""Files of the run's folder: the report without its suffix, and the page for the user study."""
 
 PICTURED = 4
-"""Views of each edit side by side in the report, evenly spread; of several edits fewer, at least
+"""Views of each edit side by side in the report, evenly spread; fewer with several edits, at least
 one."""
 
 Value = Callable[[Made], Mapping[str, float]]
@@ -44,7 +44,7 @@ VERSIONS: dict[str, Value] = {
     "as the paper's authors compute them": lambda made: made.authors or {},
     PUBLISHED: lambda made: made.figures,
 }
-"""Versions of the figures. Edit PSNR has one alone."""
+"""Versions of the figures. Edit PSNR has a single version."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Results:
     Attributes:
         planned: its cells.
         root: its folder.
-        records: cells with their records, those that are there.
+        records: finished cells with their records.
     """
 
     planned: Planned
@@ -67,7 +67,7 @@ class Results:
         return self.planned.loaded.manifest.variants
 
     def edits(self, variant: str | None = None) -> Iterator[tuple[Cell, Any]]:
-        """Edits, of one variant alone if it is named."""
+        """Edits, optionally of one variant only."""
         for cell, record in self.records:
             if cell.spec["kind"] == "edit" and (variant is None or variant in cell.labels):
                 yield cell, record
@@ -86,9 +86,9 @@ class Results:
 
 
 def write_report(planned: Planned, store: Store) -> list[Path]:
-    """Write ``results.json``, the report and the page that asks people; return their paths.
+    """Write ``results.json``, the report and the page of the user study; return their paths.
 
-    Nothing in ``results.json`` was measured in seconds, so that two runs can give the same bytes.
+    ``results.json`` has no measured seconds, so that two runs can give the same bytes.
     """
     results = Results(planned, store.root, list(made_of(planned, store)))
     write_json(store.root / RESULTS, without_nan(results_json(results)), sort_keys=False)
@@ -127,7 +127,7 @@ def _folder(cell: Cell) -> str:
 
 
 def report(results: Results) -> Report:
-    """The run as a document."""
+    """Report of the run."""
     loaded = results.planned.loaded
     m, edits = loaded.manifest, [*loaded.edits()]
     size = f"{m.size} px" if m.size else "each editor's own size"
@@ -212,7 +212,7 @@ def _figures(
     results: Results, table: TablePart, caption: str, titles: Mapping[str, str], value: Value,
     folded: bool,
 ) -> Iterator[Table]:  # fmt: skip
-    """A table of figures, published ones beside them where a row has some; none without values."""
+    """A table of figures, with published ones if a row has some; none without values."""
     published = titles is FIGURES and any(results.rows[name].paper for name in table.rows)
     rows, found = [], False
     planned = {name for cell in results.planned.edits for name in cell.labels}
@@ -231,7 +231,7 @@ def _figures(
 
 
 def _pictures(results: Results) -> Section:
-    """Edited scenes side by side, of each edit's first seed, and where each variant's page lies."""
+    """Edited scenes side by side, for each edit's first seed, with links to each variant's page."""
     edits, checked = [*results.planned.loaded.edits()], results.planned.checked
     grids, pages = [], []
     for scene, title in edits:
@@ -256,7 +256,7 @@ def _pictures(results: Results) -> Section:
 
 
 def _verdicts(results: Results, table: TablePart) -> Table | None:
-    """Each ordering of the paper's, row against row, and what this run says of it."""
+    """Each ordering of rows in the paper, with this run's verdict."""
     against = str(table.against)
     first = results.rows[against].paper
     made: list[tuple[str, str, float, Contrast, str]] = []
@@ -287,7 +287,7 @@ def _verdicts(results: Results, table: TablePart) -> Table | None:
 
 
 def difference(apart: Contrast, level: float = 0.95) -> str:
-    """Mean of a contrast with its interval over scenes, where there are enough for one."""
+    """Mean of a contrast with its interval over scenes, if there are enough."""
     mean, low, high = apart.shown(level)
     bounded = math.isfinite(low) and math.isfinite(high)
     return f"{number(mean)} [{number(low)}, {number(high)}]" if bounded else number(mean)

@@ -1,4 +1,4 @@
-"""A seal of a run on captures, its verification, and two of them side by side."""
+"""Seal of a run on captures, its verification, and a comparison of two sealed runs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from attnwarp_lab.captures.report import difference
 from attnwarp_lab.userstudy.material import RESULTS
 
 SEAL = "seal.json"
-"""File of hashes: of the code and its packages, of what went in, and of every other file."""
+"""File of hashes: of the code and its packages, of the inputs, and of every other file."""
 
 APART = "second - first [95 % interval]"
 NOTE = "Paired over scenes, edits and seeds. The interval is over scenes; fewer than six have none."
@@ -42,7 +42,7 @@ def is_sealed(run: Path) -> bool:
 
 
 def write_seal(store: Store) -> Path:
-    """Write the hashes of everything in a run's folder, with one of all of them."""
+    """Write the hashes of everything in a run's folder, with one hash over all of them."""
     here = environment()
     content = {
         "code": here["source"],
@@ -68,7 +68,7 @@ def _read_seal(store: Store) -> dict[str, Any]:
     """Content of a seal.
 
     Raises:
-        StoreError: it is damaged.
+        StoreError: the seal is damaged.
     """
     path = store.root / SEAL
     try:
@@ -87,7 +87,7 @@ def _read_seal(store: Store) -> dict[str, Any]:
 
 
 def _broken(store: Store, seal: Mapping[str, Any]) -> dict[str, str]:
-    """Name of each sealed file that is not as it was, and what happened to it."""
+    """Name of each changed sealed file, and the kind of change."""
     return {
         name: "changed since it was sealed" if (store.root / name).is_file() else "is missing"
         for name, sha256 in seal["files"].items()
@@ -96,10 +96,10 @@ def _broken(store: Store, seal: Mapping[str, Any]) -> dict[str, str]:
 
 
 def verify(store: Store) -> Problems:
-    """Compute the hashes of a sealed run again.
+    """Recompute the hashes of a sealed run.
 
     Raises:
-        StoreError: the folder is no run.
+        StoreError: the folder is not a run.
     """
     found = store.verify()
     try:
@@ -114,11 +114,11 @@ def verify(store: Store) -> Problems:
 
 
 def open_seal(store: Store, cells: Sequence[Cell]) -> list[str]:
-    """Compare a run with its seal and take the seal off; return the sealed files that are missing
+    """Compare a run with its seal and remove the seal; return the sealed files that are missing
     or changed.
 
-    These are removed, with the records of the cells that rest on them, so that the run makes them
-    anew. A folder without a seal is left alone.
+    These files are removed with the records of cells that depend on them, so that the run
+    regenerates them. A folder without a seal is unchanged.
 
     Raises:
         StoreError: the seal is damaged.
@@ -131,16 +131,16 @@ def open_seal(store: Store, cells: Sequence[Cell]) -> list[str]:
             if rests_on(cell, name):
                 store.path(cell.id).unlink(missing_ok=True)
         (store.root / name).unlink(missing_ok=True)
-    # Last: a run that is killed before finds the same ones again.
+    # Last: after an earlier interruption the next run finds the same files.
     (store.root / SEAL).unlink()
     return broken
 
 
 def side_by_side(one: Path, two: Path) -> tuple[list[str], Table]:
-    """Differences of what went into two runs, and their figures by row.
+    """Compare the inputs of two runs, and their figures by row.
 
     Raises:
-        InputError: one of the folders is no such run, or is damaged.
+        InputError: a folder is not such a run, or is damaged.
     """
     (study, first), (other, second) = map(_read, (one, two))
     lines = [
@@ -174,7 +174,7 @@ def side_by_side(one: Path, two: Path) -> tuple[list[str], Table]:
 def _pairs(
     first: Cells, second: Cells, keys: Sequence[Key], title: str
 ) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, float]]]:
-    """Scene -> edit and seed -> figure of both, where both have it."""
+    """Scene -> edit and seed -> figure of both, if both have it."""
     a: dict[str, dict[str, float]] = {}
     b: dict[str, dict[str, float]] = {}
     for key in keys:

@@ -21,12 +21,12 @@ from attnwarp_eval.cli.shell import (
 )
 
 ONE = "One capture"
-"""Panel of the help."""
+"""Name of the help panel."""
 
 
 @dataclass(frozen=True)
 class One:
-    """Options that make a manifest of one capture and one edit."""
+    """Options that define a manifest of one capture and one edit."""
 
     data: Annotated[
         Path | None,
@@ -74,7 +74,7 @@ class One:
         """Keys of a manifest; None without a capture.
 
         Raises:
-            InputError: an option that needs another one, or marks that do not go together.
+            InputError: an option that needs another one, or incompatible marks.
         """
         from attnwarp.io import read_ply
 

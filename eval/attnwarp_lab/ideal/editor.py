@@ -1,5 +1,5 @@
-"""The ideal editor: the exact posterior mean over all answers, by way of attention that others can
-record and inject.
+"""The ideal editor: the exact posterior mean over all answers, computed by attention that can be
+recorded and injected.
 
 Tokens i of f x f px are the pixel-unshuffle of 2 picture - 1, which is orthonormal, so that parts
 factorise. z_0 is the picture before, z_k the true picture of answer k, D_ki = z_ki - z_0i, p(i) the
@@ -45,7 +45,7 @@ class Answers:
 
     Attributes:
         before: (H, W, 3) sRGB in [0, 1] before the edit.
-        after: (K, H, W, 3) after it, the whole thing in one answer.
+        after: (K, H, W, 3) after the edit, the whole thing in one answer.
         parts: (h, w) part of each token, -1 outside the thing.
     """
 
@@ -58,7 +58,7 @@ class _Output(torch.nn.Module):
     """The output of an attention layer, where hooks read and replace it."""
 
     def forward(self, features: Tensor) -> Tensor:
-        """(B, n, C) as they are."""
+        """Return (B, n, C) features unchanged."""
         return features
 
 
@@ -85,7 +85,7 @@ class IdealUNet(torch.nn.Module):
             [torch.stack([tokens_of(_picture(one)) for one in view.after]) for view in views]
         )
         self.cross: Cross = cross
-        # Buffers, so that a digest of the network knows its answers.
+        # Buffers, so that a digest of the network includes its answers.
         self.register_buffer("before", before)  # (V, n, C)
         self.register_buffer("change", after - before[:, None])  # (V, K, n, C)
         parts = torch.stack([torch.from_numpy(np.asarray(v.parts)).flatten() for v in views]).long()
@@ -110,7 +110,7 @@ class IdealUNet(torch.nn.Module):
         """Predict the clean latents of noisy ones.
 
         Args:
-            sample: (B, C, h, w) at the step.
+            sample: (B, C, h, w) latents at the step.
             timestep: timestep of the schedule.
             views: number of each row's view.
 
@@ -171,7 +171,7 @@ def part_means(values: Tensor, parts: Tensor) -> Tensor:
 
 
 def _counts(parts: Tensor, count: int) -> Tensor:
-    """(B, count) tokens of each part, those of none first."""
+    """(B, count) number of tokens of each part, starting with tokens of no part."""
     ones = torch.ones_like(parts)
     return torch.zeros(len(parts), count, dtype=parts.dtype).scatter_add(1, parts + 1, ones)
 
@@ -193,8 +193,8 @@ def tokens_of(picture: Tensor) -> Tensor:
 
 
 def schedule(share: float = 1.0) -> DDIM:
-    """Noise schedule of the ideal editor: Stable Diffusion's, whose last step is noise alone (Lin
-    et al. 2024, algorithm 1), with a share of its signal.
+    """Noise schedule of the ideal editor: Stable Diffusion's, whose last step is pure noise (Lin
+    et al. 2024, algorithm 1), with its signal scaled.
 
     Args:
         share: factor of the signal-to-noise ratio a / (1 - a) at every step, above 0.
@@ -215,7 +215,7 @@ def schedule(share: float = 1.0) -> DDIM:
 
 
 class IdealEditor:
-    """An :class:`~attnwarp.editing.editor.Editor` that knows every view's answers.
+    """An :class:`~attnwarp.editing.editor.Editor` with the answers of every view.
 
     Args:
         views: by name.
@@ -243,7 +243,7 @@ class IdealEditor:
 
     @property
     def parts(self) -> dict[str, Any]:
-        """The network; words are not read."""
+        """The network; there is no text encoder."""
         return {"unet": self.unet}
 
     @property
@@ -260,7 +260,7 @@ class IdealEditor:
         )
 
     def call(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:
-        """The pass that the network is called for."""
+        """The pass of a network call."""
         return unet_call(self.branches, args, kwargs)
 
     def noise_shape(self, size: Size) -> tuple[int, int, int]:
@@ -268,7 +268,7 @@ class IdealEditor:
         return 3 * FACTOR**2, size[0] // FACTOR, size[1] // FACTOR
 
     def check_text(self, text: str) -> None:
-        """Take any words: the answers are what it knows."""
+        """Accept any words: only the answers matter."""
 
     def task(
         self,
@@ -276,10 +276,10 @@ class IdealEditor:
         prompt: str,
         regions: Sequence[npt.NDArray[Any]] | None = None,
     ) -> IdealTask:
-        """An edit of views by their pictures before it.
+        """Edit of the views with the given original pictures.
 
         Raises:
-            ValueError: a picture that is none of the views'.
+            ValueError: a picture of no view.
         """
         tensor_of(guides, "guides", FACTOR)
         numbers = [self._numbers.get(_key(guide)) for guide in guides]
@@ -313,7 +313,7 @@ class IdealTask:
 
     Attributes:
         editor: editor with the network.
-        views: their numbers.
+        views: numbers of the views.
     """
 
     editor: IdealEditor

@@ -1,4 +1,4 @@
-"""Figures of an edit whose answers vary over a thing in parts: seen, through, bleed and dE.
+"""Figures of an edit with answers per part of a thing: seen, through, bleed and dE.
 
 They are read together: ``seen`` alone rewards painting everything.
 """
@@ -18,10 +18,10 @@ Labels = npt.NDArray[np.int16]
 Mask = npt.NDArray[np.bool_]
 
 LEAST_PIXELS = 16
-"""Pixels of a part that a view must show for its answer to count, the area of one token."""
+"""Least visible pixels of a part for its answer to count: the area of one token."""
 
 UNKNOWN = -1
-"""Answer of a part that a view does not show."""
+"""Answer of a part that is not visible."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,8 @@ class PartTruth:
 
     Attributes:
         before: (H, W, 3) sRGB in [0, 1] before the edit.
-        after: (K, H, W, 3) after it, the whole thing in one answer.
-        pixels: (H, W) part of each pixel, where it is its token's part too; else -1.
+        after: (K, H, W, 3) after the edit, the whole thing in one answer.
+        pixels: (H, W) part of each pixel if its token has the same part, else -1.
         outside: (H, W) bool: neither the pixel nor its token shows the thing.
     """
 
@@ -64,8 +64,8 @@ class PartTruth:
 def part_answers(
     picture: Image, truth: PartTruth, parts: int, among: Mask | None = None
 ) -> npt.NDArray[np.int64]:
-    """(P,) the answer that each part of a picture is nearest to; :data:`UNKNOWN` where fewer than
-    :data:`LEAST_PIXELS` pixels show it.
+    """(P,) nearest answer of each part of a picture; :data:`UNKNOWN` if fewer than
+    :data:`LEAST_PIXELS` pixels show the part.
 
     Args:
         picture: (H, W, 3) sRGB in [0, 1].
@@ -89,8 +89,8 @@ def part_answers(
 
 
 def answered(truth: PartTruth, answers: npt.NDArray[np.int64]) -> Image:
-    """(H, W, 3) the true picture in which each part has its own answer; NaN at the thing's pixels
-    whose part has none, or none of its own.
+    """(H, W, 3) the true picture in which each part has its answer; NaN at the thing's pixels
+    without a part or an answer.
 
     Args:
         answers: (P,) from :func:`part_answers` of the source.
@@ -121,13 +121,13 @@ def part_figures(
         before_it: (H, W) part of the surface that the source shows there instead; -1 for none.
 
     Returns:
-        ``parts.seen``: of the parts truly seen by the source, those that show its answer;
-        ``parts.through``: of hidden pixels with another part before them, those that show that
-        part's answer, by chance 1/K;
+        ``parts.seen``: share of the parts truly seen by the source that show the source's answer;
+        ``parts.through``: share of hidden pixels behind another part that show that part's answer,
+        by chance 1/K;
         ``parts.bleed``: mean CIEDE2000 to the picture before, outside the thing;
         ``parts.delta_e``: mean CIEDE2000 to the truth of the source's answers, at pixels truly
         seen; and the counts ``parts.seen_parts`` and ``parts.hidden_pixels``. NaN where there is
-        nothing to measure.
+        nothing is measured.
     """
     parts = len(answers)
     there = part_answers(picture, truth, parts, visible)

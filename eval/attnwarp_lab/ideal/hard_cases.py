@@ -1,4 +1,4 @@
-"""Hard cases of the ideal editor and of labels: answers almost certain, parts of one token."""
+"""Hard cases of the ideal editor and of labels: nearly certain answers, parts of one token."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Label transport: part labels carried along the tokens of a warp, against exact truth.
 
-No diffusion is needed: what a token takes is decided by the warp and its mask alone.
-docs/measuring/ideal-editor.md tells what the figures decide, and what they cannot.
+No diffusion is needed: the label that a token takes depends only on the warp and its mask.
+docs/measuring/ideal-editor.md describes what the figures can and cannot decide.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Labels = npt.NDArray[np.int16]
 Mask = npt.NDArray[np.bool_]
 
 NONE = -2
-"""Label of a token that takes nothing."""
+"""Label of a token without features."""
 
 OUTSIDE = -1
 """Label of a token that does not show the thing."""
@@ -84,14 +84,14 @@ def label_tokens(
     """Tokens of each kind that :func:`label_transport` counts.
 
     Args:
-        carried, tokens, pixels, visible, unseen: as there.
+        carried, tokens, pixels, visible, unseen: as for :func:`label_transport`.
 
     Returns:
-        (h, w) bool: "right", "wrong" and "none" are the "visible" ones; "painted_hidden" are among
-        the "hidden", "painted_outside" among those "outside".
+        (h, w) bool: "right", "wrong" and "none" partition "visible"; "painted_hidden" is part of
+        "hidden", "painted_outside" part of "outside".
 
     Raises:
-        ValueError: shapes that do not fit.
+        ValueError: incompatible shapes.
 
     Example:
         >>> import numpy as np
@@ -131,15 +131,15 @@ def label_transport(
 ) -> dict[str, float]:
     """Right, wrong and missing labels among visible tokens, and labels where none belongs.
 
-    A token is visible where more than half of its pixels show its part and the source shows them;
-    hidden where more than half show its part and the source does not.
+    A token is visible if more than half of its pixels show its part and the source shows them;
+    hidden if more than half show its part and the source does not.
 
     Args:
         carried: (h, w) from :func:`carried_labels`.
         tokens: (h, w) true part of each token of the target, -1 outside the thing.
         pixels: (H, W) true part of each pixel.
         visible: (H, W) bool, the source certainly shows the pixel's surface.
-        unseen: (H, W) bool, the source certainly does not.
+        unseen: (H, W) bool, the source certainly does not show the pixel's surface.
 
     Returns:
         ``labels.right``, ``labels.wrong`` and ``labels.none`` of visible tokens, which sum to 1;
@@ -148,7 +148,7 @@ def label_transport(
         ``labels.outside``. NaN where there are no such tokens.
 
     Raises:
-        ValueError: shapes that do not fit.
+        ValueError: incompatible shapes.
 
     Example:
         >>> import numpy as np

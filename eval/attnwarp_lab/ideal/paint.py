@@ -28,7 +28,7 @@ def answer_colors(count: int) -> list[str]:
         count: at least 2.
 
     Raises:
-        ValueError: fewer.
+        ValueError: fewer than 2.
 
     Example:
         >>> answer_colors(2)
@@ -50,7 +50,7 @@ def answer_colors(count: int) -> list[str]:
 def painted(scene: Scene, objects: Sequence[str], color: str) -> Scene:
     """The scene with some objects in shades of one colour.
 
-    What shows no texture, as metal and glass, becomes matt.
+    Materials without texture, such as metal and glass, become matt.
 
     Args:
         color: as #rrggbb.

@@ -1,4 +1,4 @@
-"""Parts of a thing: cells of its surface that are the same in every view."""
+"""Parts of a thing: cells of its surface, the same in every view."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int16]
 
 MOST_POINTS = 20_000
-"""Surface points that k-means sees; evenly taken from all views."""
+"""Number of surface points for k-means, taken evenly from all views."""
 
 GRAIN = 1e-9
-"""Step of their coordinates, as a share of the thing's extent: far above rounding."""
+"""Quantization step of the points, as a share of the thing's extent: far above rounding."""
 
 
 def part_labels(points: Mapping[str, Array], parts: int) -> dict[str, Labels]:
     """Parts of a thing in every view: k-means cells of its surface points, pooled over the views.
 
-    Cells of points alone part the front of a thin body from nothing: both of its sides are one
-    part. Which is meant: an answer does not depend on the side it is seen from.
+    Cells depend only on position, so both sides of a thin body are one part. This is intended: an
+    answer does not depend on the viewing side.
 
     Args:
         points: by view, (H, W, 3) world coordinates of the thing; NaN elsewhere.
@@ -45,13 +45,13 @@ def part_labels(points: Mapping[str, Array], parts: int) -> dict[str, Labels]:
     if not len(pooled):
         raise ValueError("points: no view shows the thing; choose other objects or views")
     every = max(1, len(pooled) // MOST_POINTS)
-    # A processor's rounding must not decide the order of points that share a coordinate, as those
-    # of a box's face do: k-means begins with points drawn by their number, and ends elsewhere.
+    # Rounding must not decide the order of points that share a coordinate, as on a box's face:
+    # k-means is initialized with points by index, and another order gives other cells.
     grain = GRAIN * max(float(np.ptp(pooled, axis=0).max()), np.finfo(float).tiny)
     sample = grain * np.unique(np.round(pooled[::every] / grain) + 0.0, axis=0)
     count = min(parts, len(sample))
     centers, _ = kmeans2(sample, count, minit="++", rng=np.random.default_rng(0), iter=50)
-    # By place, so that numbers do not depend on the order in which k-means found them.
+    # Numbered by position, independent of the order of k-means.
     centers = centers[np.lexsort(centers.T)]
     result = {}
     for view, own in points.items():
@@ -64,7 +64,7 @@ def part_labels(points: Mapping[str, Array], parts: int) -> dict[str, Labels]:
 
 
 def token_parts(labels: Labels, size: tuple[int, int]) -> Labels:
-    """(h, w) part of each token: the one that most of its pixels show; -1 counts as one.
+    """(h, w) part of each token: the part of most of its pixels; -1 counts as a part.
 
     Args:
         labels: (H, W) parts, -1 for none; sides are multiples of the grid's.

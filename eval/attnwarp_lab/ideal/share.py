@@ -1,7 +1,7 @@
 """Share of signal of the ideal editor: solved from the step at which answers settle, and checked.
 
 A part's evidence grows with its pixels, so one schedule settles large parts at once and small ones
-never. The share is solved from what a person means: at which share of the steps answers settle.
+never. The share is solved from a target: the share of the steps after which answers settle.
 
 A view edited alone moves in the span of its parts' changes: with r = x - sqrt(a) z_0 and the Gram
 matrices G_kl = sum over the part's tokens of <D_k, D_l>, the K numbers y_k = <r, D_k> of a part
@@ -9,7 +9,7 @@ decide its evidence, y_k - a / 2 G_kk over 1 - a, and a DDIM step takes them to
 
 y'_k = sqrt(a') (G w)_k + sqrt((1 - a') / (1 - a)) (y_k - sqrt(a) (G w)_k).
 
-From pure noise y is N(0, G). So thousands of edits alone take a moment, of pictures of any size.
+From pure noise y is N(0, G). So thousands of edits take a moment, for pictures of any size.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from attnwarp.editing.schedule import PUBLISHED_STEPS, following, steps_from
 from attnwarp_lab.ideal.editor import Answers, IdealUNet, schedule
 
 DRAWS = 200
-"""Edits of each view alone."""
+"""Number of edits of each view alone."""
 
 HELD = 0.5
-"""Posterior weight above which an answer holds."""
+"""Posterior weight above which an answer counts as settled."""
 
 SHARES = (1e-5, 1e4)
-"""Shares of signal that are searched."""
+"""Range of shares of signal searched."""
 
 FREQUENCY, AGREEMENT = 0.5, 0.25
 """Largest relative distance of an answer's frequency from 1/K, and of agreement from 1/K. Four
@@ -42,7 +42,7 @@ answers at the limit of the first (3/8, 3/8, 1/8, 1/8) agree by chance at that o
 
 @dataclass(frozen=True)
 class Alone:
-    """Views edited alone, with noise of their own.
+    """Statistics of views edited alone, with separate noise.
 
     Attributes:
         settled: mean over views and parts of the share of steps before the final answer holds.
@@ -55,7 +55,7 @@ class Alone:
     agreement: float
 
     def fault(self) -> str | None:
-        """Reason why the editor is not ideal, in words; None where it is.
+        """Reason why the editor is not ideal, in words; None if it is ideal.
 
         Example:
             >>> Alone(0.4, (0.25, 0.26, 0.24, 0.25), 0.26).fault() is None
@@ -90,7 +90,7 @@ class Grams:
 
     @classmethod
     def of(cls, views: Sequence[Answers]) -> Grams:
-        """Those of views with their answers."""
+        """Compute the matrices of views with their answers."""
         net = IdealUNet(views, schedule().alphas)
         matrices, view, part = [], [], []
         for number, (change, parts) in enumerate(zip(net.change, net.parts, strict=True)):
@@ -140,7 +140,7 @@ def settling_steps(weights: Tensor) -> Tensor:
     """
     final = weights[-1].argmax(dim=-1)
     held = weights.gather(-1, final.expand(len(weights), *final.shape)[..., None])[..., 0] > HELD
-    # Steps from the end on which it holds without a gap.
+    # Steps, counted from the end, for which the answer holds without a gap.
     return len(weights) - held.flip(0).long().cumprod(dim=0).sum(dim=0)
 
 
@@ -158,7 +158,7 @@ def alone(grams: Grams, share: float, steps: int, seed: int = 1) -> Alone:
     """Edit views alone, each with fresh noise.
 
     Args:
-        grams: Gram matrices of the parts; the first view is what others agree with.
+        grams: Gram matrices of the parts; agreement is measured with the first view.
         share: share of signal.
         steps: number of steps of denoising.
         seed: seed of the noise.
@@ -190,7 +190,7 @@ def solve_share(grams: Grams, settled: float, steps: int) -> float:
         steps: number of steps of denoising.
 
     Raises:
-        ValueError: answers cannot settle then; the message has the range.
+        ValueError: answers cannot settle at that share; the message has the range.
     """
 
     def excess(log_share: float) -> float:

@@ -27,7 +27,7 @@ def labels_of(
 
     Args:
         cameras: cameras of the views, whose surface points are pooled.
-        objects: names of what the thing is made of.
+        objects: names of the thing's objects.
 
     Raises:
         ValueError: no such object, or no view shows one.
@@ -52,7 +52,7 @@ class Thing:
     Attributes:
         labels: (H, W) part of each pixel, by view.
         before: (H, W, 3) sRGB in [0, 1] before the edit, by view.
-        after: (K, H, W, 3) after it, the whole thing in one answer, by view.
+        after: (K, H, W, 3) after the edit, the whole thing in one answer, by view.
         parts: number of parts.
     """
 
@@ -106,7 +106,7 @@ class Thing:
 
     @cached_property
     def views(self) -> list[Answers]:
-        """Views as the editor takes them."""
+        """Views as inputs of the editor."""
         return [
             Answers(before, self.after[name], self.tokens(name))
             for name, before in self.before.items()
@@ -129,8 +129,8 @@ class Thing:
 
 
 def in_front(pair: TwoView, source: Labels) -> Labels:
-    """(H, W) part of the surface that the source shows where a target's point falls into it; -1 for
-    none, and for a point that does not fall into it.
+    """(H, W) part of the surface that the source shows at the position of a target's point; -1 for
+    no part, and for a point outside the source image.
 
     Args:
         source: (H, W) part of each pixel of the source.

@@ -15,7 +15,7 @@ from attnwarp_lab.userstudy.page import FORMAT
 
 
 class Answer(BaseModel):
-    """One choice of a person; an attention check has a side that nobody prefers."""
+    """One choice of a person; an attention check has an obviously worse side."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -40,7 +40,7 @@ class Answer(BaseModel):
 
     @property
     def comparison(self) -> tuple[object, ...]:
-        """Key of what was compared under which question, whatever the sides."""
+        """Key of the comparison and its question, independent of sides."""
         return (self.scene, self.edit, self.seed, self.question, *sorted(self.pair))
 
 
@@ -61,11 +61,11 @@ class Person:
     """The answers of one person.
 
     Attributes:
-        name: name that the page drew for the person.
+        name: random name from the page.
         path: path of the file.
         study, title: study and title of the page.
-        planned: how many choices the person was to make.
-        choices: those made, attention checks left out.
+        planned: number of choices planned for the person.
+        choices: choices made, without attention checks.
         checks: attention checks.
     """
 
@@ -84,12 +84,12 @@ class Person:
 
 
 def read_answers(paths: Sequence[Path]) -> tuple[list[Person], list[str]]:
-    """Everybody's answers, and lines on files that were left out.
+    """Read all answers; also return lines on files that were left out.
 
-    A person who saved more than once counts with the longest file.
+    Of several files by one person the longest counts.
 
     Raises:
-        InputError: a file that is not the page's, or of another page than the first.
+        InputError: a file that is not from the page, or from another page than the first.
     """
     people: dict[str, Person] = {}
     notes = []

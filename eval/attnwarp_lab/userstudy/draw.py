@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 SCRAMBLED = "(scrambled)"
-"""The side of an attention check that nobody prefers: a method's pictures with their parts moved
+"""The worse side of an attention check: a method's pictures with their parts moved
 around."""
 
 
@@ -18,7 +18,7 @@ class Choice:
 
     Attributes:
         item: number of the edited scene.
-        question: its name.
+        question: name of the question.
         left, right: methods; one is :data:`SCRAMBLED` in an attention check.
     """
 
@@ -48,15 +48,15 @@ def draw(
 ) -> list[list[Choice]]:
     """Plans, one for a person.
 
-    Comparisons go round: every pair of methods under every question comes equally often, and scene
-    after scene. In each plan a method stands on the left as often as on the right, to within one.
-    Every second plan is the one before with its sides exchanged, in another order.
+    Comparisons cycle: every pair of methods under every question comes equally often, scene
+    after scene. In each plan a method is on the left as often as on the right, to within one.
+    Every second plan mirrors the previous one, in another order.
 
     Args:
         methods: methods of each item.
-        choices: choices of a plan; all comparisons where there are fewer.
-        checks: attention checks of a plan, beside the choices.
-        seed: seed of everything drawn.
+        choices: choices of a plan; all comparisons if there are fewer.
+        checks: attention checks of a plan, besides the choices.
+        seed: seed of all random draws.
 
     Raises:
         ValueError: no item has two methods.
@@ -108,7 +108,7 @@ def _comparisons(
 def _sided(choices: list[Choice]) -> list[Choice]:
     """Sides such that each method is on the left as often as on the right, to within one.
 
-    Choices are the edges of a graph of methods. Edges to a node beyond make every degree even; an
+    Choices are the edges of a graph of methods. Edges to an extra node make every degree even; an
     Eulerian circuit then leaves each node as often as it enters it.
     """
     beyond = ""
@@ -124,7 +124,7 @@ def _sided(choices: list[Choice]) -> list[Choice]:
     left: dict[int, str] = {}
     for start in edges:
         node = start
-        # A walk that cannot go on has come back to its start, as all degrees are even.
+        # A walk that cannot continue is back at its start, since all degrees are even.
         while edges[node]:
             number = edges[node].pop()
             if number in left:
@@ -157,7 +157,7 @@ def _ordered(
     mixed.sort(key=lambda choice: order.index(choice.question))
     for number, check in enumerate(checks, start=1):
         place = number * len(mixed) // (len(checks) + 1)
-        # It asks what its neighbours ask.
+        # A check asks its neighbours' question.
         asked = mixed[min(place, len(mixed) - 1)].question
         mixed.insert(place, replace(check, question=asked))
     return mixed

@@ -1,4 +1,4 @@
-"""Material that people are shown: pictures of edited scenes, from the folders of runs."""
+"""Material of a user study: pictures of edited scenes, from the folders of runs."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ BEFORE, AFTER = "before", "render"
 
 
 RESULTS, MOST_VIEWS = "results.json", 8
-"""File of a run on captures, and the views of each that are shown, evenly spread."""
+"""File of a run on captures, and the number of views shown, evenly spread."""
 
 LEAST = 256
-"""Least longest side of a picture that people see, in px."""
+"""Least longest side of a displayed picture, in px."""
 
 OF_A_METHOD = (
     "method", "settings", "editor", "geometry", "mask", "fit", "splats", "budget",
 )  # fmt: skip
-"""Entries of a cell's spec that decide its pictures, not how they are measured."""
+"""Entries of a cell's spec that decide its pictures, without those of the measurement."""
 
 
 @dataclass
@@ -42,7 +42,7 @@ class Item:
     Attributes:
         scene, edit, seed: scene, edit and seed of the cells.
         instruction: in words.
-        content: hash of the scene, all that decides its views, and the instruction.
+        content: hash of the scene, the inputs of its views, and the instruction.
         before: by view, the file of the view before the edit.
         methods: by method and view, the file of the edited scene.
     """
@@ -57,32 +57,32 @@ class Item:
 
     @property
     def name(self) -> str:
-        """Short text that no other item of a study has."""
+        """Short text, unique within a study."""
         return f"{self.scene} / {self.edit} / seed {self.seed}"
 
     @property
     def views(self) -> list[str]:
-        """Views that every method has, in the order of their yaw, others by name."""
+        """Views of every method, ordered by yaw, others by name."""
         return sorted(set(self.before).intersection(*self.methods.values()), key=_along_the_orbit)
 
 
 def _along_the_orbit(view: str) -> tuple[float, str]:
-    """Sorts the names of :func:`attnwarp_eval.scene.scene.view_name`: yawm30, source, yaw7p5."""
+    """Sort key for names of :func:`attnwarp_eval.scene.scene.view_name`: yawm30, source, yaw7p5."""
     yaw = re.fullmatch(r"yaw(m?\d+(?:p\d+)?)", view)
     return (float(yaw[1].replace("m", "-").replace("p", ".")) if yaw else 0.0, view)
 
 
 def read_items(runs: Sequence[Path], methods: Sequence[str] | None = None) -> list[Item]:
-    """The edited scenes of runs of which at least two methods have pictures.
+    """Read the edited scenes of runs with pictures by at least two methods.
 
     Args:
         runs: folders.
-        methods: variants to compare, or the parts between commas of such names; all that have
+        methods: variants to compare, or the comma-separated parts of such names; all with
             pictures if None.
 
     Raises:
-        InputError: there is none, a picture that lies elsewhere, a method that no run has, or runs
-            that contradict each other.
+        InputError: no such item, a picture outside the folder, a method that no run has, or
+            contradictory runs.
     """
     items: dict[tuple[str, str, int], Item] = {}
     first: dict[tuple[str, str], tuple[str, Path]] = {}  # item and method -> how, and the run
@@ -136,8 +136,8 @@ def _joined(parts: Sequence[str], available: Sequence[str]) -> list[str]:
 
 
 def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
-    """(scene, edit and seed; the cell as an item of its own; method; what decides its pictures) of
-    a run's edited scenes.
+    """(scene, edit and seed; the cell as an item; method; the inputs of its pictures) of a run's
+    edited scenes.
     """
     for cell in read_results(Store(run)).cells:
         record = cell.record
@@ -160,7 +160,7 @@ def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
             continue
         how = digest({key: spec[key] for key in OF_A_METHOD if key in spec})
         for method in cell.variants:
-            # An item of its own for each name: the reader keeps the first one and adds to it.
+            # A separate item for each name: the reader keeps the first and adds to it.
             yield (
                 (cell.scene, edit.name, cell.seed),
                 replace(item, methods={method: own}),
@@ -170,7 +170,7 @@ def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
 
 
 def _captured(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
-    """The edits of a run on captures, as :func:`_edited` gives a study's cells."""
+    """The edits of a run on captures, in the format of :func:`_edited`."""
     try:
         data = json.loads((run / RESULTS).read_text(encoding="utf-8"))
         for cell in data["cells"]:
@@ -197,10 +197,10 @@ def _captured(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]
 
 
 def read_picture(path: Path) -> bytes:
-    """A picture as JPEG, enlarged smoothly to a longest side of :data:`LEAST` px if need be.
+    """A picture as JPEG, enlarged smoothly to a longest side of :data:`LEAST` px if smaller.
 
     Raises:
-        InputError: it is missing.
+        InputError: the file is missing.
     """
     from PIL import Image
 

@@ -18,7 +18,7 @@ QUESTIONS = {
     "consistency": "Which one looks like the same object from all sides?",
     "quality": "Which one looks better?",
 }
-"""Questions that people are asked, by the name that answers have."""
+"""Questions by their names in the answers."""
 
 FORMAT = 1
 """Version of the answers' file."""
@@ -26,14 +26,14 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class Design:
-    """Design of a study of people.
+    """Design of a user study.
 
     Attributes:
         questions: names of :data:`QUESTIONS`.
-        plans: different draws; each person gets one.
-        choices: choices of a person.
-        checks: attention checks of a person, beside the choices.
-        seed: seed of everything drawn.
+        plans: number of different draws; each person gets one.
+        choices: number of choices of a person.
+        checks: number of attention checks of a person, besides the choices.
+        seed: seed of all random draws.
     """
 
     questions: Sequence[str] = tuple(QUESTIONS)

@@ -31,7 +31,7 @@ def strengths(wins: npt.ArrayLike) -> Array:
     """Strengths of methods of maximum likelihood, with sum 0.
 
     Args:
-        wins: (..., n, n), how often the method of the row was chosen over that of the column.
+        wins: (..., n, n), counts of choices of the row's method over the column's.
 
     Returns:
         (..., n).
@@ -92,9 +92,9 @@ class Preferences:
     """Preferences of people among methods.
 
     Attributes:
-        methods: by name.
-        people: how many chose.
-        wins: (n, n), how often the method of the row was chosen over that of the column.
+        methods: names of the methods.
+        people: number of people who chose.
+        wins: (n, n), counts of choices of the row's method over the column's.
         shares: by method, the probability that it is chosen over another method, mean over the
             others; 95 % intervals.
         pairs: by (a, b) in the methods' order, the probability that a is chosen over b. Their
@@ -125,11 +125,11 @@ def preferences(choices: Choices, methods: Sequence[str], *, seed: int = 0) -> P
     of as many people.
 
     Args:
-        choices: choices of each person; one without any counts for nothing.
+        choices: choices of each person; people without choices are ignored.
         methods: all names.
 
     Raises:
-        ValueError: no choices, or a name that is no method's.
+        ValueError: no choices, or an unknown method.
 
     Example:
         >>> people = {f"p{k}": [("a", "b")] * 3 + [("b", "a")] * (k % 2) for k in range(20)}
@@ -147,7 +147,7 @@ def preferences(choices: Choices, methods: Sequence[str], *, seed: int = 0) -> P
                 if name not in index:
                     raise ValueError(f"choices: got {name!r}, expected one of {list(methods)}")
             row[index[chosen], index[other]] += 1
-    # Whoever chose nothing would be drawn like the others, and widen every interval.
+    # People without choices would be resampled like the others, and widen every interval.
     by_person = by_person[by_person.any((1, 2))]
     wins, people = by_person.sum(0), len(by_person)
     if not people:
@@ -231,7 +231,7 @@ def _logit(p: Array, choices: float) -> Array:
 
 
 def _connected(wins: Array) -> npt.NDArray[np.bool_]:
-    """(n,) whether a chain of choices leads to the first method that anybody chose over another."""
+    """(n,) whether a chain of choices leads to the first method that was chosen over another."""
     met = (wins + wins.T) > 0
     reached = np.zeros(len(wins), dtype=bool)
     reached[int(np.argmax(met.any(1)))] = True
@@ -249,7 +249,7 @@ class Agreement:
             any.
         kappa: the share above chance, 2 share - 1: free-marginal kappa (Randolph 2005), since
             either side of a choice is right by chance half of the time.
-        comparisons: that at least two people judged.
+        comparisons: number of comparisons that at least two people judged.
     """
 
     share: float

@@ -21,7 +21,7 @@ from attnwarp_lab.userstudy.preferences import (
 )
 
 OVERALL = "overall"
-"""Name of all questions together."""
+"""Name of the total over all questions."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class Score:
 
     Attributes:
         title: title of the page.
-        preferences: by question, and of all together.
-        agreement: the same.
-        people: everybody.
-        failed: names of people who failed an attention check; they do not count.
+        preferences: preferences by question, and over all.
+        agreement: agreement by question, and over all.
+        people: all people.
+        failed: names of people who failed an attention check; their answers are excluded.
     """
 
     title: str
@@ -86,13 +86,13 @@ class Score:
 
 
 def score(people: Sequence[Person]) -> Score:
-    """Preferences by question and overall, of the people who failed no attention check.
+    """Preferences by question and overall, of people who passed all attention checks.
 
     Args:
         people: from :func:`attnwarp_lab.userstudy.answers.read_answers`.
 
     Raises:
-        ValueError: nobody is left, or nobody chose anything.
+        ValueError: no people or no choices are left.
     """
     failed = [person.name for person in people if person.failed]
     counted = [person for person in people if not person.failed and person.choices]
@@ -119,7 +119,7 @@ def score(people: Sequence[Person]) -> Score:
 
 
 def report(result: Score) -> Report:
-    """The score as a document."""
+    """Report of the score."""
     counted = [p for p in result.people if p.name not in result.failed and p.choices]
     whole = result.preferences[OVERALL]
     made = sum(len(p.choices) for p in counted)
@@ -166,7 +166,7 @@ def _shares(result: Score) -> Section:
 
 
 def selection(value: Preferences) -> dict[str, tuple[int, int]]:
-    """Times that each method was chosen, and times that it was shown.
+    """Times that each method was chosen, and was shown.
 
     Example:
         >>> from attnwarp_lab.userstudy.preferences import preferences

@@ -1,1 +1,1 @@
-"""Consistency metrics on right edits, and on flaws of known size: which can be believed."""
+"""Audit of consistency metrics on right edits and on flaws of known size."""

@@ -1,4 +1,4 @@
-"""Area under the ROC curve of a metric that tells flawed results from right ones, with an interval
+"""Area under the ROC curve of a metric as a detector of flawed results, with an interval
 over scenes. Pure functions: numbers in, numbers out.
 """
 
@@ -14,7 +14,7 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 
 Values = Mapping[str, Sequence[float]]
-"""Scene -> values; NaN where undefined. The larger, the more flawed."""
+"""Scene -> values; NaN where undefined. Larger values mean more flawed."""
 
 RESAMPLES = 1000
 """Draws of scenes for an interval; its ends then vary by about a hundredth."""
@@ -25,13 +25,13 @@ class Auroc:
     """Probability that a flawed result has a larger value than a right one; ties are half.
 
     Attributes:
-        value: 1 tells all of them apart, 0.5 none; NaN where nothing was defined.
+        value: 1 for perfect separation, 0.5 for none; NaN if nothing is defined.
         low, high: 95 % interval over scenes, by percentiles of a bootstrap; NaN with fewer than
             six scenes.
-        scenes: how many have both kinds of results.
+        scenes: number of scenes with both kinds of results.
         undefined: share of the values that were NaN, which are left out.
-        paired: share of the flawed results whose value is above the mean of the right ones of
-            their own scene; ties are half.
+        paired: share of the flawed results with a value above the mean of the right ones of
+            the same scene; ties are half.
 
     Example:
         >>> auroc([({"bear": [3.0], "fence": [4.0]}, {"bear": [1.0], "fence": [3.0]})]).value
@@ -49,12 +49,12 @@ class Auroc:
 def auroc(groups: Sequence[tuple[Values, Values]], *, seed: int = 0) -> Auroc:
     """Mean over groups of the area under the ROC curve of each.
 
-    Scenes are resampled, the same ones in all groups, since results of one scene are correlated. A
+    Scenes are resampled, identically in all groups, since results of one scene are correlated. A
     group without a value of either kind is left out.
 
     Args:
-        groups: (flawed, right) of each group, such as each yaw; no result of one group is compared
-            with one of another.
+        groups: (flawed, right) of each group, such as each yaw; results are compared only within
+            their group.
 
     Example:
         >>> flawed, right = {"bear": [2.0, float("nan")]}, {"bear": [1.0]}

@@ -1,5 +1,5 @@
-"""Figures that the audit judges, an entry each: what a table says of one, and what computes it of
-a pair of views.
+"""Figures that the audit judges: each entry has its texts for tables, and its function of a pair of
+views.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from attnwarp_eval.metrics.known_geometry import GRID
 from attnwarp_eval.two_view import TwoView
 
 Where = tuple[Array, Mask]
-"""(H, W, 2) px of the source for each target pixel, and (H, W) bool where they are trusted."""
+"""(H, W, 2) source position in px for each target pixel, and (H, W) bool of trusted ones."""
 
 
 class Shown:
-    """A picture, and what several figures need of it or of its pair, made once.
+    """A picture, with cached intermediate results of the picture or its pair for the figures.
 
     A target belongs to one pair and one source.
 
@@ -39,7 +39,7 @@ class Shown:
         self._kept: dict[str, Any] = {}
 
     def once(self, name: str, make: Callable[[], Any]) -> Any:
-        """Result of ``make``, of the first call with that name."""
+        """Result of ``make``, cached by name."""
         if name not in self._kept:
             self._kept[name] = make()
         return self._kept[name]
@@ -53,21 +53,21 @@ class Shown:
         return self.once(kind, lambda: self._encoders[kind].images([self.picture]))
 
     def again(self) -> Shown:
-        """Copy of the picture with nothing made yet."""
+        """Copy of the picture with an empty cache."""
         return Shown(self.picture, self._encoders)
 
 
 @dataclass(eq=False)
 class Pair:
-    """A pair of views, and what figures know of it beside its pictures after the edit.
+    """A pair of views, and the figures' inputs besides the pictures after the edit.
 
     Attributes:
         truth: exact relation of the two.
         mask: (H, W) bool, the edited object in the target.
-        warp: maker of the warp by rendered depth.
-        refit: Edit PSNR of each of several pairs.
+        warp: function that makes the warp by rendered depth.
+        refit: function that gives the Edit PSNR of several pairs.
         before: source and target before the edit.
-        partners: the true target of each true source after the edit, the right edit's first.
+        partners: the true target of each true source after the edit, first the right edit's.
         encoders: encoders by kind.
         texts: descriptions of the source and of the edit.
     """
@@ -82,7 +82,7 @@ class Pair:
     texts: Sequence[str]
 
     def again(self, warp: Callable[[], WarpedView]) -> Pair:
-        """Copy of the pair with nothing made yet."""
+        """Copy of the pair with an empty cache."""
         before = self.before[0].again(), self.before[1].again()
         partners = {source.again(): target.again() for source, target in self.partners.items()}
         return Pair(
@@ -90,19 +90,19 @@ class Pair:
         )
 
     def refit_all(self, pairs: Sequence[tuple[Shown, Shown]]) -> None:
-        """Fit splats' colours to all pairs at once, which costs little more than to one."""
+        """Fit splats' colours to all pairs at once, at little more than the cost of one."""
         for (_, target), value in zip(pairs, self.refit(pairs), strict=True):
             target.once("refit", partial(float, value))
 
     @property
     def measures(self) -> dict[str, Measure]:
-        """Measures of :data:`FIGURES` that the encoders at hand allow, by figure."""
+        """Measures of :data:`FIGURES` that the available encoders allow, by figure."""
         at_hand = (None, *self.encoders)
         return {f.key: f.measure for f in FIGURES if f.measure and f.encoder in at_hand}
 
     @property
     def exact(self) -> Where:
-        """True correspondences of what both views show."""
+        """True correspondences of surfaces visible in both views."""
         return self.truth.xy, self.truth.visible & ~self.truth.edge
 
     @cached_property
@@ -113,7 +113,7 @@ class Pair:
 
     @cached_property
     def outside(self) -> Mask:
-        """(H, W) bool: neither the object nor a neighbour of it."""
+        """(H, W) bool: pixels of neither the object nor its neighbourhood."""
         grown: Mask = binary_dilation(self.mask, np.ones((3, 3), dtype=bool))
         return ~grown
 
@@ -138,14 +138,14 @@ Measure = Callable[[Pair, Shown, Shown], float]
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure as tables show it and as a pair gives it.
+    """Definition of a figure: its texts for tables, and its function of a pair.
 
     Attributes:
         key, title: key and title of the metric.
-        needs: inputs beside the edited pictures.
+        needs: inputs besides the edited pictures.
         measure: value of a pair, of source and target after the edit; None for a figure of a set.
-        encoder: kind of the encoder that it needs.
-        truth: whether it needs the truth.
+        encoder: kind of the encoder needed.
+        truth: whether the truth is needed.
     """
 
     key: str
@@ -180,15 +180,15 @@ def _exactly(pair: Pair, source: Shown, target: Shown) -> float:
 
 
 def _above_floor(pair: Pair, source: Shown, target: Shown) -> float:
-    """The floor is of the true views of what the source shows; of the right edit's where the source
-    is flawed.
+    """Disagreement above the floor of the true views; for a flawed source, the floor is the right
+    edit's.
     """
     true = source if source in pair.partners else next(iter(pair.partners))
     return _exactly(pair, source, target) - _exactly(pair, true, pair.partners[true])
 
 
 def _added(suffix: str) -> Measure:
-    """Measure of the colour that the edit adds to the difference of the views."""
+    """Measure of the colour difference between the views that the edit adds."""
 
     def measure(pair: Pair, source: Shown, target: Shown) -> float:
         figures = target.once(
@@ -254,7 +254,7 @@ def _preserved(compare: Callable[[Array, Array, Mask], float]) -> Measure:
 
 
 FIGURES = (
-    # A pair with too few matches counts against.
+    # A pair with too few matches counts as inconsistent.
     Figure(
         "consistency.tsed_2px", "TSED at 2 px", "poses",
         lambda p, s, t: float(_epipolar(p, s, t) < 2),
@@ -328,4 +328,4 @@ FIGURES = (
         truth=True,
     ),
 )  # fmt: skip
-"""Figures, those that need no truth first."""
+"""Figures; those without truth come first."""

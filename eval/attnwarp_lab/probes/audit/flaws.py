@@ -1,8 +1,8 @@
-"""Flaws of known size in a true edit: in the target view alone, or in all views alike.
+"""Flaws of known size in a true edit: in the target view only, or equally in all views.
 
-Sizes are of the picture that is flawed: pixels, shares, degrees. A flaw is drawn on the true
-picture, by exact geometry, so its size is known and nothing else differs. Where all views have it,
-they agree, and a figure that rates it above a right edit can be gamed by it.
+Sizes refer to the flawed picture: pixels, shares, degrees. A flaw is drawn on the true picture by
+exact geometry, so its size is known and nothing else differs. If all views share a flaw, they
+agree, and a figure that rates it above a right edit can be gamed by it.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from attnwarp_eval.metrics.consistency import has_taps, sampled
 from attnwarp_eval.two_view import HIDDEN, TwoView
 
 STEP = 1e-4
-"""Length in scene units by which a point is moved to see where its surface runs in the picture."""
+"""Length in scene units of a point's step for the direction of its surface in the picture."""
 
 
 @dataclass(frozen=True, eq=False)
 class Edited:
-    """A true edit as a view shows it, and what flaws are made of.
+    """A true edit in one view, and the inputs of flaws.
 
     Attributes:
         pair: pair of the source and this view.
@@ -32,10 +32,10 @@ class Edited:
         before, after, another: (H, W, 3) the view before the edit, after it, and with another right
             answer.
         mask: (H, W) bool, the edited object in the view.
-        elsewhere: (H, W, 3) a view of another scene; None where there is none.
-        misdirected: (H, W, 3) the view after an edit of other objects; None where there is none.
-        seed: seed of what flaws draw.
-        place: number of the view, 0 for the source; each view has noise of its own.
+        elsewhere: (H, W, 3) a view of another scene, or None.
+        misdirected: (H, W, 3) the view after an edit of other objects, or None.
+        seed: seed of the flaws' random draws.
+        place: number of the view, 0 for the source; each view has separate noise.
     """
 
     pair: TwoView
@@ -62,8 +62,8 @@ class Edited:
         return self._kept["grown"]
 
     def along(self) -> Array:
-        """(H, W, 2) unit direction in which the surface runs in the picture, that of one direction
-        of the world for all pixels; 0 where it runs along the ray.
+        """(H, W, 2) unit direction of the surface in the picture, for one world direction at all
+        pixels; 0 where the surface runs along the ray.
         """
         if "along" not in self._kept:
             hits, camera = self.pair.hits, self.pair.target
@@ -91,13 +91,13 @@ class Flaw:
 
     Attributes:
         name: the first part of a condition's key.
-        title: for people, short.
+        title: short title for display.
         unit: unit of its sizes.
-        sizes: rising.
-        reference: the size that tables of all flaws show.
-        make: (H, W, 3) sRGB of the flawed view at a size; None where it cannot be made.
-        counts: whether it is one of the flaws that matter most.
-        alike: whether the source has it too, and not the target alone.
+        sizes: sizes in rising order.
+        reference: the size shown in tables of all flaws.
+        make: (H, W, 3) sRGB of the flawed view at a size; None if impossible.
+        counts: whether the flaw is one of the most important.
+        alike: whether the source also has the flaw.
     """
 
     name: str
@@ -110,7 +110,7 @@ class Flaw:
     alike: bool = False
 
     def key(self, size: float) -> str:
-        """Condition's name at a size.
+        """Name of the condition at a size.
 
         Example:
             >>> FLAWS[0].key(0.3)
@@ -119,7 +119,7 @@ class Flaw:
         return f"{self.name}={size:g}"
 
     def at(self, size: float) -> str:
-        """Title with a size, for people.
+        """Title with a size, for display.
 
         Example:
             >>> FLAWS[0].at(0.3), FLAWS[3].at(45)
@@ -160,7 +160,7 @@ def _hue(edited: Edited, size: float) -> Array:
 
 
 def _slid(edited: Edited, size: float) -> Array:
-    """Texture of the object that lies ``size`` px further on its surface."""
+    """The object's texture shifted by ``size`` px along its surface."""
     row, column = np.indices(edited.mask.shape)
     at = [row + size * edited.along()[..., 1], column + size * edited.along()[..., 0]]
     moved = np.stack(
@@ -170,7 +170,7 @@ def _slid(edited: Edited, size: float) -> Array:
 
 
 def _doubled(edited: Edited, size: float) -> Array:
-    """Hidden pixels show what hides them from the source, as a mask of bounds alone has it."""
+    """Hidden pixels show the occluder in the source, as under a mask of image bounds only."""
     pair = edited.pair
     hidden = (pair.label == HIDDEN) & has_taps(pair.xy, edited.source.shape)
     result = edited.after.copy()
@@ -237,13 +237,13 @@ FLAWS = (
     Flaw("blur_all", "all views: blur", "px", (2.0,), 2.0, _blurred, alike=True),
     Flaw("noise_all", "all views: noise", "of white", (0.03,), 0.03, _noisy, alike=True),
 )  # fmt: skip
-"""Every flaw: of the target alone, those that count first, then of all views."""
+"""Every flaw: first of the target, the most important first, then of all views."""
 
 ELSEWHERE = next(flaw for flaw in FLAWS if flaw.name == "elsewhere")
-"""View of another scene, which every figure should see."""
+"""Flaw that shows another scene, which every figure should detect."""
 
 COUNTED = tuple(flaw for flaw in FLAWS if flaw.counts)
-"""Flaws that matter most."""
+"""The most important flaws."""
 
 CONDITIONS = {flaw.key(size): (flaw, size) for flaw in FLAWS for size in flaw.sizes}
 """Flaws with their sizes by name."""

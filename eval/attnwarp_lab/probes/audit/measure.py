@@ -1,10 +1,10 @@
-"""Figures of edited views whose edit is right, and of the same with one flaw of known size.
+"""Figures of right edits, and of the same edits with one flaw of known size.
 
 A pair is the source and a target turned by some yaw. Figures are named ``metric.condition``: the
 conditions are :data:`~attnwarp_lab.probes.audit.flaws.CONDITIONS`, and the right pairs of
-:data:`~attnwarp_lab.probes.audit.views.PAIRS`. A figure of the whole set of views, in which
-every second target has the flaw, stands under each of them. A figure that needs the truth stands
-beside those that a person has.
+:data:`~attnwarp_lab.probes.audit.views.PAIRS`. A figure of a whole set of views, in which
+every second target has the flaw, is repeated under each view. Figures that need the truth are
+recorded next to those that do not.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from attnwarp_lab.probes.audit.views import (
 )
 
 REFIT_SIZE = 128
-"""Side in px of the pictures that splats' colours are fitted to."""
+"""Side in px of the pictures to which splats' colours are fitted."""
 
 IN_SETS = {flaw.key(flaw.reference): flaw for flaw in (*COUNTED, ELSEWHERE)}
 """Flaws of sets of views: a reconstruction takes too long for all of them."""
@@ -59,8 +59,8 @@ IN_SETS = {flaw.key(flaw.reference): flaw for flaw in (*COUNTED, ELSEWHERE)}
 class Audit(Part):
     """Edit and views.
 
-    ``edit``: one with at least two answers. ``yaws``: degrees of the targets from the source.
-    ``splats``: the scene before the edit, whose depth is rendered. ``colmap``: whether COLMAP
+    ``edit``: an edit with at least two answers. ``yaws``: degrees of the targets from the source.
+    ``splats``: the scene before the edit, with rendered depth. ``colmap``: whether COLMAP
     reconstructs all views, too; needs pycolmap.
     """
 
@@ -80,14 +80,14 @@ class Audit(Part):
 
 
 class StudyPart(EncodersPart):
-    """Keys of a study that this probe reads."""
+    """Keys of a study for this probe."""
 
     audit: Audit = Audit()
 
 
 @dataclass(frozen=True)
 class Seconds:
-    """Seconds that one judgement costs, by metric and round, taken in turn."""
+    """Seconds of one judgement, by metric and round, taken in turn."""
 
     seconds: Mapping[str, list[float]]
 
@@ -98,7 +98,7 @@ class Seconds:
 
 @register
 class AuditProbe(Probe[Seconds]):
-    """One cell a scene and seed: all metrics judge the same pictures, which no variant changes."""
+    """Audit with one cell per scene and seed: all metrics judge the same pictures."""
 
     name = "audit"
     protocol = 3
@@ -107,7 +107,7 @@ class AuditProbe(Probe[Seconds]):
     judges_variants = False
 
     def check(self, study: Study) -> None:
-        """Variants change no metric."""
+        """Refuse variants, which would change no metric."""
         if study.probes.get(self.name):
             raise ValueError(
                 "probes.audit: got variants, expected []; it judges metrics, which no variant"
@@ -148,7 +148,7 @@ class AuditProbe(Probe[Seconds]):
                 yield Cell(spec, name, "metrics", self.name, seed, ("metrics",), sources=sources)
 
     def compute(self, work: Work) -> Seconds:
-        """Every metric on every condition at every yaw."""
+        """Compute every metric on every condition at every yaw."""
         spec, world, meter = work.spec, work.world, work.meter
         with meter.stage("setup"):
             encoders = loaded(work.cell.sources, spec["encoders"])
@@ -237,7 +237,7 @@ def _reconstructed(
 def _warp(
     model: Gaussians, source: Camera, target: Camera, surface: Surface | None = None
 ) -> WarpedView:
-    """The warp by rendered depth; ``surface`` is the source's, rendered if left out."""
+    """The warp by rendered depth; ``surface`` is the source's, by default rendered."""
     return warp_view(model, source, target, source_surface=surface, warn_empty=False)
 
 
@@ -259,10 +259,10 @@ def _refit(
 
 
 def _rounds(pair: Pair, warp: Callable[[], WarpedView], spec: Json) -> dict[str, list[float]]:
-    """Seconds that one pair costs each metric, in turn in an order drawn anew each round.
+    """Seconds of each metric for one pair, in turn, in a random order each round.
 
-    Everything that a metric needs of the four pictures is made anew: keypoints, embeddings, flow,
-    the depth of both views. Truth costs nothing.
+    All inputs of a metric from the four pictures are recomputed: keypoints, embeddings, flow,
+    the depth of both views. Truth is not timed.
     """
 
     def work(measure: Measure) -> Callable[[int], float]:

@@ -1,8 +1,8 @@
-"""Edit PSNR without a fit's hours: splats whose colours alone are fitted to the edited pictures.
+"""Edit PSNR without a fit's hours: only splats' colours are fitted to the edited pictures.
 
 A paper's Edit PSNR compares edited pictures with renders of the scene that was tuned on them. Here
-shapes stay and a splat has one colour for all views. The best colours are then a linear least
-squares problem, and what is left of it is what no such scene can show.
+shapes stay and a splat has one colour for all views. The best colours are then the solution of a
+linear least squares problem, whose residual no such scene can show.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ if TYPE_CHECKING:
     from attnwarp.gaussians import Gaussians
 
 ITERATIONS = 10
-"""Steps of conjugate gradients. Of pictures that splats can show nothing is left but their
-resolution after as many."""
+"""Steps of conjugate gradients. After these, pictures that splats can represent have only a
+resolution error left."""
 
 
 def refit_psnr(
     splats: Gaussians, cameras: Sequence[Camera], sets: Sequence[Sequence[Any]]
 ) -> list[float]:
-    """Edit PSNR of sets of pictures, each against splats whose colours were fitted to it.
+    """Compute the Edit PSNR of sets of pictures, each against splats with colours fitted to it.
 
-    Where splats do not cover a pixel, the picture itself shows behind them. Higher is better, in
+    Uncovered parts of a pixel show the picture. Higher is better, in
     dB; the PSNR is that of the mean squared error over all pictures of a set.
 
     Args:
-        splats: splats of the scene; their colours are not read.
+        splats: splats of the scene; their colours are ignored.
         cameras: cameras of the V views.
         sets: V pictures each, (H, W, 3) sRGB in [0, 1] of their cameras' sizes. All sets are
             fitted at once, in little more time than one.
 
     Raises:
-        ValueError: a set of another number of pictures, or a picture that is not sRGB in [0, 1] or
-            has another size than its camera.
+        ValueError: a set with a wrong number of pictures, or a picture that is not sRGB in [0, 1]
+            or has another size than its camera.
 
     Example:
         >>> import numpy as np, torch
@@ -94,7 +94,7 @@ def refit_psnr(
             return [render(splats, camera, features=colors).color for camera in cameras]
 
     def gathered(pictures: Sequence[torch.Tensor]) -> torch.Tensor:
-        # Renders are linear in colours: their transpose is the gradient, whatever the colours.
+        # Renders are linear in colours: the gradient is their transpose, for any colours.
         (sums,) = torch.autograd.grad(
             [view.color for view in views], values, list(pictures), retain_graph=True
         )

@@ -1,4 +1,4 @@
-"""Report of the audit: what each figure sees, misses, mistakes, rewards and costs."""
+"""Report of the audit: each figure's detections, misses, false alarms, rewards and cost."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from attnwarp_lab.probes.audit.measure import REFIT_SIZE, Seconds
 from attnwarp_lab.probes.audit.views import METAL, RIGHT, VARNISHED
 
 NEAR = 60.0
-"""Largest yaw in degrees that the first table and the recommendation speak of."""
+"""Largest yaw in degrees in the first table and the recommendation."""
 
 SEES, BLIND = 0.9, 0.6
-"""AUROC from which a metric sees a flaw, and below which it is called blind to it."""
+"""AUROC from which a metric detects a flaw, and below which it counts as blind to it."""
 
 ALARM = 0.05
 """Share of right pairs without highlights that lie above the threshold for false alarms."""
 
 MANY_ALARMS = 0.2
-"""Share of glossy pairs that a metric may take for flawed before the recommendation warns of it."""
+"""Share of glossy pairs flagged as flawed above which the recommendation warns of the metric."""
 
 
 Values = dict[str, list[float]]
 
 
 class Pairs:
-    """Figures of a run's pairs, so that larger is more flawed.
+    """Figures of a run's pairs, signed so that larger is more flawed.
 
     Args:
         records: (scene, record) of the finished cells.
@@ -58,11 +58,11 @@ class Pairs:
 
     @cached_property
     def near(self) -> list[float]:
-        """Yaws up to :data:`NEAR`; all of them where there is none."""
+        """Yaws up to :data:`NEAR`; all if there are none."""
         return [yaw for yaw in self.yaws if abs(yaw) <= NEAR] or self.yaws
 
     def plain(self, row: Figure, conditions: Sequence[str], yaw: float) -> Values:
-        """Scene -> values of conditions at a yaw, as they are."""
+        """Scene -> unsigned values of conditions at a yaw."""
         values: Values = {}
         for scene, record in self.records:
             for view, at in zip(record.views, self.yaws, strict=True):
@@ -99,7 +99,7 @@ class Pairs:
         return self._kept[key]
 
     def shown(self, row: Figure, flaw: Flaw) -> Auroc:
-        """AUROC of a flaw at the size that tables show, up to :data:`NEAR` degrees."""
+        """AUROC of a flaw at its reference size, up to :data:`NEAR` degrees."""
         return self.area(row, [flaw.key(flaw.reference)], self.near)
 
     def counted(self, row: Figure, yaws: Sequence[float], right: Sequence[str] = RIGHT) -> Auroc:
@@ -126,7 +126,7 @@ class Pairs:
         return float(np.mean(shares)) if shares else math.nan
 
     def smallest(self, row: Figure, flaw: Flaw) -> float | None:
-        """Smallest size from which on every size is seen; None where the largest is not."""
+        """Smallest size from which every size is detected; None if the largest is not."""
         found = None
         for size in reversed(flaw.sizes):
             if not self.area(row, [flaw.key(size)], self.near).value >= SEES:
@@ -174,7 +174,7 @@ class Pairs:
 
 @register_report
 class AuditReport(ProbeReport):
-    """Presentation of the metrics: which of them can be believed."""
+    """Presentation of the metrics and their reliability."""
 
     name = "audit"
     measures = "which flaws of an edit each consistency metric sees"
@@ -319,7 +319,7 @@ def _answer(results: Results, pairs: Pairs, layout: Layout) -> Section:
 
 
 def advice(pairs: Pairs) -> list[str]:
-    """Advice on the metric to report where there is no truth, and what it and others cannot do."""
+    """Advice on the metric to report without truth, and on the metrics' limits."""
     best = pairs.best()
     if best is None:
         return ["**No metric without truth has a value.**"]
@@ -351,7 +351,7 @@ def advice(pairs: Pairs) -> list[str]:
                 else f" None without truth does so in at most {percent(MANY_ALARMS)}."
             )
         )
-    # One scene alone has no view of another one.
+    # A single scene has no view of another one.
     measured = any(math.isfinite(pairs.shown(row, ELSEWHERE).value) for row in pairs.rows)
     unable = [
         row.title
@@ -418,7 +418,7 @@ def _by_yaw(pairs: Pairs, layout: Layout) -> Section:
 
 
 def _interval(area: Auroc, missed: bool = False) -> Interval:
-    """Interval of an AUROC, or of 1 minus it, as charts take it."""
+    """Interval of an AUROC, or of 1 minus it, for charts."""
     mean, low, high = area.value, area.low, area.high
     if missed:
         mean, low, high = 1 - mean, 1 - high, 1 - low

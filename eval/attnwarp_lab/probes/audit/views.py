@@ -1,4 +1,4 @@
-"""True pictures of an edit, of which figures see sets that are right and sets with a flaw."""
+"""True pictures of an edit, from which right and flawed sets are made."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ PAIRS = (*RIGHT, *TRAPS)
 ROUGH = MetalMaterial(type="metal", metal="Al", roughness=0.3)
 
 ROUGH_SAMPLES = 2
-"""Samples of metal for each of paint: what it reflects of lamps is rare and bright, and the noise
-of as few would be taken for disagreement."""
+"""Samples of metal for each of paint: its reflections of lamps are rare and bright, and the noise
+of fewer samples would look like disagreement."""
 
 COAT = 0.04
-"""Share of light that a coat of refractive index 1.5 reflects where it is seen straight on."""
+"""Share of light that a coat of refractive index 1.5 reflects at normal incidence."""
 
 Pictures = Mapping[str, Mapping[str, Array]]
 """State of the scene -> view -> (H, W, 3) sRGB."""
@@ -64,7 +64,7 @@ def two_answers(scene: Scene, edit: str) -> list[list[str]]:
 
 
 def edit_of_others(scene: Scene, edit: str) -> list[str] | None:
-    """Name and content of the scene's first edit of other objects; None where it has none."""
+    """Name and content of the scene's first edit of other objects; None without one."""
     objects = set(touched(scene, edit))
     for one in scene.edits:
         others = _objects(scene, one)
@@ -138,15 +138,15 @@ def true_pictures(work: Work) -> tuple[list[Camera], Pictures]:
 def varnished(paint: Array, metal: Array, hits: Hits, mask: Mask) -> Array:
     """(H, W, 3) linear light of an object's paint under a rough clear coat.
 
-    The coat reflects what rough metal does, by the share that Schlick's formula gives, and lets the
-    rest through to the paint.
+    The coat reflects like rough metal, by the share of Schlick's formula, and transmits the rest to
+    the paint.
     """
     share = np.where(mask, COAT + (1 - COAT) * (1 - np.nan_to_num(hits.cosine, nan=1)) ** 5, 0)
     return paint + share[..., None] * (metal - paint)
 
 
 def _metallic(scene: Scene, objects: Sequence[int]) -> Scene:
-    """The scene whose objects are of rough metal."""
+    """The scene with some objects in rough metal."""
     items = [
         changed_object(item, ObjectChange(object=item.name, material=ROUGH))
         if place in objects and not item.emission
@@ -159,7 +159,7 @@ def _metallic(scene: Scene, objects: Sequence[int]) -> Scene:
 def edited_view(
     world: World, spec: Json, pictures: Pictures, camera: Camera, place: int = 0
 ) -> Edited:
-    """A view of :func:`true_pictures` as flaws take it, with its exact relation to the source.
+    """A view of :func:`true_pictures` as input of flaws, with its exact relation to the source.
 
     Args:
         world: the cell's world.

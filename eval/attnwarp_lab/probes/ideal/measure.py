@@ -1,4 +1,4 @@
-"""An edit in parts by the ideal editor, against the answers that its source shows.
+"""An edit in parts by the ideal editor, against the answers of its source.
 
 Views of a record are named ``parts/view``. Figures end in ``.edit`` for the edited views and in
 ``.render`` for renders of the edited splats.
@@ -40,20 +40,20 @@ from attnwarp_lab.ideal.thing import Thing, in_front
 Image = npt.NDArray[np.float32]
 
 UNABLE = ("dge", "gaussctrl")
-"""Methods that change how attention is computed, which the ideal editor does not compute."""
+"""Methods that change the computation of attention, which the ideal editor does not support."""
 
 
 @dataclass(frozen=True)
 class IdealResult:
-    """Entries of a cell's record beside the figures of its views.
+    """Entries of a cell's record besides the figures of its views.
 
     Attributes:
         share: share of signal, solved from the editor's ``settled``.
         settled, frequencies, agreement: settled, frequencies and agreement of views edited alone,
             :class:`attnwarp_lab.ideal.share.Alone`.
-        fault: reason why the editor is not ideal; None where it is.
-        part_share: mean share of a view's pixels that a part takes, of those that show it.
-        answers: answers of each part in the source's edit, -1 where it does not show.
+        fault: reason why the editor is not ideal; None if it is ideal.
+        part_share: mean share of a view's pixels covered by a part, over views that show it.
+        answers: answers of each part in the source's edit, -1 for hidden parts.
         edited: number of edited views.
     """
 
@@ -86,7 +86,7 @@ class IdealProbe(MethodProbe[IdealResult]):
     metrics = metrics_of("parts.")
 
     def check(self, study: Study) -> None:
-        """Every variant needs the ideal editor, and a method that it can serve."""
+        """Require the ideal editor for every variant, and a method that it supports."""
         for name in study.probes.get(self.name, []):
             variant = study.variants[name]
             own = variant.part(VariantPart)
@@ -104,7 +104,7 @@ class IdealProbe(MethodProbe[IdealResult]):
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
-        """One for each scene, variant and seed."""
+        """Cells: one for each scene, variant and seed."""
         for name, scene in scenes.items():
             thing = thing_of(study, scene)
             for label in names:
@@ -119,7 +119,7 @@ class IdealProbe(MethodProbe[IdealResult]):
                     yield Cell(spec, name, label, self.name, seed, (label,), sources=files)
 
     def of_other_scene(self, study: Study, scene: Scene) -> Json:
-        """The other scene's thing."""
+        """Entries for the other scene's thing."""
         return {"thing": thing_of(study, scene)}
 
     def compute(self, work: Work) -> IdealResult:
@@ -139,7 +139,7 @@ class IdealProbe(MethodProbe[IdealResult]):
             donor = self._donor(work, share)
         with meter.stage("splats"):
             before = splats_of(work)
-        # The words decide nothing; the method asks for some.
+        # The words have no effect; the method requires some.
         spec["edit"] = {"instruction": EDIT, "target": EDIT, "source": world.scene.title}
         result = run_method(work, _truth(thing), names, before, editor=editor, donor=donor)
         del spec["edit"]
@@ -150,7 +150,7 @@ class IdealProbe(MethodProbe[IdealResult]):
                 for k, picture in result.edited.items()
             }
             pictures = {"edit": edited}
-            if spec["settings"]["iterations"]:  # else the scene is as it was
+            if spec["settings"]["iterations"]:  # else the scene is unchanged
                 pictures["render"] = _renders(world, names, before, result.gaussians)
             answers = part_answers(edited[names[0]], thing.truth(names[0]), thing.parts)
             for name in names[1:]:
@@ -169,7 +169,7 @@ class IdealProbe(MethodProbe[IdealResult]):
         )
 
     def _donor(self, work: Work, share: float) -> Donor | None:
-        """The other scene's source with an editor that knows its answers; None without one."""
+        """The other scene's source with an editor of its answers; None without one."""
         other = other_world(work)
         if other is None:
             return None
@@ -215,7 +215,7 @@ def _thing(
     colors: int,
     spp: int,
 ) -> Thing:
-    """The thing of a scene; the last ones are kept, since all variants share them."""
+    """The thing of a scene; the last ones are cached, since all variants share them."""
     cameras = [world.camera(name) for name in names]
     return Thing.of(
         world.scene, world.geometry, cameras, objects, parts=parts, colors=colors, spp=spp
@@ -223,7 +223,7 @@ def _thing(
 
 
 def _truth(thing: Thing) -> EditTruth:
-    """The thing's true pictures as a method may ask for them: whole in one answer."""
+    """The thing's true pictures for a method: the whole thing in one answer."""
     masks = {name: labels >= 0 for name, labels in thing.labels.items()}
     count = len(next(iter(thing.after.values())))
     answers = {

@@ -13,7 +13,7 @@ from attnwarp_eval.study.results import Results
 
 @register_report
 class IdealReport(ProbeReport):
-    """Seen, through, bleed and dE by variant; they are read together."""
+    """Seen, through, bleed and dE by variant, to be read together."""
 
     name = "ideal"
     measures = "edits in parts by the ideal editor"

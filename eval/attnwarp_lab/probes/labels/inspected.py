@@ -1,4 +1,4 @@
-"""Labels of a thing's parts as inspect shows them: what arrives along a warp, token by token."""
+"""Labels of a thing's parts for ``inspect``: labels carried along a warp, token by token."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ OTHER = ("left alone, or not counted", "#4a4a4a")
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Parts of a scene's thing, as the probe ``labels`` of a study tells them apart.
+    """Parts of a scene's thing, as defined by the probe ``labels`` of a study.
 
     Attributes:
         world: world of the scene.
         views: names of the views whose surface points are pooled, the source among them.
-        objects: names of what the thing is made of.
+        objects: names of the thing's objects.
         count: number of parts.
         grids: sides of the token grids.
     """
@@ -55,7 +55,7 @@ class Parts:
         return labels_of(self.world.scene, self.world.geometry, cameras, self.objects, self.count)
 
     def carried(self, layer: FeatureWarp, target: str, truth: TwoView) -> Carried:
-        """Labels that the tokens of a target take along a warp.
+        """Labels of a target's tokens, carried along a warp.
 
         Args:
             layer: the warp of the tokens' grid, (h, w).
@@ -74,7 +74,7 @@ class Carried:
 
     Attributes:
         own: (h, w) true part, -1 outside the thing.
-        taken: (h, w) the part that arrives, -1 for what is no part, -2 for none.
+        taken: (h, w) the carried part, -1 for a label outside the thing, -2 for no label.
         kind: (h, w) index into :attr:`Parts.legend`, -1 for :data:`OTHER`.
     """
 
@@ -83,7 +83,7 @@ class Carried:
     kind: npt.NDArray[np.int64]
 
     def text(self, row: int, column: int) -> str:
-        """Words for what happens at a token.
+        """Description of the label at a token.
 
         Example:
             >>> one = np.ones((1, 1), np.int16)

@@ -26,15 +26,15 @@ from attnwarp_lab.ideal.thing import labels_of
 from attnwarp_lab.probes.labels.inspected import Parts
 
 GRIDS = (8, 16, 32, 64)
-"""Sides of the token grids that are measured where a study names none."""
+"""Default sides of the token grids."""
 
 
 class Labels(Part):
     """Tokens and parts.
 
-    ``grids``: tokens along a side, divisors of the image size; of 8, 16, 32 and 64 those that are,
-    where it is left out. ``parts``: numbers of parts; a figure without a grid in its name is of the
-    first, on tokens of 4 px, as the ideal editor's are.
+    ``grids``: tokens along a side, divisors of the image size; by default those of 8, 16, 32 and 64
+    that are. ``parts``: numbers of parts; a figure without a grid in its name is for the first, on
+    tokens of 4 px, as in the ideal editor.
     """
 
     grids: list[Annotated[Whole, Field(ge=1)]] = Field(default_factory=list)
@@ -53,7 +53,7 @@ def grids_of(study: Study, size: int) -> list[int]:
     """Sides of the token grids that a study measures.
 
     Args:
-        study: with or without the probe.
+        study: study, with or without the probe.
     """
     grids = study.part(StudyPart).labels.grids
     return grids or [grid for grid in GRIDS if size % grid == 0]
@@ -68,7 +68,7 @@ class LabelTransport(WarpProbe):
     metrics = metrics_of("labels.")
 
     def check(self, study: Study) -> None:
-        """Grids need to divide the pictures."""
+        """Require grids that divide the pictures."""
         for grid in study.part(StudyPart).labels.grids:
             if study.size % grid:
                 raise ValueError(
@@ -78,7 +78,7 @@ class LabelTransport(WarpProbe):
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
-        """One for each scene, variant and seed."""
+        """Cells: one for each scene, variant and seed."""
         things = {name: thing_of(study, scene) for name, scene in scenes.items()}
         for cell in super().cells(study, names, scenes):
             yield replace(cell, spec={**cell.spec, "thing": things[cell.scene]}, pictures=())
@@ -92,7 +92,7 @@ class LabelTransport(WarpProbe):
         }
 
     def token_labels(self, study: Study, world: World, targets: Sequence[str]) -> Parts:
-        """Labels of the first of the numbers of parts."""
+        """Labels for the first number of parts."""
         size = world.source.width
         return Parts(
             world,
@@ -130,7 +130,7 @@ class LabelTransport(WarpProbe):
 def _figures(
     work: Work, truth: TwoView, view: WarpedView, labels: tuple[LabelMap, LabelMap], grid: int
 ) -> dict[str, float]:
-    """Figures of the part labels that a warp carries.
+    """Figures of the part labels carried by a warp.
 
     Args:
         truth: truth of the pair, (H, W).

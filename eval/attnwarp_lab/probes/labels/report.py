@@ -12,7 +12,7 @@ from attnwarp_eval.study.results import Results
 
 @register_report
 class LabelReport(ProbeReport):
-    """Labels of a thing's parts that arrive, by variant."""
+    """Carried labels of a thing's parts, by variant."""
 
     name = "labels"
     measures = "where labels of parts arrive"
@@ -27,7 +27,7 @@ class LabelReport(ProbeReport):
     stage = "pair"
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
-        """Labels that arrive right by the grid's side and the number of parts."""
+        """Share of right labels by the grid's side and the number of parts."""
         specs = [record.spec for _, record in results.finished(self.name)]
         if not specs:
             return []
