@@ -1,4 +1,4 @@
-"""Splats from pictures: the optimisation of 2D and 3D Gaussians on posed images. See
+"""Splats from pictures: the optimisation of 2D and 3D Gaussians on posed images; see
 docs/method/fitting.md.
 """
 

@@ -1,14 +1,13 @@
-"""Adaptive density control (3DGS), for both kinds: where splats are added and removed.
+"""Adaptive density control (3DGS), for both kinds: adding and removing splats.
 
-Splats whose position on screen the loss wants to change strongly are too few or too large there:
-small ones are cloned, large ones split in two. Splats that are nearly transparent or far too large
-are removed. From time to time every opacity is lowered, so that splats that are not needed stay low
-and go.
+A large loss gradient in a splat's screen position means too few or too large splats nearby: small
+splats are cloned, large ones split in two. Nearly transparent and far too large splats are removed.
+At intervals every opacity is lowered, so that unneeded splats stay low and are removed.
 
 Two things differ from the published code. The gradient on screen is computed from the one in space
-(see :func:`screen_gradient`). And sizes are judged against the extent of the scene or the splat's
-distance from its middle, whichever is larger: splats of a sky or of far hills are large without
-being too large.
+(see :func:`screen_gradient`). And a splat's size is compared with the extent of the scene or the
+splat's distance from the scene's middle, whichever is larger: splats of a sky or of far hills are
+large without being too large.
 """
 
 from __future__ import annotations
@@ -26,30 +25,29 @@ from attnwarp.gaussians import Gaussians
 Tensor = torch.Tensor
 
 GROW_SCALE = 0.01
-"""Share of the extent up to which a splat counts as small (published)."""
+"""Largest size of a small splat, as a share of the extent (published)."""
 
 SPLIT_SHRINK = 1.6
-"""Factor by which the two halves of a split splat are smaller (published)."""
+"""Shrink factor of the two halves of a split splat (published)."""
 
 
 def screen_gradient(
     gradient: Tensor, means: Tensor, camera: Camera, origin: np.ndarray, near: float
 ) -> Tensor:
-    """(N,) length of the loss's gradient in each splat's position on screen, the screen being 2
-    wide and 2 high.
+    """Compute the length of the loss's gradient in each splat's screen position, (N,), for a screen
+    2 wide and 2 high.
 
     Let c = R m + t be the centre in camera axes and (x, y) = ((fx X + s Y) / Z, fy Y / Z) its
     pixel, s the skew. A loss that depends on a centre only through its pixel has dL/dX = fx / Z
     dL/dx and dL/dY = (s dL/dx + fy dL/dy) / Z. So the two components of R dL/dm across the view
-    give the gradient on screen. A loss may also depend on the centre's depth, on the direction of
-    view, and on the outline. These parts enter here; the published code leaves them out or, for
-    2DGS, overwrites them. A screen 2 wide makes the thresholds of 3DGS independent of the image's
-    size.
+    give the gradient on screen. Contributions through the centre's depth, the view direction and
+    the outline are included here; the published code omits them or, for 2DGS, overwrites them. A
+    screen 2 wide makes the thresholds of 3DGS independent of the image's size.
 
     Args:
         gradient, means: (N, 3) in world axes, ``means`` relative to ``origin``.
-        near: depth in scene units below which a centre has no position on screen; 0 comes out
-            there.
+        near: depth in scene units below which a centre has no position on screen and the result
+            is 0.
     """
     device = means.device
     R = torch.tensor(camera.rotation, device=device)
@@ -64,10 +62,10 @@ def screen_gradient(
 
 
 class Density:
-    """Gathers gradients and, every ``densify_every`` iterations, adds and removes splats.
+    """Collector of gradients that adds and removes splats every ``densify_every`` iterations.
 
     Attributes:
-        total, seen: (N,) sum of the gradients' lengths since the last refinement, and the number of
+        total, seen: (N,) sum of the gradients' lengths since the last refinement, and number of
             views that showed the splat.
     """
 
@@ -89,7 +87,7 @@ class Density:
         self.seen = torch.zeros_like(self.total)
 
     def watch(self, model: Model, gaussians: Gaussians, camera: Camera, weight: Tensor) -> None:
-        """Note one view's gradients, before the optimiser drops them."""
+        """Record one view's gradients before the optimiser clears them."""
         means = model.tensors["means"]
         if means.grad is None:
             return
@@ -101,18 +99,18 @@ class Density:
         self.seen += visible
 
     def active(self, iteration: int) -> bool:
-        """True if splats may still be added after so many iterations."""
+        """Return True if splats may still be added after ``iteration`` iterations."""
         return self.settings.densify and 0 < iteration < self.last
 
     def refine(self, model: Model, iteration: int, random: torch.Generator) -> bool:
-        """Add and remove splats if it is time to. Returns whether anything was done."""
+        """Add and remove splats if due; return True if the model changed."""
         s = self.settings
         if not self.active(iteration):
             return False
         done = False
         if iteration >= s.densify_from and iteration % s.densify_every == 0:
-            # Published: after the first reset, which a short fit has none of. By half of the time,
-            # first splats that were too large have been split or have shrunk.
+            # Published: after the first opacity reset, which a short fit lacks. By half of the
+            # time, initially too large splats have been split or have shrunk.
             sizes_count = iteration > min(s.reset_every, self.last / 2)
             self._grow_and_prune(model, sizes_count, random)
             done = True
@@ -122,7 +120,7 @@ class Density:
         return done
 
     def _room(self, model: Model) -> Tensor:
-        """(N,) what a splat's size is judged against."""
+        """Compute each splat's reference length for its size, (N,)."""
         away = (model.tensors["means"].detach() - self.center).norm(dim=1)
         return away.clamp_min(self.extent)
 
@@ -137,11 +135,11 @@ class Density:
             gone |= largest > s.prune_scale * room
         wanted = (gradient > s.grow_gradient) & ~gone
         if s.max_splats is not None:
-            # Either way of growing adds one splat.
+            # Cloning and splitting each add one splat.
             spare = max(0, s.max_splats - int((~gone).sum()))
             if int(wanted.sum()) > spare:
-                # Stable, so that equal gradients do not make the choice depend on the sorting
-                # method.
+                # Stable sort, so that the choice between equal gradients does not depend on the
+                # sorting method.
                 order = torch.argsort(
                     torch.where(wanted, gradient, -1.0), descending=True, stable=True
                 )
@@ -167,12 +165,12 @@ class Density:
     def _half(
         self, t: dict[str, Tensor], index: Tensor, random: torch.Generator
     ) -> dict[str, Tensor]:
-        """One of the two that take a splat's place: a smaller copy at a point drawn from its own
+        """Create one half of a split splat: a smaller copy at a point drawn from the splat's
         Gaussian.
         """
         half = {name: tensor[index].clone() for name, tensor in t.items()}
         scales = half["scales"].exp()
-        # Drawn in main memory: every device grows the same splats.
+        # Drawn on the CPU, so that every device grows the same splats.
         drawn = torch.randn(scales.shape, generator=random, dtype=torch.float32)
         offset = drawn.to(scales.device) * scales
         if scales.shape[1] == 2:
@@ -186,11 +184,11 @@ class Density:
         return half
 
     def state(self) -> dict[str, Any]:
-        """Everything that the next refinement depends on."""
+        """Collect the state that the next refinement depends on."""
         return {"total": self.total.cpu().clone(), "seen": self.seen.cpu().clone()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what :meth:`state` gave."""
+        """Restore the result of :meth:`state`."""
         device = self.center.device
         self.total = state["total"].to(device, copy=True)
         self.seen = state["seen"].to(device, copy=True)

@@ -1,4 +1,4 @@
-"""The optimisation loop: one view an iteration, until iterations, time or patience end."""
+"""Optimisation loop: one view per iteration, until iterations, time or patience end."""
 
 from __future__ import annotations
 
@@ -38,28 +38,28 @@ CHECKPOINT = "checkpoint.pt"
 SPLATS = "splats.ply"
 
 NAMED = {"start": "first splats", "held_out": "held-out views"}
-"""Names, in messages, of parts of a fit's identity."""
+"""Names of the parts of a fit's identity in messages."""
 
 GIANT = 30
-"""Size of a splat, in extents of the scene, that is warned of; skies and far hills have 5 to 20."""
+"""Splat size in scene extents that triggers a warning; skies and far hills have 5 to 20."""
 
 SMOOTHING = 0.98
-"""Share of the past in the loss and the PSNR that are shown while a fit runs."""
+"""Weight of past values in the smoothed loss and PSNR shown during a fit."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """One point on the curve of accuracy against time.
+    """Point on the curve of accuracy against time.
 
     Attributes:
         iteration: iterations done.
-        seconds, cpu_seconds: spent on iterations alone: no evaluation, no writing, over all
-            sittings.
-        splats: their number.
-        loss: loss of the last iterations, smoothed; None before the first.
-        psnr: mean over the held-out views, dB; None without any. Infinite where all are equal to
+        seconds, cpu_seconds: time of iterations alone, without evaluation and writing, over all
+            processes of the fit.
+        splats: number of splats.
+        loss: smoothed loss of the last iterations; None before the first.
+        psnr: mean over the held-out views, dB; None without held-out views. Infinite if all equal
             their pictures.
-        psnr_pooled: PSNR of their mean squared error.
+        psnr_pooled: PSNR of the held-out views' mean squared error.
         measures: figures of the caller's measure.
 
     Example:
@@ -85,12 +85,12 @@ class Fit:
 
     Attributes:
         gaussians: the splats, float32, outside autograd.
-        settings: those used.
-        history: the evaluations, the first before the first iteration, the last at the end.
+        settings: settings used.
+        history: evaluations, the first before the first iteration, the last at the end.
         iteration: iterations done.
-        seconds, cpu_seconds: spent on them.
-        stopped: why it ended: "iterations" (all done), "time", "patience", or "asked".
-        extent: extent of the scene, by which the settings' shares are measured.
+        seconds, cpu_seconds: time of the iterations.
+        stopped: reason of the end: "iterations" (all done), "time", "patience", or "asked".
+        extent: extent of the scene, the unit of the settings' shares.
 
     Example:
         >>> import numpy as np
@@ -133,46 +133,45 @@ def fit(
 ) -> Fit:
     """Fit splats to posed pictures.
 
-    With ``folder``, a checkpoint is written there every ``checkpoint_seconds`` and at the end,
-    which also writes the splats (``splats.ply``), each atomically. A fit with a checkpoint is
+    With ``folder``, a checkpoint is written there every ``checkpoint_seconds`` and at the end, when
+    the splats (``splats.ply``) are written too, each atomically. A fit with a checkpoint is
     resumed. On the same machine, with the same number of torch threads, it gives the bits of an
-    uninterrupted fit. One that was planned with other iterations goes on to the new end, and the
-    report says that the schedule of those done was another.
+    uninterrupted fit. A fit planned with another number of iterations continues to the new end, and
+    the report says that its past iterations followed another schedule.
 
     Args:
-        start: first splats: :func:`attnwarp.fit.from_points`, or splats that were fitted before; of
-            the settings' kind. Harmonics that it uses are used from the first iteration. The fit
-            runs where they lie: ``start.to(device="cuda")`` takes it to a GPU.
-        views: the pictures to fit on.
-        settings: the default ones for ``start.kind`` if left out.
+        start: first splats, of the settings' kind: from :func:`attnwarp.fit.from_points`, or from
+            an earlier fit. Their harmonics are used from the first iteration. The fit runs on
+            their device: ``start.to(device="cuda")`` selects a GPU.
+        views: pictures to fit on.
+        settings: settings of the fit; the defaults for ``start.kind`` if omitted.
         held_out: pictures to evaluate on, never fitted on.
-        folder: made if need be.
-        restart: begin again, without the folder's checkpoint, and write over its splats.
-        max_seconds: stop after so many seconds of iterations, over all sittings; compiling kernels
-            is none of them. The learning rates follow ``settings.iterations`` all the same.
-        checkpoint_seconds: see above; more where a checkpoint takes long, of which the writing
-            then takes 5 % of the time.
-        third_scale: normal scale of 2D splats in ``splats.ply``, for viewers of 3D ones; see
+        folder: folder of the checkpoint, created if missing.
+        restart: True ignores the folder's checkpoint and overwrites its splats.
+        max_seconds: limit on the seconds of iterations over all processes; compiling kernels is
+            excluded. The learning rates still follow ``settings.iterations``.
+        checkpoint_seconds: time between checkpoints; extended for a slow checkpoint, so that
+            writing takes 5 % of the time.
+        third_scale: normal scale of 2D splats in ``splats.ply``, for viewers of 3D splats; see
             :func:`attnwarp.io.write_ply`.
-        backend: name of :func:`attnwarp.render.render`.
-        measure: called at every evaluation with the splats; its figures go into the history. A view
-            of the truth, such as the error of depth.
-        report: receives how the fit stands after every iteration.
-        stop: asked before every iteration; True ends the fit in good order.
+        backend: renderer name, as for :func:`attnwarp.render.render`.
+        measure: function of the splats, called at every evaluation; its figures enter the history.
+            It can compare with ground truth, such as the error of depth.
+        report: receiver of progress after every iteration.
+        stop: function called before every iteration; True ends the fit regularly.
 
     Raises:
-        ValueError: ``start`` is of another kind or degree than the settings say, the folder holds a
-            fit of other views, settings or first splats, one that is beyond
-            ``settings.iterations``, or ``splats.ply`` without a checkpoint, or a number is out of
-            range.
+        ValueError: ``start`` differs in kind or degree from the settings; the folder holds a fit of
+            other views, settings or first splats, a fit beyond ``settings.iterations``, or
+            ``splats.ply`` without a checkpoint; or a number is out of range.
         FileFormatError: the folder's checkpoint is damaged.
         InputError: another run writes to the folder.
-        RuntimeError: the loss or a held-out view is no longer finite, or no splat is left; the
-            message says what to try. The last checkpoint stays.
+        RuntimeError: the loss or a held-out view is not finite, or no splat is left; the message
+            suggests a remedy. The last checkpoint is kept.
 
     Warns:
-        InputWarning: held-out pictures that are fitted on; splats 30 times as large as the scene;
-            float32 world coordinates would not do for ``splats.ply``.
+        InputWarning: held-out pictures are also fitted on; a splat is 30 times as large as the
+            scene; world coordinates in ``splats.ply`` exceed float32's precision.
 
     Example:
         >>> import numpy as np
@@ -225,7 +224,7 @@ def fit(
 
 
 class _Run:
-    """A fit in progress: everything that the next iteration depends on."""
+    """Fit in progress: the state that the next iteration depends on."""
 
     def __init__(
         self,
@@ -269,7 +268,7 @@ class _Run:
         self.folder = folder
         path = folder.path / CHECKPOINT
         if restart:
-            return  # What is there stays until the first save replaces it.
+            return  # The old files stay until the first save replaces them.
         if not path.exists():
             splats = folder.path / SPLATS
             if splats.exists():
@@ -312,7 +311,7 @@ class _Run:
             ) from error
 
     def _lengthen(self, state: dict[str, Any], report: Reporter) -> None:
-        """Take up a fit that was planned with other iterations, if it is not beyond these."""
+        """Resume a fit planned with another number of iterations, unless it is beyond this one."""
         settings, now = state.get("settings"), self.settings.iterations
         if not isinstance(settings, dict) or state.get("iteration", now) > now:
             return
@@ -365,7 +364,7 @@ class _Run:
             self.iterate()
             self.seconds += time.perf_counter() - wall
             self.cpu_seconds += time.process_time() - cpu
-            # The last before it is shown, so that what stays on a screen is the result's.
+            # Evaluate before the final report, so that the last displayed figures are the result's.
             if self.iteration % s.evaluate_every == 0 or self.iteration == s.iterations:
                 self.evaluate()
             left = self.time_left.after(self.iteration, len(self.model))
@@ -381,7 +380,7 @@ class _Run:
         gaussians = self.model.gaussians().detach()
         self.warn_of_giants(gaussians)
         if self.folder is not None:
-            # After the checkpoint: splats without one are taken for somebody's own.
+            # Written after the checkpoint: splats without a checkpoint count as foreign files.
             write_ply(self.folder.path / SPLATS, gaussians, third_scale=self.third_scale)
         return Fit(
             gaussians,
@@ -395,7 +394,7 @@ class _Run:
         )
 
     def warn_of_giants(self, gaussians: Gaussians) -> None:
-        """Say whether splats are far larger than the scene: where they show, depth is lost."""
+        """Warn of splats far larger than the scene, which spoil depth wherever they are visible."""
         sizes = gaussians.scales.amax(dim=1) / self.extent
         giants = int((sizes > GIANT).sum())
         if giants:
@@ -418,7 +417,7 @@ class _Run:
 
     def _out_of_patience(self) -> bool:
         patience, every = self.settings.patience, self.settings.evaluate_every
-        # A sitting that was stopped evaluated once more, and must not shorten the patience.
+        # A stopped process evaluated once more, which must not shorten the patience.
         regular = (record for record in self.history if record.iteration % every == 0)
         values = [record.psnr for record in regular if record.psnr is not None]
         if patience is None or len(values) <= patience:
@@ -426,7 +425,7 @@ class _Run:
         return max(values[-patience:]) < max(values[:-patience]) + self.settings.min_gain
 
     def figures(self) -> str:
-        """One line; loss and PSNR are of the pictures fitted on, smoothed."""
+        """Format a line with the smoothed loss and PSNR of the fitted pictures."""
         last = self.history[-1]
         held = "" if last.psnr is None else f", held out {_decibels(last.psnr)}"
         if held and last.iteration != self.iteration:
@@ -435,7 +434,7 @@ class _Run:
         return f"loss {self.loss:.4f}, PSNR {psnr}{held}, {len(self.model)} splats"
 
     def background(self, *, fitting: bool) -> Tensor:
-        """Colour behind everything; for pictures that are looked at or measured, never random."""
+        """Choose the background colour; never random for displayed or measured pictures."""
         choice = self.settings.background
         if choice == "auto":
             choice = "random" if self.views.transparent else "black"
@@ -447,7 +446,7 @@ class _Run:
 
     def iterate(self) -> None:
         s = self.settings
-        # At the beginning of an iteration, so that what is evaluated or written after one is never
+        # Refined at the beginning of an iteration, so that evaluated or written splats are never
         # fresh from a refinement, which costs some dB at first.
         self.density.refine(self.model, self.iteration, self.random)
         if not self.queue:

@@ -1,4 +1,4 @@
-"""State of the optimisation: the splats as free numbers, and Adam's memory of each."""
+"""State of the optimisation: the splats as unconstrained numbers, and Adam's moments."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ Tensor = torch.Tensor
 NAMES = ("means", "dc", "rest", "opacity", "scales", "quats")
 
 SMALLEST, LARGEST = 1e-7, 1e3
-"""Scales stay within these shares of the extent, or the first splats' own range where that is
-wider: beyond, they would leave float32."""
+"""Limits of scales as shares of the extent, widened to the first splats' range: scales outside
+would leave float32."""
 
 EPSILON = 1e-15
-"""Adam's (3DGS): gradients of a mean over pixels are tiny, and must not be taken for noise."""
+"""Adam's epsilon (3DGS): gradients of a mean over pixels are tiny and must not be damped."""
 
 LARGEST_LOGIT = 15.0
-"""Opacity stays within sigmoid(+-15), 3e-7 from 0 and 1, where its gradient can still bring it back
-in float32.
+"""Limit of opacity's logit: opacity stays within sigmoid(+-15), 3e-7 from 0 and 1, where its
+float32 gradient can still bring it back.
 """
 
 
 class Model:
-    """Splats as Adam sees them: centres, harmonics, logit of opacity, logarithm of scales,
+    """Splats as optimised by Adam: centres, harmonics, logit of opacity, logarithm of scales,
     quaternions.
 
     Attributes:
-        origin: (3,) float64 world coordinates that "means" are relative to.
-        tensors: the leaves by name: "means" (N, 3), "dc" (N, 1, 3), "rest" (N, K - 1, 3), "opacity"
+        origin: (3,) float64 world coordinates of the origin of "means".
+        tensors: leaves by name: "means" (N, 3), "dc" (N, 1, 3), "rest" (N, K - 1, 3), "opacity"
             (N,) logits, "scales" (N, 2 or 3) logarithms, "quats" (N, 4).
         first, second: Adam's moments by name.
         steps: steps done.
         rates: learning rates by name.
         extent: extent of the scene, in its units.
-        scales_range: smallest and largest logarithm that a scale may take.
+        scales_range: smallest and largest logarithm of a scale.
     """
 
     def __init__(self, start: Gaussians, settings: FitSettings, extent: float) -> None:
@@ -53,7 +53,7 @@ class Model:
         self.antialiased = settings.antialiased
         self.screen_filter = start.screen_filter
         g = start.detach().to(dtype=torch.float32)
-        # float64 centres far from zero would be moved by float32.
+        # float32 would round float64 centres far from zero.
         offset, means = split_origin(start.means.detach().cpu().numpy())
         self.origin = start.origin + offset
         self.tensors: dict[str, Tensor] = {
@@ -66,7 +66,7 @@ class Model:
         }
         smallest, largest = math.log(SMALLEST * extent), math.log(LARGEST * extent)
         if len(g):
-            # So that a step moves no splat whose scales have the learning rate 0.
+            # Otherwise clamping would move splats whose scales have the learning rate 0.
             smallest = min(smallest, float(self.tensors["scales"].min()))
             largest = max(largest, float(self.tensors["scales"].max()))
         self.scales_range = smallest, largest
@@ -93,11 +93,11 @@ class Model:
 
     @property
     def device(self) -> torch.device:
-        """Device of the splats and of Adam's memory."""
+        """Device of the splats and of Adam's moments."""
         return self.tensors["means"].device
 
     def gaussians(self) -> Gaussians:
-        """The splats, differentiable in the leaves."""
+        """Build the splats, differentiable in the leaves."""
         t = self.tensors
         return Gaussians(
             self.settings.kind,
@@ -112,10 +112,10 @@ class Model:
         )
 
     def step(self, progress: float) -> None:
-        """One step of Adam along the leaves' gradients, which are then dropped.
+        """Take one Adam step along the leaves' gradients, then clear the gradients.
 
         Args:
-            progress: share of the fit that is done, in [0, 1]; decides the learning rate of the
+            progress: completed share of the fit, in [0, 1]; determines the learning rate of the
                 centres.
         """
         s = self.settings
@@ -152,8 +152,8 @@ class Model:
             self.tensors["opacity"].clamp_(-LARGEST_LOGIT, LARGEST_LOGIT)
 
     def replace(self, keep: Tensor, added: dict[str, Tensor]) -> None:
-        """Keep the splats at the index ``keep`` with Adam's memory of them, and append ``added``,
-        which have none.
+        """Keep the splats at the index ``keep`` with their Adam moments, and append ``added`` with
+        zero moments.
         """
         for name in NAMES:
             self.tensors[name] = torch.cat(
@@ -163,14 +163,14 @@ class Model:
                 moment[name] = torch.cat([moment[name][keep], torch.zeros_like(added[name])])
 
     def lower_opacity(self, limit: float) -> None:
-        """Bring every opacity down to at most ``limit``, and forget where Adam was taking them."""
+        """Lower every opacity to at most ``limit``, and reset Adam's moments of opacity."""
         with torch.no_grad():
             self.tensors["opacity"].clamp_(max=math.log(limit / (1 - limit)))
         self.first["opacity"].zero_()
         self.second["opacity"].zero_()
 
     def state(self) -> dict[str, Any]:
-        """Everything that the next step depends on, in main memory."""
+        """Collect the state that the next step depends on, in main memory."""
         parts = {"tensors": self.tensors, "first": self.first, "second": self.second}
         return {
             "steps": self.steps,
@@ -182,7 +182,7 @@ class Model:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what :meth:`state` gave."""
+        """Restore the result of :meth:`state`."""
         origin = np.array(state["origin"], dtype=np.float64)
         check.shape(origin, (3,), "origin")
         self.steps, self.origin = int(state["steps"]), origin

@@ -1,4 +1,4 @@
-"""Settings of a fit: the published numbers, and reasons where others are used."""
+"""Settings of a fit: the published numbers, and the reasons for deviations."""
 
 from __future__ import annotations
 
@@ -17,54 +17,54 @@ class FitSettings(Settings):
     """Settings of a fit. Equal settings, views, first splats and threads give equal bits.
 
     Learning rates, thresholds and intervals are those published for 3DGS and 2DGS, whose fits take
-    30,000 iterations on a GPU. What they fix in iterations and what has to scale with a shorter fit
-    is given as a share of ``iterations`` here.
+    30,000 iterations on a GPU. Published iteration counts that must scale with a shorter fit are
+    given as shares of ``iterations`` here.
 
     Args:
         kind: "2d" (2DGS) or "3d" (3DGS).
-        iterations: optimisation steps, one view each.
+        iterations: number of optimisation steps, one view each.
         seed: seed of the order of views, the random background and the splitting of splats.
         sh_degree: degree of the colour's spherical harmonics, 0 to 3.
-        sh_every: iterations after which one more degree is used, from the degree of the first
-            splats (0 for points).
+        sh_every: number of iterations between increases of the used degree, which starts at the
+            first splats' degree (0 for points).
         lr_means, lr_means_final: learning rates of the centres at the beginning and the end,
             exponential in between, times the scene's extent.
-        lr_dc, lr_rest, lr_opacity, lr_scales, lr_quats: learning rates
-            of the constant and the other harmonics, the opacity's logit, the scales'
-            logarithm, and the quaternions.
+        lr_dc, lr_rest, lr_opacity, lr_scales, lr_quats: learning rates of the constant harmonic,
+            the other harmonics, the opacity's logit, the scales' logarithm, and the
+            quaternions.
         ssim: share of 1 - SSIM in the picture's loss; the rest is L1.
         normal: weight of normal consistency. None: 0.05 for "2d" (published), 0 for "3d".
         distortion: weight of depth distortion. None: 0.01 for "2d", 0 for "3d".
         distortion_form: "l1" or "ordered" (in units of the scene's extent), or "l2_ndc"; see
             :func:`attnwarp.losses.depth_distortion`. "l1" takes twice as long.
-        normal_from, distortion_from: share of the iterations after which these begin (2DGS: 7,000
-            and 3,000 of 30,000).
+        normal_from, distortion_from: share of the iterations after which these losses begin (2DGS:
+            7,000 and 3,000 of 30,000).
         background: colour behind the splats and behind transparent pixels of the images: "black",
-            "white" or "random". Random is another colour each iteration, so that no colour can
-            stand for transparency. "auto" is random for images with transparency, else black.
-        densify: clone, split and prune splats.
+            "white" or "random". Random draws a new colour each iteration, so that no colour can
+            imitate transparency. "auto" is random for images with transparency, else black.
+            ify: True clones, splits and prunes splats.
         densify_from: first iteration at which splats are added.
-        densify_every: iterations between two refinements.
+        densify_every: number of iterations between two refinements.
         densify_until: share of the iterations after which splats are neither added nor removed.
-        grow_gradient: mean norm of the loss's gradient in a splat's position on screen above which
-            it is cloned or split, the screen being 2 wide and high.
-        max_splats: no refinement grows the model beyond this number; those of the largest gradient
-            go first. None: without limit.
-        prune_opacity: splats below this opacity are removed. None: 0.05 for "2d", 0.005 for "3d"
+        grow_gradient: mean norm of the loss's gradient in a splat's screen position above which
+            the splat is cloned or split, for a screen 2 wide and high.
+        max_splats: largest number of splats after a refinement; splats of the largest gradient
+            are preferred. None: no limit.
+        prune_opacity: opacity below which splats are removed. None: 0.05 for "2d", 0.005 for "3d"
             (published).
-        prune_scale: splats larger than this share of the extent are removed, from the first opacity
-            reset on or the middle of ``densify_until``, whichever is earlier.
-        reset_every: iterations after which all opacities are lowered to ``reset_opacity``, as long
-            as splats are added.
+        prune_scale: share of the extent above which splats are removed, from the first opacity
+            reset or the middle of ``densify_until`` on, whichever is earlier.
+        reset_every: number of iterations between resets of all opacities to ``reset_opacity``,
+            while splats are added.
         reset_opacity: opacity after a reset, in (0, 1).
-        antialiased: "3d" only: fit for the opacity-compensated rasteriser.
-        near: nothing nearer to a camera is drawn, as a share of the extent.
-        evaluate_every: iterations between two evaluations on the held-out views, which also the
-            curve of the result is made of.
-        patience: stop when the held-out PSNR has not risen by ``min_gain`` dB in so many
-            evaluations. None: never. One more, at the end of a sitting, does not count. The
-            held-out figures of a fit that stopped early are slightly optimistic.
-        min_gain: see ``patience``, dB.
+        antialiased: True fits "3d" splats for the opacity-compensated rasteriser.
+        near: near-plane depth, as a share of the extent.
+        evaluate_every: number of iterations between two evaluations on the held-out views, which
+            also form the history.
+        patience: number of evaluations after which the fit stops if the held-out PSNR has not risen
+            by ``min_gain`` dB. None: never. The additional evaluation at a process's end does not
+            count. The held-out figures of a fit that stopped early are slightly optimistic.
+        min_gain: least gain for ``patience``, dB.
 
     Raises:
         ValueError: a number out of range or an unknown choice; the message names the field.
@@ -106,7 +106,7 @@ class FitSettings(Settings):
     prune_opacity: Share | None = None
     prune_scale: Annotated[float, Range(1e-6)] = 0.1
     reset_every: Count = 3000
-    reset_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)] = 0.01  # its logit is finite
+    reset_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)] = 0.01  # keeps the logit finite
     antialiased: bool = False
     near: Annotated[float, Range(1e-9)] = 0.01
     evaluate_every: Count = 500

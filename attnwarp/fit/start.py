@@ -1,4 +1,4 @@
-"""The splats a fit begins with."""
+"""First splats of a fit."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from attnwarp.reporting import SILENT, Reporter
 Array = npt.NDArray[np.float64]
 
 FIRST_OPACITY = 0.1
-"""Opacity of every first splat (3DGS)."""
+"""Opacity of the first splats (3DGS)."""
 
 NEIGHBOURS = 3
-"""A first splat is as large as the root mean square distance to so many neighbours (3DGS)."""
+"""Number of neighbours whose root mean square distance is a first splat's size (3DGS)."""
 
 ROUNDINGS = 32
 """Rounding of a camera's position, in float64 epsilons of the largest coordinate.
@@ -45,13 +45,13 @@ def extent_of(cameras: Sequence[Camera], points: Array | None = None) -> float:
     """Size of a scene in its own units: 1.1 times the largest distance of a camera from their mean
     (3DGS).
 
-    Cameras that stand at one place say nothing about it. Then it is the median distance of
-    ``points`` from there.
+    Cameras at one place do not determine the size; it is then the median distance of ``points``
+    from that place.
 
     Args:
-        cameras: at least one.
-        points: (P, 3) world coordinates of what they see. Without any, or where they lie at the
-            cameras' place, the extent of cameras at one place is 1.
+        cameras: cameras, at least one.
+        points: (P, 3) world coordinates of the seen surface. For cameras at one place, the extent
+            is 1 if points are missing or lie at that place too.
 
     Example:
         >>> from attnwarp import Camera
@@ -72,7 +72,7 @@ def extent_of(cameras: Sequence[Camera], points: Array | None = None) -> float:
 def _at_one_place(centers: Array) -> bool:
     """Return True if positions, (N, 3), differ by no more than their float64 rounding.
 
-    The size of the world's unit says nothing about it.
+    The test is independent of the world's unit of length.
     """
     apart = float(np.abs(centers - centers[0]).max())
     return apart <= ROUNDINGS * float(np.finfo(np.float64).eps * np.abs(centers).max())
@@ -88,26 +88,27 @@ def from_points(
     seed: int = 0,
     cameras: Sequence[Camera] = (),
 ) -> Gaussians:
-    """One splat a point: as large as the gaps around it, opacity 0.1, grey where no colour is
-    given.
+    """Create one splat per point: as large as the gaps around the point, opacity 0.1, grey without
+    colours.
 
-    3D splats begin round, and unturned. 2D splats begin as discs that are turned at random (2DGS).
+    3D splats begin round and unrotated. 2D splats begin as randomly rotated discs (2DGS).
 
     Args:
         points: (P, 3) world coordinates, at least one; duplicates are dropped.
         colors: (P, 3) uint8 sRGB.
         kind: "2d" or "3d".
-        sh_degree: room for harmonics up to this degree; all but the constant are 0.
-        seed: seed of the random turns.
-        cameras: that see the points. They size a lone point, which has no gaps around it: a
-            hundredth of the scene's extent (:func:`extent_of`), or of one unit without cameras.
+        sh_degree: highest degree of the allocated harmonics; all but the constant are 0.
+        seed: seed of the random rotations.
+        cameras: cameras that see the points, used to size a lone point, which has no gaps around
+            it: a hundredth of the scene's extent (:func:`extent_of`), or of one unit without
+                cameras.
 
     Returns:
         float32 splats relative to an ``origin`` at the points' median.
 
     Raises:
-        ValueError: no points, a wrong shape or dtype, a coordinate that is not finite, a degree out
-            of range.
+        ValueError: no points, a wrong shape or dtype, a coordinate that is not finite, or a degree
+            out of range.
 
     Example:
         >>> from attnwarp.fit import from_points
@@ -129,11 +130,11 @@ def from_points(
     check.shape(rgb, (len(xyz), 3), "colors")
     if rgb.dtype != np.uint8:
         raise ValueError(f"colors: got {rgb.dtype}, expected uint8")
-    # Two splats at one place have no distance to be sized by, and would stay together for ever.
+    # Two coincident splats have no distance that sizes them, and would never separate.
     _, first = np.unique(xyz, axis=0, return_index=True)
     first.sort()
     xyz, rgb = xyz[first], rgb[first]
-    # The median: a few points far astray must not cost the others their digits.
+    # The median, since a few outliers must not cost the other points their digits.
     origin = np.median(xyz, axis=0)
     local = xyz - origin
     n = len(local)
@@ -145,7 +146,7 @@ def from_points(
     quats = torch.zeros(n, 4, dtype=torch.float32)
     quats[:, 0] = 1
     if kind == "2d":
-        # Four independent normals point evenly over the 3-sphere: every rotation is as likely.
+        # Four independent normals are uniform on the 3-sphere: all rotations are equally likely.
         generator = torch.Generator().manual_seed(seed)
         quats = torch.randn(n, 4, generator=generator, dtype=torch.float32)
         quats = quats / quats.norm(dim=1, keepdim=True)
@@ -163,19 +164,19 @@ def from_points(
 
 
 FAR = 100
-"""Points beyond so many times the usual distance begin no splat. Their first discs would be as
-large, and a few of them outweigh all else in the depth distortion of 2DGS."""
+"""Distance, over the usual distance, beyond which points give no splat. Such first discs would be
+equally large, and a few would outweigh all others in the depth distortion of 2DGS."""
 
 
 def within_reach(points: Array, cameras: Sequence[Camera]) -> npt.NDArray[np.bool_]:
-    """(P,) bool: points that are at most 100 times as far from the cameras as is usual.
+    """Select points at most 100 times as far from the cameras as usual, (P,) bool.
 
-    Usual is the points' median distance, or the scene's extent where that is larger. What is not
-    finite stays, for others to refuse.
+    The usual distance is the points' median distance, or the scene's extent if larger. Non-finite
+    points stay, so that a later check refuses them.
 
     Args:
         points: (P, 3) world coordinates.
-        cameras: that see them, at least one.
+        cameras: cameras that see the points, at least one.
 
     Example:
         >>> import numpy as np
@@ -193,7 +194,7 @@ def within_reach(points: Array, cameras: Sequence[Camera]) -> npt.NDArray[np.boo
 
 
 FIRST_POINTS = 10_000
-"""Random first points, where a data set has none."""
+"""Number of random first points for a dataset without points."""
 
 
 @on_cpu_unless_named
@@ -205,15 +206,15 @@ def first_splats(
     *,
     random: int = FIRST_POINTS,
 ) -> Gaussians:
-    """First splats at a data set's points, or at random ones where it has none.
+    """Create first splats at a dataset's points, or at random points if it has none.
 
     Args:
-        dataset: data set with points and colours.
-        cameras: cameras of the views that are fitted on.
+        dataset: dataset with points and colours.
+        cameras: cameras of the fitted views.
         settings: kind, degree and seed of the splats.
-        report: receives a line where random points are taken, and of points that lie too far
-        away (:func:`within_reach`).
-        random: their number.
+        report: receiver of a line if random points are used, or if points lie too far
+            away (:func:`within_reach`).
+        random: number of random points.
 
     Example:
         >>> from attnwarp import Camera
@@ -253,23 +254,23 @@ def first_splats(
 def random_points(
     cameras: Sequence[Camera], count: int, *, seed: int = 0
 ) -> tuple[Array, npt.NDArray[np.uint8]]:
-    """Random points and colours for data sets without points.
+    """Draw random points and colours for datasets without points.
 
-    They fill a cube about the point that the cameras look at, which is nearest to all optical
-    axes. Half of the cube's edge is the cameras' mean distance from that point. For parallel axes
-    the cube lies in front of the cameras.
+    The points fill a cube around the point nearest to all cameras' optical axes. Half of the cube's
+    edge is the cameras' mean distance from that point. For parallel axes the cube lies in front of
+    the cameras.
 
     Args:
-        cameras: at least one.
+        cameras: cameras, at least one.
         count: number of points, at least 1.
         seed: seed of positions and colours.
 
     Returns:
         points: (count, 3) world coordinates.
-        colors: (count, 3) uint8, at random.
+        colors: (count, 3) uint8, random.
 
     Raises:
-        ValueError: a count below 1; cameras that all stand at one place and look different ways.
+        ValueError: the count is below 1, or cameras at one place look in different directions.
 
     Example:
         >>> import numpy as np
@@ -290,7 +291,7 @@ def random_points(
     middle = centers.mean(0)
     A = across.sum(0)
     meet = np.linalg.eigvalsh(A)[0] > 1e-3 * len(cameras)
-    # Axes that are opposite are parallel, too.
+    # Opposite axes are parallel, too.
     if _at_one_place(centers) and (meet or (forward @ forward[0]).min() < 0):
         raise ValueError(
             "cameras: got cameras that all stand at one place and look different ways, so"

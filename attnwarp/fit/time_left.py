@@ -1,4 +1,4 @@
-"""The time that a fit will take: its iterations grow dearer as splats are added."""
+"""Remaining time of a fit, whose iterations slow down as splats are added."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from attnwarp.fit.settings import FitSettings
 from attnwarp.reporting import Pace
 
 PIXELS_PER_SPLAT = 5
-"""Pixels of a picture that take as long as one splat does, from 14,000 to 112,000 splats at 256 x
+"""Pixels of a picture whose cost equals one splat's, from 14,000 to 112,000 splats at 256 x
 256 px."""
 
 
 class TimeLeft:
-    """Tells the seconds of a fit's iterations to come by the pace of those done.
+    """Estimator of a fit's remaining seconds from the pace of past iterations.
 
-    The work of an iteration is that of its splats and its pixels. Splats are taken to grow by as
-    many a refinement as so far.
+    An iteration's work is the sum of its splats' and its pixels' work. The estimate assumes that
+    refinements keep adding as many splats as before.
 
     Args:
         settings: settings of the fit.
         first: number of the first splats.
-        pixels: pixels of a picture.
+        pixels: number of pixels of a picture.
     """
 
     def __init__(self, settings: FitSettings, first: int, pixels: int) -> None:
@@ -31,9 +31,9 @@ class TimeLeft:
         self._pace, self._done = Pace(), 0
 
     def after(self, iteration: int, splats: int) -> float:
-        """Seconds left when so many iterations are done; NaN while they cannot be told.
+        """Estimate the seconds left after ``iteration`` iterations; NaN while unknown.
 
-        Called after each iteration.
+        Call this after each iteration.
         """
         self._done += splats + self.pixels
         ahead = self._ahead(iteration, splats)
@@ -41,7 +41,7 @@ class TimeLeft:
         return math.nan if ahead is None or left is None else left
 
     def _ahead(self, iteration: int, splats: int) -> float | None:
-        """Work to come; None before two refinements show how splats grow."""
+        """Estimate the remaining work; None before two refinements show the growth."""
         s = self.settings
         last = int(s.densify_until * s.iterations) if s.densify else 0
         times = np.arange(0, last, s.densify_every)

@@ -1,4 +1,4 @@
-"""The pictures that splats are fitted on, with their cameras."""
+"""Pictures that splats are fitted on, with their cameras."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ from attnwarp.io.file import is_file
 from attnwarp.io.images import weighted_by_alpha
 
 HELD_OUT_EVERY = 8
-"""One image of so many is held out where a data set names no split (LLFF's share)."""
+"""Interval of held-out images for a dataset without splits (LLFF's share)."""
 
 HELD_BYTES = 2**31
-"""Bytes of pictures that a GPU keeps: 650 of 1297 x 840 px in 8 bits."""
+"""Limit on the bytes of pictures kept on a GPU: 650 of 1297 x 840 px in 8 bits."""
 
 SAME_POSE = 1e-6
-"""Largest difference of rotations, of places in extents of the cameras, and of focal lengths and
-principal points in sides of the picture, by which two views are one: rounding of printed poses."""
+"""Largest difference between two views that count as one, covering the rounding of printed poses:
+of rotations, of positions in extents of the cameras, of focal lengths and principal points in
+sides."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +41,14 @@ class Views:
     """Posed pictures.
 
     Args:
-        cameras: one for each picture, at least one.
+        cameras: cameras, one for each picture, at least one.
         images: (H, W, 3), or (H, W, 4) with straight (not premultiplied) alpha; sRGB; uint8,
-            uint16, or floating in [0, 1]. They are kept as they are: 8 bits take a quarter of the
+            uint16, or floating in [0, 1]. Their type is kept: 8 bits take a quarter of the
             memory.
 
     Raises:
-        ValueError: lists of different lengths, a picture of another size than its camera's, a wrong
-            dtype, values out of range; the message names the picture.
+        ValueError: the lists differ in length, a picture's size differs from its camera's, or a
+            dtype or value is invalid; the message names the picture.
 
     Example:
         >>> import numpy as np
@@ -97,15 +98,15 @@ class Views:
 
     @cached_property
     def transparent(self) -> bool:
-        """True if any picture has pixels that are not opaque."""
+        """True if any picture has non-opaque pixels."""
         return any(
             image.shape[2] == 4 and bool((image[..., 3] < _top(image)).any())
             for image in self.images
         )
 
     def target(self, index: int, background: check.Array) -> torch.Tensor:
-        """(H, W, 3) float32 picture in [0, 1], over ``background`` (3,) where it is transparent;
-        on the background's device."""
+        """Return a (H, W, 3) float32 picture in [0, 1], composited over ``background`` (3,), on the
+        background's device."""
         image, background = self.images[index], check.tensor(background, "background")
         if background.device.type == "cpu":
             pixels = torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32))
@@ -118,7 +119,7 @@ class Views:
         return picture[..., :3] * alpha + (1 - alpha) * background.to(picture.dtype)
 
     def _on(self, device: torch.device, index: int) -> torch.Tensor:
-        """The pixels of a picture on a GPU, which keeps those of as many pictures as fit."""
+        """Copy a picture's pixels to a GPU, which caches as many pictures as fit."""
         if (device, index) in self._held:
             return self._held[device, index]
         pixels = torch.from_numpy(np.ascontiguousarray(self.images[index])).to(device)
@@ -132,7 +133,7 @@ class Views:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of cameras and pictures: whether a fit that is taken up again has the same
+        """Hash cameras and pictures (SHA-256), to check that a resumed fit has the same
         ones."""
         total = hashlib.sha256()
         for camera, image in zip(self.cameras, self.images, strict=True):
@@ -152,16 +153,17 @@ def load_views(
     max_size: int | None = None,
     damaged: Literal["warn", "error"] = "warn",
 ) -> Views:
-    """Read the pictures of a data set; cameras without one are left out.
+    """Read the pictures of a dataset; cameras without a picture are left out.
 
     Args:
-        dataset: see :func:`attnwarp.io.read_dataset`.
-        max_size: longest side in px; larger pictures are averaged down to it, and their cameras
-            with them.
-        damaged: "error" for pictures to measure on; see :func:`attnwarp.io.read_image`.
+        dataset: dataset, see :func:`attnwarp.io.read_dataset`.
+        max_size: longest side in px; larger pictures and their cameras are averaged down to
+            it.
+        damaged: "error" refuses damaged pictures, for measurements; see
+            :func:`attnwarp.io.read_image`.
 
     Raises:
-        FileFormatError: a picture that cannot be read, or of another size than its camera.
+        FileFormatError: a picture is unreadable, or differs in size from its camera.
         ValueError: no camera has a picture.
 
     Example:
@@ -221,25 +223,25 @@ def _shrink(image: npt.NDArray[Any], longest: int) -> npt.NDArray[Any]:
 
 
 def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Dataset | None]:
-    """The part of a data set to fit on and the part to measure on.
+    """Split a dataset into the part to fit on and the part to measure on.
 
-    Splits of the data set come first: "train", and "test" or else "val".
+    The dataset's splits have priority: "train", and "test" or else "val".
 
     Args:
         dataset: posed images, see :func:`attnwarp.io.read_dataset`.
-        every: without splits, one of so many images is held out, in the order of their names,
-            beginning after the data set's first, which edits take as their source; 0 holds out
-            none.
+        every: interval of held-out images for a dataset without splits, in the order of their
+            names, beginning after the dataset's first, which edits take as their source; 0 holds
+            out none.
 
-    Returns:
-        The part to fit on, and the held-out part or None. A view that is fitted on is not held
-        out: neither under another name or by a link, nor as a copy, nor at the same pose.
+        rns:
+        The part to fit on, and the held-out part or None. A fitted view is never held out: neither
+        under another name or by a link, nor as a copy, nor at the same pose.
 
     Raises:
-        ValueError: the data set's splits leave nothing to fit on, or ``every`` is 1 or negative.
+        ValueError: the dataset's splits leave nothing to fit on, or ``every`` is 1 or negative.
 
     Warns:
-        InputWarning: held-out views that are fitted on, which are left out.
+        InputWarning: held-out views that are also fitted on were left out.
 
     Example:
         >>> from attnwarp import Camera
@@ -274,7 +276,7 @@ def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Da
 
 
 def _apart(train: Dataset, test: Dataset) -> Dataset | None:
-    """The held-out part without views that are fitted on; None where none is left."""
+    """Remove fitted views from the held-out part; None if no view is left."""
     files = _file_keys([*train.image_paths, *test.image_paths])
     again = twins(train.cameras, test.cameras, files[: len(train)], files[len(train) :])
     if not again:
@@ -295,12 +297,12 @@ def twins(
     fitted_keys: Sequence[Collection[Hashable]],
     held_out_keys: Sequence[Collection[Hashable]],
 ) -> dict[int, int]:
-    """The held-out views that are fitted on too, and as which: those with a key in common, or at
-    the same pose.
+    """Find held-out views that are also fitted on, and their fitted twins: views with a common key
+    or at the same pose.
 
     Args:
-        fitted, held_out: cameras of either part.
-        fitted_keys, held_out_keys: keys that tell the pictures apart.
+        fitted, held_out: cameras of each part.
+        fitted_keys, held_out_keys: keys that identify the pictures.
     """
     of_key = {key: j for j, keys in enumerate(fitted_keys) for key in keys}
     both = [*fitted, *held_out]
@@ -326,7 +328,7 @@ def twins(
 
 
 def warn_of_twins(views: Views, held_out: Views) -> None:
-    """Say which held-out pictures are those of views to fit on, by their pixels or pose."""
+    """Warn of held-out pictures that equal fitted views by pixels or pose."""
     keys = [[_pixel_keys(image) for image in each.images] for each in (views, held_out)]
     again = twins(views.cameras, held_out.cameras, *keys)
     if again:
@@ -347,8 +349,8 @@ def _named(again: dict[int, int], fitted: Sequence[Camera], held_out: Sequence[C
 
 
 def _file_keys(paths: Sequence[Path | None]) -> list[set[Hashable]]:
-    """Keys that identify the file of each picture: the file itself, under whatever name, and its
-    content, which is read where another file has the same size.
+    """Collect keys that identify the file of each picture: the file's inode, under any name, and
+    its content, which is only read if another file has the same size.
     """
     stats = [path.stat() if path is not None and is_file(path) else None for path in paths]
     sizes = Counter({(s.st_dev, s.st_ino): s.st_size for s in stats if s is not None}.values())
@@ -360,7 +362,7 @@ def _file_keys(paths: Sequence[Path | None]) -> list[set[Hashable]]:
             keys.add((stat.st_dev, stat.st_ino))
             if sizes[stat.st_size] > 1:
                 content = hashlib.sha256(path.read_bytes()).hexdigest()
-                # Blank views are equal and no copies.
+                # Blank views are equal without being copies.
                 if first.setdefault(content, path) is path or _pixel_keys(read_image(path)):
                     keys.add(content)
         result.append(keys)
@@ -368,7 +370,7 @@ def _file_keys(paths: Sequence[Path | None]) -> list[set[Hashable]]:
 
 
 def _pixel_keys(image: npt.NDArray[Any]) -> set[Hashable]:
-    """Keys that identify a picture by its pixels; none for one colour, as blank views have."""
+    """Collect keys that identify a picture by its pixels; none for a uniform colour."""
     if (image == image[0, 0]).all():
         return set()
     return {hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()}

@@ -1,4 +1,4 @@
-"""Kernels that are compiled before a clock starts."""
+"""Compilation of kernels before timing starts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from attnwarp.render import render
 from attnwarp.reporting import SILENT, Reporter
 
 QUIET_SECONDS = 5.0
-"""A person is told of what takes longer. Loading what is compiled takes about one."""
+"""Log compilation that takes longer than this; loading a cached kernel takes about one second."""
 
 _ready: set[tuple[Kind, str]] = set()
 
@@ -21,15 +21,15 @@ _ready: set[tuple[Kind, str]] = set()
 def compile_kernels(
     kind: Kind, report: Reporter = SILENT, device: torch.device | str = "cpu"
 ) -> None:
-    """Have the renderer and its gradients compiled, or loaded if they were compiled before.
+    """Compile the renderer and its gradients, or load them from the cache.
 
-    Otherwise the first iteration does so, and the seconds of a fit hold a minute that no later fit
-    takes. Further calls in a process do nothing.
+    Otherwise the first iteration compiles them, and the fit's seconds include a minute that no
+    later fit takes. Further calls in a process do nothing.
 
     Args:
         kind: kind of the splats, "2d" or "3d".
-        report: receives one line if it takes seconds.
-        device: where the splats lie: numba compiles for a CPU, Warp for a GPU.
+        report: receiver of one line if compilation takes seconds.
+        device: device of the splats: numba compiles for a CPU, Warp for a GPU.
 
     Example:
         >>> from attnwarp.fit import compile_kernels
@@ -43,7 +43,7 @@ def compile_kernels(
     timer.daemon = True
     timer.start()
     try:
-        # A caller may have switched gradients off.
+        # A caller may have disabled gradients.
         with torch.inference_mode(False), torch.enable_grad():
             _call_all(kind, place)
     finally:
@@ -52,7 +52,7 @@ def compile_kernels(
 
 
 def _call_all(kind: Kind, device: torch.device) -> None:
-    """Render one splat, and its loss's gradients. Fits are in float32, whatever torch's default."""
+    """Render one splat and its loss's gradients, in float32 like fits, for any torch default."""
     single = torch.float32
     means = torch.zeros(1, 3, requires_grad=True, dtype=single)
     disc = Gaussians(
