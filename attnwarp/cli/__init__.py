@@ -1,1 +1,1 @@
-"""The command line: attnwarp. Nothing heavy is imported until a command needs it."""
+"""Command line of attnwarp. Heavy libraries are imported only by the commands that need them."""

@@ -1,4 +1,4 @@
-"""A scene of the evaluation harness in place of a person's capture: `attnwarp edit bear`."""
+"""Scene of the evaluation harness instead of the user's capture: `attnwarp edit bear`."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ import typer
 from attnwarp.reporting import Reporter
 
 VIEWS, SIZE = 24, 128
-"""Pictures of a bundled scene, and their edge in px: the larger size of the bundled editors."""
+"""Number of pictures of a bundled scene, and their side in px: the bundled editors' larger size."""
 
 
 def scenes() -> list[str]:
-    """Names of the scenes that the evaluation harness ships, where it is installed."""
+    """List the scenes of the evaluation harness, if installed."""
     package = find_spec("attnwarp_eval")
     folders = package.submodule_search_locations if package is not None else None
     return sorted(p.stem for folder in folders or () for p in Path(folder, "scenes").glob("*.yaml"))
 
 
 def view_names() -> list[str]:
-    """Names of the views that :func:`capture` renders."""
+    """List the names of the views rendered by :func:`capture`."""
     return [f"images/orbit_{k:03d}_of_{VIEWS}.png" for k in range(VIEWS)]
 
 
 def capture(name: str, folder: Path, report: Reporter) -> Path:
-    """Render a scene's pictures, points and exact masks into a folder; what is there is kept.
+    """Render a scene's pictures, points and exact masks into a folder; a finished one is kept.
 
     Raises:
-        typer.Exit: the harness failed, and said why.
+        typer.Exit: the harness failed and printed the reason.
     """
-    if not (folder / "transforms.json").is_file():  # it is written last
+    if not (folder / "transforms.json").is_file():  # this file is written last
         report.log(f"{name}: a bundled scene; rendering {VIEWS} pictures of it: {folder}")
-        # The library does not import the instrument: its command runs beside this one.
+        # The library must not import the evaluation harness, so its command runs as a subprocess.
         command = [sys.executable, "-m", "attnwarp_eval", "scenes", "export", name, str(folder)]
         options = ["--views", str(VIEWS), "--size", str(SIZE)]
         done = subprocess.run([*command, *options], stdout=subprocess.DEVNULL, check=False)
@@ -46,10 +46,10 @@ def capture(name: str, folder: Path, report: Reporter) -> Path:
 
 
 def exact_masks(folder: Path, instruction: str, report: Reporter) -> Path | None:
-    """Exact masks of the object that an instruction names, in a folder of :func:`capture`.
+    """Find exact masks of the object named by an instruction, in a folder of :func:`capture`.
 
     Returns:
-        The folder of masks; None, which is said, where the instruction names no object.
+        Folder of masks; None, with a report line, if the instruction names no object.
     """
     objects = sorted(path.name for path in (folder / "masks").iterdir())
     words = f" {' '.join(re.findall(r'[a-z0-9]+', instruction.lower()))} "

@@ -1,4 +1,4 @@
-"""attnwarp convert and attnwarp undistort: files for other programs."""
+"""Commands attnwarp convert and attnwarp undistort: files for other programs."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def convert(
 
 
 def _check_start(path: Path) -> None:
-    """Refuse what does not begin as a PLY does, before the seconds of torch's import."""
+    """Refuse a file without a PLY header, before the seconds of torch's import."""
     if path.suffix.lower() == ".splat" or not path.is_file():
         return
     with path.open("rb") as stream:

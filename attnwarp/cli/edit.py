@@ -1,4 +1,4 @@
-"""attnwarp edit."""
+"""Command attnwarp edit."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ from attnwarp.errors import InputWarning
 from attnwarp.reporting import reporter
 
 NO_FEATURES = 0.001
-"""Share of the targets' pixels below which each view was, in effect, edited alone."""
+"""Share of warped target pixels below which each view was effectively edited alone."""
 
 FIT_ITERATIONS, FIT_SPLATS = 3_000, 30_000
-"""Limits of the fit that begins an edit without splats."""
+"""Limits of the fit that precedes an edit without splats."""
 
 
 @options_of(Editing, Reading)
@@ -216,7 +216,7 @@ def edit(
         results = ("edited.ply", "edited-3dgs.ply")
         files = [path for path in (source_picture, ply, editing.mask) if path is not None]
         check_inputs_stay((out / name for name in results), files)
-        guide_of(editor)  # refuses what is no editor
+        guide_of(editor)  # refuses an unknown editor
         check_words(editor, instruction, anyway=anyway)
         from attnwarp import check, methods
         from attnwarp.editing.segment import check_marks
@@ -298,7 +298,7 @@ def edit(
 
 
 def _check_splat_options(ply: Path | None, of_fit: dict[str, Any], of_file: dict[str, Any]) -> None:
-    """Refuse options that would change nothing."""
+    """Refuse options that would have no effect."""
     for name, value in (of_file if ply is None else of_fit).items():
         if value is not None:
             raise ValueError(

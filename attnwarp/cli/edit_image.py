@@ -1,4 +1,4 @@
-"""The command attnwarp edit-image. Nothing heavy is imported until it runs."""
+"""Command attnwarp edit-image. Heavy libraries are imported only when it runs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 TILE_COLUMNS = 5
 
 MOST_STRETCH = 0.03
-"""Change of a picture's shape that is not worth a word."""
+"""Largest change of a picture's aspect ratio that is not reported."""
 
 PictureEditorOption = Annotated[
     str,
@@ -169,7 +169,7 @@ def edit_image(
         )
     edited = result.images[0]
     masked = edited if share is None else share * edited + (1 - share) * image
-    # The photograph's own detail stays, and gets the change, enlarged.
+    # The photograph keeps its detail, and the enlarged change is added.
     _write(out, enlarged_change(whole, masked.astype(np.float32)))
     if sheet is not None:
         _write(sheet, _sheet(tiles))
@@ -177,8 +177,8 @@ def edit_image(
 
 
 def _read(path: Path) -> Image:
-    """(H, W, 3) sRGB in [0, 1], turned as its EXIF tag asks; transparent pixels are laid over
-    black, as in a scene's edit.
+    """Read a picture, (H, W, 3) sRGB in [0, 1], in EXIF orientation; transparent pixels are
+    composited over black, as in a scene's edit.
     """
     import numpy as np
 
@@ -190,7 +190,7 @@ def _read(path: Path) -> Image:
 
 
 def _fit(image: Image, longest: int, multiple: int) -> Image:
-    """The picture with that longest side, its sides rounded to multiples."""
+    """Resize a picture to a longest side, rounding its sides to multiples."""
     import cv2
     import numpy as np
 
@@ -204,7 +204,7 @@ def _fit(image: Image, longest: int, multiple: int) -> Image:
 
 
 def _tell_stretch(before: Sequence[int], after: Sequence[int], multiple: int) -> None:
-    """Warn of a picture whose shape is clearly another once its sides are multiples."""
+    """Warn if rounding the sides to multiples clearly changes a picture's aspect ratio."""
     import warnings
 
     h, w = before[:2]
@@ -220,7 +220,7 @@ def _tell_stretch(before: Sequence[int], after: Sequence[int], multiple: int) ->
 
 
 def _sheet(tiles: list[Image]) -> Image:
-    """Pictures side by side, white where a row has none left."""
+    """Arrange pictures in a grid; empty cells are white."""
     import numpy as np
 
     blank = np.ones_like(tiles[0])

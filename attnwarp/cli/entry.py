@@ -1,4 +1,4 @@
-"""Beginning and end of both commands: a stop is one line from the first moment to the last."""
+"""Entry and exit of both commands: an interruption prints one line at any moment."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from typing import Any
 from attnwarp import process
 
 STOPPED = 130
-"""Exit code after Ctrl-C, a polite kill or the terminal's end, as shells have it for Ctrl-C."""
+"""Exit code after Ctrl-C, SIGTERM or SIGHUP; shells use it for Ctrl-C."""
 
 
 def enter(name: str, module: str) -> None:
     """Import a command and run its ``main``.
 
     Args:
-        name: name of the command, with which its messages begin.
-        module: where its ``main`` is.
+        name: name of the command, the prefix of its messages.
+        module: module of the command's ``main``.
     """
 
     def leave(*_: Any) -> None:
-        # Not by an exception: where an import, a destructor or the interpreter's end runs, one
-        # becomes pages of others.
+        # No exception: raised inside an import, a destructor or the interpreter's shutdown, it
+        # would print pages of further errors.
         os.write(2, f"{name}: stopped; nothing was written\n".encode())
         os._exit(STOPPED)
 
     before = signal.getsignal(signal.SIGINT)
     heeds = before is signal.default_int_handler  # a shell's background job ignores Ctrl-C
-    # Before its import's end, a command has nothing to keep.
+    # A command has nothing to save before its import ends.
     early = [*process.heeded(process.STOPS), *([signal.SIGINT] if heeds else [])]
     for number in early:
         signal.signal(number, leave)
@@ -45,7 +45,7 @@ def enter(name: str, module: str) -> None:
         leave()
     except SystemExit as done:
         if process.interrupted and isinstance(done.code, int):
-            # Libraries whose import was cut end the interpreter with codes of their own.
+            # Libraries with an interrupted import end the interpreter with different exit codes.
             atexit._run_exitfuncs()
             os._exit(done.code)
         raise
@@ -55,7 +55,7 @@ def enter(name: str, module: str) -> None:
 
 
 def expanded(argument: str) -> str:
-    """An argument with the home folder that it begins with: a shell leaves ``--out=~/x`` alone.
+    """Expand an argument's leading home folder, since a shell leaves ``--out=~/x`` unexpanded.
 
     Example:
         >>> import os
@@ -69,4 +69,4 @@ def expanded(argument: str) -> str:
         option, equals, value = argument.rpartition("=")
     if not value.startswith("~"):
         return argument
-    return option + equals + os.path.expanduser(value)  # noqa: PTH111  (keeps a last slash)
+    return option + equals + os.path.expanduser(value)  # noqa: PTH111  (keeps a trailing slash)

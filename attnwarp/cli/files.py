@@ -1,4 +1,4 @@
-"""Files that commands read and write."""
+"""Files read and written by commands."""
 
 from __future__ import annotations
 
@@ -20,32 +20,33 @@ if TYPE_CHECKING:
     from attnwarp.reporting import Reporter
 
 COVERED = 0.002
-"""Share of a picture, 8 pixels of 64 x 64, below which splats leave nothing to edit in it."""
+"""Share of a picture that splats must cover to be editable: 8 pixels of 64 x 64."""
 
 LOOK_SIZE = 256
-"""Longest side in px of the renders that look for splats: a photograph's own takes its seconds."""
+"""Longest side in px of renders that search for splats; full size would take seconds."""
 
 LOOKS = 6
-"""Views whose renders are held against their pictures."""
+"""Number of views whose renders are compared with their pictures."""
 
 ALIKE = 18.0
-"""dB of renders above which splats fit their pictures for certain."""
+"""PSNR of renders, dB, above which splats certainly fit their pictures."""
 
 UNSEEN = (
     "check that the splats and the cameras are of one scene, in the same coordinates and the same"
     " units"
 )
-"""Remedy in messages where cameras do not see splats."""
+"""Remedy in messages if cameras do not see splats."""
 
 
 def read_views(path: Path, reading: Reading, **options: Any) -> Dataset:
-    """The data set at ``path``; whoever gives a scene in its place is told how a scene becomes
-    one.
+    """Read the dataset at ``path``. A scene name raises an error that explains how to export
+    it.
 
     Args:
-        path: as typed.
-        reading: the options that a person may type.
-        options: the command's own keywords of `attnwarp.io.read_dataset`, which go before those.
+        path: path as typed.
+        reading: reading options of the command line.
+        options: keywords of `attnwarp.io.read_dataset` set by the command, which override reading
+            options.
     """
     from attnwarp.io import read_dataset
 
@@ -69,7 +70,7 @@ def read_views(path: Path, reading: Reading, **options: Any) -> Dataset:
 def read_splats(
     path: Path, kind: Kind | None, antialiased: bool | None, screen_filter: float | None = None
 ) -> Gaussians:
-    """The splats of a .ply or .splat file; the other arguments overrule what it says."""
+    """Read the splats of a .ply or .splat file; the other arguments override the file."""
     from dataclasses import replace
 
     from attnwarp.io import read_ply, read_splat
@@ -98,8 +99,8 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera], report:
     Args:
         path: path of the splats, for the message.
         splats: splats of the scene.
-        cameras: cameras of the data set; the first that sees splats ends the search.
-        report: receives a line where kernels are compiled first.
+        cameras: cameras of the dataset; the first that sees splats ends the search.
+        report: receiver of a line if kernels must be compiled.
 
     Raises:
         InputError: the splats cover less than :data:`COVERED` of every view.
@@ -122,12 +123,12 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera], report:
 
 
 def note_held_out(path: Path, dataset: Dataset, index: int) -> str:
-    """Sentence of an edit's source that splats were not fitted to; empty where nothing says so.
+    """Write a sentence if the edit's source was not fitted; empty if fitted or unknown.
 
     Args:
-        path: path of the splats. A fit writes the views that it held out beside them.
+        path: path of the splats. A fit writes its held-out views to the same folder.
         dataset: views, with their splits.
-        index: number of the source among those with a picture.
+        index: number of the source among views with a picture.
     """
     from attnwarp.io.names import file_stems
 
@@ -145,14 +146,14 @@ def note_held_out(path: Path, dataset: Dataset, index: int) -> str:
 
 
 def warn_of_misfit(path: Path, splats: Gaussians, dataset: Dataset) -> None:
-    """Warn of splats whose renders are unlike the pictures, such as splats that a trainer moved.
+    """Warn of splats whose renders differ from the pictures, such as splats moved by a trainer.
 
-    A render that is farther from the picture than one colour a view explains nothing of it.
+    A render farther from its picture than a uniform colour explains nothing of the picture.
 
     Args:
         path: path of the splats, for the message.
         splats: splats of the scene.
-        dataset: its views.
+        dataset: views of the scene.
     """
     psnr, plain = likeness(splats, dataset)
     if psnr < min(plain, ALIKE):
@@ -166,8 +167,8 @@ def warn_of_misfit(path: Path, splats: Gaussians, dataset: Dataset) -> None:
 
 
 def likeness(splats: Gaussians, dataset: Dataset) -> tuple[float, float]:
-    """PSNR in dB of renders of some views against their pictures, where splats cover them, and that
-    of one colour a view; infinite where they cover none.
+    """Compute the PSNR in dB, where splats cover some views, of renders and of one uniform colour
+    per view; infinite if splats cover none.
     """
     import numpy as np
     import torch
@@ -205,16 +206,16 @@ def likeness(splats: Gaussians, dataset: Dataset) -> tuple[float, float]:
 
 
 def check_inputs_stay(results: Iterable[Path], read: Iterable[Path | None]) -> None:
-    """Refuse to write over what a command reads, under one name or two, or by a link.
+    """Refuse to overwrite a command's inputs, under the same or another name, or by a link.
 
     Args:
         results: files that the command writes.
-        read: files that it is given; None where there is none.
+        read: input files of the command; None entries are skipped.
 
     Raises:
-        InputError: a result would replace a file that is read.
+        InputError: a result would replace an input.
     """
-    # A PLY that is written to a link goes to the file that it leads to.
+    # Writing a PLY to a link replaces the link's target.
     existing = {_identity(look): path for path in results for look in (path.lstat, path.stat)}
     existing.pop(None, None)
     for path in read:
@@ -230,7 +231,7 @@ def check_inputs_stay(results: Iterable[Path], read: Iterable[Path | None]) -> N
 
 
 def _identity(look: Callable[[], os.stat_result]) -> tuple[int, int] | None:
-    """The file system's own name of a file; None where there is none."""
+    """Return a file's device and inode; None if the file does not exist."""
     try:
         status = look()
     except OSError:
@@ -239,7 +240,7 @@ def _identity(look: Callable[[], os.stat_result]) -> tuple[int, int] | None:
 
 
 def write_image(path: Path, rgb: Any) -> None:
-    """(H, W, 3) sRGB in [0, 1] as an 8-bit PNG, atomically."""
+    """Write (H, W, 3) sRGB in [0, 1] as an 8-bit PNG, atomically."""
     from attnwarp.io.file import write_atomically
     from attnwarp.io.picture import encode_picture
 

@@ -1,4 +1,4 @@
-"""attnwarp fit."""
+"""Command attnwarp fit."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ OWN_OPTIONS = {
 
 
 OVERFITTED = 0.5
-"""Fall of the held-out PSNR from its best, dB, that is said; the last evaluations of a sound fit
-differ by less."""
+"""Fall of the held-out PSNR from its best, dB, that triggers a message; the last evaluations of a
+sound fit differ by less."""
 
 
 RESULTS = ("splats.ply", "checkpoint.pt", "history.jsonl", "settings.json")
-"""Files of a fit beside ``held_out``."""
+"""Files of a fit, in addition to ``held_out``."""
 
 
 @options_of(Reading)
@@ -110,7 +110,7 @@ def fit(
         f"stopped; what {out} holds is whole, and the same command goes on from its checkpoint"
     )
     with clear_errors(stopped, out), reporter(title=out.name) as report:
-        # What needs nothing heavy is read first: a typing error is answered at once.
+        # Inputs that need no heavy library are read first, to report typing errors at once.
         changes = assignments(change or [], OWN_OPTIONS)
         check_out(out)
         if start is not None and points is not None:
@@ -149,9 +149,9 @@ def fit(
 
 
 def _warn_of_overfit(result: Fit) -> None:
-    """Say whether held-out views were nearer to their pictures before."""
+    """Report if held-out views were nearer to their pictures in an earlier evaluation."""
     every, whole = result.settings.evaluate_every, result.stopped == "iterations"
-    # Where a fit was stopped, opacities may just have been lowered.
+    # A stopped fit may have just lowered its opacities.
     said = [(r.psnr, r.iteration) for r in result.history if whole or r.iteration % every == 0]
     known = [(psnr, iteration) for psnr, iteration in said if psnr is not None]
     if not known or max(known)[0] <= known[-1][0] + OVERFITTED:
@@ -195,7 +195,7 @@ def _fit(
     report: Reporter,
     **options: Any,
 ) -> Fit:
-    """The fit, with settings in place of the default ones; ``options`` are those of
+    """Run the fit, with settings that replace the defaults; ``options`` are those of
     :func:`attnwarp.fit.fit`.
     """
     import attnwarp.fit
@@ -207,7 +207,7 @@ def _fit(
     settings = attnwarp.fit.FitSettings.from_dict(changes)
     device = choose(device, report)
     dataset = read_views(data, reading)
-    # A view without a picture can be neither fitted on nor held out.
+    # A view without a picture can be neither fitted nor held out.
     there = [k for k, path in enumerate(dataset.image_paths) if path is not None]
     dataset = dataset.select(there) if there else dataset
     train, test = attnwarp.fit.hold_out(dataset, every)
@@ -244,15 +244,15 @@ def _fit(
 
 
 def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
-    """Write the settings, the curve, and the held-out views beside their pictures; print how near
-    each of these comes to its picture.
+    """Write the settings, the history, and the held-out views with their pictures; print each
+    view's distance from its picture.
     """
     from dataclasses import asdict
 
     from attnwarp.io.file import write_atomically
     from attnwarp.io.names import file_stems
 
-    # A held-out picture that is met exactly has an infinite PSNR, which JSON has not.
+    # An exactly reproduced picture has an infinite PSNR, which JSON lacks.
     rows = [
         {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
         for row in map(asdict, result.history)

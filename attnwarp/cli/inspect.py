@@ -1,4 +1,4 @@
-"""attnwarp inspect: attnwarp-eval's command, for a person's own scene."""
+"""Command attnwarp inspect: attnwarp-eval's command for the user's scene."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def inspect(
 
     if find_spec("attnwarp_eval") is None:
         raise fail(f"inspect: needs the package attnwarp_eval; {install_command('inspect')}")
-    # The library does not import the instrument: this process becomes its command.
+    # The library must not import the evaluation harness, so this process executes its command.
     become = "from attnwarp.cli.entry import enter; enter('attnwarp', 'attnwarp_eval.cli.main')"
     command = [sys.executable, "-c", become, "inspect", str(splats), "--data", str(data)]
     os.execv(sys.executable, [*command, *context.args])

@@ -1,4 +1,4 @@
-"""The command attnwarp, and what it does at its end."""
+"""Command attnwarp, and its handling of errors at the end."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ app.command("edit-image")(shell.clear_errors()(edit_image))
 
 
 def main(name: str = "attnwarp") -> None:
-    """Entry point of the console script."""
+    """Run the console script."""
     shell.run(app, name)
 
 

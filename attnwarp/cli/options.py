@@ -1,4 +1,4 @@
-"""Options that several commands share."""
+"""Options shared by several commands."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 
 class Kind(StrEnum):
-    """Values of the option for the kind of splats."""
+    """Values of the option ``--kind`` of splats."""
 
     two = "2dgs"
     three = "3dgs"
 
 
 class Format(StrEnum):
-    """Values of the option for the format of a data set."""
+    """Values of the option for the format of a dataset."""
 
     transforms = "transforms"
     colmap = "colmap"
@@ -60,13 +60,13 @@ class Coordinates(StrEnum):
 PANELS = (MARKING, METHOD, SPLATS, PAGE, MACHINE, READING) = (
     "What is edited", "The method", "Splats", "The page", "The machine", "Reading DATA",
 )  # fmt: skip
-"""Panels of the help in their order, below that of the options that most calls have."""
+"""Panels of the help in order, below the panel of common options."""
 
 MOST_PIXELS = 4096
-"""Longest side that an edit works at; more is a typing error that would take all the memory."""
+"""Longest side of an edit; a larger value is a typing error that would exhaust the memory."""
 
 SEGMENTER = "clip-parts"
-"""Segmenter of ``--where`` if ``--segmenter`` is left out."""
+"""Segmenter of ``--where`` if ``--segmenter`` is omitted."""
 
 InstructionOption = Annotated[str, typer.Option(help='What to change, such as "make it red".')]
 
@@ -210,7 +210,7 @@ AntialiasedOption = Annotated[
 
 @dataclass(frozen=True)
 class Reading:
-    """Options of reading a data set: the keywords of `attnwarp.io.read_dataset`, each an option."""
+    """Options of reading a dataset: one per keyword of `attnwarp.io.read_dataset`."""
 
     format: Annotated[
         Format | None,
@@ -267,7 +267,7 @@ def check_segmenter(segmenter: str | None, words: str | None) -> None:
 
 @dataclass(frozen=True)
 class Marking:
-    """Options of marking what is edited."""
+    """Options that mark the edited part."""
 
     source: Annotated[
         str | None,
@@ -299,10 +299,10 @@ class Marking:
     ] = None
 
     def marks(self) -> Marks:
-        """The marks.
+        """Build the marks.
 
         Raises:
-            InputError, ValueError: two ways to mark what is edited, or one that says nothing.
+            InputError, ValueError: two kinds of marks are given, or a mark is empty.
         """
         check_segmenter(self.segmenter, self.words)
         from attnwarp.methods.marks import Marks, numbers
@@ -348,10 +348,10 @@ class Editing(Marking):
     ] = None
 
     def checked(self) -> EditOptions:
-        """The options as an edit takes them.
+        """Check the options and convert them for an edit.
 
         Raises:
-            InputError, ValueError: two ways to mark what is edited, or one that says nothing.
+            InputError, ValueError: two kinds of marks are given, or a mark is empty.
         """
         from attnwarp.methods.command import EditOptions
 
@@ -364,13 +364,13 @@ class Editing(Marking):
 def options_of(
     *groups: type[Any], without: str | None = None
 ) -> Callable[[Callable[..., None]], Any]:
-    """Give a command an option for each field of dataclasses, in place of an argument for each.
+    """Replace a command's dataclass arguments by one option for each field.
 
-    Typer reads a command's options from its signature, so the fields are put there.
+    Typer reads a command's options from its signature, so the fields are added there.
 
     Args:
-        groups: `Reading` for the argument ``reading``, `Editing` for ``editing``.
-        without: a field that is no option of this command and keeps its default.
+        groups: dataclass by argument name: `Reading` for ``reading``, `Editing` for ``editing``.
+        without: name of a field that is no option of this command and keeps its default.
     """
     fields = {
         group: [
@@ -401,7 +401,7 @@ def options_of(
 
 
 def _place(option: inspect.Parameter) -> int:
-    """Place of an option's panel in the help."""
+    """Return the position of an option's panel in the help."""
     panel = option.annotation.__metadata__[0].rich_help_panel
     return PANELS.index(panel) if panel in PANELS else -1
 

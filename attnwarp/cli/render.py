@@ -1,4 +1,4 @@
-"""attnwarp render."""
+"""Command attnwarp render."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def render(
 
         use_threads(threads)
         splats = read_splats(model, kind, antialiased, screen_filter)
-        # Cameras are resized to their images, so those must be there.
+        # Cameras are resized to their images, so the images must exist.
         missing = "error" if reading.scale > 1 else "none"
         dataset = read_views(cameras, reading, missing_images=missing, points=False)
         views = dataset.cameras

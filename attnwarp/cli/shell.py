@@ -1,4 +1,4 @@
-"""End of every command: exit codes, errors as one line, Ctrl-C; and the threads that it uses."""
+"""Exit of every command: exit codes, one-line errors, Ctrl-C; and its number of threads."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from attnwarp.process import (
 )
 
 USAGE = 2
-"""Exit code of everything that a person can mend: arguments, files, folders."""
+"""Exit code of errors that the user can fix: arguments, files, folders."""
 
 
 CLOSED_PIPE = 141
-"""Exit code when nobody reads the output any more (128 + SIGPIPE, as shells have it)."""
+"""Exit code after the reader closes the output (128 + SIGPIPE, as in shells)."""
 
 
 CRASH = 70
-"""Exit code of a fault of the program, as in sysexits. Python's own is 1, which is a regression."""
+"""Exit code of an internal error, as in sysexits. Python's code 1 means a regression here."""
 
 NOTHING = "stopped; nothing was written"
 
@@ -45,25 +45,25 @@ _printed: set[str] = set()
 
 
 def begin(name: str) -> None:
-    """Take the name with which a command's messages begin."""
+    """Set the command name, the prefix of all messages."""
     global _program
     _program = name
     _printed.clear()
 
 
 def fail(message: str, code: int = USAGE) -> typer.Exit:
-    """Say what went wrong on stderr; raise what this returns."""
+    """Print an error on stderr; the caller raises the returned exception."""
     log(message)
     return typer.Exit(code)
 
 
 def log(message: str) -> None:
-    """Print a line on stderr that begins with the command's name."""
+    """Print a line on stderr, prefixed by the command's name."""
     typer.echo(f"{_program}: {message}", err=True)
 
 
 def warn(text: str) -> None:
-    """Print a warning on stderr, once a command: inputs are read more than once."""
+    """Print a warning on stderr, once per command, since inputs are read repeatedly."""
     if text not in _printed:
         _printed.add(text)
         log(f"warning: {text}")
@@ -73,14 +73,14 @@ def warn(text: str) -> None:
 def clear_errors(
     stopped: str = NOTHING, out: Path | None = None, *, strict: bool = False
 ) -> Iterator[None]:
-    """Turn errors about a person's input into one clear line and exit code 2.
+    """Turn errors about the user's input into one clear line and exit code 2.
 
     Args:
-        stopped: message after Ctrl-C, a polite kill or the terminal's end.
-        out: folder of the results that it speaks of, if it does; nothing was written while it is
-            not there.
-        strict: errors but InputError are faults of the program, and leave as they are; Python's
-            warnings are shown.
+        stopped: message after Ctrl-C, SIGTERM or SIGHUP.
+        out: folder of the results mentioned in ``stopped``, if any; while it does not exist,
+            nothing was written.
+        strict: True lets all errors but InputError propagate as internal errors, and shows Python's
+            warnings.
     """
     show_others = warnings.showwarning
 
@@ -96,7 +96,7 @@ def clear_errors(
                 warnings.simplefilter("always", InputWarning)
             warnings.showwarning = show
             yield
-    except typer.Exit:  # a RuntimeError too
+    except typer.Exit:  # a subclass of RuntimeError
         raise
     except KeyboardInterrupt:
         raise fail(stopped if out is None or out.exists() else NOTHING, STOPPED) from None
@@ -114,19 +114,19 @@ def clear_errors(
         package = error.name or str(error)
         raise fail(f"needs the package {package}: pip install {package.split('.')[0]}") from None
     except (ValueError, RuntimeError) as error:
-        loop = "Symlink loop" in str(error)  # of Path.resolve() before Python 3.13
+        loop = "Symlink loop" in str(error)  # raised by Path.resolve() before Python 3.13
         if strict and not loop:
             raise
         raise fail(f"{error}; name another path" if loop else str(error)) from None
 
 
 def file_error(error: OSError) -> str:
-    """One line about a file that the system refused, with the remedy."""
+    """Describe a file error of the system in one line, with a remedy."""
     text = str(error)
     if isinstance(error, TimeoutError | ConnectionError) and not error.filename:  # such as dask's
         text = f"{type(error).__name__}: {text}".removesuffix(": ")
         return f"a connection between processes failed ({text}); run the same command again"
-    if error.strerror is None:  # the library's own, which says what to do
+    if error.strerror is None:  # the library's error, which includes a remedy
         return text
     name = f"{error.filename}: " if error.filename else ""
     if isinstance(error, FileExistsError) and Path(error.filename or "").is_symlink():
@@ -136,15 +136,15 @@ def file_error(error: OSError) -> str:
 
 
 def closed_pipe() -> typer.Exit:
-    """Let what is still to be flushed go nowhere, as the reader of the output has gone."""
-    with suppress(OSError, ValueError):  # no real stream, as under a test's runner
+    """Discard unflushed output, since its reader has closed the pipe."""
+    with suppress(OSError, ValueError):  # not a real stream, as under a test runner
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return typer.Exit(CLOSED_PIPE)
 
 
 def check_out(out: Path) -> None:
-    """A mistaken --out is answered before the work, not after it; the folder is made once there is
-    something for it.
+    """Check --out before the work, so that an error appears early; the folder is created with the
+    first result.
     """
     if out.exists() and not out.is_dir():
         raise NotADirectoryError(
@@ -159,14 +159,14 @@ COMMANDS = {
         "metrics", "encoders", "doctor", "scenes", "userstudy", "cache",
     ),
 }  # fmt: skip
-"""Commands that one program has and the other lacks."""
+"""Commands available in only one of the two programs."""
 
 
 class Program(TyperGroup):
-    """Commands of a program; one that the other program has is said to be there."""
+    """Commands of a program; a command of the other program gets a hint."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that the first argument names."""
+        """Find the command named by the first argument."""
         for name, commands in COMMANDS.items():
             if args[0] in commands and args[0] not in self.commands:
                 raise fail(f"{args[0]} is a command of {name}: {shlex.join([name, *args])}")
@@ -174,8 +174,8 @@ class Program(TyperGroup):
 
 
 def use_threads(threads: int | None) -> None:
-    """Threads for the renderer alone: the rest is too small for them, and its bits would depend on
-    their number.
+    """Set the threads of the renderer only: other work is too small to gain, and its bits would
+    depend on the number of threads.
     """
     import cv2
     import torch
@@ -188,11 +188,11 @@ def use_threads(threads: int | None) -> None:
 
 
 def assignments(changes: list[str], options: dict[str, str]) -> dict[str, Any]:
-    """NAME=VALUE with JSON values; a bare word is text.
+    """Parse NAME=VALUE with JSON values; a bare word is text.
 
     Args:
-        changes: as typed.
-        options: names that have an option of their own, and that option.
+        changes: assignments as typed.
+        options: names with a separate option, mapped to that option.
     """
     values: dict[str, Any] = {}
     for change in changes:
@@ -209,11 +209,11 @@ def assignments(changes: list[str], options: dict[str, str]) -> dict[str, Any]:
 
 
 def run(app: typer.Typer, name: str) -> None:
-    """Run a command line to its exit code: the entry point of either program.
+    """Run a command line to its exit code: the entry point of both programs.
 
     Args:
-        app: the command line.
-        name: with which its messages begin.
+        app: command line of the program.
+        name: name of the program, the prefix of its messages.
     """
     skip_last_collection()
     resend_lost_interrupts()
@@ -225,11 +225,11 @@ def run(app: typer.Typer, name: str) -> None:
             sys.stdout.flush()
     except BrokenPipeError:
         sys.exit(closed_pipe().exit_code)
-    except OSError as error:  # output that cannot be written
+    except OSError as error:  # unwritable output
         closed_pipe()
         sys.exit(fail(file_error(error)).exit_code)
     except SystemExit as done:
-        # Typer's own code for a closed pipe is 1; a regression has a type of its own.
+        # Typer's code for a closed pipe is 1; a regression has a separate exception type.
         sys.exit(CLOSED_PIPE if done.code == 1 and type(done) is SystemExit else done.code)
     except Exception as error:
         if process.interrupted:
