@@ -1,4 +1,4 @@
-"""A run against a baseline: whether anything got worse."""
+"""Comparison of a run with a baseline, to find regressions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The baseline's file: sorted JSON lines, one a cell for its counters and one a (cell, metric)."""
+"""The baseline's file: sorted JSON lines, one per cell, and one per (cell, metric)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from attnwarp_eval.compare.snapshot import Figure, Measured, Snapshot
 from attnwarp_eval.files import write_atomic
 
 FORMAT = 1
-"""Version of the file's layout; a reader refuses others."""
+"""Version of the file's layout; readers refuse other versions."""
 
 REMEDY = "take the file from version control again, or delete it and write it anew with --update"
 
 
 class BaselineError(InputError):
-    """A baseline that cannot be used; the message says which and what to do."""
+    """A baseline that cannot be used; the message names it and the remedy."""
 
 
 def write_baseline(path: Path, snapshot: Snapshot) -> None:
@@ -54,7 +54,7 @@ def write_baseline(path: Path, snapshot: Snapshot) -> None:
 
 
 def _seal(header: dict[str, Any], lines: list[str]) -> str:
-    """The checksum over the first line, but for the checksum itself, and all that follow."""
+    """The checksum over the first line, without the checksum, and all following lines."""
     first = canonical_json({key: value for key, value in header.items() if key != "sha256"})
     return hashlib.sha256("\n".join([first, *lines]).encode()).hexdigest()
 
@@ -84,8 +84,8 @@ def read_baseline(path: Path) -> Snapshot:
         path: path of the JSON lines that ``compare --update`` wrote.
 
     Raises:
-        BaselineError: it is not a baseline, or was changed since it was written.
-        OSError: it cannot be read.
+        BaselineError: the file is not a baseline, or was changed after it was written.
+        OSError: the file cannot be read.
 
     Example:
         >>> from pathlib import Path
@@ -131,7 +131,7 @@ def _parse(first: str, lines: list[str]) -> Snapshot:
 
 
 def _add(cells: list[Measured], data: dict[str, Any]) -> None:
-    """Add a line to the cells: its own cell, or a figure of the last one."""
+    """Add a line to the cells: a new cell, or a figure of the last one."""
     name = (data["scene"], data["probe"], tuple(map(str, data["variants"])), int(data["seed"]))
     if "counters" in data:
         counters = {key: int(value) for key, value in data["counters"].items()}

@@ -1,7 +1,7 @@
 """Verdicts of a run against a baseline. Pure: two snapshots in, one comparison out.
 
 Two cells of one definition and one seed are the same computation, so their figures are compared
-view by view. Where the seeds differ they are samples, and the difference is tested over scenes,
+view by view. Cells with different seeds are samples, and the difference is tested over scenes,
 with the p-values of all tests adjusted together.
 """
 
@@ -29,12 +29,12 @@ from attnwarp_eval.study.probe import probe as probe_of
 Verdict = Literal["worse", "better", "equal", "can't tell"]
 
 FEWEST_SCENES = 6
-"""A test over fewer pairs of scenes flags nothing."""
+"""Fewest pairs of scenes with which a test can flag a difference."""
 
 NOT_IN_STUDY = "not in the run's study"
 
 SEVERAL_VIEWS = 3
-"""Views of a scene that other seeds hardly leave undefined all at once."""
+"""Number of a scene's views that are unlikely to be all undefined by a change of seed."""
 
 FaultKind = Literal["missing", "unmeasured", "redefined", "counter"]
 
@@ -44,11 +44,11 @@ class Fault:
     """A failure that is not a metric regression.
 
     Attributes:
-        kind: ``missing``: the baseline has it and the run lacks it; ``unmeasured``: scenes,
-            variants, probes or seeds of which the run has nothing; ``redefined``: the cell
-            computes something else; ``counter``: its work is another.
+        kind: ``missing``: present in the baseline, absent in the run; ``unmeasured``: scenes,
+            variants, probes or seeds without any cell in the run; ``redefined``: the cell
+            computes something else; ``counter``: its work differs.
         name: name of the cell, metric or view.
-        detail: expected value and the value that came.
+        detail: expected and actual value.
     """
 
     kind: FaultKind
@@ -62,16 +62,16 @@ class Row:
 
     Attributes:
         probe, variant, metric: probe, variant and metric.
-        verdict: "equal" only where the margin shows it.
-        baseline, run: means over scenes of the means over the views that both sides define.
-        difference: run - baseline, paired on scene and view; of absolute values where a figure is
-            best at 0.
-        adjusted_p: p-value of the difference, for all tests of the comparison; NaN where none was
-            made.
-        worst: the view that got worse most (``scene/view/seed``), with its two values.
-        undefined: views whose value was defined in the baseline only, in whatever seed.
+        verdict: verdict; "equal" only if shown within the margin.
+        baseline, run: means over scenes of the means over the views defined on both sides.
+        difference: run - baseline, paired on scene and view; of absolute values for a figure that
+            is best at 0.
+        adjusted_p: p-value of the difference, adjusted for all tests of the comparison; NaN without
+            a test.
+        worst: the view with the largest worsening (``scene/view/seed``), with its two values.
+        undefined: views whose value was defined in the baseline only, for any seed.
         beyond_margin: views of the same seed that got worse by more than the metric's margin; one
-            is enough for "worse", whatever the mean does.
+            is enough for "worse", regardless of the mean.
     """
 
     probe: str
@@ -94,13 +94,13 @@ class Comparison:
     Attributes:
         study: name of the run's study.
         exact: whether both sides have the same seeds, so that views are compared one by one.
-        scenes: how many the figure with most of them was compared on; hard cases are none.
-        rows: one a (probe, variant, metric) that both sides have.
+        scenes: number of scenes of the most widely compared figure; hard cases do not count.
+        rows: one for each (probe, variant, metric) on both sides.
         faults: failures without a figure.
-        added: figures that only the run has; they pass until ``--update`` takes it into the
+        added: figures that only the run has; they pass until ``--update`` adds them to the
             baseline.
-        unread: probes that both sides have cells of, with figures none of which was compared.
-        left_out: figures of one side alone, which a comparison of common figures left out.
+        unread: probes with cells on both sides and figures, none of which was compared.
+        left_out: figures of one side only, which a comparison of common figures omits.
     """
 
     study: str
@@ -125,7 +125,7 @@ class Comparison:
 
     @property
     def too_little(self) -> str:
-        """Reason why nothing can be said; empty where something can."""
+        """Reason why there is no verdict; empty if there is one."""
         if not self.rows:
             return "both sides share no gated figure"
         if not self.exact and self.scenes < FEWEST_SCENES:
@@ -142,7 +142,7 @@ class Comparison:
 
 
 Key = tuple[str, ...]
-"""(scene, probe, variant), with the seed behind it where the seeds are the same."""
+"""(scene, probe, variant), followed by the seed if both sides have the same seeds."""
 
 
 def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparison:
@@ -151,8 +151,8 @@ def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparis
     Args:
         baseline: trusted figures.
         run: judged figures.
-        common: whether to compare what both have alone, seeds included. The rest is then no fault,
-            and stands in ``left_out``.
+        common: whether to compare only common cells, seeds included. The rest is then no fault,
+            and is listed in ``left_out``.
 
     Example:
         >>> from attnwarp_eval.compare.snapshot import Figure
@@ -190,7 +190,7 @@ def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparis
     scenes = [row.difference.scenes for row in rows if probe_of(row.probe).needs_scenes]
     most = max(scenes, default=0)
     both = {probe for _, probe, *_ in left.keys() & right.keys()}
-    # A probe of one's own has figures that no gate knows: nothing of it was dropped.
+    # A plugin's probe has figures without gates: none of them was dropped.
     unread = sorted(name for name in both - {r.probe for r in rows} if _has_gates(name))
     if common:
         lacking = [fault for fault in faults if fault.kind in ("missing", "unmeasured")]
@@ -211,7 +211,7 @@ def _of_seeds(side: Snapshot, seeds: Set[int]) -> Snapshot:
 
 
 def _has_gates(name: str) -> bool:
-    """Return True if any gate is a figure of a probe."""
+    """Return True if any figure of a probe is gated."""
     return not GATES.keys().isdisjoint(m.name for m in probe_of(name).metrics.values())
 
 
@@ -229,8 +229,8 @@ def _by_key(cells: Iterable[Measured], exact: bool) -> dict[Key, list[Measured]]
 def _without_psnr(
     first: list[Measured], second: list[Measured]
 ) -> tuple[list[Measured], list[Measured]]:
-    """Both sides without the PSNRs whose mean squared errors both have: of equal pictures a PSNR is
-    infinite, so undefined here, and would fail where an error fell to 0.
+    """Both sides without PSNRs whose mean squared errors both have: the PSNR of equal pictures is
+    infinite, so undefined here, and would fail when an error falls to 0.
     """
     shared = _metrics(first) & _metrics(second)
     left_out = {key for key in shared if "psnr" in key and key.replace("psnr", "mse") in shared}
@@ -254,7 +254,7 @@ def _missing_cells(
     left: Mapping[Key, object], right: Mapping[Key, object], run: Snapshot, exact: bool
 ) -> tuple[list[Fault], list[str]]:
     reasons: dict[Key, str] = dict.fromkeys(left.keys() - right.keys(), NOT_IN_STUDY)
-    # A run that lacks one of its own cells is incomplete, whatever the baseline has.
+    # A run that lacks one of its expected cells is incomplete, regardless of the baseline.
     for (scene, probe, variant, seed), reason in run.missing.items():
         reasons[_key(scene, probe, variant, seed, exact)] = reason
     only_here = dict.fromkeys(right.keys() - left.keys(), "")
@@ -262,18 +262,18 @@ def _missing_cells(
 
 
 _WHOLE = ("scene", "probe", "variant", "seed")
-"""Parts of a key; all that a side lacks of one is told in one line."""
+"""Parts of a key; all missing values of a part are reported in one line."""
 
 _NOT_FAILED = ("", NOT_IN_STUDY, NOT_MEASURED)
 
 
 def _lacking(lacking: Mapping[Key, str], there: Mapping[Key, object]) -> list[Fault]:
-    """Faults for all that a side lacks: scenes, probes, variants and seeds of which it has nothing,
-    then single cells. A cell that failed has a line of its own, with its error.
+    """Faults for missing keys: first scenes, probes, variants and seeds without any cell, then
+    single cells. A failed cell has a separate line with its error.
 
     Args:
         lacking: keys -> the reason.
-        there: keys that the side has.
+        there: keys present on the side.
     """
     rest, faults = dict(lacking), []
     for place, what in enumerate(_WHOLE):
@@ -365,7 +365,7 @@ def _rows(
         _Group.of(probe, variant, metric, shared[probe, variant], left, right, exact)
         for probe, variant, metric in names
     ]
-    # Without enough scenes a test has no say, so it must not cost the others their power either.
+    # Exclude tests with too few scenes, which would reduce the power of the others.
     adjusted = benjamini_hochberg(
         [g.difference.p if g.difference.scenes >= FEWEST_SCENES else math.nan for g in groups]
     )
@@ -377,10 +377,10 @@ class _Group:
     """The values of one metric of one variant on both sides, by scene and view (and seed).
 
     Attributes:
-        before, now: as measured.
-        difference: paired.
+        before, now: measured values.
+        difference: paired difference.
         gaps: whether any value of a view and seed is undefined.
-        worsening: scene/view -> how much worse the run is, in the metric's unit.
+        worsening: scene/view -> worsening of the run, in the metric's unit.
     """
 
     probe: str
@@ -450,7 +450,7 @@ class _Group:
         return sum(w > limit.around(before[name]) for name, w in self.worsening.items())
 
     def _exactly(self, before: Mapping[str, float], undefined: int) -> Verdict | None:
-        """The verdict on equal computations, view by view; None where only a test can tell."""
+        """The verdict on equal computations, view by view; None if only a test can decide."""
         allowed = Margin(self.metric.atol, self.metric.rtol)
         limit = margin(self.key)
         if undefined or self._beyond_margin(before):
@@ -472,7 +472,7 @@ class _Group:
     def _lost(self) -> bool:
         """True if the run defines the figure nowhere, or in none of several views of a scene.
 
-        Which single views define it is a matter of the seeds.
+        The seeds decide which single views define the figure.
         """
         defined = {s: sum(map(math.isfinite, v.values())) for s, v in self.before.items()}
         left = {s: sum(map(math.isfinite, v.values())) for s, v in self.now.items()}
@@ -482,7 +482,7 @@ class _Group:
         return max(gone) >= SEVERAL_VIEWS or len(gone) == sum(map(bool, defined.values()))
 
     def _by_scenes(self, before: Mapping[str, float], adjusted_p: float) -> Verdict:
-        """The verdict of a test over scenes; a figure that is lost needs none."""
+        """The verdict of a test over scenes; a lost figure needs no test."""
         difference = self.difference
         if self._lost():
             return "worse"
@@ -506,7 +506,7 @@ class _Group:
 def _values(
     side: Mapping[Key, list[Measured]], keys: list[Key], metric: str, exact: bool
 ) -> dict[str, dict[str, float]]:
-    """Scene -> view (and seed) -> value; the mean over the defined seeds where seeds differ."""
+    """Scene -> view (and seed) -> value; the mean over the defined seeds if seeds differ."""
     table: dict[str, dict[str, list[float]]] = {}
     for key in keys:
         for cell in side[key]:
@@ -532,8 +532,8 @@ def _flat(table: ByView) -> dict[str, float]:
 
 
 def _means_of_shared(before: ByView, now: ByView) -> tuple[float, float]:
-    """Means over scenes of the means over the views that both define; where there are none, over
-    those that each defines, and NaN without any.
+    """Means over scenes of the means over the views defined on both sides; without such views, over
+    each side's defined views, and NaN without any.
     """
     names = _flat(before).keys() & _flat(now).keys()
     one, other = _flat(before), _flat(now)

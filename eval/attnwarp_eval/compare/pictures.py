@@ -1,4 +1,4 @@
-"""Pictures of what changed most: those of the baseline beside those of the run."""
+"""Pictures of the largest changes: the baseline's next to the run's."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.study.results import Results
 
 Pictures = Mapping[tuple[str, int, str], Mapping[str, Path]]
-"""(definition of the cell, seed, view) -> what is shown -> the file."""
+"""(definition of the cell, seed, view) -> content -> file."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Change:
     Attributes:
         scene, probe, variant, view: scene, probe, variant and view of the figures.
         metric: metric with the value that moved by the most margins.
-        before, now: its values.
-        margins: by how many; infinite where only one side is defined.
+        before, now: values of the metric.
+        margins: size of the change in margins; infinite if only one side is defined.
         pictures: content -> the files of the baseline and of the run.
     """
 
@@ -55,12 +55,12 @@ def pictures_of_run(results: Results, root: Path) -> Pictures:
 
 
 def folder_of(baseline: Path) -> Path:
-    """Folder of the pictures of a baseline's file: beside it."""
+    """Folder of a baseline's pictures, next to its file."""
     return baseline.with_suffix(".pictures")
 
 
 def pictures_of_baseline(baseline: Path, snapshot: Snapshot) -> Pictures:
-    """The pictures beside a baseline's file; none where it was written without them."""
+    """The pictures next to a baseline's file; none if it was written without them."""
     table = {}
     for cell in snapshot.cells:
         for view in _views(cell):
@@ -71,16 +71,16 @@ def pictures_of_baseline(baseline: Path, snapshot: Snapshot) -> Pictures:
 
 
 def write_pictures(baseline: Path, pictures: Pictures) -> None:
-    """Put a run's pictures beside a baseline's file, instead of former ones.
+    """Save a run's pictures next to a baseline's file, in place of former ones.
 
-    Those are removed when all of the new ones are there.
+    The former ones are removed after all new ones are saved.
 
     Args:
-        pictures: pictures of the run that it was written from.
+        pictures: pictures of the baseline's run.
     """
     folder = folder_of(baseline)
     new, former = folder.with_suffix(".pictures-new"), folder.with_suffix(".pictures-former")
-    for left in (new, former):  # by a call that was killed
+    for left in (new, former):  # by an interrupted call
         if left.is_dir():
             shutil.rmtree(left)
     for (cell, seed, view), files in pictures.items():
@@ -125,7 +125,7 @@ def largest_changes(
 
 
 def _shared(baseline: Snapshot, run: Snapshot) -> Iterator[tuple[Measured, Measured, str]]:
-    """The cells of each variant that both sides have, with the first of their seeds."""
+    """The cells of each variant on both sides, with the first seed."""
     sides: list[dict[tuple[str, str, str], Measured]] = [{}, {}]
     for side, snapshot in zip(sides, (baseline, run), strict=True):
         for cell in snapshot.cells:

@@ -1,5 +1,5 @@
-"""Parts of a run that a comparison reads: gated figures view by view, counters, and what each cell
-is.
+"""Parts of a run that a comparison reads: gated figures view by view, counters, and definitions of
+the cells.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from attnwarp_eval.study.results import Outcome, Results
 from attnwarp_eval.study.store import Store
 
 NOT_MEASURED = "not measured"
-"""The reason why a cell is missing that was never begun."""
+"""Reason for a missing cell that was never started."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Measured:
 
     Attributes:
         scene, probe, seed: scene, probe and seed of the cell.
-        variants: every name that the study gives to its content.
-        definition: hash of all that decides its figures but the seed.
+        variants: all names of its content in the study.
+        definition: hash of all inputs of its figures except the seed.
         counters: counts of work.
         figures: gated metrics by key.
 
@@ -58,7 +58,7 @@ class Measured:
 
     @property
     def key(self) -> tuple[str, str, tuple[str, ...], int]:
-        """Key that sorts cells, and tells them apart."""
+        """Unique sort key of cells."""
         return self.scene, self.probe, self.variants, self.seed
 
 
@@ -67,7 +67,7 @@ class Snapshot:
     """One side of a comparison.
 
     Attributes:
-        study: its name.
+        study: name of the study.
         digest: hash of the resolved study.
         cells: sorted by their key.
         missing: expected cells without a record -> the reason.
@@ -89,10 +89,10 @@ class Snapshot:
 
 
 def read_snapshot(store: Store) -> Snapshot:
-    """The snapshot of a run's folder, whose sealed cells are read through the report's reader.
+    """The snapshot of a run's folder, read by the report's reader.
 
     Raises:
-        StoreError: the folder is no run, or its study cannot be read.
+        StoreError: the folder is not a run, or its study cannot be read.
 
     Example:
         >>> from attnwarp_eval.study import parse_study
@@ -108,7 +108,7 @@ def read_snapshot(store: Store) -> Snapshot:
 
 
 def snapshot(results: Results) -> Snapshot:
-    """The snapshot of results that have been read."""
+    """The snapshot of loaded results."""
     reasons = {failure.id: failure.error for failure in results.failures}
     cells, missing = [], {}
     for cell in results.cells:
@@ -153,17 +153,17 @@ def _measured(cell: Outcome, record: Record[Any]) -> Measured:
 
 
 def definition(spec: Mapping[str, Any]) -> str:
-    """Hash of all that decides a cell's figures but its seed."""
+    """Hash of all inputs of a cell's figures except the seed."""
     return digest(without_seed(dict(spec)))[:16]
 
 
 def shortened(value: float) -> float:
-    """Nine significant digits, more than any tolerance asks for; NaN for the infinities."""
+    """Round to nine significant digits, more than any tolerance needs; NaN for the infinities."""
     return float(f"{value:.9g}") if math.isfinite(value) else math.nan
 
 
 def without_seed(value: Any) -> Any:
-    """A cell's spec without its seeds, at whatever depth they stand.
+    """A cell's spec without its seeds, at any depth.
 
     >>> without_seed({"seed": 1, "fit": {"iterations": 4, "seed": 1}})
     {'fit': {'iterations': 4}}

@@ -57,7 +57,7 @@ def summary(comparison: Comparison) -> str:
 
 
 def document(comparison: Comparison, notes: Sequence[str] = ()) -> Report:
-    """The comparison as a document: faults first, then every verdict but "equal".
+    """The comparison as a document: faults first, then every verdict except "equal".
 
     Example:
         >>> document(Comparison("quick", True, 3, (), ())).title
@@ -92,13 +92,13 @@ def page(
     why_none: str = "",
     notes: Sequence[str] = (),
 ) -> str:
-    """The comparison as one HTML file, with every figure, and the pictures of what changed most.
+    """The comparison as one HTML file, with every figure, and the pictures of the largest changes.
 
     Args:
-        comparison: the verdicts.
+        comparison: comparison with the verdicts.
         changes: the pictured views that changed, the largest change first.
-        why_none: why there are no pictures, where ``changes`` is empty.
-        notes: sentences that come before the verdicts.
+        why_none: reason for missing pictures if ``changes`` is empty.
+        notes: sentences before the verdicts.
 
     Example:
         >>> text = page(Comparison("quick", True, 3, (), ()), [], "No figure changed.")
@@ -149,7 +149,7 @@ def _sliders(change: Change) -> list[Slider]:
 
 
 def as_json(comparison: Comparison, notes: Sequence[str] = ()) -> dict[str, Any]:
-    """Everything, as JSON has it: null where undefined.
+    """The whole comparison as JSON: null where undefined.
 
     Example:
         >>> as_json(Comparison("quick", True, 3, (), ()))["regressed"]

@@ -1,4 +1,4 @@
-"""Figures as SVG, whose bytes depend on the numbers alone."""
+"""Figures as SVG, with bytes that depend only on the numbers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#000000")
-"""Okabe and Ito's colours, distinct for every kind of colour vision."""
+"""Okabe and Ito's colours, distinct for every type of colour vision."""
 
 MARKERS = "osD^vP*X"
 
@@ -91,11 +91,11 @@ def drawing(
 
 
 HOVER = "hover: "
-"""Begins the id of an element that has a text of its own, which follows."""
+"""Prefix of the id of an element with a tooltip, followed by the text."""
 
 
 def hover(axes: Axes, x: float, y: float, text: str) -> None:
-    """Give a point of a figure a text that a browser shows where the pointer rests on it.
+    """Give a point of a figure a tooltip.
 
     Example:
         >>> from pathlib import Path
@@ -104,7 +104,7 @@ def hover(axes: Axes, x: float, y: float, text: str) -> None:
         >>> "<title>half &amp; half</title>" in Path("figure.svg").read_text()
         True
     """
-    # Not fully transparent: matplotlib draws nothing then, and there is nothing to rest on.
+    # Not fully transparent: matplotlib would draw nothing, and nothing could be hovered.
     spot = axes.scatter([x], [y], s=110, color="#888888", alpha=0.004, linewidths=0, zorder=9)
     spot.set_gid(HOVER + text)
 
@@ -144,7 +144,7 @@ def lines(
     apart: float = 0.0,
 ) -> None:
     """Means with their intervals as bars; undefined points are left out. A ``share`` is drawn from
-    0 to 1. Lines that share their x are drawn ``apart``, in its unit, about where they belong.
+    0 to 1. Lines that share their x are shifted by ``apart``, in its unit, around their position.
 
     Example:
         >>> from pathlib import Path
@@ -190,12 +190,12 @@ def lines(
 
 
 def _wrapped(text: str, width: int) -> str:
-    """Plain text on lines of at most ``width`` characters, so that none is cut at an edge."""
+    """Plain text on lines of at most ``width`` characters, so that none is clipped at an edge."""
     return _plain("\n".join(textwrap.wrap(text, width)))
 
 
 def _plain(text: str) -> str:
-    """A text whose dollars stand for themselves; Matplotlib reads formulas between two."""
+    """Escape dollars in a text; Matplotlib reads formulas between two."""
     return text.replace("$", r"\$")
 
 
@@ -261,9 +261,8 @@ def heatmap(
 
 
 MOST_NAMES = 12
-"""Largest number of points with a name in a figure of a front; more names would cover one another's
-bars.
-"""
+"""Largest number of named points in a figure of a front; more names would cover one another's
+bars."""
 
 
 def cost_front(
@@ -276,8 +275,8 @@ def cost_front(
     log: bool = True,
 ) -> list[str]:
     """Error against seconds with intervals on both axes; the front as a staircase, dominated points
-    in grey. Of more than :data:`MOST_NAMES` points those on the front alone have names; the others
-    have them as titles.
+    in grey. With more than :data:`MOST_NAMES` points only those on the front have names; the others
+    have tooltips.
 
     ``log``: whether the error's axis is logarithmic, as that of seconds always is.
 
@@ -361,7 +360,7 @@ SPOTS = [(5.0, 5.0)] + [
 
 def _place_names(axes: Axes) -> None:
     """Put each name at the free spot nearest to its point: inside the axes, over no other name and,
-    where there is room, over no point and no bar. A line leads to a name that stands apart.
+    if there is room, over no point and no bar. A line leads to a name that is far away.
     """
     from matplotlib.text import Annotation, Text
     from matplotlib.transforms import Bbox
@@ -373,7 +372,7 @@ def _place_names(axes: Axes) -> None:
     places = axes.transData.transform([note.xy for note in notes] or np.empty((0, 2)))
     strokes = np.concatenate([np.empty((0, 2)), *_strokes(axes)])
     settled: list[Bbox] = []
-    # The rightmost have the least choice.
+    # The rightmost names have the fewest options.
     for note, (x, y) in sorted(zip(notes, places, strict=True), key=lambda pair: -pair[1][0]):
         width, height = Text.get_window_extent(note).size
         least, best = math.inf, Bbox.null()
@@ -412,10 +411,10 @@ def _strokes(axes: Axes) -> Iterator[npt.NDArray[np.float64]]:
 
 
 def ends(value: Interval) -> tuple[float, float]:
-    """Ends of a bar: those of the interval, or of few scenes the lowest and the highest one.
+    """Ends of a bar: of the interval, or with few scenes the lowest and the highest scene.
 
     Args:
-        value: NaN where it has no such ends.
+        value: interval; its ends may be NaN.
 
     Example:
         >>> from attnwarp_eval.statistics.intervals import interval
@@ -430,6 +429,6 @@ def _bars(value: Interval, log: bool) -> list[list[float]] | None:
     low, high = ends(value)
     if not (math.isfinite(low) and math.isfinite(high)):
         return None
-    # What crosses zero cannot be drawn on a logarithmic axis, and is cut just above it.
+    # A bar that crosses zero is clipped just above zero on a logarithmic axis.
     low = max(low, value.mean / 20) if log else low
     return [[max(value.mean - low, 0.0)], [max(high - value.mean, 0.0)]]

@@ -1,4 +1,4 @@
-"""A report's content, apart from how it is written: sections of text, tables, figures and
+"""Content of a report, independent of its output format: sections of text, tables, figures and
 pictures."""
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, replace
 class Table:
     """A table of ready-made text cells.
 
-    Columns named in ``timed`` hold seconds or memory. A ``folded`` table is closed on a page until
-    a reader opens it. In a ``glossary`` the first column names what the others explain, and the
-    same names elsewhere on the page link to it.
+    Columns named in ``timed`` hold seconds or memory. A ``folded`` table is collapsed on a page
+    until a reader opens it. In a ``glossary`` the first column has terms that the others explain,
+    and the same terms elsewhere on the page link to it.
 
     Example:
         >>> table = Table(["variant", "seconds"], [["paper", "0.1"]], timed=("seconds",))
@@ -38,7 +38,7 @@ class Table:
 
 @dataclass
 class Picture:
-    """An image file of the run's folder, with what it shows, and a command that explains it.
+    """An image file of the run's folder, with a caption, and a command that explains it.
 
     Example:
         >>> Picture("pictures/a.png", "the source").caption
@@ -73,9 +73,9 @@ class Slider:
 class Gallery:
     """Pictures in rows: a line of text, then pictures or sliders side by side.
 
-    With ``picker``, a row in bold heads the rows of one view, and on a page a reader picks two
-    pictures of a view and lays them over each other. ``commands`` stand before the pictures where
-    the text is plain; on a page each picture has its own.
+    With ``picker``, a bold row heads the rows of one view, and on a page a reader overlays any two
+    pictures of a view. ``commands`` come before the pictures in plain text; on a page each picture
+    has a separate one.
 
     Example:
         >>> gallery = Gallery([("yaw 30", [Picture("a.png", "truth"), Picture("b.png", "warp")])])
@@ -90,7 +90,7 @@ class Gallery:
 
 @dataclass
 class Grid:
-    """Pictures side by side: columns are views, rows what is compared, all named; None for none.
+    """Pictures side by side: columns are views, rows variants, all named; None if missing.
 
     Example:
         >>> grid = Grid("An edit", ["yaw 30"], [("before", [Picture("a.png", "before, yaw 30")])])
@@ -107,7 +107,7 @@ class Grid:
 class Section:
     """A heading with text, grids, tables, figures and galleries, in this order.
 
-    A ``folded`` section is closed until a reader opens it.
+    A ``folded`` section is collapsed until a reader opens it.
 
     Example:
         >>> section = Section("Depth", ["Against exact depth."], [Table(["AbsRel"], [["0.01"]])])
@@ -126,7 +126,7 @@ class Section:
 
 @dataclass
 class Report:
-    """The whole report: its answer, if it has one, before everything else.
+    """The whole report: its answer, if any, before everything else.
 
     Example:
         >>> from attnwarp_eval.document.write import markdown

@@ -7,7 +7,7 @@ import math
 from attnwarp_eval.statistics.intervals import Interval, Ratio
 
 FEWEST_SCENES = 6
-"""Scenes below which a document shows their range, and no interval."""
+"""Number of scenes below which a document shows their range instead of an interval."""
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -15,7 +15,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
     Args:
         value: None and NaN are undefined.
-        digits: significant ones.
+        digits: number of significant digits.
 
     Example:
         >>> number(0.0123456), number(12345.6), number(None)
@@ -39,8 +39,8 @@ def pooled(error: Interval, scenes: int | None = None) -> str:
     """PSNR of a mean squared error, with the PSNRs of its interval's ends.
 
     Args:
-        error: mean squared error of pictures in [0, 1]. 0 has an infinite PSNR; so has an end of
-            the interval that reaches below it.
+        error: mean squared error of pictures in [0, 1]. For an error of 0, and an end of the
+            interval at most 0, the PSNR is infinite.
         scenes: as for :func:`spread`.
 
     Example:
@@ -69,12 +69,12 @@ def decibels(error: float) -> str:
 def spread(value: Interval, scenes: int | None = None) -> str:
     """Mean ± half of the 95 % interval, with the number of undefined values.
 
-    Of few scenes it is the mean with the lowest and the highest scene: an interval would speak of
-    scenes in general.
+    For few scenes it is the mean with the lowest and the highest scene: an interval would make a
+    statement about scenes in general.
 
     Args:
         value: the interval.
-        scenes: scenes of the study; where fewer were measured, the text says how many.
+        scenes: scenes of the study; if fewer were measured, the text says how many.
 
     Example:
         >>> from attnwarp_eval.statistics.intervals import interval
@@ -95,7 +95,7 @@ def spread(value: Interval, scenes: int | None = None) -> str:
 
 
 def ratio_text(value: Ratio) -> str:
-    """A ratio of seconds with its 95 % interval, where it has one.
+    """A ratio of seconds with its 95 % interval, if it has one.
 
     Example:
         >>> from attnwarp_eval.statistics.intervals import time_ratio
@@ -107,7 +107,7 @@ def ratio_text(value: Ratio) -> str:
 
 
 def _note(value: Interval, scenes: int | None) -> str:
-    """Note, in brackets, of what a mean leaves out."""
+    """Note, in brackets, on values missing from a mean."""
     notes = [f"{value.undefined} undefined"] if value.undefined else []
     if scenes is not None and value.scenes < scenes:
         notes.append(f"{value.scenes} of {scenes} scenes")

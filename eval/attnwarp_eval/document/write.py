@@ -38,8 +38,8 @@ _CLASSES = {
 
 
 def inline(text: str) -> Markup:
-    """Escaped text in which `code`, **bold** and `#rrggbb` (a swatch of that colour) have been
-    set.
+    """Escaped text in which `code`, **bold** and `#rrggbb` (a swatch of that colour) are
+    rendered.
 
     Example:
         >>> print(inline("`a` < **b**"))
@@ -54,7 +54,7 @@ def inline(text: str) -> Markup:
 
 
 def _block(text: str) -> Markup:
-    """A paragraph, or a list where the text begins with a dash."""
+    """A paragraph, or a list if the text begins with a dash."""
     if not text.startswith("- "):
         return Markup("<p>{}</p>").format(inline(text))
     items = text.removeprefix("- ").split("\n- ")
@@ -92,7 +92,7 @@ def _pictures(report: Report) -> set[str]:
 
 
 def _embedder(report: Report, root: Path) -> Callable[[str], str]:
-    """Return the function that writes a file into the page; pictures are made smaller where all are
+    """Return the function that embeds a file into the page; pictures are scaled down if all are
     too large.
     """
     pictures = _pictures(report)
@@ -110,7 +110,7 @@ def _embedder(report: Report, root: Path) -> Callable[[str], str]:
 
 
 def reduction(total: int) -> float:
-    """Scale of the sides of a page's pictures, 1 where they may stay as they are.
+    """Scale of the sides of a page's pictures, 1 to keep them.
 
     Args:
         total: bytes of all pictures.
@@ -141,7 +141,7 @@ def reduced(data: bytes, scale: float) -> bytes:
 
 
 def _drawer(root: Path) -> Callable[[str], Markup]:
-    """Return the function that puts a figure into the page as SVG, with ids that no other figure
+    """Return the function that embeds a figure into the page as SVG, with ids that no other figure
     has.
     """
     count = itertools.count(1)
@@ -186,7 +186,7 @@ def plain(text: str) -> str:
 
 
 _TAG = re.compile(r"(`[^`]*`)|<(?=[A-Za-z/!?])")
-"""Code, in which nothing is a tag, or the beginning of one."""
+"""Inline code, or the beginning of a tag."""
 
 
 def terminal(table: Table) -> rich.table.Table:
@@ -215,7 +215,7 @@ def markdown_table(table: Table) -> str:
         | paper | 0.01 |
     """
     lines = [
-        # A row is one line; the texts of errors may have several.
+        # A row is one line, but error texts may have several.
         " | ".join(plain(" ".join(cell.splitlines()).replace("|", "\\|")) for cell in cells)
         for cells in (table.columns, *table.rows)
     ]
@@ -224,11 +224,11 @@ def markdown_table(table: Table) -> str:
 
 
 def templates(package: str, *, autoescape: bool) -> Environment:
-    """The templates that lie beside a package's modules; a name without a value is an error.
+    """Load the templates next to a package's modules; an undefined name is an error.
 
     Args:
-        package: package that has them in its folder.
-        autoescape: whether values are text of HTML rather than of Markdown.
+        package: package with the templates in its folder.
+        autoescape: whether values are escaped for HTML; False for Markdown.
 
     Example:
         >>> templates("attnwarp_eval.document", autoescape=True).list_templates("j2")
@@ -283,7 +283,7 @@ def write_files(report: Report, folder: Path, name: str) -> list[Path]:
     """Write the report as Markdown and as a page; return their paths, the page at the end.
 
     Args:
-        report: its pictures and figures lie below ``folder``.
+        report: report with pictures and figures below ``folder``.
         name: name of the files, without a suffix.
 
     Example:

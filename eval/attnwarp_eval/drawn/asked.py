@@ -41,11 +41,11 @@ PARTS = 12
 """Parts of the edit ``parts``."""
 
 SMALL_PARTS = ("eyes", "nose", "lips")
-"""Parts that keep their looks when the whole thing is painted."""
+"""Parts that keep their appearance when the whole thing is painted."""
 
 
 def edits(draft: Draft) -> list[Entry]:
-    """The edits of a scene, as its file has them.
+    """Edits of a scene, in the format of its file.
 
     - ``colour``: the first thing in a look that training never shows it in
     - ``material``: it as a statue
@@ -64,12 +64,12 @@ def edits(draft: Draft) -> list[Entry]:
 
 
 def place(ground: int) -> str:
-    """The place that a ground is, in words."""
+    """Description of a ground as a place."""
     return PLACES[GROUNDS[ground]][0]
 
 
 def described(thing: Thing) -> str:
-    """A thing with its look, in words.
+    """Description of a thing with its look.
 
     Example:
         >>> from attnwarp_eval.drawn.scenes import draw
@@ -93,7 +93,7 @@ def _edit(draft: Draft, name: str, instruction: str, target: str, **does: Any) -
 
 
 def _over(items: list[Entry], surface: Mapping[str, Any]) -> list[Entry]:
-    """Changes that give objects one surface, whatever they are made of."""
+    """Changes that give objects one surface, regardless of their material."""
     material = surface.get("material", {"type": "diffuse"})
     changes = []
     for item in items:
@@ -107,7 +107,7 @@ def _over(items: list[Entry], surface: Mapping[str, Any]) -> list[Entry]:
 
 
 def _body(thing: Thing) -> list[Entry]:
-    """The objects of a thing that its paint covers."""
+    """The painted objects of a thing."""
     return [o for o in thing.objects if not o["name"].endswith(SMALL_PARTS)]
 
 
@@ -118,7 +118,7 @@ def _plain(rng: np.random.Generator, color: str) -> Entry:
 
 
 def _colour(draft: Draft) -> Entry:
-    """The colour kept from training for this kind; in a pattern, where it has that already."""
+    """The colour held out of training for this kind; as a pattern if the thing already has it."""
     rng, thing = draft.stream("edit colour"), draft.things[0]
     others = [c for c in draft.colors_of(thing.kind) if c != thing.look.color]
     color = others[0] if others else thing.look.color
@@ -153,7 +153,7 @@ def _material(draft: Draft) -> Entry:
 
 
 def _part(draft: Draft) -> Entry:
-    """The part with the largest box, in a colour that it has not."""
+    """The part with the largest box, in a new colour."""
     rng, thing = draft.stream("edit part"), draft.things[0]
     item = max(_body(thing), key=_size)
     name = item["name"].removeprefix(f"{thing.kind}_").replace("_", " ")
@@ -189,7 +189,7 @@ def _ground(draft: Draft) -> Entry:
 
 
 def _light(draft: Draft) -> Entry:
-    """Another time of day, of an even sky where smooth things would bend a sun into caustics."""
+    """Another time of day; an even sky if smooth things would turn a sun into caustics."""
     rng = draft.stream("edit light")
     others = [k for k, name in enumerate(TIMES) if k != draft.time]
     other = others[index(rng, len(others))]
@@ -240,7 +240,7 @@ def _some_colour(draft: Draft) -> Entry:
 
 
 def _parts(draft: Draft) -> Entry:
-    """Parts as cells about centres. All 4^12 pictures are made of the parts of four."""
+    """Parts as cells around centres. All 4^12 pictures are composed of the parts of four."""
     rng, thing = draft.stream("edit parts"), draft.things[0]
     centers = [[round(float(x), 3) for x in row] for row in part_centers(thing, rng)]
     hues = [shade(color, rng) for color in PART_COLORS]
@@ -265,8 +265,8 @@ def _parts(draft: Draft) -> Entry:
 def part_centers(thing: Thing, rng: np.random.Generator) -> Array:
     """(PARTS, 3) centres of parts of a thing's surface: k-means of points near it.
 
-    Cells about centres part front from back only where a body is thick; those by position alone are
-    what the ideal editor's parts are.
+    Cells around centres separate front from back only in a thick body; the ideal editor's parts are
+    cells by position only.
     """
     points = np.concatenate(list(_near_surface(thing, rng)))
     far = [int(rng.random() * len(points))]
@@ -277,7 +277,7 @@ def part_centers(thing: Thing, rng: np.random.Generator) -> Array:
     centers = points[far]
     for _ in range(12):
         own = ((points[:, None] - centers[None]) ** 2).sum(-1).argmin(1)
-        # A centre that lost all its points stays where it is.
+        # A centre without points stays in place.
         centers = np.stack(
             [points[own == k].mean(0) if (own == k).any() else centers[k] for k in range(PARTS)]
         )

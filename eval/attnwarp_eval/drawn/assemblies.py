@@ -1,6 +1,6 @@
-"""Things with named parts: people in garments, plants in pots, stumps with mushrooms, tables laid.
+"""Things with named parts: people in garments, plants in pots, stumps with mushrooms, laid tables.
 
-Each part is an object of its own, so it has its own surface, its own words and exact pixels. An edit
+Each part is a separate object with a surface, words and exact pixels. An edit
 changes one part, or all of them at once (a statue).
 """
 
@@ -105,7 +105,7 @@ def _bust(u: Dice) -> Pieces:
 
 
 def _potted(u: Dice, x: float = 0, y: float = 0, z: float = 0, size: float = 1) -> Pieces:
-    """A plant in a pot, for a place of its own or on a table."""
+    """A plant in a pot, alone or on a table."""
     r, h, n = u(0.2, 0.28), u(0.32, 0.44), int(u(5, 9))
     tall = u(0.25, 0.5)
     pot = [
@@ -440,7 +440,7 @@ RECIPES: dict[str, Callable[[Dice], Pieces]] = {
 """Every thing with parts, with its recipe."""
 
 WHOLE = "whole"
-"""Name in place of a part's: all parts together."""
+"""Name for all parts together."""
 
 KINDS = tuple(RECIPES)
 
@@ -481,7 +481,7 @@ USUAL: dict[str, tuple[str, ...]] = {
     "bananas": ("yellow",), "body": ("white", "green", "grey"), "pot": ("orange", "blue", "white"), "table": ("brown", "orange"),
     "shoes": ("black", "brown"),
 }  # fmt: skip
-"""Colours that a part has before an edit, in six of ten worlds; in the others any."""
+"""Colours of a part before an edit in six of ten worlds; in the others any colour."""
 
 
 def _moved(part: Part, x: float, y: float, z: float, size: float) -> Part:
@@ -515,7 +515,7 @@ class Assembly(World):
 
     @property
     def kind(self) -> str:
-        """Name of its kind."""
+        """Name of the thing's kind."""
         return KINDS[self.thing]
 
     def pieces(self) -> Pieces:
@@ -524,7 +524,7 @@ class Assembly(World):
         return RECIPES[self.kind](Dice(rng))
 
     def surfaces(self, look: Look) -> tuple[Look, ...]:
-        """A look for each part: the given one for the edited part, the world's own for the others.
+        """A look for each part: the given one for the edited part, the world's for the others.
 
         A look without a finish (-1) leaves every part as it was before an edit.
         """
@@ -538,7 +538,7 @@ class Assembly(World):
         return tuple(result)
 
     def usual(self, name: str, rng: np.random.Generator) -> dict[str, int]:
-        """Finish, colour and seed that a part has before an edit."""
+        """Finish, colour and seed of a part before an edit."""
         words = USUAL.get(name, COLORS) if rng.uniform() < 0.6 else COLORS
         color = COLORS.index(words[int(rng.integers(len(words)))])
         finish = (
@@ -553,7 +553,7 @@ class Assembly(World):
         return tuple(k for k, name in enumerate(self.pieces()) if self.part in (name, WHOLE))
 
     def spec(self, look: Look, size: int, *, statue: bool | None = None) -> dict[str, Any]:
-        """The scene as a file has it: the parts first, then the ground."""
+        """The scene in the format of a file: the parts first, then the ground."""
         alone = World(OBJECTS.index("ball"), 0, self.seed, self.views, self.bare)
         base = alone.spec(look, size)
         first, ground, *rest = base["objects"]
@@ -571,19 +571,19 @@ class Assembly(World):
         return {**base, "title": self.kind, "objects": [*objects, ground, *rest]}
 
     def scene(self, look: Look, size: int) -> Scene:
-        """The scene itself."""
+        """The scene."""
         return Scene(SceneSpec.model_validate(self.spec(look, size)))
 
 
 LEAST_THING, LEAST_PART = 0.03, 0.006
-"""Shares of both pictures that the thing, and the part that is edited, have at least."""
+"""Least shares of both pictures covered by the thing, and by the edited part."""
 
 
 @functools.lru_cache(maxsize=64)
 def draw_assembly(seed: int, kind: int, *, new_shapes: bool = False, views: int = 2) -> Assembly:
-    """A random thing with parts, and which of them is edited; one in five edits changes the whole.
+    """A random thing with parts, with a random edited part; one in five edits changes the whole.
 
-    Cameras that do not see the thing, and parts too small to be seen, are drawn again.
+    Cameras that miss the thing, and parts too small to be seen, are redrawn.
 
     Example:
         >>> draw_assembly(1, KINDS.index("plant")).kind

@@ -1,8 +1,8 @@
-"""Axes of difficulty of drawn scenes: what each one sets, and the quantity that measures it.
+"""Axes of difficulty of drawn scenes: their settings, and the quantities that measure them.
 
-A scene's place on an axis is drawn, fixed by a study, or spread evenly over its scenes. The
-quantities are measured on the exact geometry and never used to draw: they show that an axis does
-what it says.
+A scene's position on an axis is drawn, fixed by a study, or spread evenly over its scenes. The
+quantities are measured on the exact geometry and never used to draw: they show that an axis works
+as described.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from attnwarp_eval.truth.shading import object_albedo
 from attnwarp_eval.two_view import HIDDEN, Hits
 
 FEWEST, MOST = 2, 6
-"""Things that stand in a drawn scene."""
+"""Number of things in a drawn scene."""
 
 
 @dataclass(frozen=True)
 class Axes:
-    """A scene's place on each axis of difficulty, from 0 to 1; ``things`` is their number.
+    """A scene's position on each axis of difficulty, from 0 to 1; ``things`` is their number.
 
     Attributes:
-        occlusion: how near and how large the things about the first one are.
-        thin: how many fences stand there, and how thin their pickets are.
-        grazing: how low the cameras are, so that the ground is seen at a glance.
-        texture: how many surfaces have a pattern, and how fine the patterns are.
+        occlusion: nearness and size of the things around the first one.
+        thin: number of fences, and thinness of their pickets.
+        grazing: lowness of the cameras, which see the ground at a grazing angle.
+        texture: number of patterned surfaces, and fineness of the patterns.
         highlights: share of the things that are metal or plastic.
-        things: how many stand there, from 2 to 6.
+        things: number of things, from 2 to 6.
     """
 
     occlusion: float
@@ -50,7 +50,7 @@ NAMES = tuple(Axes.__dataclass_fields__)
 
 
 def drawn_axes(rng: np.random.Generator, fixed: Mapping[str, float]) -> Axes:
-    """Axes drawn evenly, but for those that are fixed.
+    """Axes drawn uniformly, except fixed ones.
 
     Example:
         >>> drawn_axes(np.random.default_rng(0), {"thin": 0.0, "things": 4}).things
@@ -65,10 +65,10 @@ def drawn_axes(rng: np.random.Generator, fixed: Mapping[str, float]) -> Axes:
 
 
 def check_axes(fixed: Mapping[str, Any], stratified: Iterable[str] = ()) -> None:
-    """Refuse what is no axis, or no place on one.
+    """Refuse unknown axes, and positions out of range.
 
     Raises:
-        InputError: names the axis, what came, and what was expected.
+        InputError: the message has the axis, the given value, and the expected one.
 
     Example:
         >>> check_axes({"thin": 2})
@@ -93,8 +93,8 @@ def check_axes(fixed: Mapping[str, Any], stratified: Iterable[str] = ()) -> None
 
 
 def spread(name: str, count: int, seed: int) -> list[float]:
-    """Places on an axis for ``count`` scenes, one in each of as many equal parts, in an order of
-    chance.
+    """Places on an axis for ``count`` scenes, one in each of ``count`` equal parts, in random
+    order.
 
     Example:
         >>> sorted(spread("occlusion", 4, seed=1))
@@ -112,13 +112,13 @@ def spread(name: str, count: int, seed: int) -> list[float]:
 def measured(scene: Scene, groups: Mapping[str, str], *, size: int = 96) -> dict[str, float]:
     """The quantity of each axis, from exact geometry and albedo.
 
-    docs/truth/drawn-scenes.md says what they are. "thin" counts the pixels of things and fences
+    docs/truth/drawn-scenes.md defines them. "thin" counts the pixels of things and fences
     within 1.5 % of the height of another object, "texture" steps between pixels of one object.
 
     Args:
         scene: with a target ``yaw060``.
-        groups: by an object's name, what it belongs to: "thing 0" and so on, "fence", "around".
-        size: size of the views that are cast, px.
+        groups: group of each object by name: "thing 0" and so on, "fence", "around".
+        size: size of the traced views, px.
     """
     small = scene.with_size(size, size)
     geometry = Geometry(small)
@@ -145,7 +145,7 @@ def _share(chosen: npt.NDArray[np.bool_]) -> float:
 def _near_edges(
     object_id: npt.NDArray[np.int32], standing: npt.NDArray[np.bool_], reach: int
 ) -> float:
-    """The share of the pixels of what stands there that another object is ``reach`` px from."""
+    """Share of the things' pixels within ``reach`` px of another object."""
     from scipy import ndimage
 
     side = 2 * reach + 1
@@ -154,7 +154,7 @@ def _near_edges(
 
 
 def _steps(scene: Scene, geometry: Geometry, hits: Hits) -> float:
-    """The mean step of the albedo between neighbours that show one object."""
+    """Mean albedo step between neighbouring pixels of one object."""
     color = np.zeros((*hits.valid.shape, 3))
     ids = hits.primitive_id[hits.valid]
     color[hits.valid] = object_albedo(scene, geometry, hits.point[hits.valid], ids)
@@ -168,5 +168,5 @@ def _shiny(scene: Scene) -> npt.NDArray[np.bool_]:
 
 
 def to_words(axes: Axes) -> str:
-    """A scene's place on each axis, as its description has it."""
+    """A scene's position on each axis, for its description."""
     return ", ".join(f"{name} {value:g}" for name, value in asdict(axes).items())

@@ -24,13 +24,13 @@ from attnwarp_eval.drawn.worlds import (
 Array = npt.NDArray[np.float64]
 
 GENERATOR = 1
-"""Raise it when the same seed and number would give another scene."""
+"""Version; raised when the same seed and number would give another scene."""
 
 SATURATED = ("red", "orange", "yellow", "green", "blue", "purple", "pink")
 
 
 def unseen_colors(kind: str) -> list[int]:
-    """Colours that training never shows a thing of this kind in.
+    """Colours held out of training for this kind.
 
     Example:
         >>> [COLORS[c] for c in unseen_colors("rabbit")]
@@ -45,11 +45,11 @@ class Thing:
 
     Attributes:
         kind: a word of :data:`~attnwarp_eval.drawn.worlds.OBJECTS`.
-        instance: number of its shape.
+        instance: number of the shape.
         look: finish and colours; of the first thing, of its first part.
-        objects: as the scene's file has them.
-        reach: radius of the circle on the ground that holds it, and its height.
-        points: (N, 3) points on a mesh, turned and scaled, before it is moved to its place.
+        objects: objects in the format of a scene file.
+        reach: radius of the enclosing circle on the ground, and height.
+        points: (N, 3) points on a mesh, turned and scaled, before translation.
     """
 
     kind: str
@@ -61,7 +61,7 @@ class Thing:
 
     @property
     def names(self) -> list[str]:
-        """Names of its objects."""
+        """Names of the thing's objects."""
         return [item["name"] for item in self.objects]
 
 
@@ -80,22 +80,22 @@ class Draft:
     word: ClassVar[str] = "drawn"
 
     def stream(self, what: str) -> np.random.Generator:
-        """Random numbers for one aspect, which no other aspect's draws move."""
+        """Random numbers for one aspect, independent of other aspects' draws."""
         return np.random.default_rng([GENERATOR, self.seed, self.number, *what.encode()])
 
     def colors_of(self, kind: str) -> list[int]:
-        """Colours that training never shows a thing of this kind in, of which its own is one."""
+        """Held-out colours of this kind, from which its colour is drawn."""
         return unseen_colors(kind)
 
     def other_color(self, rng: np.random.Generator, color: int) -> int:
-        """The accent of the scene, or a bright colour where that is ``color``."""
+        """The accent of the scene, or a bright colour if the accent is ``color``."""
         second = COLORS.index(self.accent)
         while second == color:
             second = COLORS.index(SATURATED[index(rng, len(SATURATED))])
         return second
 
     def begin(self) -> None:
-        """Draw the place on each axis, the ground and the light."""
+        """Draw the position on each axis, the ground and the light."""
         self.axes = drawn_axes(self.stream("axes"), self.fixed)
         rng = self.stream("around")
         self.accent = SATURATED[index(rng, len(SATURATED))]
@@ -112,7 +112,7 @@ class Draft:
             self.fog = {"sigma_t": between(rng, 0.02, 0.06), "albedo": 0.95, "g": 0.4}
 
     def look_of(self, rng: np.random.Generator, kind: str, shiny: bool, patterned: bool) -> Look:
-        """A look that training never shows this kind in, or one without a colour."""
+        """A look held out of training for this kind, or one without a colour."""
         colors = self.colors_of(kind)
         color = colors[index(rng, len(colors))]
         second = self.other_color(rng, color)
@@ -132,11 +132,11 @@ class Draft:
         )  # fmt: skip
 
     def surface(self, look: Look) -> dict[str, Any]:
-        """A surface as a file has it, its pattern finer where the texture's axis is higher."""
+        """A surface in a file's format, with a finer pattern for a higher texture axis."""
         surface = {key: dict(value) for key, value in look.surface.items()}
         texture, material = surface.get("texture"), surface.get("material")
         if material and material["type"] == "metal":
-            # Smoother metal throws specks of the sun that few samples a pixel make noise of.
+            # Smoother metal reflects specks of the sun, which are noisy at few samples a pixel.
             material["roughness"] = round(0.2 + material["roughness"], 3)
         if texture and look.second >= 0:
             texture["size"] = round(texture["size"] * (1.5 - 0.8 * self.axes.texture), 3)
@@ -145,7 +145,7 @@ class Draft:
         return surface
 
 
-# Draws that do not depend on NumPy's own algorithms for them ---------------------------------------
+# Draws that do not depend on NumPy's algorithms for them ---------------------------------------
 
 
 def index(rng: np.random.Generator, count: int) -> int:
@@ -159,7 +159,7 @@ def between(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def pick(rng: np.random.Generator, weights: Sequence[float]) -> int:
-    """An index, as often as its weight says."""
+    """A random index with the given weights."""
     at = rng.random() * sum(weights)
     for k, weight in enumerate(weights):
         at -= weight
@@ -169,11 +169,11 @@ def pick(rng: np.random.Generator, weights: Sequence[float]) -> int:
 
 
 def choice(rng: np.random.Generator, words: Sequence[str], weights: Sequence[float]) -> str:
-    """A word, as often as its weight says."""
+    """A random word with the given weights."""
     return words[pick(rng, weights)]
 
 
 def marks(rng: np.random.Generator, count: int, share: float) -> list[bool]:
-    """That share of ``count`` things, marked in an order of chance."""
+    """A random ``share`` of ``count`` things, marked True."""
     order = sorted(range(count), key=lambda k: (rng.random(), k))
     return [order.index(k) < round(share * count) for k in range(count)]

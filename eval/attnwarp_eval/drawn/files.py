@@ -75,17 +75,17 @@ def _flow(value: Any) -> str:
 
 
 class _Dumper(yaml.CSafeDumper if yaml.__with_libyaml__ else yaml.SafeDumper):  # type: ignore[misc]
-    """Values written out where they stand: an alias would be one value in two places."""
+    """YAML dumper without aliases: an alias would be one value in two places."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
 
 def write(scene: Drawn, folder: Path) -> Path:
-    """Write a scene into a folder, as ``NAME.yaml`` with its meshes; each file appears when whole.
+    """Write a scene into a folder, as ``NAME.yaml`` with its meshes; each file appears complete.
 
     Raises:
-        InputError: one of the files is there with other content; nothing is written.
+        InputError: one of the files exists with other content; nothing is written.
     """
     path = folder / f"{scene.spec.name}.yaml"
     contents = {folder / name: source.read_bytes() for name, source in scene.files.items()}

@@ -23,14 +23,14 @@ UPRIGHT_Z = (".stl", ".off")
 """Formats of machines and of geometry, which have z up; the others' files have y up."""
 
 LONGEST_EDGE = 0.03
-"""Edges of things, in units of the scene: a texture has its colours at vertices."""
+"""Edges of things, in units of the scene: textures have their colours at vertices."""
 
 
 def mesh_files(folder: Path) -> list[Path]:
     """Meshes of a folder, by name.
 
     Raises:
-        InputError: there is no such folder, or none in it.
+        InputError: no such folder, or no mesh in it.
     """
     if not folder.is_dir():
         raise InputError(f"meshes: there is no folder {folder}")
@@ -51,9 +51,9 @@ def draw_meshes(
 
     Args:
         number, seed, axes: as for :func:`~attnwarp_eval.drawn.scenes.draw`; there are two or three
-            things, whatever the axis says.
+            things, regardless of the axis.
         files: files of :func:`mesh_files`.
-        up: upright axis of all files; that of their format if left out.
+        up: upright axis of all files; by default that of their format.
 
     Raises:
         InputError: a file cannot be read.
@@ -70,7 +70,7 @@ class _MeshDraft(SceneDraft):
     word: ClassVar[str] = "mesh"
 
     def stream(self, what: str) -> np.random.Generator:
-        """Random numbers for one aspect, others than those of a drawn scene of that number."""
+        """Random numbers for one aspect, different from those of a drawn scene of that number."""
         return super().stream(f"mesh {what}")
 
     def colors_of(self, kind: str) -> list[int]:
@@ -114,7 +114,7 @@ class _MeshDraft(SceneDraft):
             "type": "mesh", "file": file, "up": up, "yaw": yaw, "scale": scale,
             "position": [float(x) for x in offset], "longest_edge": LONGEST_EDGE,
         }  # fmt: skip
-        # A word as people write it, and a name of its own for each thing.
+        # A readable word, and a unique name for each thing.
         word = "".join(c if c.isalnum() else " " for c in path.stem.lower()).strip() or "thing"
         thing = {"name": f"thing{number}", "shape": shape, **self.surface(look)}
         extent = scale * (high - low)

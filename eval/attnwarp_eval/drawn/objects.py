@@ -1,7 +1,8 @@
-"""The things that random scenes show: each word has a recipe for a body, drawn anew for every instance.
+"""Things of random scenes: each word has a recipe for a body, drawn separately for every instance.
 
-A recipe gives parts about one unit tall that stand on z = 0 and look along +x. Parts without a colour of their own take
-the object's; details (eyes, leaves, wheels) keep theirs, unless the whole is of one material (a statue).
+A recipe gives parts about one unit tall that stand on z = 0 and look along +x. Parts without a
+colour take the object's; details (eyes, leaves, wheels) keep theirs, unless the whole is of one
+material (a statue).
 """
 
 from __future__ import annotations
@@ -445,17 +446,17 @@ RECIPES: dict[str, Callable[[Dice], list[Part]]] = {
 """Every word for an object, with its recipe."""
 
 SHARP = {"cube", "cone", "cylinder", "mug", "chair", "table", "lamp", "house", "vase"}
-"""Those whose parts meet in edges rather than in fillets."""
+"""Objects whose parts meet in edges rather than in fillets."""
 
 
 def body(word: str, instance: int, *, plain: bool = False, resolution: int = 64) -> dict[str, Any]:
-    """The shape of one instance of ``word``, as a scene file has it, at the origin.
+    """The shape of one instance of ``word``, in the format of a scene file, at the origin.
 
     Args:
         word: a key of :data:`RECIPES`.
         instance: the same number gives the same shape.
-        plain: without the details' own colours, as a statue is.
-        resolution: resolution of the lattice that the body is meshed on.
+        plain: without the details' colours, as for a statue.
+        resolution: resolution of the meshing lattice.
     """
     rng = np.random.default_rng([instance, *word.encode()])
     parts = RECIPES[word](Dice(rng))
@@ -470,7 +471,7 @@ def body(word: str, instance: int, *, plain: bool = False, resolution: int = 64)
 
 
 def plain_numbers(value: Any) -> Any:
-    """A description with Python's own numbers, rounded but for the place of a mesh of any size."""
+    """A description with Python numbers, rounded except for the position of a mesh of any size."""
     if isinstance(value, dict) and value.get("type") == "mesh":
         return value
     if isinstance(value, dict):

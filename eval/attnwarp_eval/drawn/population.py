@@ -1,4 +1,4 @@
-"""Populations of scenes: which scenes a study means by a generator, a seed and a number."""
+"""Populations of scenes, defined by a generator, a seed and a number."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ class _Scenes(Spec, ABC):
 
     @abstractmethod
     def scene(self, number: int) -> Drawn:
-        """Draw one of them."""
+        """Draw one scene."""
 
     @abstractmethod
     def _what(self) -> str:
         """Number and kind of the scenes, in words."""
 
     def _decided_by(self) -> Any:
-        """Whatever decides the scenes beside the population's own keys."""
+        """Further inputs that decide the scenes, besides the population's keys."""
         return None
 
     @property
@@ -71,23 +71,23 @@ class _Scenes(Spec, ABC):
         return [f"{self.word}-{k}" for k in range(self.count)]
 
     def scenes(self) -> Iterator[Drawn]:
-        """Draw them, one at a time."""
+        """Draw the scenes, one at a time."""
         for k in range(self.count):
             yield self.scene(k)
 
     def places(self, number: int) -> dict[str, float]:
-        """Places of a scene on the axes that are fixed or spread."""
+        """Positions of a scene on the fixed and the stratified axes."""
         spreads = {name: spread(name, self.count, self.seed)[number] for name in self.stratify}
         return {**self.axes, **spreads}
 
     def sized(self, count: int) -> Self:
-        """The population of another number of scenes."""
+        """Copy of the population with another number of scenes."""
         return self.model_copy(update={self._number: count})
 
     _number: ClassVar[str]
 
     def files(self) -> list[Path]:
-        """Files of the scenes, drawn where they are missing; they may be deleted at any time."""
+        """Files of the scenes, drawn if missing; they may be deleted at any time."""
         kept = self.model_dump(mode="json")
         if not self.stratify:
             kept.pop(self._number)  # a larger population has the scenes of a smaller one
@@ -103,11 +103,11 @@ class DrawnScenes(_Scenes):
     """Scenes of a generator: ``scenes: {drawn: 48, generator: 1, seed: 7}`` in a study.
 
     Attributes:
-        drawn: how many, numbered from 0.
-        generator: its number; there is one.
+        drawn: number of scenes, numbered from 0.
+        generator: number of the generator; only 1 exists.
         seed: two seeds share no scene.
-        axes: places on axes of difficulty that all of them have; the others are drawn.
-        stratify: axes over which they are spread evenly.
+        axes: fixed positions on axes of difficulty; the others are drawn.
+        stratify: axes over which the scenes are spread evenly.
 
     Example:
         >>> population = DrawnScenes(drawn=2, seed=7, axes={"things": 3})
@@ -134,7 +134,7 @@ class DrawnScenes(_Scenes):
         return f"{self.drawn} scenes drawn"
 
     def scene(self, number: int) -> Drawn:
-        """Draw one of them."""
+        """Draw one scene."""
         return draw(number, self.seed, self.places(number))
 
 
@@ -143,8 +143,8 @@ class MeshScenes(_Scenes):
 
     Attributes:
         meshes: folder of OBJ, PLY, STL, GLB or OFF files.
-        n: how many scenes, numbered from 0.
-        up: upright axis of all files; that of their format if left out (z of STL and OFF, else y).
+        n: number of scenes, numbered from 0.
+        up: upright axis of all files; by default that of their format (z for STL and OFF, else y).
     """
 
     meshes: str
@@ -174,7 +174,7 @@ class MeshScenes(_Scenes):
         return LONGEST_EDGE, files
 
     def scene(self, number: int) -> Drawn:
-        """Draw one of them."""
+        """Draw one scene."""
         return draw_meshes(number, self.seed, self._paths, self.places(number), self.up)
 
 

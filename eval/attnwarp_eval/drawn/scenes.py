@@ -1,9 +1,9 @@
-"""Scenes without end: generator 1, which draws a crowded scene with its edits from three numbers.
+"""Unlimited scenes: generator 1, which draws a crowded scene with its edits from three numbers.
 
-A scene is decided by the generator's number, a seed and the scene's own number, and by nothing
-else: not by the machine, its locale or its threads, nor by the scenes drawn before it. It is held
-out from the training of the bundled weights: no thing has a shape that training shows, and a thing
-with a colour has one that training never shows such a thing in.
+A scene is decided only by the generator's number, a seed and the scene's number, and not by the
+machine, its locale or its threads, nor by scenes drawn before. It is held out from the training
+of the bundled weights: no thing has a shape from training, and coloured things have colours that
+training never shows for their kind.
 """
 
 from __future__ import annotations
@@ -47,26 +47,26 @@ from attnwarp_eval.scene.transport import likely_bounces
 Array = npt.NDArray[np.float64]
 
 FIRST_SHAPE = 2**40
-"""Shapes of drawn scenes count from here; those that training draws lie far below."""
+"""Shapes of drawn scenes count from here; training's shapes have much lower numbers."""
 
 YAWS = (10, 30, 45, 60, 90, 120, 150, 180)
 """Degrees from the source to the targets, counter-clockwise."""
 
 SUBJECTS = tuple(kind for kind in KINDS if kind in OBJECTS)
-"""Things with named parts that have a colour which training never shows them in."""
+"""Things with named parts with colours held out of training."""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A drawn scene, and what it was drawn as.
+    """A drawn scene, with its random choices.
 
     Attributes:
         spec: the scene, checked.
-        data: the same as its file has it.
-        axes: its place on each axis of difficulty.
-        things: those that stand there, the one with parts first.
-        groups: by an object's name, what it belongs to: "thing 0" and so on, "fence", "around".
-        files: mesh files beside the scene's own, by their path from its folder.
+        data: the scene in the format of its file.
+        axes: position on each axis of difficulty.
+        things: things of the scene, the one with parts first.
+        groups: group of each object by name: "thing 0" and so on, "fence", "around".
+        files: mesh files, by their path relative to the scene's folder.
     """
 
     spec: SceneSpec
@@ -83,7 +83,7 @@ def draw(number: int, seed: int, axes: Mapping[str, float] | None = None) -> Dra
     Args:
         number: number of the scene, from 0.
         seed: seed of the population.
-        axes: places on axes that are fixed; the others are drawn.
+        axes: fixed positions on axes; the others are drawn.
 
     Example:
         >>> scene = draw(3, seed=7, axes={"things": 4})
@@ -96,10 +96,10 @@ def draw(number: int, seed: int, axes: Mapping[str, float] | None = None) -> Dra
 
 
 class SceneDraft(Draft):
-    """A scene while everything in it is drawn in turn."""
+    """A scene being drawn, step by step."""
 
     def finished(self) -> Drawn:
-        """The scene, after everything has been drawn in turn."""
+        """Draw everything in turn and return the scene."""
         self.begin()
         self.choose_things()
         self._place_things()
@@ -129,10 +129,10 @@ class SceneDraft(Draft):
         spec = SceneSpec.model_validate(data)
         return Drawn(spec, data, self.axes, tuple(self.things), groups, self.files)
 
-    # What is there ----------------------------------------------------------------------------
+    # Things ----------------------------------------------------------------------------
 
     def choose_things(self) -> None:
-        """Draw what stands there."""
+        """Draw the scene's things."""
         rng = self.stream("things")
         count = self.axes.things
         shiny = marks(rng, count, 0.7 * self.axes.highlights)
@@ -140,7 +140,7 @@ class SceneDraft(Draft):
         kinds = [SUBJECTS[index(rng, len(SUBJECTS))]]
         while len(kinds) < count:
             kind = OBJECTS[index(rng, len(OBJECTS))]
-            # A second thing of one colour half of the time: kinds share the colours kept for them.
+            # A second thing of one colour half of the time: kinds share their held-out colours.
             twin = len(kinds) == 1 and rng.random() < 0.5
             if kind in kinds or (
                 twin and not set(unseen_colors(kind)) & set(unseen_colors(kinds[0]))
@@ -216,7 +216,7 @@ class SceneDraft(Draft):
         reach, height = _reach([item["shape"] for item in objects])
         return Thing(kind, instance, look, objects, (reach * scale, height * scale))
 
-    # Where it stands --------------------------------------------------------------------------
+    # Positions --------------------------------------------------------------------------
 
     def _place_things(self) -> None:
         rng = self.stream("places")
@@ -225,7 +225,7 @@ class SceneDraft(Draft):
                 place = (between(rng, -0.1, 0.1), between(rng, -0.1, 0.1))
             else:
                 gap = 0.02 + (1 - self.axes.occlusion) * between(rng, 0.3, 0.9)
-                # What is tall stays out of the way between the source and the first thing.
+                # Tall things stay off the line between the source and the first thing.
                 tall = thing.reach[1] > 0.4 * self.things[0].reach[1]
                 place = self._free(rng, thing.reach[0], gap, clear=40.0 if tall else 0.0)
             _move([item["shape"] for item in thing.objects], *place)
@@ -234,11 +234,11 @@ class SceneDraft(Draft):
     def _free(
         self, rng: np.random.Generator, radius: float, gap: float, clear: float
     ) -> tuple[float, float]:
-        """A free place about the first thing, ``gap`` from it or as near as there is room."""
+        """A free position around the first thing, ``gap`` from it or as near as possible."""
         x, y, first = self.places[0]
         for attempt in range(200):
             far = first + radius + gap + 0.02 * attempt
-            # What stands nearer to the source than the first thing hides more of what lies behind.
+            # A thing nearer to the source than the first one hides more of the scene behind.
             aside = clear + (180 - clear) * float(rng.random()) ** (0.6 + 1.4 * self.axes.occlusion)
             angle = math.radians(aside if rng.random() < 0.5 else -aside)
             place = (x + far * math.cos(angle), y + far * math.sin(angle))
@@ -252,7 +252,7 @@ class SceneDraft(Draft):
         if self.smooth:
             kind = ("mirror ball", "mirror", "glass ball", "pane")[index(rng, 4)]
             r = round(between(rng, 0.2, 0.34), 3)
-            # A mirror hides what stands behind it from half of the views: small, and not near.
+            # A mirror hides things behind it from half of the views: small, and not near.
             wide = {"mirror": 0.4, "pane": 0.6}.get(kind, r)
             gap = between(rng, 0.5, 0.9) if kind == "mirror" else between(rng, 0.05, 0.4)
             x, y = self._free(rng, wide, gap, clear=50.0)
@@ -421,7 +421,7 @@ class SceneDraft(Draft):
 
 
 def with_bounces(data: dict[str, Any]) -> None:
-    """Write the bounces of a scene and its edits into its data, by what each is made of."""
+    """Write the bounces of a scene and its edits into its data, by their materials."""
     spec = SceneSpec.model_validate(data)
     own = likely_bounces(spec)
     data["appearance"] = {"bounces": own, **data["appearance"]}
@@ -446,7 +446,7 @@ def _hue(rng: np.random.Generator, color: str) -> str:
 
 
 def _reach(shapes: Sequence[dict[str, Any]]) -> tuple[float, float]:
-    """Radius of the circle about the upright that holds bodies, and their height."""
+    """Radius of the circle around the vertical axis that encloses bodies, and their height."""
     boxes = [
         reach(part)
         for shape in shapes

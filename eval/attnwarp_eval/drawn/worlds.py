@@ -1,7 +1,8 @@
 """Random scenes with true captions: objects, their looks and places.
 
-A :class:`World` is a shape, its surroundings and its cameras; a :class:`Look` is how it appears: surface, ground and time
-of day. One world has many looks, so pictures come that differ in one attribute alone.
+A :class:`World` is a shape, its surroundings and its cameras; a :class:`Look` is its appearance:
+surface, ground and time of day. One world has many looks, which gives pictures that differ in only
+one attribute.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ TWO_COLORED = ("striped", "checked")
 STATUES = ("golden", "silver", "bronze", "stone", "marble", "wooden")
 
 ATTRIBUTES = ("object", "finish", "color", "second", "ground", "time")
-"""Attributes that describe a picture, each an index into its words; -1 where it has none, or a
-caption does not say.
+"""Attributes that describe a picture, each an index into its words; -1 if it has none, or a caption
+does not mention it.
 """
 
 HSV: dict[str, tuple[float, float, float]] = {
@@ -39,7 +40,7 @@ HSV: dict[str, tuple[float, float, float]] = {
 }  # fmt: skip
 
 TRAIN_SHAPES = 40
-"""Instances of each object that training sees; the held-out ones count from :data:`HELD_OUT_SHAPE`."""
+"""Training instances of each object; held-out ones count from :data:`HELD_OUT_SHAPE`."""
 HELD_OUT_SHAPE = 100_000
 
 
@@ -65,12 +66,12 @@ class Look:
 
     @property
     def statue(self) -> bool:
-        """True if the details have no colours of their own."""
+        """True if the details have no separate colours."""
         return FINISHES[self.finish] in STATUES
 
     @cached_property
     def surface(self) -> dict[str, Any]:
-        """``texture`` or ``material`` of the object, as a scene file has it."""
+        """``texture`` or ``material`` of the object, in the format of a scene file."""
         rng = np.random.default_rng([self.seed, 1])
         finish = FINISHES[self.finish]
         grain = {"variation": round(float(rng.uniform(0.05, 0.3)), 3), "grain": round(float(rng.uniform(0.03, 0.1)), 3)}
@@ -134,7 +135,7 @@ class Look:
 
     @cached_property
     def floor(self) -> dict[str, Any]:
-        """The ground's texture, as a scene file has it."""
+        """The ground's texture, in the format of a scene file."""
         rng = np.random.default_rng([self.seed, 2])
         kind = GROUNDS[self.ground]
         bright = rng.uniform(0.85, 1.1)
@@ -178,7 +179,7 @@ class Look:
 
     @cached_property
     def lights(self) -> list[dict[str, Any]]:
-        """Sun and sky of the time of day, as a scene file has them."""
+        """Sun and sky of the time of day, in the format of a scene file."""
         rng = np.random.default_rng([self.seed, 3])
         azimuth = round(float(rng.uniform(0, 360)), 1)
         match TIMES[self.time]:
@@ -261,7 +262,7 @@ def _scaled(color: str, factor: float) -> str:
 
 @dataclass(frozen=True)
 class World:
-    """An object with its surroundings and cameras; ``seed`` decides everything but the shape itself."""
+    """An object with its surroundings and cameras; ``seed`` decides everything but the shape."""
 
     thing: int
     instance: int
@@ -274,7 +275,7 @@ class World:
         return (look,)
 
     def spec(self, look: Look, size: int, *, statue: bool | None = None) -> dict[str, Any]:
-        """The scene as a file has it; the object is object 0, the ground object 1."""
+        """The scene in the format of a file; the object is object 0, the ground object 1."""
         rng = np.random.default_rng([self.seed, 4])
         statue = look.statue if statue is None else statue
         shape = body(OBJECTS[self.thing], self.instance, plain=statue)
@@ -306,7 +307,7 @@ class World:
             "title": OBJECTS[self.thing],
             "objects": objects,
             "lights": look.lights,
-            # Direct light, whatever a scene's default becomes: bundled weights were trained on it.
+            # Direct light, independent of a scene's default: bundled weights were trained on it.
             "appearance": {"bounces": 1},
             "cameras": {
                 "look_at": [*middle, round(float(rng.uniform(0.38, 0.6)), 2)], "radius": round(float(radius), 2),
@@ -375,7 +376,7 @@ class World:
         return items
 
     def scene(self, look: Look, size: int) -> Scene:
-        """The scene itself, which Mitsuba renders with its real materials."""
+        """The scene, which Mitsuba renders with its real materials."""
         return Scene(SceneSpec.model_validate(self.spec(look, size)))
 
 
@@ -393,8 +394,8 @@ def draw_look(thing: int, rng: np.random.Generator, *, pairs: str = "seen") -> L
     """A random look for an object.
 
     Args:
-        pairs: "seen" (colours that training shows it in), "new" (those it never does; always a coloured finish of one
-            colour) or "any".
+        pairs: "seen" (colours shown in training), "new" (held-out ones; always a coloured finish of
+            one colour) or "any".
     """
     weights = np.array([6, 3, 1.2, 1.2, 1.2, 1.4, 1.2, 1.2, 1.6, 1.6])
     while True:
@@ -407,7 +408,7 @@ def draw_look(thing: int, rng: np.random.Generator, *, pairs: str = "seen") -> L
             color == second or {COLORS[color], COLORS[second]} <= {"black", "brown", "grey", "purple"}
         ):
             continue
-        # White checks on white snow are no trouble, but two that people call by one name are.
+        # White checks on white snow are no trouble, but two checks of one named colour are.
         if kind in TWO_COLORED and {COLORS[color], COLORS[second]} in (
             {"red", "orange"},
             {"red", "brown"},
