@@ -1,9 +1,9 @@
-"""Scenes of BlendedMVS as they are published: MVSNet's cameras beside a folder of images.
+"""Scenes of BlendedMVS as published: MVSNet's cameras next to a folder of images.
 
 ``cams/00000000_cam.txt`` has the world-to-camera matrix (OpenCV axes) under ``extrinsic`` and K
-under ``intrinsic``; the line of depths below is not used. ``blended_images/00000000.jpg`` is its
-image; those ending in ``_masked`` are the same without a background, and are left out. MVSNet
-counts pixel centres at +0.5, so the principal point is taken unchanged.
+under ``intrinsic``; the line of depths below is unused. ``blended_images/00000000.jpg`` is its
+image; files ending in ``_masked`` are the same without a background and are skipped. MVSNet counts
+pixel centres at +0.5, so the principal point is unchanged.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ def read_blendedmvs(path: str | os.PathLike[str], *, missing_images: Missing = "
     """Read a scene of BlendedMVS, in either published resolution.
 
     Args:
-        path: the scene's folder, with ``cams`` and ``blended_images``.
-        missing_images: "error", or "none" to leave out cameras whose image is not there: only the
-            images say their size.
+        path: folder of the scene, with ``cams`` and ``blended_images``.
+        missing_images: "error", or "none" to leave out cameras without an image file, since only
+            images give the camera's size.
 
     Raises:
-        FileNotFoundError: no such scene.
-        FileFormatError: a damaged camera, or images that are missing.
+        FileNotFoundError: the scene does not exist.
+        FileFormatError: a camera is damaged, or images are missing.
 
     Example:
         >>> from pathlib import Path
@@ -107,7 +107,7 @@ def _camera(file: Path, image: Path) -> Camera:
 
 
 def _matrix(file: Path, words: list[str], name: str, side: int) -> npt.NDArray[np.float64]:
-    """The numbers after a word, as a square matrix."""
+    """Parse the numbers after a word as a square matrix."""
     count = side * side
     try:
         begin = words.index(name) + 1

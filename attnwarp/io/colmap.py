@@ -1,8 +1,8 @@
 """COLMAP sparse models, binary and text: cameras, images and points.
 
-COLMAP's conventions are ours: OpenCV axes, world-to-camera poses, the corner of the image at (0, 0)
-and the first pixel's centre at (0.5, 0.5) (colmap/sensor/models.h), so the principal point is taken
-as it is.
+COLMAP's conventions equal ours: OpenCV axes, world-to-camera poses, the corner of the image at
+(0, 0) and the first pixel's centre at (0.5, 0.5) (colmap/sensor/models.h), so the principal point
+is unchanged.
 """
 
 from __future__ import annotations
@@ -64,17 +64,17 @@ FISHEYE: dict[str, tuple[int, ...]] = {
     "RADIAL_FISHEYE": (0, 1),
     "OPENCV_FISHEYE": (0, 1, 2, 3),
 }
-"""Models that :class:`Lens` holds: which of its coefficients their last parameters are."""
+"""Models supported by :class:`Lens`: indices of the coefficients in their last parameters."""
 
 ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 """Models with one focal length for both axes."""
 
 MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
-"""Places in a folder where a sparse model is looked for, first hit first."""
+"""Subfolders searched for a sparse model, in order."""
 
 
 def find_model(path: str | os.PathLike[str]) -> Path | None:
-    """The folder at or under ``path`` that holds a sparse model, or None."""
+    """Find the folder at or under ``path`` with a sparse model; None without one."""
     for name in MODEL_FOLDERS:
         folder = Path(path) / name
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
@@ -92,33 +92,34 @@ def read_colmap(
     distorted: Distorted = "error",
     scale: int = 1,
 ) -> Dataset:
-    """Read a COLMAP sparse model; where both binary and text files are there, the binary ones, as
-    COLMAP does.
+    """Read a COLMAP sparse model; binary files take precedence over text files, as in
+    COLMAP.
 
-    Images come sorted by name. Quaternions are normalised, as COLMAP does on reading.
+    Images are sorted by name. Quaternions are normalised, as COLMAP does on reading.
 
     Args:
-        path: the folder of the model, or one that holds it as ``sparse/0``, ``sparse`` or
+        path: folder of the model, or a folder with the model in ``sparse/0``, ``sparse`` or
             ``colmap/sparse/0``.
-        images: folder of the images; a relative one is tried in ``path`` first and then as it is.
-            Left out, the folder ``images`` in ``path`` or in a folder above the model.
-        missing_images: "error", or "none" to get None for the path of an image that is not there.
-        resize_cameras: when an image has another size than its camera (``images_4`` for instance),
-            resize the camera instead of refusing.
-        points: False to leave the points out; their file is then not read, and may be missing or
+        images: folder of the images; a relative path is tried in ``path`` first, then in the
+            working folder. By default the folder ``images`` in ``path`` or above the model.
+        missing_images: "error", or "none" to set the path of a missing image to None.
+        resize_cameras: True resizes a camera whose image has another size (``images_4`` for
+            instance); False refuses it.
+        points: False skips the points; their file is then not read, and may be missing or
             damaged.
-        distorted: "error" to refuse lens distortion, or "keep" to hand it on in
+        distorted: "error" to refuse lens distortion, or "keep" to return it in
             ``Dataset.lenses`` for :func:`undistort`.
-        scale: 4 for the folder ``images_4`` in place of ``images``, where ``images`` is left out;
+        scale: downscaling factor such as 4, which reads ``images_4`` if ``images`` is omitted;
             the cameras are resized to its pictures.
 
     Warns:
-        InputWarning: another model beside ``sparse/0`` has more images; the head of a text file
-            counts other entries than it holds.
+        InputWarning: another model next to ``sparse/0`` has more images; the header of a text file
+            states another number of entries than the file has.
 
     Raises:
-        FileNotFoundError: no model there.
-        FileFormatError: a camera with lens distortion, a damaged or truncated file, missing images.
+        FileNotFoundError: the folder has no model.
+        FileFormatError: a camera has lens distortion, a file is damaged or truncated, or images are
+            missing.
 
     Example:
         >>> from pathlib import Path
@@ -180,8 +181,8 @@ def read_colmap(
     cloud = model / f"points3D{suffix}"
     if not points or not cloud.is_file():
         return Dataset(cameras, paths, lenses=lenses)
-    # An empty text file is what COLMAP's own guide asks for where poses are known and points are
-    # not: no points, not a damaged file.
+    # COLMAP's guide asks for an empty text file if poses are known and points are not: no
+    # points, not a damaged file.
     xyz, colors = _binary_points(existing_file(cloud)) if binary else _text_points(cloud)
     return Dataset(cameras, paths, xyz, colors, lenses=lenses)
 
@@ -206,9 +207,9 @@ class _Pose:
 
 
 def _warn_of_larger(model: Path, count: int, images: Path) -> None:
-    """Warn if another model beside this one has more images. If photographs do not hang together,
-    COLMAP leaves several models, numbered in the order in which it began them: the first need not
-    be the best.
+    """Warn if another model next to this one has more images. If photographs do not connect, COLMAP
+    writes several models, numbered in the order in which it began them: the first may not be
+    the best.
     """
     others = {
         other: _image_count(other)
@@ -226,7 +227,7 @@ def _warn_of_larger(model: Path, count: int, images: Path) -> None:
 
 
 def _image_count(model: Path) -> int:
-    """Registered images of a model; 0 where it cannot be read."""
+    """Count the registered images of a model; 0 if unreadable."""
     try:
         if (model / "images.bin").is_file():
             with (model / "images.bin").open("rb") as stream:
@@ -239,11 +240,11 @@ def _image_count(model: Path) -> int:
 def _image_folder(
     path: Path, model: Path, images: str | os.PathLike[str] | None, name: str
 ) -> Path:
-    """The folder that ``images`` says; left out, the one of that name nearest to the model."""
+    """Find the folder ``images``; by default the folder of that name nearest to the model."""
     if images is not None:
         return path / images if (path / images).is_dir() else Path(images)
     roots = [path, model.parent, model.parent.parent, model.parent.parent.parent]
-    # The parent of "." is "." itself.
+    # Resolved, since the parent of "." is ".".
     roots += model.resolve().parents[:3]
     exact = (root / name for root in roots if (root / name).is_dir())
     found = next(exact, None) or next((f for root in roots[:4] for f in _named(root, name)), None)
@@ -251,7 +252,7 @@ def _image_folder(
 
 
 def _named(root: Path, name: str) -> list[Path]:
-    """Folders of a name in another case."""
+    """Find folders whose name differs only in case."""
     return [each for each in FileFinder(root).entries(name) if each.is_dir()]
 
 
@@ -314,8 +315,8 @@ def _camera(
 
 
 class _Reader:
-    """Little-endian values off a file's bytes, with an error that says what was being read when
-    they ran out.
+    """Reader of little-endian values from a file's bytes, whose error at the end of the data names
+    the expected value.
     """
 
     def __init__(self, path: Path) -> None:
@@ -354,7 +355,7 @@ class _Reader:
         return text
 
     def entries(self, noun: str) -> Iterator[int]:
-        """Count off the entries announced at the start of the file."""
+        """Count the entries announced at the start of the file."""
         (count,) = self.take("Q")
         for i in range(count):
             self.what = f"{noun} {i} of {count}"
@@ -415,8 +416,8 @@ def _binary_points(path: Path) -> tuple[Array, npt.NDArray[np.uint8]]:
 
 
 def _text_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Line numbers and lines without comments. Empty lines are kept: in images.txt they mean 'no
-    keypoints'.
+    """Iterate over line numbers and lines without comments. Empty lines are kept: in images.txt
+    they mean 'no keypoints'.
     """
     try:
         text = read_text(path, errors="surrogateescape")
@@ -466,7 +467,7 @@ def _text_images(path: Path) -> list[_Pose]:
             raise _damaged(
                 path, number, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
             ) from error
-        # The line after it holds the keypoints and may be empty, or missing at the end.
+        # The next line has the keypoints and may be empty, or missing at the end.
         number, line = next(lines, (number, ""))
         if _is_image(line):
             raise _damaged(
@@ -480,21 +481,21 @@ def _text_images(path: Path) -> list[_Pose]:
 
 
 def _text_pose(line: str) -> _Pose:
-    """The fields of an image's line; ValueError if there are others."""
+    """Parse the fields of an image's line; ValueError for an unexpected format."""
     _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
     rotation, translation = (qw, qx, qy, qz), (tx, ty, tz)
     return _Pose(tuple(map(float, rotation)), tuple(map(float, translation)), int(camera), name)
 
 
 def _is_image(line: str) -> bool:
-    """Return True if a line in the place of keypoints is the next image. As nothing reads
-    keypoints, all else may stand there.
+    """Return True if the line after an image is the next image, not keypoints. Keypoints are never
+    read, so their line may have any content.
     """
     try:
         name = _text_pose(line).name
     except ValueError:
         return False
-    # Keypoints may begin like an image, but go on with numbers, and these in threes.
+    # Keypoints may begin like an image, but continue with numbers in groups of three.
     first, *others = name.split(maxsplit=2)
     return len(others) < 2 or not (_is_number(first) and _is_number(name.rsplit(maxsplit=1)[-1]))
 
@@ -525,7 +526,7 @@ def _text_points(path: Path) -> tuple[Array, npt.NDArray[np.uint8]]:
 
 
 def _warn_of_count(path: Path, noun: str, count: int) -> None:
-    """Say where the head of a text file counts other entries than it holds."""
+    """Warn if the header of a text file states another number of entries than it has."""
     with path.open(encoding="utf-8", errors="surrogateescape") as lines:
         head = "".join(itertools.takewhile(lambda line: line.startswith("#"), lines))
     stated = re.search(rf"Number of {noun}: *(\d+)", head)

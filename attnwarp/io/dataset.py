@@ -1,4 +1,4 @@
-"""A set of posed images: what transforms.json and COLMAP folders are read into."""
+"""Dataset of posed images, read from transforms.json and COLMAP folders."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from attnwarp.io.lens import Lens
 Array = npt.NDArray[np.float64]
 
 ROTATION_TOLERANCE = 1e-4
-"""Largest |R R^T - I| that is taken for float32 or printing noise and repaired; Camera itself
-allows 1e-5.
+"""Largest |R R^T - I| treated as float32 or printing noise and repaired; Camera allows
+1e-5.
 """
 
 Missing = Literal["error", "none"]
@@ -32,19 +32,19 @@ Distorted = Literal["error", "keep"]
 
 @dataclass(eq=False)
 class Dataset:
-    """Posed images of one scene, and perhaps a first point cloud of it.
+    """Posed images of one scene, with an optional first point cloud.
 
     Args:
-        cameras: one for each image, OpenCV axes, pixel centres at +0.5; ``name`` is the image's
-            name in the file.
-        image_paths: one for each camera; None where there is no image.
+        cameras: cameras, one for each image, OpenCV axes, pixel centres at +0.5; ``name`` is the
+            image's name in the file.
+        image_paths: paths, one for each camera; None for a missing image.
         points: (P, 3) float64 world coordinates, or None.
         colors: (P, 3) uint8 sRGB of the points, or None.
-        splits: one for each camera: "train", "val", "test", or None where the file names no split.
-        lenses: one for each camera; None for a pinhole, as which every camera is used. Pictures
-            taken through another lens must be undistorted first: see :func:`undistort`.
+        splits: splits, one for each camera: "train", "val", "test", or None if the file names none.
+        lenses: lenses, one for each camera; None for a pinhole. Every camera is used as a pinhole:
+            pictures of another lens must be undistorted first, see :func:`undistort`.
         applied_transform: (3, 4) transform from the original world to that of the cameras and
-            points, as the writer of a transforms.json states it. Information only.
+            points, as stated in a transforms.json. For information only.
 
     Raises:
         ValueError: lists of different lengths, a wrong shape or dtype.
@@ -97,7 +97,7 @@ class Dataset:
         return len(self.cameras)
 
     def select(self, indices: Sequence[int]) -> Dataset:
-        """The images at ``indices``, in that order, with the same points."""
+        """Select the images at ``indices``, in that order, with the same points."""
         return Dataset(
             [self.cameras[i] for i in indices],
             [self.image_paths[i] for i in indices],
@@ -109,10 +109,10 @@ class Dataset:
         )
 
     def split(self, name: str) -> Dataset:
-        """The images of one split.
+        """Select the images of one split.
 
         Raises:
-            ValueError: no image belongs to it; the message lists the splits there are.
+            ValueError: the split has no image; the message lists the existing splits.
         """
         indices = [i for i, split in enumerate(self.splits) if split == name]
         if not indices:
@@ -125,13 +125,13 @@ class Dataset:
 
 
 def nearest_rotation(path: Path, name: str, R: Array) -> Array:
-    """``R`` if it is a rotation to 1e-12; the nearest one (by SVD) if it is to 1e-4; an error that
-    says by how much.
+    """Return ``R`` if it is a rotation to 1e-12, or the nearest rotation (by SVD) if to 1e-4; raise
+    an error with the deviation otherwise.
 
     Args:
-        path: the file that ``R`` comes from, for the error.
-        name: name of the field there.
-        R: (3, 3).
+        path: file of ``R``, for the error.
+        name: name of the field in the file.
+        R: (3, 3) matrix.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         error = float(np.abs(R @ R.T - np.eye(3)).max())
@@ -172,17 +172,17 @@ def with_images(
 
     Args:
         source: source of the cameras, for messages.
-        cameras, paths: one path for each camera.
+        cameras, paths: cameras and paths, one path for each camera.
         missing_images, resize_cameras: see :func:`attnwarp.io.read_dataset`.
-        finder: text of the folder that the images' names are relative to.
-        elsewhere: how a person names the images' folder, where that can be.
+        finder: file finder in the root folder of the images' names.
+        elsewhere: hint on naming another folder of images, if possible.
 
-    Returns:
-        the cameras (resized to their images where ``resize_cameras`` says so), and the paths, None
-        where missing.
+        rns:
+        Cameras (resized to their images if ``resize_cameras``), and paths, None for missing
+        images.
 
     Warns:
-        InputWarning: images with an EXIF tag that asks for a turn.
+        InputWarning: images have an EXIF tag that requests rotation.
     """
     check.one_of(missing_images, ("error", "none"), "missing_images")
     absent = [path for path in paths if not is_file(path)]
@@ -231,7 +231,7 @@ def with_images(
 
 
 def _warn_of_turns(source: Path, paths: Sequence[Path]) -> None:
-    """Say which pictures viewers show otherwise than their poses have them."""
+    """Warn of pictures that viewers rotate although their poses refer to stored pixels."""
     turned = [path for path in paths if orientation(path) != 1]
     if turned:
         warnings.warn(
@@ -244,8 +244,8 @@ def _warn_of_turns(source: Path, paths: Sequence[Path]) -> None:
 
 
 def _near(path: Path, finder: FileFinder) -> list[str]:
-    """Names of files that a missing image may be: those of another suffix, or else those in a
-    folder of another name or on another machine.
+    """List likely files for a missing image: those of another suffix, or else those in a folder
+    of another name or from another machine.
     """
     stem = path.with_suffix("")
     each = (Path(f"{stem}{suffix}") for suffix in IMAGE_SUFFIXES)

@@ -1,4 +1,4 @@
-"""Parts of readers and writers: the error for a bad file, and a write that is whole or not."""
+"""Helpers of readers and writers: the error for a bad file, and atomic writes."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from attnwarp.errors import InputError
 
 
 class FileFormatError(InputError):
-    """A file that cannot be read as what it claims to be.
+    """Error for a file that does not have its claimed format.
 
-    The message names the file, the property or field, the first bad row where there is one (counted
-    from 0), and what to do.
+    The message names the file, the property or field, the first bad row if any (counted from 0),
+    and a remedy.
 
     Attributes:
-        path: the file.
-        field: the property or key at fault, or None when it is the file as a whole.
-        row: the first bad row or frame, counted from 0, or None.
+        path: path of the file.
+        field: faulty property or key, or None for the file as a unit.
+        row: first bad row or frame, counted from 0, or None.
 
     Example:
         >>> from pathlib import Path
@@ -46,7 +46,7 @@ class FileFormatError(InputError):
 
 
 def is_file(path: Path) -> bool:
-    """Return True if there is such a file; False too for a name that no file system can hold."""
+    """Return True if the file exists; False also for a name invalid in every file system."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -54,29 +54,29 @@ def is_file(path: Path) -> bool:
 
 
 def check_other(out: Path, source: Path, what: str) -> None:
-    """Refuse to write over what is read.
+    """Refuse to overwrite an input.
 
     Args:
-        out: where a result goes.
-        source: name of the input that it is made from.
-        what: the source is, for the message.
+        out: path of a result.
+        source: path of the input.
+        what: description of the source, for the message.
 
     Raises:
-        InputError: both are one file or folder, under one name or two, or by a link.
+        InputError: both are the same file or folder, under any name or by a link.
     """
     if out.exists() and source.exists() and out.samefile(source):
         raise InputError(f"{out}: is {what}; choose another name for the result")
 
 
 def inside(folder: Path, name: str | os.PathLike[str]) -> Path:
-    """Return the path of a name in a folder, for names that a file or another person gives.
+    """Return the path of an untrusted name in a folder.
 
     Args:
-        folder: the folder that the path has to stay in.
-        name: path from there.
+        folder: folder that the path must not leave.
+        name: relative path from the folder.
 
     Raises:
-        InputError: it leads out of the folder, by ``..``, as an absolute path or by a link.
+        InputError: the path leaves the folder, by ``..``, as an absolute path or by a link.
 
     Example:
         >>> inside(Path("run"), "pictures/a.png").as_posix()
@@ -88,7 +88,7 @@ def inside(folder: Path, name: str | os.PathLike[str]) -> Path:
     path = folder / name
     try:
         stays = path.resolve().is_relative_to(folder.resolve())
-    except (OSError, ValueError, RuntimeError):  # a name or links that lead nowhere
+    except (OSError, ValueError, RuntimeError):  # an invalid name or broken links
         stays = False
     if not stays:
         raise InputError(f"{str(name)!r}: leads out of {folder}, expected a path inside it")
@@ -96,11 +96,11 @@ def inside(folder: Path, name: str | os.PathLike[str]) -> Path:
 
 
 def existing_file(path: str | os.PathLike[str]) -> Path:
-    """``path`` as a Path.
+    """Return ``path`` as a Path to an existing file.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        FileFormatError: it is a folder, or it is empty.
+        FileNotFoundError: the file does not exist.
+        FileFormatError: the path is a folder, or the file is empty.
     """
     path = Path(path)
     try:
@@ -125,24 +125,24 @@ def write_atomically(
     durable: bool = True,
     follow_link: bool = False,
 ) -> None:
-    """Call ``write`` on a temporary file beside ``path`` and rename it to ``path``.
+    """Call ``write`` on a temporary file in the folder of ``path``, then rename it to ``path``.
 
-    A reader, or a run that is killed, sees the old file or the new one and never a part. When
+    A reader sees the old file or the new one and never a part, even if the run is killed. If
     ``write`` raises, the old file stays and the temporary one is removed. The temporary file of a
-    killed process is removed by the next one that writes to the folder.
+    killed process is removed by the next process that writes to the folder.
 
     Args:
         path: path of the file; its folder must exist.
-        write: called with the open temporary file.
-        durable: whether the content survives a power cut too, which costs milliseconds. A file
-            that carries a checksum and can be made again does without.
-        follow_link: where ``path`` is a link, write the file that it leads to. Without, the link is
-            replaced, so that nothing outside a program's own folder is written.
+        write: function called with the open temporary file.
+        durable: True makes the content survive a power cut, which costs milliseconds. A file with a
+            checksum that can be regenerated does not need it.
+        follow_link: True writes the target of a link ``path``. False replaces the link, so that
+            nothing outside a program's folder is written.
 
     Raises:
         FileNotFoundError: the folder does not exist.
-        IsADirectoryError: the path is a folder's.
-        OSError: the disk is full, or the folder cannot be written to.
+        IsADirectoryError: the path is a folder.
+        OSError: the disk is full, or the folder is not writable.
 
     Example:
         >>> from pathlib import Path
@@ -159,8 +159,8 @@ def write_atomically(
     if path.is_dir() and not path.is_symlink():
         raise IsADirectoryError(f"{path}: is a folder, expected a file; choose another name")
     _sweep(path.parent.resolve(), os.getpid())
-    # Opened by name instead of tempfile.mkstemp, which would leave the result readable by its owner
-    # alone. Of a long name a part, so that this one is not too long for the file system.
+    # Opened by name, since tempfile.mkstemp would make the result readable by its owner only. A
+    # long name is shortened, so that the temporary name fits the file system.
     part = path.name[:NAME_PART]
     temporary = path.with_name(f".{part}.{_host()}-{os.getpid()}-{uuid.uuid4().hex}.tmp")
     try:
@@ -171,8 +171,8 @@ def write_atomically(
                 os.fsync(stream.fileno())
         temporary.replace(path)
     except BaseException as error:
-        # A full disk is found by write(), which does not know what it wrote to, and a folder that
-        # cannot be written to by the temporary file, which means nothing to a person.
+        # write() reports a full disk without a path, and an unwritable folder is reported for the
+        # temporary file, whose name means nothing to the user.
         if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
             error.filename = str(path)
         temporary.unlink(missing_ok=True)
@@ -180,21 +180,21 @@ def write_atomically(
 
 
 ABANDONED_SECONDS = 24 * 3600
-"""A temporary file of another machine counts as abandoned when nothing was written to it for this
-long: whether its process is alive cannot be asked from here.
+"""Age in seconds at which another machine's temporary file counts as abandoned, since its process
+cannot be queried from here.
 """
 
 NAME_PART = 40
-"""Characters of a file's name in that of its temporary one: at most 160 bytes, where a file system
-takes 255."""
+"""Characters of a file's name kept in its temporary name: at most 160 bytes, within a file system's
+limit of 255."""
 
 _TEMPORARY = re.compile(r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>[0-9]{1,10})-[0-9a-f]{32}\.tmp")
 
 
 def remove_abandoned(folder: str | os.PathLike[str]) -> int:
-    """Remove the temporary files that dead processes left in ``folder``; return how many.
+    """Remove temporary files of dead processes in ``folder``; return their number.
 
-    Files of :func:`write_atomically` alone are touched, and none of a process that is alive.
+    Only files of :func:`write_atomically` are removed, and never those of a live process.
     """
     removed = 0
     for path in Path(folder).glob(".*.tmp"):
@@ -214,16 +214,16 @@ def remove_abandoned(folder: str | os.PathLike[str]) -> int:
 
 @cache
 def _sweep(folder: Path, process: int) -> None:
-    """:func:`remove_abandoned`, once for a folder and a process: the cache remembers it."""
-    # A folder that cannot be listed may be written to all the same.
+    """Call :func:`remove_abandoned` once per folder and process, by a cache."""
+    # A folder that cannot be listed may still be writable.
     with contextlib.suppress(OSError):
         remove_abandoned(folder)
 
 
 @cache
 def _host() -> str:
-    """Eight hexadecimal digits of where a process's number means this process: the machine's name,
-    and on Linux the namespace, as containers may share the name and not the numbers.
+    """Compute eight hexadecimal digits that identify the scope of process numbers: the machine's
+    name, and on Linux the PID namespace, since containers may share the name.
     """
     try:
         namespace = str(Path("/proc/self/ns/pid").readlink())
@@ -234,9 +234,9 @@ def _host() -> str:
 
 def _alive(process: int) -> bool:
     try:
-        os.kill(process, 0)  # signal 0 asks and sends nothing
+        os.kill(process, 0)  # signal 0 only tests for existence
     except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
-        pass  # it is another user's
+        pass  # another user's process
     return True

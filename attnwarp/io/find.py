@@ -1,4 +1,4 @@
-"""Files by the names that other systems and programs write for them."""
+"""Lookup of files by names written by other systems and programs."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from attnwarp.io.file import is_file
 
 
 def name_key(name: str) -> str:
-    """Key that all spellings of one name share: backslashes are slashes, URL escapes their
-    characters, and neither case nor the form of accents (NFC, NFD) counts.
+    """Compute a key shared by all spellings of a name: backslashes become slashes, URL escapes
+    their characters; case and the form of accents (NFC, NFD) are ignored.
 
     Example:
         >>> from attnwarp.io.find import name_key
@@ -26,13 +26,13 @@ def name_key(name: str) -> str:
 
 
 class FileFinder:
-    """The files below a folder, by names that may be those of another system.
+    """Finder of files below a folder by names that may come from another system.
 
-    A folder's list is read once, and only where a name is not there as it is.
+    A folder is listed once, and only if a name does not exist literally.
 
     Args:
-        folder: that names are relative to.
-        suffixes: that a name may lack, in the order in which they are tried.
+        folder: root folder of the names.
+        suffixes: suffixes to try for a name without suffix, in order.
 
     Example:
         >>> from pathlib import Path
@@ -49,8 +49,8 @@ class FileFinder:
         self._lists: dict[Path, dict[str, list[Path]]] = {}
 
     def find(self, name: str) -> Path:
-        """The file that a name means, if there is one and no second: its own before those of
-        another spelling. Otherwise the path of the name as it is.
+        """Find the file of a name: the exact spelling first, else a unique file of another
+        spelling. Without one, return the path of the name unchanged.
         """
         for suffix in self.suffixes:
             if is_file(path := self.folder / f"{name}{suffix}"):
@@ -59,19 +59,19 @@ class FileFinder:
         return others[0] if len(others) == 1 else self.folder / name
 
     def others(self, name: str) -> list[Path]:
-        """The files that a name may mean in another spelling."""
+        """List the files that match a name in another spelling."""
         plain = name.replace("\\", "/")
         if plain.startswith("/") or re.match("[A-Za-z]:", plain):
             return []
         return sorted(set(self._below(self.folder, [p for p in plain.split("/") if p not in "."])))
 
     def entries(self, name: str) -> list[Path]:
-        """The files and folders in the folder itself that are of this name in some spelling."""
+        """List direct children of the folder that match this name in some spelling."""
         return self._entries(self.folder).get(name_key(name), [])
 
     def tail(self, name: str) -> list[Path]:
-        """The files below the folder that have the longest last part of a path in common with
-        ``name``, whatever folder of whatever machine that begins with.
+        """List the files below the folder that share the longest trailing part of a path with
+        ``name``, ignoring the leading folders of the original machine.
         """
         parts = [part for part in re.split(r"[\\/]", name) if part not in (".", "..", "")]
         tails = ("/".join(parts[start:]) for start in range(len(parts)))
@@ -83,7 +83,7 @@ class FileFinder:
         if parts[0] == "..":
             yield from self._below(folder / "..", parts[1:])
             return
-        # A backslash may be part of a file's name, as some programs unpack archives.
+        # A backslash may be part of a file's name, as some archive programs create.
         rest, entries = "/".join(parts), self._entries(folder)
         for suffix in self.suffixes:
             yield from filter(is_file, entries.get(name_key(f"{rest}{suffix}"), []))
@@ -91,7 +91,7 @@ class FileFinder:
             yield from self._below(path, parts[1:])
 
     def _entries(self, folder: Path) -> dict[str, list[Path]]:
-        """The entries of a folder by the keys of their names; none of what is no folder."""
+        """Map name keys to the entries of a folder; empty for a path that is no folder."""
         if folder not in self._lists:
             entries: dict[str, list[Path]] = {}
             with contextlib.suppress(OSError):

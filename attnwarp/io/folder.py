@@ -1,4 +1,4 @@
-"""One door for a folder of posed images, whatever wrote it."""
+"""Common reader for folders of posed images of any format."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from attnwarp.io.transforms import SPLITS, read_transforms
 Format = Literal["transforms", "colmap", "blendedmvs"]
 
 SCALES = (1, 2, 4, 8)
-"""Scales of image folders, as nerfstudio and Mip-NeRF 360 have them: images, images_2 and so on."""
+"""Scales of image folders in nerfstudio and Mip-NeRF 360: images, images_2 and so on."""
 
 
 def read_dataset(
@@ -38,29 +38,29 @@ def read_dataset(
       another split.
     - A folder with a sparse model is COLMAP's: ``cameras.bin`` or ``.txt`` in it, in ``sparse/0``
       or in ``sparse``.
-    - A folder that is both needs ``format``. A model under ``colmap/`` does not count: nerfstudio
-      made the transforms.json from it.
+    - A folder of both kinds needs ``format``. A model under ``colmap/`` does not count: nerfstudio
+      derived the transforms.json from it.
     - A folder with ``cams`` and ``blended_images`` is a scene of BlendedMVS.
 
     Args:
-        path: file or folder.
-        format: "transforms", "colmap" or "blendedmvs", for a folder that is more than one.
+        path: file or folder of the dataset.
+        format: "transforms", "colmap" or "blendedmvs", for a folder of several kinds.
         images: folder of the images of a COLMAP model; see :func:`read_colmap`.
-        missing_images: "error", or "none" to get None for the path of an image that is not there.
-        resize_cameras: when an image has another size than its camera, resize the camera instead of
-            refusing.
-        points: False to leave the points out; their file is then not read, and may be missing or
+        missing_images: "error", or "none" to set the path of a missing image to None.
+        resize_cameras: True resizes a camera whose image has another size; False refuses
+            it.
+        points: False skips the points; their file is then not read, and may be missing or
             damaged.
-        distorted: "error" to refuse lens distortion, or "keep" to hand it on in
+        distorted: "error" to refuse lens distortion, or "keep" to return it in
             ``Dataset.lenses`` for :func:`undistort`.
-        ignore_keys: keys of a transforms.json to pass over although they change what a picture
-            shows, such as "mask_path".
-        scale: one of 1, 2, 4 and 8: images are read from ``images_4`` in place of ``images``, and
-            the cameras resized to them.
+        ignore_keys: keys of a transforms.json to ignore although they change a picture's content,
+            such as "mask_path".
+        scale: one of 1, 2, 4 and 8; 4 reads images from ``images_4`` instead of ``images`` and
+            resizes the cameras to them.
 
     Raises:
-        FileNotFoundError: nothing there that could be read.
-        FileFormatError: both kinds are there, or what is there is damaged or not usable.
+        FileNotFoundError: no readable dataset was found.
+        FileFormatError: both kinds exist, or the dataset is damaged or unusable.
 
     Example:
         >>> from attnwarp import Camera

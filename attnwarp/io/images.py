@@ -1,7 +1,7 @@
-"""Pictures: the one door through which they come in, so that a damaged one is refused everywhere.
+"""Reading of pictures, the only entry point, so that damaged files are refused everywhere.
 
-OpenCV reads the pixels, since it keeps 16 bits. It fills what is missing of a JPEG with grey and
-returns a picture; Pillow, which refuses such a file, therefore decodes it first.
+OpenCV reads the pixels, since it keeps 16 bits. It fills missing parts of a JPEG with grey and
+returns a picture; Pillow, which refuses such a file, therefore decodes the file first.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ IMAGE_SUFFIXES = (
     ".tiff",
     ".exr",
 )
-"""Suffixes of images, in the order in which they are looked for."""
+"""Suffixes of images, in search order."""
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """(width, height) in px from a picture's header, without decoding it.
+    """Read (width, height) in px from a picture's header, without decoding it.
 
-    The size is that of the stored pixels: EXIF orientation is ignored.
+    The size refers to stored pixels: EXIF orientation is ignored.
 
     Args:
-        path: picture of any format that Pillow or OpenCV reads.
+        path: path of a picture in any format of Pillow or OpenCV.
 
     Raises:
-        FileNotFoundError: no such file.
-        FileFormatError: not a picture, or larger than Pillow opens.
+        FileNotFoundError: the file does not exist.
+        FileFormatError: the file is not a picture, or exceeds Pillow's size limit.
 
     Example:
         >>> from pathlib import Path
@@ -72,9 +72,9 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
 
 
 def orientation(path: str | os.PathLike[str]) -> int:
-    """EXIF's orientation of a picture, 1 to 8: the turn that viewers show it with; 1 is none.
+    """Read the EXIF orientation of a picture, 1 to 8; 1 means no rotation.
 
-    A tag that cannot be read turns nothing.
+    An unreadable tag counts as 1.
 
     Example:
         >>> from PIL import Image
@@ -87,19 +87,19 @@ def orientation(path: str | os.PathLike[str]) -> int:
     """
 
     def asked(image: Any) -> Any:
-        # Pillow raises whatever a damaged tag leads to.
+        # A damaged tag can raise any exception in Pillow.
         with contextlib.suppress(Exception):
             return image.getexif().get(_ORIENTATION, 1)
         return 1
 
     path = existing_file(path)
-    tags = _tiff_tags(path)  # Pillow does not open the pixels of all of them
+    tags = _tiff_tags(path)  # Pillow cannot open the pixels of every TIFF
     turn: Any = _with_pillow(path, asked) if tags is None else tags.get(_ORIENTATION)
     return int(turn) if turn in range(1, 9) else 1
 
 
 def upright_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """(width, height) in px of what :func:`read_upright` reads."""
+    """Compute (width, height) in px of the result of :func:`read_upright`."""
     width, height = image_size(path)
     return (height, width) if orientation(path) >= 5 else (width, height)
 
@@ -110,16 +110,16 @@ def read_upright(
     beside: str | os.PathLike[str] | None = None,
     damaged: Literal["warn", "error"] = "warn",
 ) -> npt.NDArray[Any]:
-    """Read a picture as every viewer shows it: turned or mirrored as its EXIF tag asks.
+    """Read a picture as viewers show it: rotated or mirrored by its EXIF tag.
 
     Args:
-        path: see :func:`read_image`.
-        beside: the picture of a pose that this one belongs to. Its pixels are taken as stored, so
-            a tag that both have is followed in neither.
-        damaged: see :func:`read_image`.
+        path: path of the picture, see :func:`read_image`.
+        beside: path of the posed picture that this one belongs to. A posed picture's pixels are
+            used as stored, so a tag present in both is ignored in both.
+        damaged: treatment of damaged files, see :func:`read_image`.
 
     Returns:
-        (H, W, 3) or (H, W, 4) as of :func:`read_image`.
+        (H, W, 3) or (H, W, 4) as in :func:`read_image`.
 
     Example:
         >>> from PIL import Image
@@ -143,26 +143,26 @@ def read_upright(
 def read_image(
     path: str | os.PathLike[str], *, damaged: Literal["warn", "error"] = "warn"
 ) -> npt.NDArray[Any]:
-    """(H, W, 3) or (H, W, 4) sRGB of a picture, in the depth and the orientation of the file.
+    """Read a picture, (H, W, 3) or (H, W, 4) sRGB, in the file's depth and stored orientation.
 
-    Grey becomes three equal channels. A camera's pose belongs to the pixels as stored, so an EXIF
-    tag that asks for a turn is not followed; :func:`read_upright` follows it.
+    Grey becomes three equal channels. A camera's pose refers to the stored pixels, so an EXIF
+    rotation is not applied; :func:`read_upright` applies it.
 
     Args:
-        path: a picture of 8 or 16 bits a channel: PNG, JPEG, TIFF, WebP.
-        damaged: "error" to refuse a JPEG of which the decoder complains, as doors that measure do.
-            A JPEG has no checksum: some damage shows in the picture alone.
+        path: picture of 8 or 16 bits a channel: PNG, JPEG, TIFF, WebP.
+        damaged: "error" refuses a JPEG that triggers decoder warnings, for measurements. A JPEG has
+            no checksum, so some damage is visible only in the picture.
 
     Returns:
         uint8 or uint16; a fourth channel is straight (not premultiplied) alpha.
 
     Warns:
-        InputWarning: what the decoder complains of in a JPEG, with ``damaged="warn"``.
+        InputWarning: the decoder's warnings on a JPEG, with ``damaged="warn"``.
 
     Raises:
-        FileNotFoundError: no such file.
-        FileFormatError: not a picture, one that breaks off or is damaged, one of other than 8 or 16
-            bits, or one larger than Pillow opens (about 179 million px).
+        FileNotFoundError: the file does not exist.
+        FileFormatError: the file is not a picture, is truncated or damaged, has neither 8 nor 16
+            bits, or exceeds Pillow's size limit (about 179 million px).
 
     Example:
         >>> from attnwarp.io import read_image
@@ -177,13 +177,13 @@ def read_image(
     tiff = _unturned(path)
     rgba: npt.NDArray[Any] | None = _with_pillow(path, _alpha_lost_by_opencv, tiff)
     data = path.read_bytes() if tiff is None else tiff
-    # Not every decoder looks at the checksum of each part of a PNG, and damage would be pixels.
+    # Some decoders skip PNG checksums, and damage would become pixels.
     if data.startswith(_PNG) and not _with_pillow(path, lambda image: image.verify() or True):
         raise FileFormatError(path, "the picture is damaged; replace it or leave it out")
     if rgba is not None:
         return rgba
     flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-    # Never by its path: OpenCV crashes at a name that is no UTF-8.
+    # Never by path: OpenCV crashes on a name that is not UTF-8.
     bits = np.frombuffer(data, np.uint8)
 
     def decode() -> Any:
@@ -205,7 +205,7 @@ def read_image(
 
 
 def encode_png(rgb: npt.NDArray[Any]) -> bytes:
-    """The PNG of a picture.
+    """Encode a picture as PNG.
 
     Args:
         rgb: (H, W, 3) or (H, W, 4) uint8 or uint16 RGB(A).
@@ -220,16 +220,16 @@ def encode_png(rgb: npt.NDArray[Any]) -> bytes:
 def weighted_by_alpha(
     image: npt.NDArray[Any], resample: Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
 ) -> npt.NDArray[Any]:
-    """A picture with straight alpha, resampled with its colours weighted by alpha.
+    """Resample a picture with straight alpha, weighting its colours by alpha.
 
     The colour of transparent pixels has no meaning and must not bleed into their neighbours.
 
     Args:
         image: (H, W, 4) uint8 or uint16.
-        resample: makes the new (h, w, 4) of (H, W, 4) float32 in [0, 1].
+        resample: function from (H, W, 4) float32 in [0, 1] to the new (h, w, 4).
 
     Returns:
-        (h, w, 4) of the same dtype; black where it is transparent.
+        (h, w, 4) of the same dtype; transparent pixels are black.
     """
     top = float(np.iinfo(image.dtype).max)
     values: npt.NDArray[Any] = image.astype(np.float32) / top
@@ -242,20 +242,20 @@ def weighted_by_alpha(
 
 
 def _with_pillow(path: Path, use: Callable[[Any], Any], data: bytes | None = None) -> Any:
-    """Open a picture with Pillow and return ``use`` of it; an error takes one line.
+    """Open a picture with Pillow and return ``use`` of it; an error message has one line.
 
-    None for a format that Pillow does not know, such as TIFF of 16 bits and three channels.
+    Formats unknown to Pillow, such as TIFF of 16 bits and three channels, return None.
 
     Args:
         path: path of the picture.
-        use: called with it.
-        data: in place of the file's, if given.
+        use: function of the opened picture.
+        data: bytes that replace the file's, if given.
     """
     from PIL import Image, UnidentifiedImageError
 
     try:
         with warnings.catch_warnings():
-            # A large picture or an odd tag is no reason to stop.
+            # Pillow's warnings of a large picture or an odd tag are ignored.
             warnings.simplefilter("ignore")
             with Image.open(path if data is None else io.BytesIO(data)) as image:
                 return use(image)
@@ -266,7 +266,7 @@ def _with_pillow(path: Path, use: Callable[[Any], Any], data: bytes | None = Non
         raise FileFormatError(
             path, f"the picture has more than {limit:,} px; make it smaller"
         ) from None
-    # Pillow's decoders raise whatever a damaged byte leads to.
+    # A damaged byte can raise any exception in Pillow's decoders.
     except (OSError, SyntaxError, ValueError, ArithmeticError, LookupError, TypeError) as error:
         if isinstance(error, OSError) and error.errno is not None:
             raise
@@ -277,19 +277,19 @@ def _with_pillow(path: Path, use: Callable[[Any], Any], data: bytes | None = Non
 
 
 _COMPLAINT = re.compile(rb"^(?:Corrupt JPEG|Premature end|Inconsistent prog|Invalid ).*\n", re.M)
-"""Warnings of libjpeg (jerror.h) after which pixels are made up."""
+"""Warnings of libjpeg (jerror.h) after which pixels are invented."""
 
 _STDERR = threading.Lock()
 
 
 def _with_complaint(decode: Callable[[], Any]) -> tuple[Any, str]:
-    """The result of ``decode``, and what libjpeg writes of it to the standard error: OpenCV hands
-    its warnings on in no other way. All else that is written meanwhile goes there afterwards.
+    """Return the result of ``decode`` and libjpeg's messages on standard error, the only way OpenCV
+    passes warnings on. Other output in the meantime is forwarded afterwards.
     """
     with _STDERR, tempfile.TemporaryFile() as caught:
         try:
             stderr = os.dup(2)
-        except OSError:  # closed
+        except OSError:  # stderr is closed
             return decode(), ""
         os.dup2(caught.fileno(), 2)
         try:
@@ -318,7 +318,7 @@ def _report(path: Path, complaint: str, damaged: Literal["warn", "error"]) -> No
 
 
 def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8 | np.uint16] | None:
-    """Decode a picture; return (H, W, 4) where OpenCV drops its alpha or multiplies it into the
+    """Decode a picture; return (H, W, 4) if OpenCV drops its alpha or multiplies it into the
     colours: TIFF of 8 bits, and grey PNG with a transparent value.
     """
     image.load()
@@ -328,25 +328,25 @@ def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8 | np.uint16] | Non
         alpha = np.where(values == clear, 0, 65535).astype(np.uint16)
         return np.stack([values, values, values, alpha], axis=2)
     tiff = image.format == "TIFF" and image.mode in ("LA", "RGBA")
-    # Pillow opens 16 bits as 8, and OpenCV reads them right.
+    # Pillow opens 16 bits as 8; OpenCV reads them correctly.
     tiff = tiff and max(image.tag_v2.get(_BITS, (8,))) <= 8
     grey = image.mode in ("1", "L") and clear is not None
     return np.array(image.convert("RGBA")) if tiff or grey else None
 
 
 _ORIENTATION, _BITS, _SAMPLES = 274, 258, 277
-"""TIFF's tags that ask for a turn, that hold the bits of each channel, and their number."""
+"""TIFF tags of the orientation, the bits of each channel, and the number of channels."""
 
 _BIG = 43
-"""Number that a BigTIFF has in place of 42."""
+"""Version number of a BigTIFF, 42 in a plain TIFF."""
 
 _FLIPS = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}
-"""Axes to flip by EXIF's orientation, after rows and columns have changed places from 5 on."""
+"""Axes to flip by EXIF orientation, after transposing for orientations from 5 on."""
 
 
 def _tiff_tags(path: Path) -> dict[int, Any] | None:
-    """The tags of a TIFF's first picture that concern its reading, and under 0 where its directory
-    begins; None for any other file.
+    """Read the tags of a TIFF's first picture needed for reading, with the directory's offset under
+    0; None for any other file.
     """
     from PIL.TiffImagePlugin import PREFIXES, ImageFileDirectory_v2
 
@@ -355,11 +355,11 @@ def _tiff_tags(path: Path) -> dict[int, Any] | None:
         head = stream.read(8)
         if not head.startswith(tuple(PREFIXES)):
             return None
-        # What is damaged the decoders find; Pillow raises whatever it leads to.
+        # Decoders report damage; here it can raise any exception in Pillow.
         with warnings.catch_warnings(), contextlib.suppress(Exception):
             warnings.simplefilter("ignore")
             header = head
-            if _BIG in head[2:4]:  # Pillow knows it by a third byte alone, which is II's
+            if _BIG in head[2:4]:  # Pillow recognises BigTIFF only by II's third byte
                 header = b"II" + bytes([_BIG, 0]) + head[4:] + stream.read(8)
             directory = ImageFileDirectory_v2(header, head[:2])
             tags[0] = stream.seek(directory.next)
@@ -370,11 +370,11 @@ def _tiff_tags(path: Path) -> dict[int, Any] | None:
 
 
 def _unturned(path: Path) -> bytes | None:
-    """The bytes of a TIFF whose tag, if it asks for a turn, asks for none: OpenCV and Pillow turn
-    the pixels of this format whatever they are told. None for any other file.
+    """Return a TIFF's bytes with its orientation tag reset: OpenCV and Pillow always rotate the
+    pixels of this format. None for any other file.
 
     Raises:
-        FileFormatError: grey of 16 bits with alpha, which OpenCV reads as 8 bits without alpha.
+        FileFormatError: 16-bit grey with alpha, which OpenCV reads as 8 bits without alpha.
     """
     tags = _tiff_tags(path)
     if tags is None:
@@ -387,6 +387,6 @@ def _unturned(path: Path) -> bytes | None:
     if tags.get(_ORIENTATION, 1) not in range(2, 9):
         return data
     order = "<" if data.startswith(b"II") else ">"
-    entry = struct.Struct(f"{order}HH{'Q' if _BIG in data[2:4] else 'I'}H")  # and the turn
+    entry = struct.Struct(f"{order}HH{'Q' if _BIG in data[2:4] else 'I'}H")  # and the value
     turned, upright = (entry.pack(_ORIENTATION, 3, 1, v) for v in (tags[_ORIENTATION], 1))
     return data[: tags[0]] + data[tags[0] :].replace(turned, upright, 1)

@@ -1,4 +1,4 @@
-"""Lens distortion: OpenCV's two formulas, and pictures resampled as a pinhole camera sees them.
+"""Lens distortion: OpenCV's two formulas, and resampling of pictures to a pinhole camera.
 
 Formulas: docs.opencv.org, calib3d ("Brown", rational, with tangential terms) and calib3d_fisheye
 (Kannala and Brandt 2006). COLMAP's models RADIAL, OPENCV, FULL_OPENCV and their fisheye kin are
@@ -20,24 +20,24 @@ from attnwarp.io.images import weighted_by_alpha
 Array = npt.NDArray[np.float64]
 
 LARGEST_GROWTH = 2.0
-"""An undistorted picture has at most so many times the width and the height (COLMAP's limit)."""
+"""Largest growth of an undistorted picture's width and height (COLMAP's limit)."""
 
 STEEPEST = 1.4
-"""Rays further than this from the optical axis (radians, 80 degrees) are left out: a pinhole needs
-ever more pixels for them."""
+"""Largest angle of rays from the optical axis (radians, 80 degrees): a pinhole needs ever more
+pixels for steeper rays."""
 
 ROUND_TRIP = 0.01
-"""Largest distance in px between a border pixel and its undistorted point distorted again."""
+"""Largest round-trip error of a border pixel, undistorted and distorted again, in px."""
 
 FOLD_GRID = 200
-"""Points along each axis at which an undistorted picture is searched for folds: milliseconds."""
+"""Number of points per axis in the search for folds; the search takes milliseconds."""
 
 
 INVERTED = 1e-9
-"""Largest distance, in focal lengths, between a point and its undistorted point distorted again."""
+"""Largest round-trip error of a point, undistorted and distorted again, in focal lengths."""
 
 RADII = 4097
-"""Radii of the table that the inversion of radial distortion begins with."""
+"""Number of radii in the table that initialises the inversion of radial distortion."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class Lens:
 
     Args:
         kind: "brown" for radial and tangential terms, "fisheye" for a polynomial in the angle.
-        coefficients: k1 k2 p1 p2 k3 k4 k5 k6 for "brown", k1 k2 k3 k4 for "fisheye"; those left
-            out are 0.
+        coefficients: k1 k2 p1 p2 k3 k4 k5 k6 for "brown", k1 k2 k3 k4 for "fisheye"; missing ones
+            are 0.
 
     Raises:
-        ValueError: another kind, too many coefficients, or one that is not finite.
+        ValueError: unknown kind, too many coefficients, or a non-finite coefficient.
 
     Example:
         >>> from attnwarp.io import Lens
@@ -75,17 +75,17 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """True if it changes nothing. A fisheye lens without coefficients is no pinhole."""
+        """True if the lens has no effect. A fisheye lens without coefficients is not a pinhole."""
         return self.kind == "brown" and not any(self.coefficients)
 
     def distort(self, xy: npt.ArrayLike) -> Array:
-        """Normalised coordinates (X/Z, Y/Z) as this lens shows them.
+        """Distort normalised coordinates (X/Z, Y/Z).
 
         Args:
-            xy: (..., 2) undistorted.
+            xy: (..., 2) undistorted coordinates.
 
         Returns:
-            (..., 2) distorted.
+            (..., 2) distorted coordinates.
 
         Example:
             >>> from attnwarp.io import Lens
@@ -111,19 +111,20 @@ class Lens:
         )
 
     def undistort(self, xy: npt.ArrayLike) -> Array:
-        """The inverse of :meth:`distort`, by iteration; NaN where the iteration finds none.
+        """Invert :meth:`distort` by iteration; NaN if the iteration finds no inverse.
 
-        The one before the first fold is found where there is one; :meth:`folds` tells the others.
+        If several inverses exist, the one before the first fold is found; :meth:`folds` marks
+        others.
 
         Args:
             xy: (..., 2) distorted normalised coordinates.
 
         Returns:
-            (..., 2) undistorted; beyond 80 degrees from the axis the length is cut there.
+            (..., 2) undistorted coordinates, clamped to 80 degrees from the axis.
         """
         target = np.asarray(xy, dtype=np.float64)
         if self.kind == "fisheye":
-            # Newton's method in the angle alone, begun at the angle without coefficients.
+            # Newton's method in the angle alone, starting at the angle without coefficients.
             r = np.linalg.norm(target, axis=-1)
             theta = np.minimum(r, STEEPEST)
             for _ in range(50):
@@ -133,13 +134,13 @@ class Lens:
             with np.errstate(invalid="ignore", divide="ignore"):
                 factor = np.where(r > 0, np.tan(theta) / r, 1.0)
             left = np.abs(self._angle(theta) - r)
-            # Cut at the steepest ray where the angle still rises there, and only then.
+            # Clamp to the steepest ray only if the angle still rises there.
             ends = self._angle(np.array([STEEPEST - 1e-6, STEEPEST]))
             cut = (r > ends[1]) & bool(ends[1] > ends[0]) & (theta >= STEEPEST)
             found = (left <= INVERTED * (1 + r)) | cut
             return np.where(found[..., None], target * factor[..., None], np.nan)
-        # Newton's method, begun where the radial terms alone are inverted before their first fold:
-        # begun at the target it may end beyond a fold.
+        # Newton's method, starting from the inverse of the radial terms before their first fold:
+        # a start at the target may converge beyond a fold.
         point = self._unrolled(target)
         for _ in range(50):
             here, dx, dy, det = self._linear(point)
@@ -158,7 +159,7 @@ class Lens:
         return np.where(found[..., None], point, np.nan)
 
     def _linear(self, point: Array) -> tuple[Array, Array, Array, Array]:
-        """:meth:`distort`, its slopes in x and in y by differences, and their determinant."""
+        """Compute :meth:`distort`, its slopes in x and y by differences, and their determinant."""
         step = 1e-6
         here = self.distort(point)
         dx = (self.distort(point + np.array([step, 0.0])) - here) / step
@@ -166,8 +167,7 @@ class Lens:
         return here, dx, dy, dx[..., 0] * dy[..., 1] - dx[..., 1] * dy[..., 0]
 
     def folds(self, xy: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Mask of the points that :meth:`distort` mirrors, beyond a fold that shows the same points
-        again.
+        """Mark the points beyond a fold, which :meth:`distort` mirrors onto already visible points.
 
         Args:
             xy: (..., 2) undistorted normalised coordinates.
@@ -184,12 +184,12 @@ class Lens:
         return folded
 
     def _radial(self, r2: Array) -> Array:
-        """Stretch of a point at this squared distance from the axis."""
+        """Compute the stretch of a point at a squared distance from the axis."""
         k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
         return (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
 
     def _unrolled(self, target: Array) -> Array:
-        """The inverse of the radial terms, by a table as far as their first fold."""
+        """Invert the radial terms by a table up to their first fold."""
         r = np.linspace(0, np.tan(STEEPEST), RADII)
         with np.errstate(invalid="ignore", divide="ignore"):
             shown = r * self._radial(r * r)
@@ -207,11 +207,11 @@ class Lens:
 
 
 def undistorted_camera(camera: Camera, lens: Lens) -> Camera:
-    """The largest pinhole camera of the same focal length and axis that sees no blank pixel.
+    """Compute the largest pinhole camera of equal focal length and axis without blank pixels.
 
     Args:
-        camera: camera of the distorted picture, its lens apart.
-        lens: its distortion.
+        camera: camera of the distorted picture, without the lens.
+        lens: lens of the distorted picture.
 
     Returns:
         A camera at the same pose; its image is a window of whole pixels, at most twice as wide and
@@ -247,7 +247,7 @@ def undistorted_camera(camera: Camera, lens: Lens) -> Camera:
     K = camera.K.copy()
     K[:2, 2] -= [x0, y0]
     target = Camera(K, camera.world_to_camera, x1 - x0, y1 - y0, camera.name)
-    # The border may lie beyond a fold, and be right there.
+    # A border beyond a fold may still be valid.
     grid = [np.linspace(0.5, n - 0.5, min(n, FOLD_GRID)) for n in (target.width, target.height)]
     if lens.folds(target.directions(np.stack(np.meshgrid(*grid), -1))[..., :2]).any():
         raise _folded(camera, lens)
@@ -264,7 +264,7 @@ def _folded(camera: Camera, lens: Lens) -> ValueError:
 def undistorted_image(
     image: npt.NDArray[Any], camera: Camera, lens: Lens, target: Camera
 ) -> npt.NDArray[Any]:
-    """A picture resampled (bilinearly) to what ``target``, a pinhole at the same pose, sees.
+    """Resample a picture (bilinearly) to the pinhole camera ``target`` at the same pose.
 
     Args:
         image: (H, W, C) uint8 or uint16, taken by ``camera`` through ``lens``; a fourth channel is
@@ -273,10 +273,10 @@ def undistorted_image(
         target: camera to resample to.
 
     Returns:
-        (target.height, target.width, C) of the same dtype; 0 where the picture does not reach.
+        (target.height, target.width, C) of the same dtype; 0 outside the picture.
 
     Raises:
-        ValueError: ``image`` has another size than ``camera``.
+        ValueError: ``image`` and ``camera`` differ in size.
 
     Example:
         >>> import numpy as np
@@ -316,7 +316,7 @@ def undistorted_image(
 
 
 def _pixels(camera: Camera, xy: Array) -> Array:
-    """(..., 2) px of (..., 2) normalised coordinates."""
+    """Convert (..., 2) normalised coordinates to px."""
     K = camera.K
     return np.stack(
         [
@@ -328,11 +328,11 @@ def _pixels(camera: Camera, xy: Array) -> Array:
 
 
 def _window(low: float, high: float, center: float, size: int) -> tuple[int, int]:
-    """Whole pixels whose centres lie in [low, high], at most LARGEST_GROWTH as many as ``size``."""
+    """Count pixels with centres in [low, high], at most LARGEST_GROWTH times ``size``."""
     first, last = int(np.ceil(low - 0.5)), int(np.floor(high - 0.5)) + 1
     spare = last - first - int(LARGEST_GROWTH * size)
     if spare > 0:
-        # Taken off the side that is further from the principal point, as far as that goes.
+        # Cropped first from the side that is farther from the principal point.
         cut = int(np.clip(round((spare + (center - first) - (last - center)) / 2), 0, spare))
         first, last = first + cut, last - (spare - cut)
     return first, max(last, first + 1)

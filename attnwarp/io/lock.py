@@ -1,4 +1,4 @@
-"""Locks between processes; the end of a process lets go of its own."""
+"""Locks between processes; a process's end releases its locks."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EBADF, errno.EINVAL)
 
 @contextmanager
 def locked(path: Path, *, wait: bool) -> Iterator[None]:
-    """Hold a lock file, which is made.
+    """Hold a lock file, creating it if missing.
 
     Args:
-        path: path of the file, in a folder that exists.
-        wait: until whoever holds it lets go.
+        path: path of the file, in an existing folder.
+        wait: True waits until the current holder releases the lock.
 
     Raises:
-        BlockingIOError: another holds it, and ``wait`` is False.
-        OSError: it cannot be written.
+        BlockingIOError: another process holds the lock, and ``wait`` is False.
+        OSError: the file cannot be written.
     """
     file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
@@ -37,18 +37,18 @@ def locked(path: Path, *, wait: bool) -> Iterator[None]:
 
 @contextmanager
 def alone_in(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Hold a folder against other runs that would write to it; it is made if need be.
+    """Hold a folder against other runs that would write to it; create it if missing.
 
-    The folder itself is locked, so that no file is left in it. Without effect where the file system
-    has no such locks.
+    The folder itself is locked, so no lock file remains. File systems without folder locks make
+    this a no-op.
 
     Args:
-        folder: path of the results. If nothing was written to it and it was made here, it is
+        folder: path of the results. A folder created here and left empty is
             removed.
 
     Raises:
-        InputError: another run holds it.
-        FileExistsError: it is a file.
+        InputError: another run holds the folder.
+        FileExistsError: the path is a file.
 
     Example:
         >>> from attnwarp.io.lock import alone_in
@@ -68,15 +68,15 @@ def alone_in(folder: str | os.PathLike[str]) -> Iterator[None]:
         if held is not None:
             os.close(held)
         if made:
-            with suppress(OSError):  # it has files by now
+            with suppress(OSError):  # the folder has files by now
                 folder.rmdir()
 
 
 def _held(folder: Path) -> int | None:
-    """The number of the open folder, locked; None where that cannot be."""
+    """Open and lock the folder, returning its descriptor; None if locking is impossible."""
     try:
         file = os.open(folder, os.O_RDONLY)
-    except PermissionError:  # it can be written to, and not listed
+    except PermissionError:  # the folder is writable but not listable
         return None
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -10,8 +10,8 @@ from attnwarp.camera import Camera
 
 
 def file_stems(cameras: Sequence[Camera]) -> list[str]:
-    """A file name without suffix for each camera: the last part of its own name, numbered where
-    several are the same. No two cameras get one name.
+    """Build a file name without suffix for each camera: the last part of the camera's name,
+    numbered if several are equal. No two cameras share a name.
 
     Example:
         >>> from attnwarp import Camera
@@ -24,7 +24,7 @@ def file_stems(cameras: Sequence[Camera]) -> list[str]:
 
 
 def numbered(names: Sequence[str]) -> list[str]:
-    """The names, with a number before the last part of those that are the same.
+    """Insert a number before the last part of equal names.
 
     Example:
         >>> from attnwarp.io.names import numbered
@@ -36,7 +36,7 @@ def numbered(names: Sequence[str]) -> list[str]:
     result = []
     for index, own in enumerate(names):
         name = own
-        # A numbered name may be that of another view.
+        # A numbered name may equal another view's name.
         while counts[own] > 1 and (name == own or name in alone):
             folder, slash, last = name.rpartition("/")
             name = f"{folder}{slash}{index:04d}-{last}"

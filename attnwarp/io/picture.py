@@ -1,4 +1,4 @@
-"""Pictures as PNG and JPEG."""
+"""Encoding of pictures as PNG and JPEG."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ def encode_picture(
     quality: int = 85,
     chroma: Literal["444", "420"] = "444",
 ) -> bytes:
-    """The bytes of a picture file.
+    """Encode a picture as the bytes of a file.
 
     Args:
-        image: (H, W, 3) sRGB in [0, 1], clipped there, or uint8, taken as it is.
+        image: (H, W, 3) sRGB, floating and clipped to [0, 1], or uint8.
         suffix: ".png" or ".jpg".
         quality: quality of a JPEG, 1 to 100.
         chroma: chroma of a JPEG: colours at full ("444") or half ("420") resolution.
 
     Raises:
-        ValueError: another shape or suffix.
+        ValueError: the shape or suffix is unsupported.
 
     >>> encode_picture(np.zeros((2, 3, 3)))[:4]
     b'\\x89PNG'

@@ -1,10 +1,10 @@
-"""PLY files: splats as the 2DGS and 3DGS trainers and viewers write them, and plain point clouds.
+"""PLY files: splats in the format of 2DGS and 3DGS trainers and viewers, and point clouds.
 
 Properties of a splat file, in the order of the original trainers: ``x y z``, ``nx ny nz`` (zeros),
 ``f_dc_0..2``, ``f_rest_*`` (all coefficients of red, then green, then blue), ``opacity`` (logit),
 ``scale_0..1`` for 2DGS or ``scale_0..2`` for 3DGS (natural logarithm), ``rot_0..3`` (wxyz, any
-length). Header comments carry what the properties cannot; docs/method/files.md lists them and says
-who else writes them.
+length). Header comments carry further values; docs/method/files.md lists them and the other
+programs that write them.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ Columns = dict[str, npt.NDArray[Any]]
 THIRD_SCALE = 1e-6
 """Third scale, in scene units, that turns a 2D splat into one that viewers of 3D splats show.
 
-The value the authors of 2DGS recommend for that (hbb1/2d-gaussian-splatting, issue 94). A file
-whose third scales are all exactly this is read back as 2D.
+The authors of 2DGS recommend this value (hbb1/2d-gaussian-splatting, issue 94). A file whose third
+scales all equal it exactly is read back as 2D.
 """
 
 WORLD_TOLERANCE = 0.01
-"""Largest distance by which float32 world coordinates may move a splat, as a share of its largest
-scale: a hundredth of a standard deviation changes no pixel by more than 0.6 % of the splat's peak.
+"""Largest displacement of a splat by float32 world coordinates, as a share of its largest scale: a
+hundredth of a standard deviation changes no pixel by more than 0.6 % of the splat's peak.
 """
 
 Coordinates = Literal["auto", "world", "relative"]
@@ -49,21 +49,21 @@ COLORS = (
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
     ("r", "g", "b"),
 )
-"""Names of a point's colours, by who writes them: most programs, MeshLab, some scanners."""
+"""Names of a point's colours: of most programs, of MeshLab, of some scanners."""
 
 FILTER_3D = "filter_3D"
-"""Property of Mip-Splatting's files."""
+"""Property specific to Mip-Splatting's files."""
 
 MIP_SCREEN_FILTER = 0.1
 """Mip-Splatting's screen filter, px^2 (its ``kernel_size``)."""
 
 LOGIT_OF_ZERO = -120.0
 LOGIT_OF_ONE = 40.0
-"""Logits written for opacity 0 and 1, whose own are infinite.
+"""Logits written for opacity 0 and 1, whose exact logits are infinite.
 
-Their sigmoids are 0 and 1 exactly in float32 (and 1 in float64), beyond every logit that a float32
-opacity strictly between 0 and 1 can have (-103.3 to 16.6): nothing else is mapped onto 0 or 1, and
-nothing in the file is infinite.
+Their sigmoids are exactly 0 and 1 in float32 (and 1 in float64), beyond every logit of a float32
+opacity strictly between 0 and 1 (-103.3 to 16.6): no other opacity maps to 0 or 1, and the file has
+no infinite values.
 """
 
 
@@ -77,36 +77,36 @@ def read_ply(
     """Read splats.
 
     ASCII and binary PLY of either byte order are read; further properties and elements are ignored.
-    The kind is the first of these that applies:
+    The first applicable rule determines the kind:
 
-    1. ``kind``, or that of a comment (``attnwarp kind 2d``, ``SplatRenderMode: 2dgs``);
-    2. 2D without ``scale_2``, or where every ``scale_2`` is the logarithm of :data:`THIRD_SCALE`;
-    3. 3D. But a third scale that is one constant, and in every row at most a hundredth of both
-       others, could be of either kind. It is refused without ``kind``.
+    1. ``kind``, or a comment's kind (``attnwarp kind 2d``, ``SplatRenderMode: 2dgs``);
+    2. 2D without ``scale_2``, or if every ``scale_2`` is the logarithm of :data:`THIRD_SCALE`;
+    3. 3D. A constant third scale that is in every row at most a hundredth of both others is
+       ambiguous and is refused without ``kind``.
 
     For the 2D kind a third scale is dropped.
 
-    Of Mip-Splatting's files ``filter_3D``, the standard deviation of each splat's smoothing filter,
+    In Mip-Splatting's files ``filter_3D``, the standard deviation of each splat's smoothing filter,
     is merged into scales and opacities (Yu et al. 2024, the 3D smoothing
     filter).
 
     Args:
-        path: the file.
-        kind: "2d" or "3d" to override the rule above.
-        antialiased: overrides the comments ``SplatRenderMode: mip|default`` and ``antialiased
-            1|0``; without any, True of Mip-Splatting's files and else False.
-        screen_filter: px^2, overrides the comment ``attnwarp screen_filter``; without any,
-            Mip-Splatting's 0.1 where the file has a ``filter_3D``, else 3DGS's 0.3. Other programs
-            that write ``filter_3D``, such as GOF and RaDe-GS, have no screen filter: give 1e-4.
+        path: path of the file.
+        kind: "2d" or "3d" to override the rules above.
+        antialiased: value that overrides the comments ``SplatRenderMode: mip|default`` and
+            ``antialiased 1|0``; without either, True for Mip-Splatting's files, else False.
+        screen_filter: px^2, overrides the comment ``attnwarp screen_filter``; without it,
+            Mip-Splatting's 0.1 if the file has a ``filter_3D``, else 3DGS's 0.3. Other programs
+            that write ``filter_3D``, such as GOF and RaDe-GS, have no screen filter: pass 1e-4.
 
     Returns:
-        Gaussians in float32. ``x y z`` of type double that float32 cannot hold and that lie further
+        Gaussians in float32. Double ``x y z`` that float32 cannot represent and that lie farther
         from zero than twice the extent of the scene become float32 means relative to a rounded
-        ``origin``. Logits of +-inf become opacity 1 and 0; everything else must be finite.
+        ``origin``. Logits of +-inf become opacity 1 and 0; all other values must be finite.
 
     Raises:
-        FileNotFoundError: no such file.
-        FileFormatError: it is not a splat file, or a value in it is out of range; the message names
+        FileNotFoundError: the file does not exist.
+        FileFormatError: the file is not a splat file, or a value is out of range; the message names
             the property and the first bad row.
 
     Example:
@@ -130,7 +130,7 @@ def read_ply(
     xyz = _stack(path, columns, ("x", "y", "z"), np.float64)
     opacity = _column(path, columns, "opacity", np.float64, infinities=True)
     quats = _stack(path, columns, ("rot_0", "rot_1", "rot_2", "rot_3"), np.float32)
-    # In float32, as the model checks: the square of 1e-30 is zero there, and that of 1e30 infinite.
+    # In float32, like the model's check: there 1e-30 squared is zero and 1e30 squared infinite.
     norm = torch.from_numpy(quats).norm(dim=-1).numpy()
     _refuse(path, "rot_0..3", norm == 0, "a zero quaternion has no rotation", "remove the row")
     _refuse(
@@ -204,19 +204,19 @@ def write_ply(
 ) -> None:
     """Write splats as binary little-endian PLY, all properties float32, atomically.
 
-    Read back, quaternions, spherical harmonics, kind and the antialias flag have the same bits.
+    A round trip keeps the bits of quaternions, spherical harmonics, kind and the antialias flag.
     Opacities 0 and 1 are exact. Other opacities and the scales pass through a float32 logarithm,
-    with an error below 4e-6 of their value. Means are world coordinates rounded to float32, as
-    every other program reads them; with an origin they have the same bits.
+    with an error below 4e-6 of their value. Means are written as world coordinates rounded to
+    float32, as other programs expect; with an origin they keep their bits.
 
     Args:
-        path: the file; an older one is replaced.
+        path: path of the file; an older file is replaced.
         gaussians: splats to write.
-        third_scale: for the 2D kind, write a third scale of this size (scene units) for viewers
-            that know only 3D splats; :data:`THIRD_SCALE` is the usual one. Left out, two scales are
-            written, as 2DGS trainers do.
+        third_scale: third scale (scene units) written for the 2D kind, for viewers that support
+            only 3D splats; :data:`THIRD_SCALE` is usual. None writes two scales, as 2DGS trainers
+            do.
         coordinates: "world" for world coordinates; "relative" for means relative to the model's
-            origin, which a comment of the header gives and only this package knows; "auto" for
+            origin, which is written to a header comment that only this package reads; "auto" for
             world coordinates unless float32 would move a splat by more than
             :data:`WORLD_TOLERANCE`.
 
@@ -241,8 +241,8 @@ def write_ply(
     """
     from plyfile import PlyData, PlyElement
 
-    # The fields may have been assigned, or trained, since the checks ran, and float64 may not fit
-    # the file's float32: replace() runs the checks again.
+    # Fields may have been assigned or trained since the checks, and float64 may exceed the
+    # file's float32, so replace() runs the checks again.
     original = gaussians.detach().to(device="cpu")
     g = replace(original.to(dtype=torch.float32))
     scales = g.scales.numpy().astype(np.float64)
@@ -294,23 +294,23 @@ def write_ply(
 
 
 def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uint8] | None]:
-    """Read a point cloud: the initial points of a dataset.
+    """Read a point cloud, such as the initial points of a dataset.
 
     Args:
-        path: a PLY file with ``x y z``.
+        path: path of a PLY file with ``x y z``.
 
     Returns:
         points: (P, 3) float64.
-        colors: (P, 3) uint8 from ``red green blue``, or from another triple of :data:`COLORS`,
-            which is said; None when the file has none.
+        colors: (P, 3) uint8 from ``red green blue``, or from another triple of :data:`COLORS` with
+            a warning; None if the file has no colours.
 
-    Raises:
-        FileNotFoundError: no such file.
-        FileFormatError: not a PLY, truncated, no ``x y z``, a value that is not finite, colours
-            that are not uchar.
+        es:
+        FileNotFoundError: the file does not exist.
+        FileFormatError: the file is not a PLY, is truncated, lacks ``x y z``, or has a non-finite
+            value or colours that are not uchar.
 
     Warns:
-        InputWarning: its colours have other names than usual.
+        InputWarning: the colours have unusual names.
 
     Example:
         >>> from attnwarp.io import read_points, write_points
@@ -345,12 +345,12 @@ def write_points(
     """Write a point cloud as binary little-endian PLY with double ``x y z``, atomically.
 
     Args:
-        path: the file; an older one is replaced.
-        points: (P, 3) finite.
+        path: path of the file; an older file is replaced.
+        points: (P, 3) finite points.
         colors: (P, 3) uint8, optional.
 
     Raises:
-        ValueError: another shape, a point that is not finite, or colours that are not uint8.
+        ValueError: wrong shape, a non-finite point, or colours that are not uint8.
 
     Example:
         >>> import numpy as np
@@ -390,14 +390,14 @@ def _names(stem: str, count: int) -> tuple[str, ...]:
 
 
 def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
-    """The scalar columns of the element ``vertex``, and all comments of the header."""
+    """Read the scalar columns of the element ``vertex``, and all header comments."""
     import plyfile
 
     header, text = _check_header(path)
-    # plyfile wants one kind of line end, and closes what it reads text from.
+    # plyfile needs uniform line ends, and closes the text stream that it reads.
     plain = plain_ply(path.read_bytes()) if text or b"\r" in header else None
     try:
-        # Values too large for their type become infinite, and are refused as such.
+        # Values too large for their type become infinite and are refused later.
         with (
             np.errstate(over="ignore"),
             path.open("rb") if plain is None else io.BytesIO(plain) as stream,
@@ -445,7 +445,7 @@ def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
     vertex = data["vertex"]
     scalar = [p.name for p in vertex.properties if not isinstance(p, plyfile.PlyListProperty)]
     own = {name: name for name in scalar}
-    # CloudCompare keeps what it does not know as scalar fields of these names.
+    # CloudCompare stores unknown properties as scalar fields of these names.
     own |= {
         name.removeprefix("scalar_"): name
         for name in scalar
@@ -458,8 +458,8 @@ def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
 
 
 def _check_header(path: Path) -> tuple[bytes, bool]:
-    """The header, and whether the body is text. More rows than bytes are refused, before memory is
-    asked for them.
+    """Read the header, and whether the body is text. A row count larger than the bytes is refused
+    before memory is allocated.
     """
     size = path.stat().st_size
     with path.open("rb") as stream:
@@ -504,7 +504,7 @@ def _column(
     *,
     infinities: bool = False,
 ) -> npt.NDArray[Any]:
-    """One property, finite in ``dtype``."""
+    """Read one property and check that it is finite in ``dtype``."""
     if name not in columns:
         raise FileFormatError(
             path,
@@ -542,9 +542,9 @@ def _refuse(
 def _filtered(
     path: Path, columns: Columns, scales: npt.NDArray[np.float32]
 ) -> tuple[npt.NDArray[np.float32], Array]:
-    """(N, 3) scales of splats smoothed by their 3D filter, and (N,) what is left of opacities.
+    """Merge the 3D filter: (N, 3) smoothed scales, and the (N,) remaining factor of opacities.
 
-    The covariance grows by the filter's, and the splat keeps its mass: its peak falls by the square
+    The filter's covariance is added and the splat keeps its mass, so its peak falls by the square
     root of the ratio of determinants.
     """
     width = _column(path, columns, FILTER_3D, np.float64)
@@ -572,8 +572,8 @@ def _read_sh(path: Path, columns: Columns, n: int) -> npt.NDArray[np.float32]:
 
 
 class _Header:
-    """Statements of a header's comments about the splats; contradictions are kept until someone
-    asks.
+    """Header comments about the splats; contradictions are stored until a value is
+    requested.
     """
 
     def __init__(self) -> None:
@@ -583,7 +583,7 @@ class _Header:
         self.screen_filter: float | None = None
 
     def width(self, default: float, given: float | None) -> float:
-        """The screen filter, px^2: the given one, the file's, or the default of its kind."""
+        """Choose the screen filter, px^2: the given one, the file's, or the default."""
         if given is not None:
             return given
         return default if self.screen_filter is None else self.screen_filter
@@ -627,7 +627,7 @@ def _read_comments(path: Path, comments: list[str]) -> _Header:
                         f"got {comment!r}, expected px^2 in [{LEAST_FILTER:g}, {LARGEST_FILTER:g}]",
                         field="screen_filter",
                     ) from None
-            # The tag follows the colon at once in some files.
+            # Some files have no space between colon and tag.
             case ["splatrendermode:" | "splatrendermode", mode] if mode in (
                 "mip",
                 "default",
@@ -645,7 +645,7 @@ def _read_comments(path: Path, comments: list[str]) -> _Header:
 def _recognise(
     path: Path, columns: Columns, header: _Header, kind: Kind | None
 ) -> tuple[Kind, tuple[str, ...]]:
-    """The kind of the splats and the names of the scales that it uses."""
+    """Determine the kind of the splats and the names of its scales."""
     for name in ("scale_0", "scale_1"):
         if name not in columns:
             raise FileFormatError(
@@ -695,7 +695,7 @@ def _kind_by_scales(path: Path, columns: Columns) -> Kind:
 
 
 def world_error(gaussians: Gaussians) -> Array:
-    """(N,) how far float32 world coordinates move each splat, as a share of its largest scale."""
+    """Compute each splat's shift by float32 world coordinates over its largest scale, (N,)."""
     exact = gaussians.world_means()
     with np.errstate(over="ignore", invalid="ignore"):
         moved = np.abs(exact.astype(np.float32) - exact)
@@ -706,7 +706,7 @@ def world_error(gaussians: Gaussians) -> Array:
 def _place(
     path: Path, g: Gaussians, coordinates: Coordinates
 ) -> tuple[Array, npt.NDArray[np.float32]]:
-    """The origin that the file names, and the float32 means relative to it."""
+    """Return the file's origin, and the float32 means relative to it."""
     check.one_of(coordinates, get_args(Coordinates), "coordinates")
     error = world_error(g)
     moved = int((~(error <= WORLD_TOLERANCE)).sum())
@@ -738,12 +738,12 @@ def _warn(message: str) -> None:
 
 
 def split_origin(points: npt.NDArray[np.floating[Any]]) -> tuple[Array, npt.NDArray[np.float32]]:
-    """float64 (N, 3) points as an origin and float32 means with points = origin + means.
+    """Split float64 (N, 3) points into an origin and float32 means with points = origin + means.
 
-    The origin is zero when float32 holds the points exactly, or when none lies further from zero
-    than twice the longest side of their bounding box, where a move would win at most two bits.
+    The origin is zero if float32 represents the points exactly, or if none lies farther from zero
+    than twice the longest side of their bounding box, where a shift gains at most two bits.
     Otherwise it is the centre of the box, rounded to a power of ten no larger than half that side
-    so that it reads well in a header; float32 then resolves the scene to 2^-24 of its extent.
+    for a readable header; float32 then resolves the scene to 2^-24 of its extent.
     """
     xyz = np.asarray(points, dtype=np.float64)
     with np.errstate(over="ignore"):
@@ -770,7 +770,7 @@ def _logit(opacities: npt.NDArray[np.floating[Any]]) -> Array:
 
 
 def _not_ascii(content: bytes) -> str:
-    """Describe the fault of a file whose header is not ASCII text."""
+    """Describe the error of a file whose header is not ASCII text."""
     lines, _ = split_ply(content) or ([], 0)
     if lines and lines[0].strip() == b"ply":
         for number, line in enumerate(lines, 1):

@@ -1,4 +1,4 @@
-"""``.splat`` files: the 32 bytes a splat that web viewers load.
+"""``.splat`` files for web viewers, with 32 bytes per splat.
 
 Layout of github.com/antimatter15/splat.
 """
@@ -40,7 +40,7 @@ def write_splat(
     has two. Ties keep their order.
 
     Args:
-        path: the file; an older one is replaced, atomically.
+        path: path of the file; an older file is replaced, atomically.
         gaussians: splats to write.
         third_scale: normal scale of 2D splats, in scene units.
         coordinates: "world", or "relative" for positions without ``gaussians.origin``.
@@ -103,15 +103,15 @@ def read_splat(path: str | os.PathLike[str]) -> Gaussians:
     """Read ``.splat``: 3D splats with constant colour, as precise as their bytes.
 
     Args:
-        path: the file.
+        path: path of the file.
 
     Returns:
         Gaussians in float32, of degree 0, in the order of the file.
 
     Raises:
-        FileNotFoundError: no such file.
-        FileFormatError: not a whole number of records, a value that is not finite, a scale that is
-            not positive, or a quaternion of zeros; the message names the first bad row.
+        FileNotFoundError: the file does not exist.
+        FileFormatError: the number of records is not whole, a value is not finite, a scale is not
+            positive, or a quaternion is zero; the message names the first bad row.
 
     Example:
         >>> import torch

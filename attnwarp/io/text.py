@@ -1,4 +1,4 @@
-"""Text as other systems and editors write it: how it begins, how its lines end."""
+"""Text files of other systems and editors: byte order marks and line ends."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ MARKS = {
     codecs.BOM_UTF16_LE: "utf-16",
     codecs.BOM_UTF16_BE: "utf-16",
 }
-"""Encodings by what a file begins with; Windows' editors and shells write such marks."""
+"""Encodings by byte order mark, as written by Windows' editors and shells."""
 
 _LINE_ENDS = re.compile(rb"\r\n|\n|\r")
 
 
 def read_text(path: Path, errors: str = "strict") -> str:
-    """The text of a file, in UTF-8 or with a byte order mark, its lines ended by ``\\n``.
+    """Read a text file, in UTF-8 or with a byte order mark, with line ends ``\\n``.
 
     Args:
         path: path of the file.
-        errors: treatment of bytes that are no UTF-8, as for :meth:`bytes.decode`.
+        errors: treatment of invalid UTF-8, as for :meth:`bytes.decode`.
 
     Raises:
-        OSError: it cannot be read.
-        UnicodeDecodeError: a byte that is no text.
+        OSError: the file is unreadable.
+        UnicodeDecodeError: a byte is not text.
 
     Example:
         >>> from pathlib import Path
@@ -40,10 +40,10 @@ def read_text(path: Path, errors: str = "strict") -> str:
 
 
 def split_ply(data: bytes) -> tuple[list[bytes], int] | None:
-    """The lines of a PLY file's header up to ``end_header``, and where its body begins; None where
-    the header does not end.
+    """Split a PLY file into its header's lines up to ``end_header`` and the offset of its body;
+    None if the header does not end.
 
-    Only a line of its own ends the header: a comment may hold the word.
+    Only a separate line ends the header: a comment may contain the word.
 
     Example:
         >>> split_ply(b"ply\\rcomment end_header\\rend_header\\r\\x00")
@@ -59,7 +59,7 @@ def split_ply(data: bytes) -> tuple[list[bytes], int] | None:
 
 
 def plain_ply(data: bytes) -> bytes:
-    """A PLY file whose header's lines, and those of a text body, end by ``\\n``."""
+    """Convert the line ends of a PLY file's header and text body to ``\\n``."""
     found = split_ply(data)
     if found is None:
         return data
@@ -71,8 +71,8 @@ def plain_ply(data: bytes) -> bytes:
 
 
 def overstated(lines: list[bytes], size: int) -> tuple[str, str] | None:
-    """The first element of which a PLY header announces more rows than the file has bytes, and the
-    number that it announces; None where there is none. Readers take memory for announced rows.
+    """Find the first element for which a PLY header announces more rows than the file has bytes,
+    and its announced number; None without one. Readers allocate memory for announced rows.
 
     Args:
         lines: lines of the header.
@@ -90,5 +90,5 @@ def overstated(lines: list[bytes], size: int) -> tuple[str, str] | None:
 
 
 def is_text(lines: list[bytes]) -> bool:
-    """True for a PLY header that announces a body of text."""
+    """Return True if a PLY header announces a text body."""
     return any(line.split()[:2] == [b"format", b"ascii"] for line in lines)

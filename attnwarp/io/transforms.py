@@ -1,9 +1,9 @@
-"""transforms.json: cameras as nerfstudio, instant-ngp and the Blender data sets of NeRF write them.
+"""transforms.json: cameras of nerfstudio, instant-ngp and NeRF's Blender datasets.
 
 ``transform_matrix`` is camera-to-world in OpenGL axes (x right, y up, z backward). Pixel centres
 lie at +0.5 as here, so ``cx = w / 2`` is the middle of the image. Cameras and points stay in the
-world of the file: ``applied_transform`` is handed on as information, and instant-ngp's ``scale``,
-``offset`` and ``aabb_scale`` (how it fits the scene into its unit cube) are not applied.
+world of the file: ``applied_transform`` is returned as information, and instant-ngp's ``scale``,
+``offset`` and ``aabb_scale`` (the scene's fit into its unit cube) are not applied.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Array = npt.NDArray[np.float64]
 
 SPLITS = ("train", "val", "test")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-"""Keys of the distortion coefficients, in the order of OpenCV's vector."""
+"""Keys of distortion coefficients, in the order of OpenCV's vector."""
 
 DISTORTION_LIST = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Names of the six numbers of nerfstudio's ``distortion_params``."""
@@ -49,10 +49,10 @@ PINHOLE_MODELS = (
     "RADIAL",
     "FULL_OPENCV",
 )
-"""Values of ``camera_model`` that are a pinhole as long as every distortion coefficient is zero."""
+"""Values of ``camera_model`` that mean a pinhole if all distortion coefficients are zero."""
 
 INTRINSICS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy", "w", "h")
-"""Keys that may stand in the frame and at the top of the file."""
+"""Keys allowed both in a frame and at the top of the file."""
 
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
@@ -72,7 +72,7 @@ CHANGES_THE_PICTURE = {
     "fix_premult": "alpha of another kind",
     "sharpen": "sharpened pictures",
 }
-"""Keys that are not read though they change what a picture shows, and how; refused if set."""
+"""Unsupported keys that change a picture's content, and their effect; refused if set."""
 
 UNUSED = {
     "aabb_scale", "scale", "offset", "up", "n_frames", "from_na", "render_aabb", "sharpness",
@@ -82,7 +82,7 @@ UNUSED = {
     "driver_parameters", "n_extra_learnable_dims", "ftheta_p1", "ftheta_p2", "ftheta_p3",
     "ftheta_p4", "ftheta_cx", "ftheta_cy",
 }  # fmt: skip
-"""Keys that change no picture: other programs' hints, and how they fit a scene into their box."""
+"""Keys without effect on pictures: other programs' hints, and their scene normalisation."""
 
 USED = {
     "camera_model", "is_fisheye", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy",
@@ -105,38 +105,38 @@ def read_transforms(
 ) -> Dataset:
     """Read a transforms.json.
 
-    Intrinsics stand in the frame or else at the top: ``fl_x``, ``fl_y`` (or ``camera_angle_x``,
-    ``camera_angle_y`` in radians), ``cx``, ``cy`` (the middle of the image if left out), ``w``,
-    ``h`` (the image's own size if left out). ``file_path`` is relative to the file, with or without
-    its extension; a name that another system wrote (backslashes, other case, URL escapes, another
-    form of accents) finds the one file that it can mean. Rotations off by up to 1e-4 (float32, or
-    printed numbers) are replaced by the nearest rotation; beyond, they are refused. Frames keep
-    their order.
+    Intrinsics are in the frame or else at the top: ``fl_x``, ``fl_y`` (or ``camera_angle_x``,
+    ``camera_angle_y`` in radians), ``cx``, ``cy`` (default: the middle of the image), ``w``, ``h``
+    (default: the image's size). ``file_path`` is relative to the file, with or without its
+    extension; a name written by another system (backslashes, other case, URL escapes, another form
+    of accents) finds the unique matching file. Rotations off by up to 1e-4 (float32, or printed
+    numbers) are replaced by the nearest rotation; larger errors are refused. Frames keep their
+    order.
 
     Args:
-        path: the file, or a folder with transforms.json or with transforms_train.json, _val.json,
-            _test.json, which are read together and told apart by ``Dataset.splits``.
-        missing_images: "error", or "none" to get None for the path of an image that is not there.
-        resize_cameras: when an image has another size than its camera, resize the camera instead of
-            refusing.
-        points: False to leave the points out; their file is then not read, and may be missing or
+        path: file, or folder with transforms.json or with transforms_train.json, _val.json,
+            _test.json, which are read together and distinguished by ``Dataset.splits``.
+        missing_images: "error", or "none" to set the path of a missing image to None.
+        resize_cameras: True resizes a camera whose image has another size; False refuses
+            it.
+        points: False skips the points; their file is then not read, and may be missing or
             damaged.
-        distorted: "error" to refuse lens distortion, or "keep" to hand it on in
+        distorted: "error" to refuse lens distortion, or "keep" to return it in
             ``Dataset.lenses`` for :func:`undistort`.
-        ignore_keys: keys to pass over although they change what a picture shows, such as
+        ignore_keys: keys to ignore although they change a picture's content, such as
             "mask_path".
-        scale: 4 to read ``images_4/a.png`` where the file says ``images/a.png``, as nerfstudio
-            lays out smaller copies; the cameras are resized to them.
+        scale: downscaling factor; 4 reads ``images_4/a.png`` for the file's ``images/a.png``, in
+            nerfstudio's layout, and resizes the cameras.
 
     Raises:
-        FileNotFoundError: no such file.
-        FileFormatError: not JSON, a key that is missing or of the wrong type, lens distortion, a
-            key that changes the picture and is not read, a pose that is not rigid, missing images,
+        FileNotFoundError: the file does not exist.
+        FileFormatError: invalid JSON, a missing or wrongly typed key, lens distortion, an
+            unsupported key that changes the picture, a pose that is not rigid, missing images, or
             a split that names no frame; the message names the frame and the key.
 
     Warns:
-        InputWarning: keys that are not understood; frames that no split names; a frame whose
-            intrinsics differ from those at the top; an image that several frames name.
+        InputWarning: unknown keys; frames without a split; a frame whose intrinsics differ from
+            those at the top; an image named by several frames.
 
 
     Example:
@@ -187,21 +187,21 @@ def read_transforms(
 def write_transforms(
     path: str | os.PathLike[str], dataset: Dataset, *, points_name: str = "sparse_pc.ply"
 ) -> None:
-    """Write ``dataset`` as a transforms.json, and its points as a PLY beside it; atomically, images
-    are not copied.
+    """Write ``dataset`` as a transforms.json, and its points as a PLY in the same folder;
+    atomically, without copying images.
 
-    Read back, rotations, intrinsics, points and splits are the same, and camera centres to one
-    rounding of float64. nerfstudio needs all three splits as soon as there is one. If only one of
-    "test" and "val" stands beside "train", its images are written under both names.
+    A round trip keeps rotations, intrinsics, points and splits, and camera centres to one rounding
+    of float64. nerfstudio needs all three splits if any exists. If only one of "test" and "val"
+    accompanies "train", its images are written under both names.
 
     Args:
-        path: the file, or a folder in which transforms.json is written.
-        dataset: ``file_path`` becomes the image's path relative to the file, or the camera's name
-            without an image.
-        points_name: name of the point cloud beside the file.
+        path: file, or folder in which transforms.json is written.
+        dataset: dataset to write; ``file_path`` becomes the image's path relative to the file, or
+            the camera's name without an image.
+        points_name: name of the point cloud in the file's folder.
 
     Raises:
-        ValueError: a camera with skew, which the format cannot hold, with a lens, or with neither
+        ValueError: a camera has skew, which the format cannot represent, or a lens, or neither
             image nor name.
 
     Example:
@@ -235,13 +235,13 @@ def write_transforms(
         pose = np.eye(4)
         pose[:3, :3] = camera.rotation.T * OPENGL_TO_OPENCV
         pose[:3, 3] = camera.position
-        # 0.0 + x turns -0.0, which the change of axes makes, into 0.0.
+        # 0.0 + x turns -0.0, which the change of axes produces, into 0.0.
         frames.append({"file_path": name, "transform_matrix": (pose + 0.0).tolist()})
         names.append(name)
     data: dict[str, Any] = {"camera_model": "OPENCV"}
     if intrinsics and all(each == intrinsics[0] for each in intrinsics):
         shared = intrinsics[0]
-        # The reader of the original 3DGS knows only this angle.
+        # The reader of the original 3DGS supports only this angle.
         data |= {"camera_angle_x": 2 * math.atan(shared["w"] / (2 * shared["fl_x"])), **shared}
     else:
         frames = [frame | each for frame, each in zip(frames, intrinsics, strict=True)]
@@ -267,16 +267,16 @@ def write_transforms(
 
 
 def _relative(image: Path, folder: Path) -> str:
-    """The way from a folder to an image, which holds where either lies behind a link too."""
+    """Compute the relative path from a folder to an image, valid through links too."""
     way = Path(os.path.relpath(image, folder))
-    # Behind a link, ".." leads to the parent of what it links to.
+    # Behind a link, ".." means the parent of the link's target.
     if (folder / way).resolve() != image.resolve():
         way = Path(os.path.relpath(image.parent.resolve() / image.name, folder.resolve()))
     return way.as_posix()
 
 
 def _scaled(path: Path, name: str, scale: int) -> str:
-    """The name of a smaller copy of an image."""
+    """Build the name of a smaller copy of an image."""
     parts = list(Path(name).parts)
     place = next((i for i, part in enumerate(parts) if part.casefold() == "images"), None)
     if place is None:
@@ -337,7 +337,7 @@ def _read_file(
         cameras.append(_camera(values, image))
         lenses.append(lens)
         names.append(name)
-        # The camera is that of the full picture; with_images resizes it.
+        # This camera has the full picture's size; with_images resizes it.
         paths.append(image if scale == 1 else finder.find(_scaled(path, name, scale)))
     keys = {key for level in (data, *frames) for key in level}
     unknown = sorted(keys - USED - UNUSED - CHANGES_THE_PICTURE.keys())
@@ -376,7 +376,7 @@ def _read_file(
 
 
 def brief(value: Any) -> str:
-    """A value in an error: its beginning alone, since it may be of any length."""
+    """Shorten a value of any length for an error message."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:60]}..."
 
@@ -418,7 +418,7 @@ def _check_keys(values: _Values, ignore_keys: Sequence[str]) -> None:
 
 
 def _warn_of_doubles(path: Path, names: Sequence[str], images: Sequence[Path]) -> None:
-    """Say which images several frames name, by whatever names and links."""
+    """Warn of images named by several frames, under any names or links."""
     real = [os.path.realpath(image) for image in images]
     counts = Counter(real)
     doubles = [name for name, file in zip(names, real, strict=True) if counts[file] > 1]
@@ -433,7 +433,7 @@ def _warn_of_doubles(path: Path, names: Sequence[str], images: Sequence[Path]) -
 
 
 def _warn_of_own_intrinsics(path: Path, data: dict[str, Any], frames: list[dict[str, Any]]) -> None:
-    """Say that frames replace intrinsics of the top, since programs disagree on which holds."""
+    """Warn that frames override the top's intrinsics, since programs disagree on precedence."""
     other = {
         i: keys
         for i, frame in enumerate(frames)
@@ -451,7 +451,7 @@ def _warn_of_own_intrinsics(path: Path, data: dict[str, Any], frames: list[dict[
 
 
 def _replaces(frame: dict[str, Any], data: dict[str, Any], key: str) -> bool:
-    """Return True if a frame's value of ``key`` puts another value out of use."""
+    """Return True if a frame's value of ``key`` overrides a different value."""
     if key not in frame:
         return False
     if key in data:
@@ -468,11 +468,11 @@ def _splits(
     split: str | None,
     finder: FileFinder,
 ) -> list[str | None]:
-    """The split of each frame: what the lists of the file say, else ``split``.
+    """Determine the split of each frame: from the file's lists, else ``split``.
 
-    Names are compared as paths, so "./a.png" is "a.png", with or without the image's suffix, and
-    where that names no frame, as other systems spell them. A frame in both test and val belongs to
-    test.
+    Names are compared as paths, so "./a.png" is "a.png", with or without the image's suffix; a name
+    without a match is compared in other systems' spellings. A frame in both test and val belongs
+    to test.
     """
     frames: dict[str, list[int]] = {}
     loose: dict[str, list[int]] = {}
@@ -510,7 +510,7 @@ def _splits(
                 )
             result[i] = each
     without = [name for name, each in zip(names, result, strict=True) if each is None]
-    # Programs write empty lists where nothing is split.
+    # Programs write empty lists for unsplit datasets.
     if without and any(data[f"{each}_filenames"] for each in lists):
         warnings.warn(
             f"{path}: {len(without)} of {len(names)} frames are in no split and not used by a"
@@ -522,19 +522,19 @@ def _splits(
 
 
 def number(value: Any) -> float | None:
-    """A JSON number as float; None for anything else, "1.0" and true among it, and what is not
-    finite.
+    """Convert a JSON number to float; None for anything else, including "1.0", true and non-finite
+    values.
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
         return float(value) if math.isfinite(value) else None
-    except OverflowError:  # a whole number beyond 1.8e308
+    except OverflowError:  # an integer beyond 1.8e308
         return None
 
 
 class _Values:
-    """The values that hold for one frame: its own, or else those at the top of the file."""
+    """Values of one frame: the frame's, or else those at the top of the file."""
 
     def __init__(
         self, path: Path, index: int, name: str, frame: dict[str, Any], top: dict[str, Any]
@@ -547,7 +547,7 @@ class _Values:
         )
 
     def level_of(self, *keys: str) -> dict[str, Any]:
-        """The innermost level that has one of ``keys``."""
+        """Find the innermost level with one of ``keys``."""
         return next((level for level in self.levels if any(key in level for key in keys)), {})
 
     def get(self, key: str) -> Any:
@@ -564,9 +564,9 @@ class _Values:
 
 
 def _lens(values: _Values) -> Lens | None:
-    """The lens of a frame, None for a pinhole.
+    """Read the lens of a frame, None for a pinhole.
 
-    Coefficients stand in ``distortion_params`` or under their own keys, in the frame or at the top.
+    Coefficients are in ``distortion_params`` or in separate keys, in the frame or at the top.
     """
     model = values.get("camera_model")
     if model is not None and model not in (*PINHOLE_MODELS, *FISHEYE_MODELS):
@@ -576,7 +576,7 @@ def _lens(values: _Values) -> Lens | None:
             " undistort the images first",
         )
     fisheye = model in FISHEYE_MODELS or bool(values.get("is_fisheye"))
-    # A level without any coefficient says nothing; two that differ cannot both be right.
+    # A level without coefficients is ignored; two different sets cannot both be right.
     given = [c for level in values.levels if (c := _coefficients(values, level)) is not None]
     if len(given) == 2 and given[0] != given[1]:
         raise values.refuse(
@@ -584,7 +584,7 @@ def _lens(values: _Values) -> Lens | None:
         )
     by_name = given[0] if given else dict.fromkeys(DISTORTION, 0.0)
     if by_name["k4"] and not fisheye and model != "FULL_OPENCV":
-        # The term of a polynomial for some programs, of a denominator for others.
+        # Some programs use the coefficient in a polynomial, others in a denominator.
         raise values.refuse(
             "k4", f"got {by_name['k4']:g}, expected 0 unless camera_model is FULL_OPENCV"
         )
@@ -599,7 +599,7 @@ def _lens(values: _Values) -> Lens | None:
 
 
 def _distortion_message(values: _Values, lens: Lens) -> tuple[str, str]:
-    """The key at fault, and what to do."""
+    """Name the faulty key and a remedy."""
     remedy = (
         "expected a pinhole; undistort the images first (attnwarp undistort DATA OUT, or COLMAP's"
         " image_undistorter)"
@@ -613,7 +613,7 @@ def _distortion_message(values: _Values, lens: Lens) -> tuple[str, str]:
 
 
 def _coefficients(values: _Values, level: dict[str, Any]) -> dict[str, float] | None:
-    """Coefficients by name of one level; None where it has none."""
+    """Read the coefficients of one level by name; None without any."""
     own = {key: values.number(key, level) for key in DISTORTION}
     listed = level.get("distortion_params")
     if listed is None:
@@ -692,13 +692,13 @@ def _camera(values: _Values, image: Path) -> Camera:
 
 
 def _matrix(path: Path, key: str, row: int | None, value: Any) -> Array:
-    """(4, 4) or (3, 4) of finite numbers, with the last row [0, 0, 0, 1] if it is there."""
+    """Parse a finite (4, 4) or (3, 4) matrix; a last row must be [0, 0, 0, 1]."""
     rows = value if isinstance(value, list) else []
     if len(rows) not in (3, 4) or not all(isinstance(r, list) and len(r) == 4 for r in rows):
         raise FileFormatError(
             path, f"got {brief(value)}, expected 4 x 4 or 3 x 4 numbers", field=key, row=row
         )
-    # Strings and booleans, which numpy would take for numbers, are none.
+    # Strings and booleans, which numpy would convert, are refused.
     entries = [number(entry) for entries in rows for entry in entries]
     if None in entries:
         wrong = [entry for entries in rows for entry in entries][entries.index(None)]

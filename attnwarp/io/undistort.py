@@ -1,4 +1,4 @@
-"""Pictures with lens distortion, written anew as pinhole cameras see them."""
+"""Undistortion of pictures: resample them to pinhole cameras and write them."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ def undistort(
 ) -> Dataset:
     """Write undistorted pictures, and a transforms.json for them.
 
-    Focal lengths, poses, points and splits stay. Each new picture is the largest window of whole
+    Focal lengths, poses, points and splits are unchanged. A new picture is the largest window of
     pixels without a blank one; pictures of pinhole cameras are copied pixel by pixel.
 
     Args:
-        dataset: read with ``distorted="keep"``; cameras without a picture are left out.
-        folder: receives transforms.json and images/NAME.png, numbered where names are the same;
-            made if need be.
-        report: receives each picture that is done.
+        dataset: dataset read with ``distorted="keep"``; cameras without a picture are left out.
+        folder: target of transforms.json and images/NAME.png, numbered for equal names; created if
+            missing.
+        report: receiver of progress, picture by picture.
 
     Returns:
-        The data set that was written.
+        Written dataset.
 
     Raises:
-        FileFormatError: a picture that cannot be read.
-        InputError: a picture would be written over one that is read, or transforms.json over one
-            of a folder that holds a picture that is read.
+        FileFormatError: a picture is unreadable.
+        InputError: a result would overwrite an input picture, or the transforms.json of a folder
+            with an input picture.
         ValueError: no camera has a picture, or a lens folds its picture over.
 
     Example:
@@ -64,7 +64,7 @@ def undistort(
             "dataset: none of its cameras has an image that is there; put the images where the data"
             " set names them"
         )
-    # Before the first picture is written: a lens that cannot be undone costs no work.
+    # Checked before the first picture, so that a lens without an inverse costs no work.
     cameras = [
         camera if lens is None else undistorted_camera(camera, lens)
         for camera, lens in zip(dataset.cameras, dataset.lenses, strict=True)
@@ -90,8 +90,8 @@ def undistort(
 
 
 def _check_apart(folder: Path, written: list[Path | None], read: list[Path | None]) -> None:
-    """Refuse to write over any picture that is read, that of another camera too, or over the
-    transforms.json of the folder that they come from.
+    """Refuse to overwrite any input picture, also another camera's, or the transforms.json of the
+    inputs' folder.
     """
     scene, place = folder / "transforms.json", folder.resolve()
     if is_file(scene) and any(path and path.resolve().is_relative_to(place) for path in read):
@@ -99,7 +99,7 @@ def _check_apart(folder: Path, written: list[Path | None], read: list[Path | Non
             f"{scene}: stands in the folder of the pictures to undistort; name another folder for"
             " the result, or remove it if it is an earlier result"
         )
-    # By what the system calls a file, so under another name or by a link as well.
+    # Compared by device and inode, so other names and links are recognised.
     files = [path.stat() for path in read if path is not None and is_file(path)]
     sources = {(file.st_dev, file.st_ino) for file in files}
     for path in written:
@@ -113,7 +113,7 @@ def _check_apart(folder: Path, written: list[Path | None], read: list[Path | Non
 
 
 def _check_own(folder: Path, cameras: list[Camera], names: list[str]) -> None:
-    """Refuse to write over a transforms.json that is no earlier result of the same cameras."""
+    """Refuse to overwrite a transforms.json unless it is a result of the same cameras."""
     path = folder / "transforms.json"
     if not is_file(path):
         return
@@ -136,7 +136,7 @@ def _check_own(folder: Path, cameras: list[Camera], names: list[str]) -> None:
 
 
 def _name(name: str, index: int) -> str:
-    """A path below the folder for the picture of a camera, whatever the camera's name is."""
+    """Build a path below the folder for a camera's picture, for any camera name."""
     parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..", ".", "images")]
     if not parts:
         return f"{index:06d}.png"
