@@ -857,6 +857,15 @@ def test_a_polite_kill_says_what_is_kept(data, tmp_path, monkeypatch):
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["0.png"]
 
 
+def test_the_help_of_edit_names_every_method_and_preset(monkeypatch):
+    """It names them in words of its own, since importing them would import torch."""
+    from attnwarp.methods import PRESETS
+
+    monkeypatch.setenv("COLUMNS", "400")
+    said = in_process("edit", "--help").output
+    assert [name for name in (*PRESETS, *PRESETS["attention_warping"]) if name not in said] == []
+
+
 @pytest.mark.door
 def test_a_missing_package_is_named(tmp_path, monkeypatch):
     write_ply(tmp_path / "a.ply", spread())
