@@ -1,8 +1,8 @@
-"""The one place that imports pycolmap: a program of its own, ``python -m attnwarp_eval._colmap
+"""The only module that imports pycolmap: a separate program, ``python -m attnwarp_eval._colmap
 TASK FOLDER [MODEL]``, which :func:`run` starts.
 
-In one process with other packages pycolmap corrupts memory: its compression library takes the place
-of theirs.
+In one process with other packages pycolmap corrupts memory: its compression library replaces
+theirs.
 
 - ``reconstruct`` finds poses and points, and writes their figures to ``result.json``.
 - ``triangulate`` finds points for the poses of ``poses.json``, and writes ``tracks.npz``.
@@ -32,10 +32,10 @@ SEED = 0
 def write_pictures(
     folder: Path, images: Sequence[npt.NDArray[np.uint8]], cameras: Sequence[Camera]
 ) -> list[str]:
-    """Write what :func:`match` reads, and return the pictures' names there.
+    """Write the input files of :func:`match`, and return the pictures' names in them.
 
     Args:
-        folder: receives ``pictures.npz`` and ``cameras.json``.
+        folder: folder for ``pictures.npz`` and ``cameras.json``.
         images: (H, W, 3) sRGB.
         cameras: pinhole cameras, one a picture, of its size.
     """
@@ -114,7 +114,7 @@ def match(folder: Path) -> Any:
 
 
 def options() -> Any:
-    """Mapping options that leave the cameras as they are."""
+    """Mapping options that keep the cameras fixed."""
     import pycolmap
 
     return pycolmap.IncrementalPipelineOptions(
@@ -123,7 +123,7 @@ def options() -> Any:
 
 
 def reconstruct(folder: Path) -> None:
-    """Write the figures of the largest model that the pictures of ``folder`` give."""
+    """Write the figures of the largest model reconstructed from the pictures of ``folder``."""
     import pycolmap
 
     found = pycolmap.incremental_mapping(
@@ -134,8 +134,8 @@ def reconstruct(folder: Path) -> None:
 
 
 def triangulate(folder: Path) -> None:
-    """Write the tracks of the pictures of ``folder`` at the (3, 4) world-to-camera matrices that
-    ``poses.json`` has by name.
+    """Write the tracks of the pictures of ``folder`` at the (3, 4) world-to-camera matrices of
+    ``poses.json``, by name.
     """
     import pycolmap
 
@@ -191,7 +191,7 @@ def write_tracks(reconstruction: Any, folder: Path) -> None:
 
 
 def main(task: str, *paths: str) -> None:
-    """Do ``task`` in the folder that comes first in ``paths``."""
+    """Run ``task`` in the first folder of ``paths``."""
     import pycolmap
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)

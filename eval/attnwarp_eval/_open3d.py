@@ -1,4 +1,4 @@
-"""The one place that imports Open3D."""
+"""The only module that imports Open3D."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 
 @functools.cache
 def open3d() -> Any:
-    """The open3d module.
+    """Import the open3d module.
 
-    Its shared library needs libusb-1.0.so.0 (for depth sensors that nothing here uses), which a
+    Its shared library needs libusb-1.0.so.0 (for depth sensors, unused here), which a
     bare machine lacks. The wheel libusb-package carries that library under the same SONAME: loaded
     first and globally, it is the one the dynamic linker finds. A machine where it cannot be loaded
-    may still have its own.
+    may still have one installed.
     """
     with contextlib.suppress(ImportError, OSError):
         import libusb_package

@@ -1,4 +1,4 @@
-"""Derived files: where they live, how they are sealed, and how several processes share them."""
+"""Derived files: their location, checksums, and sharing between processes."""
 
 from __future__ import annotations
 
@@ -27,20 +27,21 @@ def content_key(*parts: Any) -> str:
 
 
 SEAL = b"attnwarp sha256 "
-"""Precedes the checksum at a file's end. Before it is a usual npz, which NumPy also reads with the
-seal behind it.
+"""Precedes the checksum at a file's end. The preceding bytes are a plain npz, which NumPy also
+reads with the seal appended.
 """
 
 _warned: set[Path] = set()
-"""Damaged files that this process has named."""
+"""Damaged files already reported by this process."""
 
 
 def read_arrays(kind: str, key: str) -> dict[str, npt.NDArray[Any]] | None:
-    """The arrays stored under ``kind``/``key``, or None where they must be computed.
+    """The arrays stored under ``kind``/``key``, or None if they must be computed.
 
-    A file whose checksum does not fit its content is named on stderr, once, and counts as none: the
-    caller computes the arrays and :func:`write_arrays` replaces it. zip has a checksum of its own,
-    but NumPy does not read as far as it where the header of an array was changed.
+    A file whose checksum does not match its content is reported on stderr, once, and treated as
+    missing: the caller computes the arrays and :func:`write_arrays` replaces it. zip's checksum is
+        not
+    enough: NumPy does not verify it if an array's header was changed.
     """
     path = cache_dir() / kind / f"{key}.npz"
     try:
@@ -61,15 +62,15 @@ _SEAL_SIZE = len(SEAL) + hashlib.sha256().digest_size
 
 
 def _seal(kind: str, key: str, content: bytes) -> bytes:
-    """The last bytes of a file, which depend on its name: it cannot stand in for another."""
+    """The last bytes of a file, which include its name: it cannot be mistaken for another."""
     return SEAL + hashlib.sha256(f"{kind}/{key}\n".encode() + content).digest()
 
 
 def write_arrays(kind: str, key: str, arrays: Mapping[str, Any]) -> None:
     """Store ``arrays`` under ``kind``/``key``.
 
-    The file appears under its name only when it is whole, so a reader never sees half of one and
-    the last of several writers wins. A folder that cannot be written to is no error: the value is
+    The file appears under its name only when complete, so a reader never sees a partial file and
+    the last of several writers wins. An unwritable folder is no error: the value is
     computed again next time.
 
     Raises:
@@ -89,16 +90,16 @@ def write_arrays(kind: str, key: str, arrays: Mapping[str, Any]) -> None:
 
 
 _unseen: float = float("inf")
-"""Bytes that this process has written since it last looked at the whole folder; it looks at its
+"""Bytes that this process has written since it last scanned the whole folder; it scans at its
 first write.
 """
 
 
 def _keep_within(limit: int, written: int) -> None:
-    """Trim the folder, but look at all of it only after every hundredth of the limit.
+    """Trim the folder, scanning it only after every hundredth of the limit written.
 
-    To look costs a call for each file: done at every write, keeping thousands of small meshes took
-    longer than making them.
+    A scan costs a call for each file: at every write, storing thousands of small meshes took longer
+    than computing them.
     """
     global _unseen
     _unseen += written
@@ -130,7 +131,7 @@ def limit_bytes() -> int:
 
 
 def _files() -> list[tuple[Path, os.stat_result]]:
-    """Every stored file with its state; one that another process removes meanwhile is left out."""
+    """Every stored file with its state; files removed meanwhile by another process are left out."""
     files = []
     for path in cache_dir().glob("*/*.npz"):
         with contextlib.suppress(OSError):
@@ -149,10 +150,10 @@ def usage() -> dict[str, tuple[int, int]]:
 
 def trim(limit: int) -> int:
     """Remove the files written longest ago until at most ``limit`` bytes are left; return how many
-    bytes went.
+    bytes were removed.
 
-    Temporary files that dead processes left go, too. Safe beside other processes: a reader that has
-    a file open keeps it, and one that comes later computes it again.
+    Temporary files of dead processes are removed too. Safe with concurrent processes: a reader with
+    an open file keeps it, and a later one computes it again.
     """
     for folder in cache_dir().glob("*/"):
         remove_abandoned(folder)

@@ -1,4 +1,4 @@
-"""JSON as the harness writes it: one text for a value, names made from it, null for NaN."""
+"""JSON of the harness: one text for each value, hashes of it, null for NaN."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from attnwarp_eval.files import write_atomic
 
 
 def canonical_json(value: Any) -> str:
-    """The one JSON text of a value: sorted keys, no spaces, no NaN.
+    """The unique JSON text of a value: sorted keys, no spaces, no NaN.
 
     >>> canonical_json({"b": 1, "a": [2.5, None]})
     '{"a":[2.5,null],"b":1}'
@@ -33,7 +33,7 @@ def digest(value: Any) -> str:
 def without_nan(value: Any) -> Any:
     """``value`` with null for every number that JSON lacks: NaN and the infinities.
 
-    Mappings and sequences are gone through; NumPy's numbers become Python's.
+    Mappings and sequences are converted recursively; NumPy's numbers become Python's.
 
     >>> without_nan({"psnr": float("inf"), "views": [1, np.float64("nan"), "a"]})
     {'psnr': None, 'views': [1, None, 'a']}
@@ -48,11 +48,11 @@ def without_nan(value: Any) -> Any:
 
 
 def write_json(path: Path, value: Any, *, sort_keys: bool = True, durable: bool = True) -> None:
-    """Write ``value`` as JSON that a person can read, atomically.
+    """Write ``value`` as readable JSON, atomically.
 
     Args:
         sort_keys: whether the keys of objects are sorted.
-        durable: see :func:`attnwarp_eval.files.write_atomic`.
+        durable: as for :func:`attnwarp_eval.files.write_atomic`.
 
     Raises:
         ValueError: a number that JSON lacks; see :func:`without_nan`.

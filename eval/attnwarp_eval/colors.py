@@ -13,8 +13,8 @@ def to_srgb(linear: npt.ArrayLike) -> npt.NDArray[Any]:
     """Linear values to sRGB-encoded ones in [0, 1], by IEC 61966-2-1.
 
     Args:
-        linear: linear of any shape; values outside [0, 1] are clipped. A float dtype stays the
-            same.
+        linear: linear values of any shape; values outside [0, 1] are clipped. A float dtype stays
+            the same.
 
     Example:
         >>> [round(float(value), 4) for value in to_srgb([0.0, 0.2140411, 1.0, 2.0])]
@@ -41,7 +41,7 @@ def to_linear(srgb: npt.ArrayLike) -> npt.NDArray[Any]:
 def color_difference(
     a: npt.NDArray[Any], b: npt.NDArray[Any], mask: npt.NDArray[np.bool_]
 ) -> float:
-    """Mean CIEDE2000 of two (H, W, 3) sRGB pictures inside a mask; NaN where it is empty."""
+    """Mean CIEDE2000 of two (H, W, 3) sRGB pictures inside a mask; NaN if the mask is empty."""
     from skimage.color import deltaE_ciede2000, rgb2lab
 
     if not mask.any():

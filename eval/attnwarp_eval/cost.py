@@ -1,5 +1,5 @@
-"""Cost of a figure: seconds by stage, work counters, peak memory, and the machine it was measured
-on.
+"""Cost of a figure: seconds by stage, work counters, peak memory, and the machine that it was
+measured on.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ PACKAGES = (
     "transformers",
     "tokenizers",
 )
-"""Packages that figures depend on, beside the source."""
+"""Packages that figures depend on, besides the source."""
 
 
 class Meter:
     """Seconds and counters of one cell.
 
-    The method's own work is timed view by view: the first view pays for compilation and cold caches
-    ("warm"), the others give the steady figure. Everything else (truth, splats, the checks
-    themselves) is set-up and checking, and never mixed into what a method costs.
+    The method's work is timed view by view: the first view pays for compilation and cold caches
+    ("warm"), the others give the steady figure. Everything else (truth, splats,
+    checks) is set-up and checking, and never part of a method's cost.
     """
 
     def __init__(self) -> None:
@@ -69,7 +69,7 @@ class Meter:
             self._cpu[name] = self._cpu.get(name, 0.0) + time.process_time() - start_cpu
 
     def add(self, name: str, seconds: float) -> None:
-        """Add seconds that the work itself has measured to stage ``name``."""
+        """Add externally measured seconds to stage ``name``."""
         self._stages[name] = self._stages.get(name, 0.0) + seconds
 
     @contextmanager
@@ -109,7 +109,7 @@ class Turns(Generic[T]):
     """Results and seconds of contestants that ran in turn.
 
     Attributes:
-        results: contestant -> round -> what it returned.
+        results: contestant -> round -> returned value.
         seconds: contestant -> round -> wall seconds.
         cpu: contestant -> round -> seconds of all of this process's threads together.
         again: round -> wall seconds of the first contestant's second run.
@@ -122,7 +122,7 @@ class Turns(Generic[T]):
 
 
 AGAIN = 10_000
-"""Added to the round that the first contestant's second run is given, so that it draws other noise.
+"""Offset of the round number for the first contestant's second run, so that its noise differs.
 """
 
 
@@ -133,18 +133,18 @@ def in_turn(
     seed: int = 0,
     before: Callable[[int], None] = lambda _: None,
 ) -> Turns[T]:
-    """Time contestants round by round in one process, each round in an order drawn anew.
+    """Time contestants round by round in one process, each round in a random order.
 
     The speed of a machine drifts. Contestants of one round see the same machine, so the ratio of
-    two within a round can be trusted where two separate means cannot. The first contestant runs
-    twice a round: the ratio of it to itself is what noise alone does on this machine. One more
-    round comes first, which compiles and fills caches; it is not kept.
+    two within a round is reliable where two separate means are not. The first contestant runs
+    twice a round: its ratio to itself is the effect of noise alone on this machine. An extra
+    first round compiles and fills caches; it is discarded.
 
     Args:
         contestants: at least one; called with the number of the round, from 1.
-        rounds: how many are kept.
+        rounds: number of rounds kept.
         seed: seed of the order.
-        before: called, untimed, with the index of the contestant that comes next.
+        before: untimed callback with the index of the next contestant.
 
     >>> turns = in_turn([lambda turn: "a", lambda turn: "b"], rounds=3)
     >>> turns.results
@@ -173,7 +173,7 @@ def in_turn(
 
 
 def reset_peak_memory() -> None:
-    """Count this process's peak memory from now on, where the system can (Linux).
+    """Count this process's peak memory from now on, if the system can (Linux).
 
     Memory that was freed and kept for later use still counts.
     """
@@ -192,7 +192,7 @@ def peak_memory_mb() -> float:
 
 @cache
 def environment() -> dict[str, Any]:
-    """Versions, machine and source revision: what a person needs to reproduce a figure."""
+    """Versions, machine and source revision: all that is needed to reproduce a figure."""
     versions = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -216,10 +216,10 @@ _plugins: dict[str, str] = {}
 
 
 def count_plugin(module: str, file: Path) -> None:
-    """Let the source of a plugin be part of the code that cells are computed by.
+    """Include the source of a plugin in the hash of the code.
 
     Args:
-        module: its name.
+        module: name of the plugin's module.
         file: file of the module; of a package all files count.
     """
     whole = file.name == "__init__.py"
@@ -232,7 +232,7 @@ def count_plugin(module: str, file: Path) -> None:
 def source_hash() -> str:
     """SHA-256 of every source file of both packages, and of the plugins that are loaded.
 
-    A revision would not do: an installed copy has none, and files of a checkout change without one.
+    A revision is not enough: an installed copy has none, and a checkout may have local changes.
     """
     packages = [Path(attnwarp.__file__).parent, Path(__file__).parent]
     parts = {package.name: _hash_of(package, package.rglob("*.py")) for package in packages}
@@ -261,7 +261,7 @@ def _git(folder: Path) -> dict[str, Any]:
             return None
         return done.stdout.strip() if done.returncode == 0 else None
 
-    # An installed copy may lie inside somebody else's repository, whose revision says nothing about
+    # An installed copy may lie inside an unrelated repository, whose revision says nothing about
     # this code.
     if ask("ls-files", "--error-unmatch", str(Path(__file__).resolve())) is None:
         return {"sha": None, "dirty": None}

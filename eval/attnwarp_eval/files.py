@@ -1,4 +1,4 @@
-"""Files that the harness writes: atomically, and pictures."""
+"""Atomic writing of files and pictures."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from attnwarp.io.picture import encode_picture
 def write_atomic(path: Path, data: bytes, *, durable: bool = True) -> None:
     """Write so that ``path`` keeps its old content or has all of ``data``, even after a power cut.
 
-    Folders that are missing are made.
+    Missing folders are created.
 
     Args:
-        durable: False does without the flush, which takes milliseconds; after a power cut the file
+        durable: False skips the flush, which takes milliseconds; after a power cut the file
             may then be missing or damaged.
 
     Raises:
@@ -28,7 +28,7 @@ def write_atomic(path: Path, data: bytes, *, durable: bool = True) -> None:
     write_atomically(path, lambda stream: stream.write(data), durable=durable)
     if not durable:
         return
-    # The name is the folder's content: it lasts only when the folder is flushed as well.
+    # The name is stored in the folder, which must be flushed as well.
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)
@@ -40,8 +40,8 @@ def write_picture(path: Path, image: npt.ArrayLike, **jpeg: Any) -> Path:
     """Write a picture atomically, as PNG or JPEG by its name's suffix; return ``path``.
 
     Args:
-        path: path of the file; missing folders are made.
-        image: see :func:`attnwarp.io.picture.encode_picture`.
+        path: path of the file; missing folders are created.
+        image: picture, as for :func:`attnwarp.io.picture.encode_picture`.
         jpeg: its ``quality`` and ``chroma``.
     """
     write_atomic(path, encode_picture(image, path.suffix, **jpeg))

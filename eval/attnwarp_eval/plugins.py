@@ -1,4 +1,4 @@
-"""Probes and editing methods of other packages, which register themselves at their import."""
+"""Probes and editing methods of other packages, which register themselves on import."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from attnwarp.errors import InputError
 from attnwarp_eval.cost import count_plugin
 
 GROUP = "attnwarp_eval"
-"""Group of entry points: each names a module of an installed package. The laboratory's is one."""
+"""Group of entry points: each names a module of an installed package, such as the laboratory."""
 
 VARIABLE = "ATTNWARP_PLUGINS"
 """Environment variable: modules to import as well, separated by commas. Workers of the same machine
@@ -24,10 +24,10 @@ inherit it.
 
 @cache
 def load_plugins() -> None:
-    """Import every plugin, once a process.
+    """Import every plugin, once per process.
 
     Raises:
-        InputError: one cannot be imported; the message says where it was named.
+        InputError: a plugin cannot be imported; the message says where it is named.
     """
     for module, named_by in _named():
         try:
@@ -44,12 +44,12 @@ def load_plugins() -> None:
 
 
 def plugin_modules() -> list[str]:
-    """Modules of the plugins that are named here, sorted."""
+    """Modules of the configured plugins, sorted."""
     return sorted({module for module, _ in _named()})
 
 
 def plugin_folders(name: str) -> list[Path]:
-    """Folders of that name in the packages of plugins, which need not be there."""
+    """Paths of a folder in each plugin's package; they may not exist."""
     load_plugins()
     packages = sorted({module.partition(".")[0] for module in plugin_modules()})
     paths = (path for each in packages for path in getattr(sys.modules[each], "__path__", ()))
@@ -57,7 +57,7 @@ def plugin_folders(name: str) -> list[Path]:
 
 
 def _named() -> Iterator[tuple[str, str]]:
-    """Module names, each with what names it."""
+    """Module names, each with its origin."""
     for entry in entry_points(group=GROUP):
         package = entry.dist.name if entry.dist else "a package"
         yield entry.module, f"entry point {entry.name!r} of {package}"

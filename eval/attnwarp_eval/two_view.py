@@ -1,4 +1,4 @@
-"""The exact relation of two views as plain data: what truth computes and metrics read."""
+"""The exact relation of two views as plain data, computed by truth and read by metrics."""
 
 from __future__ import annotations
 
@@ -65,10 +65,10 @@ class TwoView:
         label: (H, W) uint8.
             0 NONE: no surface in the target pixel, or its point is outside the source image (or
             behind its camera); ``hits.valid`` tells the two apart.
-            1 VISIBLE: inside the source image, on the side that faces it, and nothing in between.
+            1 VISIBLE: inside the source image, on the side that faces it, and unoccluded.
             2 HIDDEN: inside the source image, but occluded or turned away.
-            3 AMBIGUOUS: there is a surface, but the four corners of the pixel do not get the same
-            answer as its centre (no surface, outside, visible or hidden), or the surface is seen at
+            3 AMBIGUOUS: there is a surface, but the four corners of the pixel do not have the same
+            class as its centre (no surface, outside, visible or hidden), or the surface is seen at
             a cosine of incidence under 1e-3 by either camera.
         edge: (H, W) bool: within 2 px of a depth or object edge of the target, or, where the point
             falls inside the source image, within 2 px of one there.
@@ -98,8 +98,8 @@ class TwoView:
 
     @property
     def outside(self) -> Mask:
-        """(H, W) bool: a surface, certainly not inside the source image (beside it, or behind the
-        camera).
+        """(H, W) bool: a surface, certainly not inside the source image (out of frame, or behind
+        the camera).
         """
         return self.hits.valid & (self.label == NONE)
 

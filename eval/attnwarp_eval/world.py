@@ -24,21 +24,21 @@ from attnwarp_eval.truth.mitsuba import forget
 from attnwarp_eval.two_view import TwoView
 
 SPLATS_PROTOCOL = 1
-"""Version of the sampling. Raise it when the same settings give other splats."""
+"""Version of the sampling; raised when the same settings give other splats."""
 
 Features = npt.NDArray[np.float64]
 Samples = tuple[SurfaceSamples, npt.NDArray[np.float64]]
 
 
 class World:
-    """Parts of a scene that all variants share: truth, memoised by view.
+    """Parts of a scene shared by all variants: truth, memoised by view.
 
     Args:
-        scene: as it was loaded.
-        size: size of the images, in pixels; the study's.
+        scene: the loaded scene.
+        size: size of the study's images, in pixels.
 
     Attributes:
-        content_hash: hash of the scene's file, which a cell's spec names.
+        content_hash: hash of the scene's file, as in a cell's spec.
         source: the source camera.
         targets: the target cameras by name.
         signed_yaw: degrees from the source in [-180, 180), by the target's name.
@@ -57,9 +57,9 @@ class World:
             for camera, view in zip(scene.targets, scene.spec.cameras.targets, strict=True)
         }
         self.yaw = {name: abs(yaw) for name, yaw in self.signed_yaw.items()}
-        # Cells of one scene use the same pairs; a world lives as long as its scene is at work.
+        # Cells of one scene use the same pairs; a world lives as long as its scene is in use.
         self.pair: Callable[[str, int], TwoView] = cache(self._pair)
-        # Of two targets there are many pairs, of 100 bytes a pixel each.
+        # Pairs of two targets are many, at 100 bytes a pixel each.
         self.between: Callable[[str, str], TwoView] = lru_cache(maxsize=64)(self._between)
         self.features: Callable[[str, int, int, int], Features] = cache(self._features)
         self.edge: Callable[[str, int], npt.NDArray[np.bool_]] = cache(self._edge)
@@ -67,7 +67,7 @@ class World:
         self.samples: Callable[[int, int], Samples] = cache(self._samples)
 
     def edited_hash(self, edit: str, answer: str | None) -> str:
-        """The hash of the scene's file after an edit, which a cell's spec names."""
+        """The hash of the scene's file after an edit, as in a cell's spec."""
         return self._loaded.edited(edit, answer).content_hash
 
     def add(self, camera: Camera) -> None:
@@ -129,20 +129,20 @@ class World:
 
 
 def world(scene: str, size: int) -> World:
-    """The world of a scene (a name or a path) at an image size; the last one is cached, as long as
-    its file stays as it is.
+    """The world of a scene (a name or a path) at an image size; the last one is cached while its
+    file is unchanged.
     """
     return _world(scene, size, scene_file(scene).read_bytes())
 
 
 @lru_cache(maxsize=1)
 def _world(scene: str, size: int, content: bytes) -> World:
-    forget()  # what was loaded for the pictures of the former one
+    forget()  # data loaded for the pictures of the previous scene
     return World(load_scene(scene), size)
 
 
 def turned(scene: Scene, yaw: float) -> Camera:
-    """The scene's source camera, taken around the point that it looks at by ``yaw`` degrees, at the
+    """The scene's source camera, rotated around its look-at point by ``yaw`` degrees, at the
     same height.
     """
     spec = scene.spec.cameras
@@ -163,12 +163,12 @@ def turned(scene: Scene, yaw: float) -> Camera:
 
 
 def changed(what: str) -> InputError:
-    """The error of a scene that is no longer what a cell was planned for."""
+    """The error of a scene that has changed since a cell was planned."""
     return InputError(f"{what} has changed since the run was planned; start the run again")
 
 
 def splats(scene: str, size: int, seed: int, **settings: Any) -> Gaussians:
-    """Gaussians on a scene's surfaces; the last few are cached here, all of them on disk.
+    """Gaussians on a scene's surfaces; the last few are cached in memory, all of them on disk.
 
     Args:
         scene, size: arguments of the :func:`world`.

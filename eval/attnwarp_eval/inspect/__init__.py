@@ -1,1 +1,1 @@
-"""Inspection of a warp in 3D: what each pixel sees, in a window, a picture or a file to share."""
+"""Inspection of a warp in 3D, pixel by pixel, in a window, a picture or a file to share."""

@@ -1,4 +1,4 @@
-"""A user's own scene: splats, cameras with pictures, and perhaps the folder of an edit of it."""
+"""A user's scene: splats, cameras with pictures, and optionally the folder of an edit."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ class Capture:
         size: longest side of the pictures in px; larger ones are averaged down.
 
     Attributes:
-        near: nothing nearer than this is drawn, in scene units, as in a fit and an edit.
+        near: near-plane depth in scene units, as in a fit and an edit.
         source: the source camera.
         targets: all other cameras by the name of their file, without suffix.
-        center: (3,) where the optical axes pass closest to each other.
+        center: (3,) point nearest to all optical axes.
         up: (3,) mean of the cameras' upward axes.
 
     Raises:
@@ -65,7 +65,7 @@ class Capture:
         ]
         source = names[0] if source is None else source
         one_of(source, names, "source")
-        # The fit's losses and networks take their time to import.
+        # Import here: the fit's losses and networks import slowly.
         from attnwarp.methods.scene import near_of
 
         self.near = near_of(cameras, model)
@@ -83,7 +83,7 @@ class Capture:
         return self.source if name == self.source.name else self.targets[name]
 
     def surface(self, name: str, settings: WarpSettings) -> Surface:
-        """Surface that the splats show to a view, rendered once for all settings that render
+        """Surface of the splats in a view, rendered once for all settings that render
         alike.
         """
         return self._rendered(name, settings.depth, settings.depth_statistic)
@@ -93,11 +93,11 @@ class Capture:
         return render_surface(self.model, self.camera(name), settings, near=self.near)
 
     def _image(self, name: str) -> Image:
-        """(H, W, 3) sRGB of a view in [0, 1]: its picture, or a render where it has none."""
+        """(H, W, 3) sRGB of a view in [0, 1]: its picture, or a render if it has none."""
         index, data = self.names.index(name), self.dataset
         if data.image_paths[index] is None:
             return np.clip(np.asarray(self.surface(name, PRESETS["corrected"]).image), 0, 1)
-        # The fit's losses and networks take their time to import.
+        # Import here: the fit's losses and networks import slowly.
         from attnwarp.fit import load_views
 
         one = Dataset([data.cameras[index]], [data.image_paths[index]], lenses=[data.lenses[index]])
@@ -110,12 +110,12 @@ class Edit:
     """The files of an edit of a scene, made by ``attnwarp edit``.
 
     Attributes:
-        path: its folder.
-        instruction: in words.
+        path: folder of the edit.
+        instruction: instruction of the edit.
         source: name of the source view.
         views: names of the edited target views.
-        settings: settings of its warp.
-        steps: "before", the stages, and "edited" once it is done.
+        settings: settings of the edit's warp.
+        steps: "before", the stages, and "edited" once the edit is done.
     """
 
     path: Path
@@ -137,7 +137,7 @@ class Edit:
         return None
 
     def after(self, view: str, step: str) -> Image | None:
-        """(h, w, 3) render of the scene after a step; None where the edit has not made it."""
+        """(h, w, 3) render of the scene after a step; None if the edit has not written it."""
         return self._picture(f"renders/after/{view}.png") if step == EDITED else None
 
     def details(self, view: str) -> dict[str, Image]:
@@ -146,7 +146,7 @@ class Edit:
         return {} if features is None else {"features, warped": features}
 
     def _picture(self, name: str) -> Image | None:
-        """(h, w, 3) sRGB of a file of the folder; None where the edit has not made it."""
+        """(h, w, 3) sRGB of a file of the folder; None if the edit has not written it."""
         path = self.path / name
         return read_picture(path) if path.is_file() else None
 
@@ -158,7 +158,7 @@ def read_picture(path: Path) -> Image:
 
 
 def is_edit(path: Path) -> bool:
-    """Return True if a folder holds an edit."""
+    """Return True if a folder contains an edit."""
     return (path / _manifest()).is_file()
 
 
@@ -169,13 +169,13 @@ def _manifest() -> str:
 
 
 def read_edit(path: Path, names: Sequence[str]) -> Edit:
-    """The edit in a folder.
+    """Read the edit in a folder.
 
     Args:
         names: names of the data set's views, without suffix.
 
     Raises:
-        InputError: the manifest is damaged, or the edit is of another data set.
+        InputError: the manifest is damaged, or the edit belongs to another data set.
     """
     file = path / _manifest()
     try:
@@ -214,7 +214,7 @@ def rendered(model: Gaussians, camera: Camera, near: float) -> Image:
 
 
 def one_of(value: str, choices: Sequence[str], name: str) -> None:
-    """Refuse what is no choice, with the nearest one that is.
+    """Refuse an unknown choice, and suggest the nearest one.
 
     Raises:
         InputError: ``value`` is none of ``choices``.
@@ -243,7 +243,7 @@ def _resized(camera: Camera, longest: int) -> Camera:
 def _convergence(cameras: Sequence[Camera]) -> Array:
     """The point with the least squared distance to all optical axes.
 
-    Axes that are nearly parallel have no such point; the mean of the cameras then serves.
+    Axes that are nearly parallel have no such point; the mean of the cameras is used then.
     """
     across = [np.eye(3) - np.outer(camera.forward, camera.forward) for camera in cameras]
     matrix = np.sum(across, axis=0)

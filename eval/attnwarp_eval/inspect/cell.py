@@ -1,4 +1,4 @@
-"""Everything about one cell of a feature grid: its position, its taps, and its mask."""
+"""Report on one cell of a feature grid: position, taps and mask."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Vector = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Tap:
-    """A source cell that is read.
+    """A source cell read by bilinear sampling.
 
     Attributes:
         column, row: column and row of the cell in the source's grid.
-        weight: its share of the warped feature, in [0, 1].
-        point: (3,) surface point that the source sees at the cell's centre; NaN where none.
+        weight: share of the warped feature, in [0, 1].
+        point: (3,) surface point seen by the source at the cell's centre; NaN if none.
 
     Example:
         >>> Tap(3, 4, 0.25, np.zeros(3)).weight
@@ -43,17 +43,17 @@ class CellReport:
     Attributes:
         column, row: column and row of the cell.
         size: (h, w) of the target's grid.
-        depth: at the cell's centre, along the target's axis; NaN where taps straddle an edge.
+        depth: depth at the cell's centre, along the target's axis; NaN if taps straddle an edge.
         point: (3,) surface point in the world; NaN without a depth.
         xy: (2,) position in the source's grid, in cells.
         z: depth of the point in the source camera.
-        inside: the position lies inside the source's image.
-        share: share of the image-size mask inside the cell; above one half counts.
-        accepted: the cell gets features of the source.
-        taps: the source cells that are read, with their weights.
+        inside: whether the position lies inside the source's image.
+        share: share of the image-size mask inside the cell; accepted above one half.
+        accepted: whether the cell gets features of the source.
+        taps: source cells read, with their weights.
         label: label of the truth on this grid, "" without truth.
         true_xy: (2,) exact position in cells; NaN without truth.
-        token: fate of its label, in words; "" where no run has labels.
+        token: description of the carried label; "" if no run has labels.
 
     Example:
         >>> from attnwarp.warp import PRESETS
@@ -81,7 +81,7 @@ class CellReport:
     token: str = ""
 
     def lines(self) -> list[str]:
-        """The report in words, a line each."""
+        """Text lines of the report."""
         h, w = self.size
         text = [f"cell ({self.column}, {self.row}) of {w} x {h}"]
         if self.label:
@@ -104,7 +104,7 @@ class CellReport:
 
 
 def cell_of(pair: Pair, size: Size, column: int, row: int) -> tuple[int, int]:
-    """The cell (column, row) of a feature grid that a target pixel's centre lies in.
+    """The cell (column, row) of a feature grid that contains a target pixel's centre.
 
     Args:
         size: (h, w) of the feature grid.
@@ -120,7 +120,7 @@ def cell_of(pair: Pair, size: Size, column: int, row: int) -> tuple[int, int]:
 
 
 def cell_report(pair: Pair, size: Size, column: int, row: int) -> CellReport:
-    """Everything about one cell of the target's feature grid.
+    """Report on one cell of the target's feature grid.
 
     Args:
         size: (h, w) of the grid.

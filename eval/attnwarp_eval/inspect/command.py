@@ -19,9 +19,9 @@ def inspect_command(
     """Command that shows a view of a run in 3D.
 
     Args:
-        scene, variant, view: as the run names them.
-        seed: one of the run's; its first if None.
-        color: quantity that colours the surface; the command's own choice if None.
+        scene, variant, view: names in the run.
+        seed: a seed of the run; by default the first.
+        color: quantity that colours the surface; by default the command's choice.
         pixel: COLUMN,ROW of a target pixel to explain.
 
     Example:

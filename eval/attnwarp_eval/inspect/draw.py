@@ -19,11 +19,11 @@ VIEW_ANGLE = 30.0
 """Height of the view from outside, in degrees."""
 
 FILLED = 0.8
-"""Share of that view that the frusta take at most; the sliders are below it."""
+"""Largest share of that view for the frusta; the sliders are below."""
 
 
 def add_part(plotter: Any, part: Part) -> Any:
-    """Draw a part, in place of the one of its name; the actor is returned."""
+    """Draw a part, replacing the part of the same name; return the actor."""
     how: dict[str, Any] = {"color": part.color}
     if part.picture is not None:
         how = {"texture": texture(part.picture())}
@@ -45,7 +45,7 @@ def add_part(plotter: Any, part: Part) -> Any:
 
 
 def add_lighter(plotter: Any, name: str, mesh: pyvista.PolyData) -> Any:
-    """Draw what stands for a part while the view moves; the actor is returned, hidden."""
+    """Draw a part's simplified version for moving views; return the actor, hidden."""
     actor = plotter.add_mesh(
         mesh,
         scalars="colors",
@@ -94,7 +94,7 @@ def outside(
     local = (points - center) @ axes
     middle = (local.min(axis=0) + local.max(axis=0)) / 2 * [1, 1, 0]
     across, along, toward = (local - middle).T
-    # A point's distance ahead of the viewer is the viewer's own from the middle, less its depth.
+    # A point's distance from the viewer is the viewer's distance from the middle, minus its depth.
     slope = FILLED * np.tan(np.radians(VIEW_ANGLE / 2))
     distance = (np.maximum(abs(across) / aspect, abs(along)) / slope + toward).max()
     focus = center + axes @ middle

@@ -1,5 +1,5 @@
-"""Export of what is on show to a file to share: .glb for viewers, .vtp with every number, .html a
-page.
+"""Export of the current view to a file to share: .glb for viewers, .vtp with every number, .html as
+a page.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ FLOAT, UINT32, UINT16 = 5126, 5125, 5123
 """glTF's numbers of the types."""
 
 POINTS, LINES, TRIANGLES = 0, 1, 4
-"""glTF's numbers of what indices form."""
+"""glTF's numbers of primitive types."""
 
 
 def check_ending(path: Path) -> None:
-    """Refuse a file of an unknown kind, before anything is computed.
+    """Refuse a file of an unknown kind, before any computation.
 
     Raises:
         InputError: another ending.
@@ -49,12 +49,12 @@ def check_ending(path: Path) -> None:
 
 
 def write_export(path: Path, subject: Subject, state: State, picked: Any = None) -> None:
-    """Write what a state shows; no OpenGL is needed but for .html.
+    """Write the scene of a state; only .html needs OpenGL.
 
     Args:
         path: ends in .html (a page that needs no network), .glb (coloured surface, frusta with
             their pictures, splats, rays) or .vtp (the surface with every number of its pixels).
-        subject, state: subject, and the state that is shown.
+        subject, state: subject, and the displayed state.
         picked: the report of a picked pixel or cell, or None.
 
     Raises:
@@ -75,7 +75,7 @@ def write_export(path: Path, subject: Subject, state: State, picked: Any = None)
 
 
 def vtp(pair: Pair, state: State) -> bytes:
-    """The surface that the target sees as VTK's XML, with the numbers of each pixel."""
+    """The target's visible surface as VTK's XML, with the numbers of each pixel."""
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
     seen = pair.seen
@@ -194,7 +194,7 @@ def glb(
     """A binary glTF file of the parts, upright, with ``center`` at its origin.
 
     Args:
-        center: (3,) subtracted in float64, so that far-away worlds keep their digits.
+        center: (3,) subtracted in float64, so that far-away worlds keep precision.
         up: (3,) unit vector, which becomes glTF's +y.
     """
     gltf = _Gltf()
@@ -276,8 +276,8 @@ def page(parts: Sequence[Part], subject: Subject, pair: Pair, title: str, legend
 
     Args:
         subject, pair: subject and pair with the cameras in view.
-        title: title of the page, and of what it shows.
-        legend: (text, "#rrggbb") of what the colours mean.
+        title: title of the page and of the view.
+        legend: (text, "#rrggbb") of the colours' meanings.
     """
     with optional_imports():
         from trame_vtk.modules.vtk import serializers
@@ -326,6 +326,6 @@ def page(parts: Sequence[Part], subject: Subject, pair: Pair, title: str, legend
     entries = "".join(
         f'<br><span style="color: {color}">\u25a0</span> {escape(name)}' for name, color in legend
     )
-    # The viewer empties what it draws in, so the caption stands beside it.
+    # The viewer clears its container, so the caption is outside.
     body = f'<div class="content"></div><p style="{CAPTION}">{escape(title)}{entries}</p>{script}'
     return viewer.replace("</body>", f"{body}</body>").encode()

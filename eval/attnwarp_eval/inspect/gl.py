@@ -1,4 +1,4 @@
-"""OpenGL: what VTK draws with, and a clear error where there is none."""
+"""OpenGL, which VTK draws with, and a clear error if it is missing."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ WITHOUT_DRAWING = "--export FILE.glb or FILE.vtp needs no OpenGL, --pixel prints
 
 
 def has_display() -> bool:
-    """Return True if this machine names a display for windows."""
+    """Return True if this machine has a display for windows."""
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def require_gl(*, display: bool) -> None:
-    """Refuse to draw where VTK would crash, or would draw into nothing.
+    """Refuse to draw if VTK would crash, or would draw nowhere.
 
-    VTK chooses a display, else EGL, else OSMesa, and crashes where it finds none of them.
+    VTK chooses a display, else EGL, else OSMesa, and crashes if it finds none of them.
 
     Args:
-        display: a window on the screen is wanted, rather than a picture.
+        display: whether a window on the screen is needed, rather than a picture.
 
     Raises:
         InputError: no display, or no OpenGL.

@@ -1,4 +1,4 @@
-"""A pair of views under one variant: its warp, its truth where there is one, and its colours."""
+"""A pair of views under one variant: its warp, its truth if available, and its colours."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ COLORINGS = (
     EDIT_DISAGREEMENT,
     PART_LABELS,
 )
-"""Colourings of the surface that the target sees; :attr:`Pair.colorings` has those that a pair can
+"""Colourings of the target's visible surface; :attr:`Pair.colorings` has those that a pair can
 show.
 """
 
@@ -72,7 +72,7 @@ CATEGORIES = (
     "#1f78b4", "#e31a1c", "#17becf", "#ff7f00", "#6a3d9a", "#b15928", "#a6cee3", "#fb9a99",
     "#b2df8a", "#fdbf6f", "#cab2d6", "#ffd92f",
 )  # fmt: skip
-"""Colours of rules and of views, in order (ColorBrewer, Paired; its dark green would pass for
+"""Colours of rules and of views, in order (ColorBrewer, Paired; its dark green resembles
 ``ACCEPTED``, so cyan stands in its place)."""
 
 DISAGREEMENT = 0.3
@@ -81,7 +81,7 @@ DISAGREEMENT = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """The surface that the target's pixels see.
+    """The surface seen by the target's pixels.
 
     Attributes:
         point: (H, W, 3) world coordinates, NaN where there is none.
@@ -103,9 +103,9 @@ class Pair:
     """One target view against the source, under one variant.
 
     Args:
-        views: a scene with truth, or a user's own.
-        model: the splats that give depth; None takes the truth's own depth.
-        exact_mask: whether the mask is the truth's, as an oracle's.
+        views: a scene with truth, or a user's capture.
+        model: the splats that give depth; None takes the true depth.
+        exact_mask: whether the mask is the exact one, as for an oracle.
         labels: labels of tokens that a probe of a run follows.
     """
 
@@ -120,11 +120,11 @@ class Pair:
 
     @property
     def world(self) -> World | None:
-        """The scene's truth; None for a user's own scene."""
+        """The scene's truth; None for a user's capture."""
         return None if isinstance(self.views, Capture) else self.views
 
     def near(self, model: Gaussians) -> float:
-        """Depth in the target below which nothing of splats is drawn, in scene units."""
+        """Near-plane depth of splats in the target, in scene units."""
         if isinstance(self.views, Capture):
             return self.views.near
         return near_plane(model, self.cameras[1])
@@ -147,7 +147,7 @@ class Pair:
         return self.world.pair(self.target, self.world.source.height)
 
     def truth_at(self, size: Size) -> TwoView | None:
-        """The truth on a feature grid (h, w); None where it is not known."""
+        """The truth on a feature grid (h, w); None if unknown."""
         if self.world is None or size[0] != size[1]:
             return None
         return self.world.pair(self.target, size[0])
@@ -162,7 +162,7 @@ class Pair:
 
     @cached_property
     def surfaces(self) -> tuple[Surface, Surface]:
-        """Surfaces of source and target, as the warp takes them."""
+        """Surfaces of source and target, as inputs of the warp."""
         source, target = self.cameras
         if isinstance(self.views, Capture):
             return (
@@ -213,7 +213,7 @@ class Pair:
 
     @cached_property
     def seen(self) -> Seen:
-        """The surface that the target sees: the true one, or that of the splats."""
+        """The surface seen by the target: the true one, or that of the splats."""
         if self.truth is not None:
             hits = self.truth.hits
             return Seen(hits.point, hits.depth, hits.normal, hits.object_id, hits.valid)
@@ -246,7 +246,7 @@ class Pair:
 
     @cached_property
     def source_depth(self) -> Array:
-        """(H, W) depth that the source itself has at the warp's positions; NaN where none."""
+        """(H, W) depth of the source's surface at the warp's positions; NaN if none."""
         depth = torch.as_tensor(np.asarray(self.surfaces[0].depth, dtype=np.float64))
         spread = self.settings.depth_spread
         return sample_depth(depth, self.view.correspondence, spread=spread).numpy()
@@ -264,7 +264,7 @@ class Pair:
 
     @cached_property
     def margins(self) -> Mapping[str, tuple[Array, str]]:
-        """(H, W) distance of each rule's pixels from the other verdict, and its unit.
+        """(H, W) margin of each rule's pixels to the other verdict, and its unit.
 
         Positive where the rule passes, NaN where the quantity is undefined.
         """
@@ -299,7 +299,7 @@ class Pair:
 
     @cached_property
     def first_rejection(self) -> npt.NDArray[np.int64]:
-        """(H, W) number of the first rule that rejects the pixel; -1 where none does."""
+        """(H, W) number of the first rule that rejects the pixel; -1 if none does."""
         passed = np.stack([mask.numpy() for mask in self.view.rules.values()])
         return np.where(passed.all(axis=0), -1, passed.argmin(axis=0))
 
@@ -307,7 +307,7 @@ class Pair:
     def covering(self) -> npt.NDArray[np.int64]:
         """(H, W) number of the view that sees the surface at the smallest incidence, -1 for none.
 
-        Number 0 is the source; the others are the targets in order, this one left out.
+        Number 0 is the source; the others are the targets in order, without this one.
         """
         assert not isinstance(self.views, Capture) and self.truth is not None
         hits, geometry = self.truth.hits, self.views.geometry
@@ -338,7 +338,7 @@ class Pair:
     def disagreement(self) -> Array:
         """(H, W) mean absolute difference of the target's edit and the source's, warped.
 
-        NaN where the mask rejects, and where a view has not been edited.
+        NaN where the mask rejects, and if a view has not been edited.
         """
         edited = self._edited(self.views.source.name), self._edited(self.target)
         if edited[0] is None or edited[1] is None:
@@ -378,7 +378,7 @@ class Pair:
         return blocks(self.layer(layer).mask.numpy(), self.size)
 
     def carried(self, layer: Size | None = None) -> Carried | None:
-        """Labels carried on a feature grid, or by pixels; None where no run has any."""
+        """Labels carried on a feature grid, or by pixels; None if no run has any."""
         if self.labels is None or self.truth is None:
             return None
         return self.labels.carried(self.layer(layer or self.size), self.target, self.truth)
@@ -387,7 +387,7 @@ class Pair:
 
     @property
     def colorings(self) -> tuple[str, ...]:
-        """Those of :data:`COLORINGS` that this pair can show."""
+        """The :data:`COLORINGS` available for this pair."""
         return tuple(
             name
             for name in COLORINGS
@@ -401,7 +401,7 @@ class Pair:
 
         Args:
             coloring: one of :attr:`colorings`.
-            layer: (h, w) of a feature grid, whose mask "mask" and whose tokens "labels" then show.
+            layer: (h, w) of a feature grid, whose mask or tokens "mask" and "labels" then show.
             step: step of the edit, whose scene "picture" then shows.
         """
         if coloring not in self.colorings:
@@ -436,7 +436,7 @@ class Pair:
         return tinted([*CATEGORIES, REJECTED], self.covering, target)
 
     def legend(self, coloring: str) -> Legend:
-        """(text, "#rrggbb") of what the colours mean."""
+        """(text, "#rrggbb") of the colours' meanings."""
         if coloring == "mask":
             if self.truth is None:
                 return [("accepted", ACCEPTED), ("rejected", REJECTED)]
@@ -480,7 +480,7 @@ class Pair:
         return rendered(splats, target, self.near(splats))
 
     def splats(self, step: str = "") -> Gaussians:
-        """The splats after a step of the edit; those before it where a run has no others.
+        """The splats after a step of the edit; those before it if a run has no others.
 
         Only for a pair with splats.
         """
@@ -491,10 +491,10 @@ class Pair:
         return self.model if after is None else after
 
     def insets(self, layer: Size | None = None, step: str | None = None) -> dict[str, Image]:
-        """The pictures beside the 3D view, by title.
+        """The pictures next to the 3D view, by title.
 
         Args:
-            layer: (h, w) of a feature grid: what is warped then has its cells.
+            layer: (h, w) of a feature grid, whose cells the warped pictures then have.
             step: step of the edit.
         """
         source, target = self.images
@@ -527,7 +527,7 @@ def fitted(picture: Image, camera: Camera) -> Image:
     """A picture at a camera's size: averaged where it shrinks, cubic where it grows."""
     if picture.shape[:2] == (camera.height, camera.width):
         return picture
-    # Editors take their time to import.
+    # Import here: editors import slowly.
     from attnwarp.methods.pictures import resized
 
     return resized(picture, (camera.height, camera.width))

@@ -1,4 +1,4 @@
-"""Everything about one target pixel: depths, positions, each rule's verdict and its margin."""
+"""Report on one target pixel: depths, positions, each rule's verdict and its margin."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from attnwarp_eval.inspect.pair import LABELS, Pair
 Vector = npt.NDArray[np.float64]
 
 NEARER = 1e-6
-"""Least share of the distance by which an obstacle is nearer than the point."""
+"""Least share of the distance by which an occluder must be nearer than the point."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A rule at one pixel.
+    """Verdict of a rule at one pixel.
 
     Attributes:
-        rule: its name.
+        rule: name of the rule.
         passed: verdict of the rule.
-        margin: how far the pixel is from the other verdict, positive where it passes; NaN where
+        margin: distance of the pixel to the other verdict, positive if it passes; NaN if
             the quantity is undefined.
         unit: unit of the margin.
 
@@ -46,7 +46,7 @@ class Exact:
         object: name of the object that the pixel shows, or "".
         xy: (2,) source pixel coordinates of its surface point.
         z: depth of the point in the source camera.
-        blocked_by: name of the object that the source sees instead, or "" where the way is free.
+        blocked_by: name of the object that the source sees instead, or "" if the way is free.
 
     Example:
         >>> Exact("hidden", "marble", np.array([3.5, 4.5]), 2.0, blocked_by="chrome").blocked_by
@@ -70,13 +70,13 @@ class PixelReport:
         depths: z along the target's axis, by definition.
         xy: (2,) source pixel coordinates of the warp.
         z: depth of the warp's point in the source camera.
-        source_depth: depth that the source itself has at ``xy``; NaN where it has none.
+        source_depth: depth of the source's surface at ``xy``; NaN if none.
         tolerance: tolerance of the depth agreement there.
-        verdicts: every rule that was applied, in order.
-        accepted: all rules together.
-        seen_instead: (3,) what the source really sees toward the point, where something else
-            stands in the way; None where the way is free or unknown.
-        exact: the truth, where there is one.
+        verdicts: every applied rule, in order.
+        accepted: whether all rules pass.
+        seen_instead: (3,) point really seen by the source toward this point, if something occludes
+            it; None if the way is free or unknown.
+        exact: the truth, if available.
 
     Example:
         >>> from attnwarp.warp import PRESETS
@@ -110,7 +110,7 @@ class PixelReport:
         return float(np.linalg.norm(self.xy - self.exact.xy))
 
     def lines(self) -> list[str]:
-        """The report in words, a line each."""
+        """Text lines of the report."""
         text = [f"pixel ({self.column}, {self.row})"]
         if self.exact is not None:
             text[0] += f" {self.exact.object or 'nothing'}: {self.exact.label}"
@@ -135,7 +135,7 @@ class PixelReport:
 
 
 def report(pair: Pair, column: int, row: int) -> PixelReport:
-    """Everything about one target pixel.
+    """Report on one target pixel.
 
     Raises:
         ValueError: the pixel lies outside the target's image.
@@ -191,7 +191,7 @@ def _truth(pair: Pair, pixel: tuple[int, int]) -> tuple[Exact | None, Vector | N
         faces = hits.normal[pixel] @ (eye - point) > 0
         free = world.geometry.reached(eye, point[None], [hits.primitive_id[pixel]])[0]
         first = world.geometry.trace_rays(eye, (point - eye)[None])
-        # The far side of a thing is hidden by its near side; that of a sheet by nothing before it.
+        # The far side of a solid is hidden by its near side; that of a sheet by nothing in front.
         if not (free and faces) and first.valid[0] and first.t[0] < 1 - NEARER:
             blocker, name = first.point[0], names[first.object_id[0]]
     owner = names[hits.object_id[pixel]] if hits.valid[pixel] else ""
@@ -200,7 +200,7 @@ def _truth(pair: Pair, pixel: tuple[int, int]) -> tuple[Exact | None, Vector | N
 
 
 def _nearer(pair: Pair, pixel: tuple[int, int]) -> Vector | None:
-    """Point that stands before the target's point by the source's own depth."""
+    """Point that occludes the target's point by the source's depth."""
     correspondence = pair.view.correspondence
     depth, z = float(pair.source_depth[pixel]), float(correspondence.z[pixel])
     if not depth < z - float(pair.tolerance[pixel]):  # NaN too

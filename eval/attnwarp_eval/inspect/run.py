@@ -1,5 +1,5 @@
-"""Contents of a run's folder for one variant of a scene: the settings of its warp, its fitted
-splats, and pictures of edited views.
+"""One variant of a scene in a run's folder: the settings of its warp, its fitted splats, and
+pictures of edited views.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class RunEdit:
-    """Pictures of one edited view that a run has.
+    """A run's pictures of one edited view.
 
     Attributes:
         folder: path of the run.
         source, target: names of the views.
-        files: by what they show.
+        files: files by content.
         steps: "before" and "edited".
     """
 
@@ -48,7 +48,7 @@ class RunEdit:
         return self._picture("render")
 
     def splats(self, step: str) -> None:
-        """A run has no edited splats."""
+        """Return None: a run has no edited splats."""
 
     def details(self, view: str) -> dict[str, Image]:
         """Further pictures of the target, by title."""
@@ -67,14 +67,14 @@ class RunEdit:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Records of one variant of a scene, as far as they tell of its warp.
+    """Parts of the records of a scene's variant that concern its warp.
 
     Attributes:
-        edited: whether an editing method was measured, else a fit alone.
-        settings: settings of the method's warp; None where it has none.
+        edited: whether an editing method was measured, else only a fit.
+        settings: settings of the method's warp; None without one.
         exact_mask: whether the method injects features where the source truly sees the surface.
-        fit: file of the splats that were fitted to true pictures; None where none were.
-        edits: by "edit/view", those of which the run has pictures.
+        fit: file of the splats that were fitted to true pictures; None without a fit.
+        edits: edits with pictures in the run, by "edit/view".
     """
 
     edited: bool = False
@@ -84,7 +84,7 @@ class Measured:
     edits: Mapping[str, RunEdit] = field(default_factory=dict)
 
     def fitted(self) -> Gaussians | None:
-        """The splats that were fitted to true pictures; None where none were.
+        """Read the splats fitted to true pictures; None without a fit.
 
         Raises:
             InputError: the run's folder lacks them.
@@ -108,16 +108,16 @@ def measured(
     *,
     content: str,
 ) -> dict[str, Measured]:
-    """Variants of a run: those that edit the scene, or fit splats to it.
+    """Variants of a run that edit the scene or fit splats to it.
 
     Args:
-        cells: the expected ones, as ``study.json`` lists them.
+        cells: the expected cells of ``study.json``.
         scene, seed: scene and seed of the cells to read.
-        content: hash of the scene as it is now.
+        content: hash of the scene's present content.
 
     Raises:
         StoreError: a record is damaged.
-        InputError: a cell was measured of the scene as it was before.
+        InputError: a cell was measured on an earlier version of the scene.
     """
     from attnwarp_eval.study.probe import probes
 
@@ -130,7 +130,7 @@ def measured(
         if (cell["scene"], cell["seed"]) != (scene, seed) or cell["id"] not in done or own is None:
             continue
         if own.times_in_turn:
-            continue  # several variants in one record, for their seconds alone
+            continue  # several variants in one record, only for their seconds
         read = partial(_measured, folder, source, own)
         measured_of, one = store.read_as(cell["id"], read)
         if measured_of != content:
@@ -146,14 +146,14 @@ def measured(
                 result[name] = replace(one, edits={**former, **one.edits})
             else:
                 result.setdefault(name, one)
-    # Where a variant is also measured on sampled splats, its warp is theirs.
+    # If a variant is also measured on sampled splats, its warp uses those.
     return {name: one for name, one in result.items() if one.edited or name not in sampled}
 
 
 def _measured(
     folder: Path, source: str, own: Probe[Any], data: dict[str, Any]
 ) -> tuple[str, Measured | None]:
-    """Hash of the scene, and what a record has of it; None where it neither edits nor fits."""
+    """Hash of the scene, and contents of a record; None if it neither edits nor fits."""
     from attnwarp_eval.study.shared.fits import folder_of
 
     record = own.read(data)

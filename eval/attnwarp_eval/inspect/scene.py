@@ -29,15 +29,15 @@ SEAM = 0.05
 """Neighbouring pixels whose depths differ by more than this fraction are not joined by a face."""
 
 MOVING = 20_000
-"""More faces than this of the surface or of the discs are drawn lighter while the view moves."""
+"""Number of faces above which a surface or discs are simplified while the view moves."""
 
 DISC_SIDES = ((20_000, 10), (60_000, 6))
-"""(splats, corners): up to so many splats, a disc is a polygon of so many corners; beyond, it is a
-square. Software draws 200,000 ten-sided discs in a second, squares in a third of it."""
+"""(splats, corners): up to ``splats`` splats, a disc is a polygon with ``corners`` corners; beyond,
+a square. Software rendering draws 200,000 ten-sided discs in a second, squares in a third of it."""
 
 
 def seen_surface(seen: Seen, colors: Image, seam: float = SEAM) -> pyvista.PolyData:
-    """The surface that a view sees: a vertex a pixel, faces between neighbours of one surface.
+    """The surface seen by a view: one vertex per pixel, faces between neighbours of one surface.
 
     Args:
         colors: (H, W, 3) sRGB in [0, 1].
@@ -64,18 +64,18 @@ def seen_surface(seen: Seen, colors: Image, seam: float = SEAM) -> pyvista.PolyD
 
 
 def coarser_surface(seen: Seen, surface: pyvista.PolyData, faces: int) -> pyvista.PolyData:
-    """:func:`seen_surface` with about ``faces`` faces: of every k-th pixel of every k-th row.
+    """:func:`seen_surface` with about ``faces`` faces, from every k-th pixel of every k-th row.
 
     Args:
-        surface: the :func:`seen_surface` of it, for its colours.
-        faces: about so many.
+        surface: result of :func:`seen_surface`, for its colours.
+        faces: approximate number of faces.
     """
     colors = np.zeros((*seen.valid.shape, 3))
     colors.reshape(-1, 3)[surface.point_data["pixel"]] = surface.point_data["colors"] / 255
     step = math.ceil(math.sqrt(seen.valid.size / faces))
     every = (slice(step // 2, None, step),) * 2
     grids = {f.name: getattr(seen, f.name)[every] for f in fields(seen)}
-    # The depth of a slope changes that much more from one of these pixels to the next.
+    # Between these pixels the depth of a slope changes k times as much.
     return seen_surface(replace(seen, **grids), colors[every], seam=step * SEAM)
 
 
@@ -133,7 +133,7 @@ def disc_points(mesh: pyvista.PolyData) -> pyvista.PolyData:
 
 
 def disc_sides(count: int) -> int:
-    """Corners of each disc among so many."""
+    """Corners of each disc for a number of splats."""
     return next((sides for most, sides in DISC_SIDES if count <= most), 4)
 
 
@@ -167,9 +167,9 @@ def picture_plane(corners: Array) -> pyvista.PolyData:
 
 
 def rays(pair: Pair, report: PixelReport | CellReport) -> dict[str, pyvista.PolyData]:
-    """A picked pixel's or cell's ray, its way to the source, and what the source really sees.
+    """A picked pixel's or cell's ray, the line to the source, and the source's line of sight.
 
-    A cell also has its taps: what the source sees at the cells that are read.
+    A cell also has its taps: the source's surface points at the cells read.
     """
     import pyvista
 
@@ -224,7 +224,7 @@ def fly(cameras: tuple[Camera, Camera], center: Array, steps: int) -> list[tuple
 
     Args:
         cameras: first and last.
-        center: (3,) what the arc goes around.
+        center: (3,) centre of the arc.
         steps: number of poses, both ends among them.
     """
     from scipy.spatial.transform import Rotation, Slerp
@@ -251,13 +251,13 @@ class Part:
 
     Attributes:
         name: name of the part; a part of the same name is replaced.
-        key: inputs that it depends on; a part with the key of the one on show is not drawn again.
-        mesh: makes it.
+        key: inputs of the part; a part with an unchanged key is not redrawn.
+        mesh: function that makes the mesh.
         color: "#rrggbb", or None for the mesh's own ``colors``.
-        picture: makes the (H, W, 3) sRGB texture, where it has one.
+        picture: function that makes the (H, W, 3) sRGB texture, if any.
         opacity: in [0, 1].
-        moving: makes, from the mesh, what is drawn in its place while the view moves, where the
-            mesh has more than :data:`MOVING` faces; None where it stays.
+        moving: function from the mesh to its simplified version while the view moves, if the
+            mesh has more than :data:`MOVING` faces; None to keep the mesh.
     """
 
     name: str
@@ -274,12 +274,12 @@ class State:
     """State of the window.
 
     Attributes:
-        variant, target: names.
+        variant, target: names of the variant and the target.
         coloring: one of the pair's colorings.
         layer: (h, w) of a feature grid; None for the image's pixels.
         step: step of the edit, "" without one.
-        splats: as discs.
-        surface: the whole true surface, translucent.
+        splats: whether splats are drawn as discs.
+        surface: whether the whole true surface is drawn, translucent.
     """
 
     variant: str

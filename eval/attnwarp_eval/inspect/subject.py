@@ -1,4 +1,4 @@
-"""Subjects to inspect: a run, a scene, or a user's own splats and cameras."""
+"""Subjects to inspect: a run, a scene, or a user's splats and cameras."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from attnwarp_eval.world import World
 
 SIZE = 512
-"""Image size of a scene that is inspected by its name, and longest side of a user's pictures."""
+"""Image size of a scene inspected by name, and longest side of a user's pictures."""
 
 EDIT_VARIANT = "the edit's"
-"""Name of the variant with the settings that an edit's manifest names."""
+"""Name of the variant with the settings of an edit's manifest."""
 
 _NOT_MEASURED = Measured()
 
@@ -48,20 +48,20 @@ class Subject:
     """A scene with the variants and the target views that can be inspected.
 
     Attributes:
-        scene: name or path.
+        scene: name or path of the scene.
         size: size of the images, in pixels.
         spp: samples a pixel of the true pictures.
         seed: seed of the splats.
-        variants: by name, each with its splats; None stands for the truth's own depth, or for the
-            user's own splats.
+        variants: splats by variant's name; None stands for the true depth, or for the user's
+            splats.
         targets: names of the views.
-        capture: the user's own scene, which has no truth.
-        edit: edit of the user's own scene.
+        capture: the user's capture, without truth.
+        edit: edit of the user's capture.
         measured: measured figures of a run's variants, where they edit the scene or fit splats to
             it.
-        elsewhere: file to open for an edited view that a run has no pictures of; empty for anything
-            but a run of edits.
-        labels: labels of tokens that a probe of a run follows; None where none does.
+        elsewhere: advice on the file to open for an edited view without pictures in the run; empty
+            except for a run of edits.
+        labels: labels of tokens that a probe of a run follows; None without one.
 
     Example:
         >>> subject = of_scene("spheres", 16)
@@ -85,12 +85,12 @@ class Subject:
     )
 
     def pair(self, variant: str, target: str) -> Pair:
-        """One target view under one variant; an edited view of a run is named ``edit/view``.
+        """The pair of a target view and a variant; an edited view of a run is named ``edit/view``.
 
-        A pair is made once.
+        Pairs are cached.
 
         Raises:
-            InputError: there is no such variant or view.
+            InputError: no such variant or view.
         """
         one_of(variant, list(self.variants), "variant")
         one_of(target, list(self.targets), "view")
@@ -100,7 +100,7 @@ class Subject:
 
     def _pair(self, variant: str, target: str) -> Pair:
         chosen, model = self.variants[variant]
-        # Methods with presets of their own have no warp: the corrected rules show where one leads.
+        # Methods with separate presets have no warp: show the corrected rules instead.
         own_preset = chosen.preset is not None and chosen.preset not in PRESETS
         settings = PRESETS["corrected"] if own_preset else chosen.settings()
         if self.capture is not None:
@@ -128,7 +128,7 @@ class Subject:
 
     @property
     def preferred(self) -> str:
-        """The variant to begin with: the edit's own, else "corrected", else the first with pictures
+        """The initial variant: the edit's, else "corrected", else the first with pictures
         of an edit, else the first.
         """
         names = list(self.variants)
@@ -138,7 +138,7 @@ class Subject:
 
     @property
     def steps(self) -> tuple[str, ...]:
-        """Steps of the edits; one without a name where there is none."""
+        """Steps of the edits; a single unnamed one without edits."""
         if self.edit is not None:
             return self.edit.steps
         return (BEFORE, EDITED) if any(own.edits for own in self.measured.values()) else ("",)
@@ -154,7 +154,7 @@ class Subject:
 
     @cached_property
     def center(self) -> npt.NDArray[np.float64]:
-        """(3,) what the cameras look at."""
+        """(3,) look-at point of the cameras."""
         views = self.views
         center = views.center if isinstance(views, Capture) else views.scene.center
         return np.asarray(center, dtype=np.float64)
@@ -166,14 +166,14 @@ class Subject:
 
 
 def of_scene(scene: str, size: int = SIZE) -> Subject:
-    """A scene under the presets, with splats as studies put them on its surfaces.
+    """A scene under the presets, with splats sampled on its surfaces as in studies.
 
     Args:
         scene: a name, or the path of a file.
         size: side of the pictures in px.
 
     Raises:
-        InputError: there is no such scene.
+        InputError: no such scene.
 
     Example:
         >>> sorted(of_scene("spheres", 16).variants)
@@ -193,16 +193,16 @@ def _presets(model: Splats | None) -> dict[str, tuple[Variant, Splats | None]]:
 def of_run(
     folder: Path, scene: str | None = None, size: int | None = None, seed: int | None = None
 ) -> Subject:
-    """A run's variants and views; edited views, of which the run has pictures, come first.
+    """A run's variants and views; edited views with pictures come first.
 
     Args:
-        scene: one of the run's; the first, if left out.
-        size: size of the images; the run's own, if left out.
-        seed: one of the run's; the first, if left out.
+        scene: a scene of the run; by default the first.
+        size: size of the images; by default the run's.
+        seed: a seed of the run; by default the first.
 
     Raises:
-        InputError: the folder is no run, a record is damaged, the run has no such scene or seed or
-            no variants, or the scene was edited in a former state.
+        InputError: the folder is not a run, a record is damaged, the run has no such scene or seed
+            or no variants, or the scene has changed since.
 
     Example:
         >>> from attnwarp_eval.study import Store, parse_study
@@ -263,7 +263,7 @@ def of_run(
 
 
 def _elsewhere(folder: Path, variants: Sequence[str], views: Sequence[str]) -> str:
-    """Advice on what to open for an edited view that a run has no pictures of."""
+    """Advice on the file to open for an edited view without pictures in the run."""
     other = "edit the scene with attnwarp edit, and open its folder with --data"
     if not views:
         return (
@@ -286,18 +286,18 @@ def of_capture(
     source: str | None = None,
     size: int = SIZE,
 ) -> Subject:
-    """A user's own scene: splats, or the folder of an edit, and the cameras with their pictures.
+    """A user's scene: splats, or the folder of an edit, and the cameras with their pictures.
 
     Args:
-        path: a PLY or .splat file, or a folder that ``attnwarp edit`` made.
+        path: a PLY or .splat file, or a folder written by ``attnwarp edit``.
         data: transforms.json, its folder, or a COLMAP folder.
-        ply: the splats before the edit, where the folder does not have them.
+        ply: the splats before the edit, if the folder lacks them.
         images: folder of the pictures of a COLMAP model.
-        source: name of the source view; that of the edit, else the first.
+        source: name of the source view; by default the edit's, else the first.
         size: longest side of the pictures.
 
     Raises:
-        InputError: the folder holds no edit, the splats are missing, or there is no such view.
+        InputError: the folder has no edit, the splats are missing, or no such view exists.
 
     Example:
         >>> subject = of_capture(Path("scene.ply"), Path("my_capture"), size=32)
@@ -326,7 +326,7 @@ def of_capture(
     capture = Capture(_splats(path if ply is None else ply), dataset, source=source, size=size)
     targets = tuple(capture.targets)
     if edit is not None:
-        # Views that were edited come first.
+        # Edited views come first.
         targets = tuple(sorted(targets, key=lambda name: name not in edit.views))
     return Subject(str(path), size, 0, 0, variants, targets, capture, edit)
 

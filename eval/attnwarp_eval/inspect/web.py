@@ -14,14 +14,14 @@ from attnwarp_eval.inspect.window import Window, layer_name, plain
 LOCAL = "127.0.0.1"
 
 LEFT = 10.0
-"""Seconds after which the server ends, once the last browser has gone; a reload takes less."""
+"""Seconds from the last browser's leaving to the server's end; a reload takes less."""
 
 
 def check_web() -> None:
-    """Refuse to go on without trame, before anything is computed.
+    """Require trame before any computation.
 
     Raises:
-        MissingExtraError: it is not installed.
+        MissingExtraError: trame is not installed.
     """
     with optional_imports():
         import trame.app
@@ -42,10 +42,10 @@ def serve(
     connect without it.
 
     Args:
-        window: drawn off screen.
+        window: window, drawn off screen.
         host: address to listen at.
-        port: to listen at; 0 takes a free one.
-        announce: told the address to open.
+        port: port to listen at; 0 takes a free one.
+        announce: callback with the address to open.
 
     Raises:
         InputError: the address cannot be used.
@@ -61,13 +61,13 @@ def serve(
 
 
 def server_arguments(secret: str) -> list[str]:
-    """The secret for trame's own command line; in one word, as a secret may begin with a dash."""
+    """The secret as an argument of trame; one word, since a secret may begin with a dash."""
     return [f"--authKey={secret}"]
 
 
 async def _serve(page: _Page, host: str, port: int, secret: str) -> None:
     page.url = lambda bound: f"http://{host}:{bound}/index.html?secret={secret}"
-    # trame reads the command line by itself, in a way that clashes with this command's options.
+    # trame parses the command line, which clashes with this command's options.
     arguments, sys.argv = sys.argv, ["attnwarp-eval", *server_arguments(secret)]
     try:
         task = page.server.start(
@@ -127,7 +127,7 @@ class _Page:
         state.numbers = "" if window.picked is None else "\n".join(window.picked.lines())
 
     def _changed(self, **_: Any) -> None:
-        """Show what the controls say."""
+        """Apply the controls' state."""
         window, state = self.window, self.server.state
         wanted = {
             "target": window.targets[int(state.target)],
@@ -163,14 +163,14 @@ class _Page:
         for position, rotation in scene.fly(window.pair.cameras, window.subject.center, 24):
             window.look(position, rotation)
             self.server.controller.view_update()
-            # The picture goes out while this waits.
+            # The picture is sent during this wait.
             await asyncio.sleep(0.05)
 
     def _ready(self, **_: Any) -> None:
         self.announce(self.url(self.server.port))
 
     def _joined(self, **_: Any) -> None:
-        """A browser that knows the secret has opened the page."""
+        """A browser with the secret has opened the page."""
         self.joined = True
 
     def _watch_clients(self, root: Any) -> None:

@@ -51,24 +51,24 @@ PICKING_TOLERANCE = 5e-4
 """Tolerance of a click on the surface, as a share of the window's diagonal: about a pixel."""
 
 PIXELS = "pixels"
-"""Name of the layer that is no feature grid."""
+"""Name of the layer of image pixels."""
 
 
 class Window:
     """A warp in 3D.
 
     Args:
-        state: state that is shown at first.
-        off_screen: draw without a display.
+        state: initial state.
+        off_screen: whether to draw without a display.
         size: size of the window, in pixels.
 
     Attributes:
-        state: state that is shown.
+        state: displayed state.
         picked: the report of the picked pixel or cell, or None.
-        changed: called after each change of what is shown.
+        changed: callback after each change of the state.
 
     Raises:
-        InputError: no OpenGL can be had.
+        InputError: OpenGL is not available.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Window:
         # PyVista wraps its methods in a way that mypy cannot follow.
         self.plotter: Any = self._plotter(off_screen, size)
         self._samples: int = self.plotter.render_window.GetMultiSamples()
-        # Whoever shows the window, or takes its picture, renders it.
+        # Showing the window or taking its picture renders it.
         self.plotter.suppress_rendering = True
         self._draw()
         self.look_from_outside()
@@ -103,18 +103,18 @@ class Window:
 
     @property
     def pair(self) -> Pair:
-        """The pair of views on show."""
+        """The displayed pair of views."""
         return self.subject.pair(self.state.variant, self.state.target)
 
     @property
     def layers(self) -> list[Size | None]:
-        """The pixels (None) and the feature grids of the pair on show."""
+        """The pixels (None) and the feature grids of the displayed pair."""
         return [None, *self.pair.layers]
 
     def show(self, **changes: Any) -> None:
         """Change some of the :class:`~attnwarp_eval.inspect.scene.State`.
 
-        A pixel that was picked is picked again under another variant, and dropped in another view.
+        A picked pixel is picked again for another variant, and dropped for another view.
         """
         before = self.state
         self.state = replace(self.state, **changes)
@@ -128,7 +128,7 @@ class Window:
         self._draw()
 
     def pick(self, column: int, row: int) -> PixelReport | CellReport:
-        """Show a target pixel's rays and numbers; those of its cell while a grid is shown."""
+        """Show a target pixel's rays and numbers; or those of its cell if a grid is shown."""
         if self.state.layer is not None:
             column, row = cell_of(self.pair, self.state.layer, column, row)
         self.picked = self._report(column, row)
@@ -143,7 +143,7 @@ class Window:
     # --- the camera
 
     def look_from_outside(self) -> None:
-        """A view of the scene and of both cameras."""
+        """Look at the scene and both cameras from outside."""
         self._main()
         self.plotter.camera.view_angle = draw.VIEW_ANGLE
         width, height = self.plotter.renderer.GetSize()
@@ -154,7 +154,7 @@ class Window:
         self.plotter.render()
 
     def look_through(self, name: str) -> None:
-        """Take the place of the source or of a target."""
+        """Move the view to the source or a target."""
         camera = self.subject.views.camera(name)
         self._main()
         view = 2 * np.degrees(np.arctan(camera.height / 2 / camera.K[1, 1]))
@@ -174,11 +174,11 @@ class Window:
             show()
 
     def look(self, position: Any, rotation: Any) -> None:
-        """Take the place of a camera.
+        """Move the view to a camera's pose.
 
         Args:
             position: (3,) world.
-            rotation: (3, 3) its axes in rows: right, down, forward.
+            rotation: (3, 3) axes in rows: right, down, forward.
         """
         forward, down = rotation[2], rotation[1]
         distance = max(float(np.linalg.norm(self.subject.center - position)), 1e-6)
@@ -205,7 +205,7 @@ class Window:
         self.plotter.show()
 
     def close(self) -> None:
-        """Free what the window holds of the graphics."""
+        """Free the window's graphics resources."""
         self.plotter.close()
 
     # --- keys, sliders, clicks
@@ -232,7 +232,7 @@ class Window:
     def _replace_keys(self) -> None:
         """Bind the keys of :data:`KEYS`, and no others.
 
-        Of PyVista's and VTK's own, e closes the window and v turns the view.
+        By default in PyVista and VTK, e closes the window and v turns the view.
         """
         interactor = self.plotter.iren
         interactor.clear_key_event_callbacks()
@@ -250,7 +250,7 @@ class Window:
         self._main()
         self.plotter.enable_point_picking(
             callback=self._picked_point,
-            # The one for points prefers a nearer surface beside the pointer.
+            # The point picker prefers a nearer surface next to the pointer.
             picker="cell",
             tolerance=PICKING_TOLERANCE,
             left_clicking=True,
@@ -315,7 +315,7 @@ class Window:
 
         self._inset_columns = 1 if len(self.steps) == 1 else 2
         columns = self._inset_columns
-        # PyVista's own types name integers for both.
+        # PyVista's types name integers for both.
         layout: dict[str, Any] = {
             "groups": [(slice(None), columns)],
             "col_weights": [*[0.2 if columns == 1 else 0.13] * columns, 0.8],
@@ -330,8 +330,8 @@ class Window:
         plotter.subplot(0, columns)
         plotter.renderer.AddObserver("StartEvent", self._clear_the_view)
         plotter.render_window.AddObserver("WindowResizeEvent", self._fit_insets)
-        # A button is pressed, the mouse moves, the button is released. A click picks a pixel of the
-        # surface itself, which therefore stays until the mouse moves.
+        # Press, move, release. A click picks a pixel of the surface itself, which therefore is not
+        # simplified until the mouse moves.
         for event, names in (("Start", {"discs"}), ("", {"discs", "seen"}), ("End", set[str]())):
             plotter.iren.style.AddObserver(
                 f"{event}InteractionEvent", lambda *_, names=names: self._draw_lighter(names)
@@ -339,8 +339,8 @@ class Window:
         return plotter
 
     def _clear_the_view(self, renderer: Any, *_: Any) -> None:
-        """Hide the picture of a camera whose place the view takes: it is before all that the camera
-        sees.
+        """Hide the picture of a camera at the view's position: it is in front of everything the
+        camera sees.
         """
         eye = np.array(renderer.GetActiveCamera().GetPosition())
         near = 0.5 * scene.frustum_depth(self.subject, self.pair.cameras[0])
@@ -355,7 +355,7 @@ class Window:
 
     @contextmanager
     def _one_render(self) -> Iterator[None]:
-        """PyVista renders after every change; what changes inside is rendered once, at the end."""
+        """Render all changes made inside once, at the end; PyVista renders after every change."""
         before, self.plotter.suppress_rendering = self.plotter.suppress_rendering, True
         try:
             yield
@@ -450,7 +450,7 @@ class Window:
             self.plotter.remove_actor(self._lighter.pop(name))
 
     def _make_lighter(self, name: str) -> Any:
-        """Stand-in for a large mesh while the view moves, made once it first does."""
+        """Simplified version of a large mesh, made when the view first moves."""
         actor, make = self._large[name]
         self._main()
         before, self.plotter.suppress_rendering = self.plotter.suppress_rendering, True
@@ -460,7 +460,7 @@ class Window:
             self.plotter.suppress_rendering = before
 
     def _draw_lighter(self, names: Collection[str]) -> None:
-        """Follow the mouse: draw some large meshes lighter, and edges not smooth; neither if empty.
+        """While the mouse moves, simplify these meshes and turn off smooth edges; neither if empty.
 
         Software spends more on smooth edges than on 100,000 discs.
         """
@@ -473,7 +473,7 @@ class Window:
             lighter.visibility = name in names
         window = self.plotter.render_window
         if moving:
-            # What the graphics can do is known once they have drawn.
+            # The graphics' abilities are known after the first drawing.
             self._samples = window.GetMultiSamples() or self._samples
         window.SetMultiSamples(0 if moving else self._samples)
 
@@ -489,7 +489,7 @@ class Window:
     def _draw_legend(self, legend: Legend) -> None:
         import pyvista
 
-        # A legend that is not there cannot be removed.
+        # A missing legend cannot be removed.
         if self.plotter.renderer.legend is not None:
             self.plotter.remove_legend()
         if not legend:
@@ -520,7 +520,7 @@ class Window:
 
 
 def plain(text: str, most: int = 120) -> str:
-    """Text that VTK draws as it stands: no control characters, no formulas, and not endless."""
+    """Text that VTK draws literally: no control characters, no formulas, limited length."""
     text = "".join(c if c == "\n" or c.isprintable() else "?" for c in text)
     text = text if len(text) <= most else f"{text[: most - 3]}..."
     return text.replace("$", "\\$")

@@ -1,4 +1,4 @@
-"""A scene as a data set to fit splats on: cameras around it, true pictures, and first points; as
+"""Export of a scene as a data set for fits: cameras around it, true pictures, first points; as
 arrays or as a folder."""
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 SKY_SHARE = 0.1
-"""Share of the first points that stand for the sky, where a scene has one."""
+"""Share of the first points that represent the sky, if a scene has one."""
 
 SKY_DISTANCE = 4.0
-"""Distance of those points from the scene's centre, in radii of the orbit: behind all that the
-scene consists of.
+"""Distance of those points from the scene's centre, in radii of the orbit: behind the whole
+scene.
 """
 
 RINGS = 5
-"""Heights of the orbits. Prime to 8, so that the views held out are spread over them as well."""
+"""Heights of the orbits. Coprime to 8, so that held-out views are spread over them."""
 
 
 @dataclass(frozen=True, eq=False)
 class FirstPoints:
-    """A rough point cloud such as structure from motion would give.
+    """A rough point cloud, as from structure from motion.
 
     Attributes:
         points: (P, 3) float64 world coordinates.
@@ -62,13 +62,13 @@ class FirstPoints:
 
 
 def orbit(scene: Scene, count: int, size: int | None = None) -> list[Camera]:
-    """Cameras all around a scene, at the radius of its own cameras and at five heights that span
+    """Cameras all around a scene, at the radius of its cameras and at five heights that span
     theirs.
 
     Yaws are evenly spaced. Each camera lies two rings above the one before, modulo the rings.
 
     Args:
-        size: height and width of their images in px; the scene's if left out.
+        size: height and width of their images in px; by default the scene's.
 
     Raises:
         SceneError: a camera would be inside an object; the message names both.
@@ -151,14 +151,14 @@ def first_points(
     """Points on the scene's surfaces, displaced at random, with their true colours.
 
     Where the scene has a sky, a tenth of them lie on the upper half of a sphere around everything,
-    in its colours.
+    in the sky's colours.
 
     Args:
         count: number of points, at least 10.
         noise: standard deviation of the displacement along each axis, in local spacings of the
             points.
         seed: seed of the sampling and the noise.
-        geometry: ``Geometry(scene)``, if there is one already.
+        geometry: ``Geometry(scene)``, if already available.
 
     Raises:
         ValueError: a count below 10.
@@ -220,15 +220,15 @@ def export(
     """Write a scene as a data set: transforms.json, images/*.png, masks/OBJECT/*.png, points.ply.
 
     One view of eight is in the split "test", the others in "train". A mask is white at the pixels
-    whose centres show its object; objects that no view shows have none. Files that exist are
-    overwritten, and pictures of a former export removed; a folder without transforms.json is one
-    whose export did not end.
+    whose centres show its object; objects that no view shows have none. Existing files are
+    overwritten, and pictures of a former export removed; a folder without transforms.json is an
+    unfinished export.
 
     Args:
-        scene: any of scenes/.
-        folder: made if need be.
+        scene: a scene.
+        folder: output folder, created if missing.
         views, size: number of views, and the edge of their images in px.
-        points, noise, seed: see :func:`first_points`.
+        points, noise, seed: as for :func:`first_points`.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -241,7 +241,7 @@ def export(
 
     folder = Path(folder)
     mask_folders = [inside(folder / "masks", name) for name in scene.object_names]
-    # It is written last: until then nothing may pass for the cameras of what is written here.
+    # Written last: until then no file may be mistaken for the cameras of this export.
     (folder / "transforms.json").unlink(missing_ok=True)
     report.step(0, views, "points")
     geometry = Geometry(scene)
@@ -262,7 +262,7 @@ def export(
     splits: list[str | None] = ["test" if out else "train" for out in held_out(views)]
     dataset = Dataset(cameras, paths, cloud.points, cloud.colors, splits)
     write_transforms(folder, dataset, points_name="points.ply")
-    # Pictures of a former export with other views: programs that read the folder would mix both.
+    # Pictures of a former export with other views: readers of the folder would mix both.
     former = {*(folder / "images").glob("*.png"), *(folder / "masks").glob("*/*.png")}
     for other in former - {*paths, *masks}:
         if EXPORTED.fullmatch(other.name):

@@ -42,10 +42,10 @@ def fit_scene(
     splats and at the ray's peak for 3D ones.
 
     Args:
-        scene: with the image size that the fit is to have.
-        folder: path of the fit's files; a fit that was stopped there is resumed.
-        views, spp, points, noise, seed: see :func:`attnwarp_eval.splats.export.export`.
-        geometry: ``Geometry(scene)``, if there is one already.
+        scene: scene at the image size of the fit.
+        folder: path of the fit's files; an interrupted fit there is resumed.
+        views, spp, points, noise, seed: as for :func:`attnwarp_eval.splats.export.export`.
+        geometry: ``Geometry(scene)``, if already available.
         report: as in :func:`attnwarp.fit.fit`.
 
     Example:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 CANDIDATES = 4
-"""Random points drawn for each one that stays. Yuksel 2015 recommends 3 to 5."""
+"""Random points drawn for each sample that is kept. Yuksel 2015 recommends 3 to 5."""
 
 PATCH = 1 / 4
 """Longest edge of a patch, which has one density, in units of the focus."""
@@ -30,7 +30,7 @@ PATCH = 1 / 4
 FAR = 32.0
 """Beyond this distance, in units of the focus, a patch's edge is at most an eighth of its distance
 instead, so that the density within it changes by a quarter: a plane out to 2,800 would have
-4,600,000,000 patches of one size. The scenes of the package reach out to 12, but for grazing."""
+4,600,000,000 patches of one size. The bundled scenes reach out to 12, except grazing."""
 
 MOST_CELLS = 10_000_000
 """Cells of a sphere: about a gigabyte."""
@@ -44,7 +44,7 @@ class SurfaceSamples:
         point: (N, 3) world.
         normal: (N, 3) unit geometric normals, outward on closed shapes.
         primitive_id: (N,) int64.
-        spacing: (N,) scene units: the square root of the area that each point stands for.
+        spacing: (N,) scene units: the square root of the area that each point represents.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -78,8 +78,8 @@ def surface_splats(
     """Splats that lie on the surfaces of a scene.
 
     They are spread as blue noise and lie in the tangent plane. Their colour is albedo times direct
-    light, traced to each splat (:mod:`attnwarp_eval.truth.shading`). It has no light of further
-    bounces: where a scene's pictures do, its splats are darker (docs/truth/scenes.md).
+    light, traced to each splat (:mod:`attnwarp_eval.truth.shading`). It excludes further
+    bounces: if a scene's pictures have them, its splats are darker (docs/truth/scenes.md).
     Colours are not taken from rendered views. Those have noise, mix colours across outlines, and
     lack the surfaces that no view shows. A diffuse surface under direct light looks the same from
     everywhere.

@@ -1,2 +1,2 @@
-"""Warps and masks of anybody's capture against the tracks of structure from motion. See
+"""Warps and masks of a user's capture against the tracks of structure from motion. See
 docs/measuring/tracks.md."""

@@ -1,4 +1,4 @@
-"""Tracks: image points that structure from motion says are one surface point."""
+"""Tracks: image points that structure from motion assigns to one surface point."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ Mask = npt.NDArray[np.bool_]
 FILE = "tracks.npz"
 
 MISFIT = 3.0
-"""Median distance, px of the pictures, from a track's image points to its own 3D point, beyond
-which tracks and cameras are not of one scene."""
+"""Median distance, px of the pictures, from a track's image points to its 3D point, beyond
+which tracks and cameras belong to different scenes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Observations of points in pictures, N in all, of P points.
+    """N observations of P points in pictures.
 
     Attributes:
         image: (N,) index of the camera.
         point: (N,) index of the point, 0 to P - 1.
         xy: (N, 2) float64 px of the camera, pixel centres at +0.5.
-        started: (P,) bool, True for points that a fit begins with; those are not judged.
+        started: (P,) bool, True for a fit's initial points, which are not judged.
 
     Example:
         >>> import numpy as np
@@ -59,7 +59,7 @@ class Tracks:
     started: Mask
 
     def shared(self, a: int, b: int) -> tuple[Index, Index]:
-        """Rows of the judged points that images ``a`` and ``b`` both show: of each in ``a``, and in
+        """Rows of judged points visible in both images ``a`` and ``b``: of each in ``a``, and in
         ``b``.
         """
         rows = [np.flatnonzero((self.image == k) & ~self.started[self.point]) for k in (a, b)]
@@ -117,20 +117,20 @@ def find_tracks(
     model: Path | None = None,
     report: Reporter = SILENT,
 ) -> Tracks:
-    """Tracks of a capture: those that lie in its folder, of a COLMAP model, or made by pycolmap at
-    the capture's own poses.
+    """Tracks of a capture: read from its folder, from a COLMAP model, or computed by pycolmap at
+    the capture's poses.
 
     Args:
-        data: the capture as typed; ``tracks.npz`` in its folder is read.
+        data: path of the capture; ``tracks.npz`` in its folder is read.
         dataset: the capture, every view with a picture and without a lens.
-        kept: file that tracks are kept in, so that a second call does not match pictures again.
-        model: COLMAP's sparse model with tracks, of any coordinates; by default the one of a COLMAP
+        kept: cache file of tracks, so that a second call does not match pictures again.
+        model: COLMAP's sparse model with tracks, in any coordinates; by default that of a COLMAP
             capture.
-        report: receives a line before pictures are matched.
+        report: callback for a line before pictures are matched.
 
     Raises:
-        InputError: pycolmap is missing (MissingExtraError) or fails, no picture of the model is one
-            of the capture, or tracks that do not fit the capture's cameras.
+        InputError: pycolmap is missing (MissingExtraError) or fails, no picture of the model
+            belongs to the capture, or tracks do not fit the capture's cameras.
     """
     folder = data if data.is_dir() else data.parent
     model = model or find_model(folder)
@@ -158,10 +158,10 @@ def write(tracks: Tracks, path: Path, key: str = "") -> None:
 
 
 def halve(dataset: Dataset, tracks: Tracks, folder: Path) -> int:
-    """Write a capture anew with every second point of the tracks as those that a fit begins with,
-    and its tracks beside it; return their number.
+    """Write a capture again with every second point of the tracks as a fit's initial points, and
+    its tracks next to it; return the number of points.
 
-    Pictures stay where they are. Splats that are fitted from there have not seen the other points.
+    Pictures are not copied. Splats fitted to this capture have not seen the other points.
 
     Args:
         dataset: as in :func:`find_tracks`.
@@ -190,7 +190,7 @@ def halve(dataset: Dataset, tracks: Tracks, folder: Path) -> int:
 
 
 def _read(path: Path, key: str | None) -> Tracks | None:
-    """The tracks of a file; None where it is not there, or not of ``key``."""
+    """The tracks of a file; None if missing, or not of ``key``."""
     if not path.is_file():
         return None
     try:
@@ -255,7 +255,7 @@ def _eight_bits(path: Path) -> npt.NDArray[np.uint8]:
 
 
 def _check(tracks: Tracks, dataset: Dataset, origin: Path) -> None:
-    """Refuse tracks whose own points the capture's cameras do not see where they should."""
+    """Refuse tracks whose 3D points reproject far from their observations."""
     if not len(tracks.image):
         raise InputError(
             f"{origin}: no two pictures have points in common; pictures need texture, and overlap"

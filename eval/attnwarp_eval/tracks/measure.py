@@ -22,20 +22,20 @@ OFF = 2.0
 """Error in px beyond which a position is wrong."""
 
 LEAST = 5
-"""Points that a pair has in common at least."""
+"""Least common points of a pair."""
 
 RESAMPLES = 400
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Figures of a pair by exact geometry.
+    """Figures of a pair from exact geometry.
 
     Attributes:
-        error: (n,) px of the warp at the tracks' points; NaN where they have no counterpart.
-        visible: (n,) bool: the source sees the surface that the point lies on.
-        errors: px of the warp at all pixels of the target that the source sees.
-        kept: share of those that the mask keeps.
+        error: (n,) px of the warp at the tracks' points; NaN without a counterpart.
+        visible: (n,) bool: whether the source sees the point's surface.
+        errors: px of the warp at all target pixels visible in the source.
+        kept: share of those pixels that the mask keeps.
         accepted: share of the hidden pixels that the mask keeps; NaN without any.
     """
 
@@ -48,19 +48,19 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A warp at the n points that tracks have in a source and a target.
+    """A warp at the n points of tracks common to a source and a target.
 
     Attributes:
         source, target: indices of the cameras.
         apart: number of views between them in order, plus 1.
-        held_out: one of the two was held out of the fit.
+        held_out: whether one of the two was held out of the fit.
         angle: (n,) degrees between the rays of the two views.
-        error: (n,) px in the source between the warped position and the track's; NaN where the
+        error: (n,) px in the source between the warped position and the track's; NaN if the
             splats give none.
-        kept: (n,) bool answers of the mask.
-        floor: (n,) px between the track's own 3D point and the track, in the source.
+        kept: (n,) bool whether the mask keeps the point.
+        floor: (n,) px between the track's 3D point and its observation, in the source.
         flat: (n,) px of a warp whose depth is the target's median everywhere.
-        truth: the same by exact geometry, where a scene has one.
+        truth: the same from exact geometry, if the scene has one.
     """
 
     source: int
@@ -87,21 +87,21 @@ def measure(
     near: float | None = None,
     report: Reporter = SILENT,
 ) -> list[Pair]:
-    """Warp each view to those that come ``apart`` before it, and compare with the tracks.
+    """Warp each view to the views ``apart`` before it, and compare with the tracks.
 
-    The target's depth is read at a track's point as a layer of features reads it, between pixel
+    The target's depth is read at a track's point as a feature grid reads it, between pixel
     centres; the mask is that of the pixel that holds the point.
 
     Args:
         splats: the fitted scene.
-        cameras: in the order of the capture, of the size that is measured at.
+        cameras: in the order of the capture, at the measured size.
         tracks: in px of ``cameras``.
         preset: name of the warp's settings.
         apart: distances between the views of a pair, in the cameras' order.
-        held_out: one for each camera: held out of the fit.
+        held_out: flag of each camera: held out of the fit.
         geometry: exact geometry, for captures of a scene that has it.
         near: near plane in scene units, as in :func:`attnwarp.warp.render_surface`.
-        report: receives each pair that is done.
+        report: callback for each finished pair.
 
     Returns:
         Pairs with at least :data:`LEAST` points in common.
@@ -159,7 +159,7 @@ def _angle(points: Array, a: Array, b: Array) -> Array:
 
 
 def _holds(mask: torch.Tensor, xy: Array) -> Mask:
-    """The mask's answer at the pixels that hold ``xy``."""
+    """Values of the mask at the pixels that contain ``xy``."""
     values = mask.numpy()
     x = np.clip(np.floor(xy[:, 0]).astype(int), 0, values.shape[1] - 1)
     y = np.clip(np.floor(xy[:, 1]).astype(int), 0, values.shape[0] - 1)
@@ -225,7 +225,7 @@ points and of a flat depth."""
 def summarise(pairs: Sequence[Pair], seed: int = 0) -> dict[str, Figure]:
     """The :data:`FIGURES` of pairs.
 
-    Points of one picture share its pose and its splats, so whole target pictures are drawn anew,
+    Points of one picture share its pose and its splats, so whole target pictures are resampled,
     :data:`RESAMPLES` times; an interval holds the middle 95 percent.
 
     Args:

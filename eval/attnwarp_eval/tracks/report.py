@@ -53,11 +53,11 @@ class Row:
     Attributes:
         splats, preset: name of the splats, and of the warp's settings.
         apart: distance between the views of a pair, in the cameras' order.
-        views: "all", or "held out" for pairs with a view that the fit has not seen.
-        pairs, points: their number.
+        views: "all", or "held out" for pairs with a held-out view.
+        pairs, points: numbers of pairs and points.
         angle: median degrees between the rays of a point.
         figures: see :data:`attnwarp_eval.tracks.measure.FIGURES`.
-        truth: figures of exact geometry; empty without.
+        truth: figures from exact geometry; empty without it.
     """
 
     splats: str
@@ -72,7 +72,7 @@ class Row:
 
 
 def rows_of(splats: str, preset: str, pairs: Sequence[Pair]) -> list[Row]:
-    """A row for each distance; where views were held out, one more for pairs with such."""
+    """A row for each distance; with held-out views, one more for pairs with one."""
     rows = []
     for apart in dict.fromkeys(pair.apart for pair in pairs):
         alike = [pair for pair in pairs if pair.apart == apart]
@@ -124,7 +124,7 @@ def write(
         pictures: captions and files below ``folder``, see :func:`draw`.
         inputs: names and values of the command's inputs.
         notes: sentences about this capture.
-        folder: receives the files.
+        folder: output folder.
     """
     data = {
         "format": FORMAT,
@@ -144,7 +144,7 @@ def write(
 def document(
     rows: Sequence[Row], pictures: Mapping[str, Path], notes: Sequence[str], folder: Path
 ) -> Report:
-    """The figures as a document."""
+    """Report of the figures."""
     sections = [Section("Figures", tables=[table(rows)])]
     exact = [row for row in rows if row.truth]
     if exact:
@@ -219,8 +219,8 @@ def draw(
         pairs: pairs of the target; the first is drawn.
         tracks: in px of the target's camera.
         image: (H, W, 3) float sRGB in [0, 1] of the target.
-        target: index of its camera.
-        path: PNG that is written.
+        target: index of the target's camera.
+        path: path of the PNG.
     """
     import cv2
 

@@ -1,1 +1,1 @@
-"""The metrics on a person's own images."""
+"""Metrics of a user's images."""

@@ -1,4 +1,4 @@
-"""Do neighbouring views of a person's own edit agree? Pictures with poses, and no truth.
+"""Agreement of neighbouring views of a user's edit, from posed pictures without truth.
 
 The metrics are pure functions of :mod:`attnwarp_eval.metrics`; this module reads the files, and
 compares each view with the next in the order of their names. COLMAP reconstructs all of them.
@@ -48,7 +48,7 @@ LONGEST = 256
 """Longest side in px of the pictures that all but keypoints are computed on; smaller ones stay."""
 
 PROTOCOL = 2
-"""Raised whenever the same pictures would give other figures."""
+"""Version; raised when the same pictures would give other figures."""
 
 _TSED = tuple(
     Figure(f"consistency.tsed_{limit}px", f"TSED at {limit} px", ("poses",)) for limit in LIMITS
@@ -77,7 +77,7 @@ _COLMAP = tuple(
         ("failed", "failed"),
     )
 )
-"""Figures of all views together."""
+"""Figures over all views together."""
 
 FIGURES = (
     *_TSED, _DISTANCE, _FLOW, _DIRECTION, _MATCHES, _EDIT, _RENDERED, _FEATURES, _PERCEPTUAL,
@@ -95,15 +95,15 @@ _FOUND_BY: Mapping[Figure, tuple[str, str]] = {
     **dict.fromkeys((*_TSED, _DISTANCE, _FLOW), ("cv2", "eval")),
     **dict.fromkeys(_COLMAP, ("pycolmap", "colmap")),
 }
-"""Packages that figures need beside the encoders', and the extras that have them."""
+"""Packages of figures besides the encoders', and the extras that provide them."""
 
 
 @dataclass(frozen=True)
 class _View:
-    """A view on its way to a pair.
+    """A view before pairing.
 
     Attributes:
-        edited, original: (H, W, 3) at full size; the original None where there is none.
+        edited, original: (H, W, 3) at full size; the original, or None.
         camera: camera of that size.
     """
 
@@ -120,13 +120,13 @@ def measure_consistency(
     device: str = "cpu",
     report: Reporter = SILENT,
 ) -> Measured:
-    """Compute what the pictures allow for each view and the next, and for all by COLMAP.
+    """Compute the available figures of each view and the next, and of all views by COLMAP.
 
     Args:
-        inputs: with ``poses``. Views that are judged are ``renders``, else the pictures of the
+        inputs: inputs with ``poses``. The judged views are ``renders``, else the pictures of the
             poses; with ``renders``, the pictures before the edit are ``originals``, else the
             pictures of the poses.
-        encoders, store, device, report: see :func:`attnwarp_eval.user_images.measure.measure`.
+        encoders, store, device, report: as for :func:`attnwarp_eval.user_images.measure.measure`.
 
     Raises:
         InputError: poses or pictures that cannot be read, fewer than two views, or a picture of
@@ -186,7 +186,7 @@ def measure_consistency(
 
 
 def _over(figure: Figure, values: Mapping[str, float]) -> float:
-    """The figure of all pairs: a median where its definition says so, else a mean."""
+    """The figure of all pairs: a median or a mean, by its definition."""
     defined = [value for value in values.values() if not np.isnan(value)]
     if not defined:
         return float("nan")
@@ -305,7 +305,7 @@ class _Pairs:
         matches = metrics.match_features(self._keypoints(one), self._keypoints(two))
         result = metrics.tsed([metrics.epipolar_distance(*matches, F)])
         median = float(result.medians[0])
-        # A pair with too few matches counts against.
+        # A pair with too few matches counts as inconsistent.
         return {_DISTANCE.key: median} | {
             figure.key: float(median < limit) for figure, limit in zip(_TSED, LIMITS, strict=True)
         }
@@ -421,7 +421,7 @@ def _along_flow(one: _View, two: _View) -> float:
 
 
 def _reconstruction(pairs: _Pairs, names: Sequence[str]) -> Task[dict[str, float]]:
-    """All views as one scene, at full size."""
+    """Reconstruct all views as one scene, at full size."""
     spec = {
         "probe": "user reconstruction",
         "protocol": PROTOCOL,

@@ -1,4 +1,4 @@
-"""Metrics of a user's own pictures, which are paired by name: the columns of the paper's table.
+"""Metrics of a user's pictures, paired by name: the columns of the paper's table.
 
 The metrics are pure functions of :mod:`attnwarp_eval.metrics`; this module reads the files.
 """
@@ -41,13 +41,13 @@ DEFAULTS: dict[Kind, str] = {
     "dino": "dino-small",
     "perceptual": "perceptual-small",
 }
-"""The encoders that are taken where none is named."""
+"""Default encoders."""
 
 OFF = "none"
-"""Named in place of an encoder: its figures are left out."""
+"""Value that disables an encoder and its figures."""
 
 BATCH = 4
-"""Views that are held in memory together."""
+"""Number of views held in memory together."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ class Inputs:
 
     Attributes:
         renders: folder of renders of the edited scene.
-        edited: folder of the edited pictures that the scene was fitted on, named as the renders.
+        edited: folder of the edited pictures that the scene was fitted to, named as the renders.
         originals: folder of pictures of the scene before the edit, named as the renders.
-        source_edit: the one edited picture that the others follow.
+        source_edit: the edited picture that the others follow.
         prompt: description of the edited scene.
         source_prompt: description of the scene before.
         masks: folder of masks, named as the renders: white counts for Edit PSNR and the perceptual
@@ -87,9 +87,9 @@ class Row:
     """One figure.
 
     Attributes:
-        key: its name in :data:`attnwarp_eval.metrics.registry.METRICS`.
-        title: as a table says it.
-        value: over all views; NaN where no view has one.
+        key: name of the figure in :data:`attnwarp_eval.metrics.registry.METRICS`.
+        title: title of the figure in tables.
+        value: value over all views; NaN if undefined in all.
         views: view -> value; NaN where undefined, +inf for the PSNR of two equal pictures.
         encoder: kind of the encoder behind it, if any.
     """
@@ -113,14 +113,14 @@ class Row:
 
 @dataclass
 class Measured:
-    """The figures of a user's pictures, and why others are missing.
+    """The figures of a user's pictures, and reasons for missing ones.
 
     Attributes:
         inputs: measured inputs.
         rows: the figures.
-        missing: title of a figure that was not computed -> why.
-        encoders: kind -> which one.
-        unpaired: sentence for each group of pictures that found no partner.
+        missing: title of a missing figure -> reason.
+        encoders: kind -> description of the encoder.
+        unpaired: sentence for each group of pictures without partners.
         notes: remarks on the values.
     """
 
@@ -139,7 +139,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure that pictures may give.
+    """Definition of a figure of pictures.
 
     Attributes:
         key, title: as of :class:`Row`.
@@ -179,16 +179,16 @@ _EDIT, _CLIP, _DIRECTION, _NEIGHBOURS, _DINO, _CLIP_IMAGE, _PERCEPTUAL = _OF_PAP
 
 
 def figures() -> tuple[Figure, ...]:
-    """Figures of the paper's table, then those that the registry computes of pictures."""
+    """Figures of the paper's table, then the registry's other figures of pictures."""
     own = (m for m in METRICS.values() if m.pictures)
     return (*_OF_PAPER, *(Figure(m.name, m.column or m.name, m.pictures) for m in own))
 
 
 _MASKED = (_EDIT, _PERCEPTUAL)
-"""Figures that masks act on; the others are of whole pictures."""
+"""Figures affected by masks; the others use whole pictures."""
 
 PROTOCOL = 4
-"""Raised whenever the same pictures would give other figures."""
+"""Version; raised when the same pictures would give other figures."""
 
 
 def measure(
@@ -204,16 +204,16 @@ def measure(
 
     Args:
         encoders: kind -> name, see :func:`attnwarp.encoders.load_encoder`; "none" leaves its
-            figures out. A kind that is not named, or named None, takes the bundled one, and its
-            figures are left out where there is none.
-        store: finished batches are read from there and written there, so that a killed call
-            goes on where it was. Views are known by the content of their files.
+            figures out. A missing kind, or None, takes the bundled one, and its
+            figures are left out if there is none.
+        store: cache of finished batches, so that an interrupted call is resumed. Views are
+            identified by the content of their files.
         device: "cpu" or "cuda", for real encoders.
-        load: gives an encoder, in place of :func:`attnwarp.encoders.load_encoder`.
+        load: function that loads an encoder, in place of :func:`attnwarp.encoders.load_encoder`.
 
     Raises:
-        InputError: nothing can be computed (the message says why, figure by figure), a picture that
-            cannot be read, a pair of different sizes, two files of one name.
+        InputError: nothing can be computed (the message gives the reason for each figure), a
+            picture that cannot be read, a pair of different sizes, two files of one name.
     """
     done = Measured(inputs)
     for name in ("prompt", "source_prompt"):
@@ -242,7 +242,7 @@ def measure(
                 f" {turned[0].name} first"
             )
     wanted = _possible(inputs, folders, encoders, done)
-    # Also where bundled encoders alone are needed, which would leave it unread.
+    # Check even if only bundled encoders are needed, which would ignore it.
     device_of(device)
     loaded = load_encoders(wanted, encoders, device, done, load)
     wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
@@ -269,7 +269,7 @@ def measure(
 def pictures_in(folder: Path, option: str) -> dict[str, Path]:
     """The picture files of a folder by their names without suffix, in natural order.
 
-    Normal maps that ``attnwarp render`` writes beside its pictures are left out; see
+    Normal maps written by ``attnwarp render`` next to its pictures are left out; see
     :func:`normal_maps`.
 
     Raises:
@@ -301,7 +301,7 @@ def pictures_in(folder: Path, option: str) -> dict[str, Path]:
 
 
 def _as_spelled(pictures: dict[str, Path], renders: Mapping[str, Path]) -> dict[str, Path]:
-    """Pictures of a folder under the names of renders where these alone differ in case, in the form
+    """Rename pictures of a folder to the names of renders that differ only in case, in the form
     of accents or as URLs, as other systems write them.
     """
     one, two = (Counter(map(name_key, names)) for names in (pictures, renders))
@@ -313,7 +313,7 @@ def _as_spelled(pictures: dict[str, Path], renders: Mapping[str, Path]) -> dict[
 
 
 def normal_maps(folder: Path) -> list[str]:
-    """File names of normal maps: NAME.normal.png beside NAME.png, as ``attnwarp render --normal``
+    """File names of normal maps: NAME.normal.png next to NAME.png, as ``attnwarp render --normal``
     writes them.
     """
     maps = folder.glob("*.normal.png")
@@ -326,12 +326,12 @@ def read_picture(
     """(H, W, 3) float32 sRGB in [0, 1].
 
     8 and 16 bits are divided by their largest value; grey becomes three equal channels; transparent
-    pixels are laid over ``background``. A picture is turned as its EXIF tag asks, as in viewers.
+    pixels are laid over ``background``. A picture is rotated by its EXIF tag, as in viewers.
 
     Args:
         path: picture.
         background: sRGB in [0, 1].
-        beside: picture of the pose that this one belongs to, which may be the picture itself; see
+        beside: picture of the corresponding pose, which may be the same picture; see
             :func:`attnwarp.io.read_upright`.
 
     Raises:
@@ -385,10 +385,10 @@ def load_encoders(
     done: Measured,
     load: Callable[..., Any] | None = None,
 ) -> dict[Kind, Any]:
-    """Load the encoders of figures; those that cannot be loaded cost their figures.
+    """Load the encoders of figures; figures of encoders that fail to load are left out.
 
     Raises:
-        InputError: one that is named cannot be loaded, or is of another kind.
+        InputError: a named encoder cannot be loaded, or is of another kind.
     """
     for kind, name in encoders.items():
         if name is None or name == "none":
@@ -425,7 +425,7 @@ def _views(figure: Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[st
 
 
 def _groups(figure: Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[str]:
-    """The folders that a figure is computed from."""
+    """The folders of a figure's input pictures."""
     used = [name for name in figure.needs if name in folders]
     return [*used, "masks"] if figure in _MASKED and "masks" in folders else used
 
@@ -444,8 +444,8 @@ def _compare_names(
         name for name in ("edited", "originals", "masks") if name in folders and name in used
     ):
         partners = folders[other]
-        # A scene is usually fitted on some of its views: renders without an edited picture are no
-        # mistake.
+        # A scene is usually fitted to some of its views: renders without an edited picture are not
+        # an error.
         for relation, names in (
             (
                 f"of {_option('renders')} without one in {_option(other)}",
@@ -463,7 +463,7 @@ def _compare_names(
 def _check_sizes(
     folders: Mapping[str, Mapping[str, Path]], views: Mapping[Figure, Sequence[str]]
 ) -> None:
-    """Check before anything is computed that both pictures of a pair have one size."""
+    """Check before any computation that both pictures of a pair have one size."""
     from attnwarp.io.images import upright_size
 
     for figure, names in views.items():
@@ -546,14 +546,14 @@ def _tasks(
     loaded: Mapping[Kind, Any],
     device: str,
 ) -> Iterator[Task[_Gathered]]:
-    """Batches of the views ``needed`` with what the figures need, each picture read once.
+    """Batches of the views ``needed`` with the inputs of the figures, each picture read once.
 
     A batch's files are hashed when its task is taken, just before they are read.
     """
     members = {figure: set(views.get(figure, ())) for figure in figures()}
 
     def read(group: str, names: Iterable[str]) -> dict[str, Picture]:
-        # Transparent parts of a mask count as little as black ones, whatever lies behind pictures.
+        # Transparent parts of a mask count as black, whatever the background of pictures.
         background = (0.0, 0.0, 0.0) if group == "masks" else inputs.background
         return {name: read_picture(folders[group][name], background) for name in names}
 
@@ -757,5 +757,5 @@ def _some(names: Iterable[str], count: int = 3) -> str:
 
 
 def _option(name: str) -> str:
-    """The command line's word for a field of Inputs."""
+    """The command-line option of a field of Inputs."""
     return "--mask" if name == "masks" else "--" + name.replace("_", "-")

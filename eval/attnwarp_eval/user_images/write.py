@@ -85,7 +85,7 @@ def to_json(measured: Measured) -> str:
 
 
 def report(measured: Measured) -> Report:
-    """The figures as a document."""
+    """Report of the figures."""
     lists = {
         "Not computed": [f"{what}: {why}" for what, why in measured.missing.items()],
         "Pictures without a partner": measured.unpaired,
@@ -155,7 +155,7 @@ def _spec(row: Row) -> Metric:
 
 
 def _value(row: Row, value: float) -> str:
-    """To the digits that the field's tables have: 3 after the point, 4 for a distance."""
+    """Format a value with the usual digits: 3 decimals, 4 for a distance."""
     if math.isnan(value):
         return "identical" if row.identical and not row.undefined else "undefined"
     if math.isinf(value):
@@ -175,5 +175,5 @@ def _list(items: Iterable[str]) -> str:
 
 
 def _line(text: str) -> str:
-    """Join text to one line, as names of files need not be."""
+    """Join text to one line, since file names may have several."""
     return " ".join(text.split())
