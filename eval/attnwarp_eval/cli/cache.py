@@ -1,4 +1,4 @@
-"""Commands about derived files: how much space they take, and their removal."""
+"""Commands about derived files: their size, and their removal."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ def compare(
 
 
 def _side_by_side(other: Any, one: Path, two: Path) -> None:
-    """Two people's runs on captures: what differs of their inputs, and their figures."""
+    """Compare two people's runs on captures: differing inputs, and figures."""
     from rich.console import Console
 
     from attnwarp_eval.document.write import terminal
@@ -129,7 +129,7 @@ def _side_by_side(other: Any, one: Path, two: Path) -> None:
 def _check_outputs(
     baseline: Path, run: Path, outputs: dict[str, Path | None], update: bool
 ) -> None:
-    """Refuse files that would not be written, or be written over what is compared or each other."""
+    """Refuse outputs that cannot be written, or would overwrite inputs or each other."""
     from attnwarp.errors import InputError
     from attnwarp.io.file import check_other
 
@@ -170,8 +170,8 @@ def _page(
 
 
 def _run(folder: Path) -> tuple[Snapshot, Pictures, list[str]]:
-    """A run, its pictures, and what a reader has to know of it; its records, which are many times
-    as large, are given back.
+    """Read a run, its pictures, and notes for the reader; the run's records, which are many
+    times as large, are freed.
     """
     from attnwarp_eval.compare.pictures import pictures_of_run
     from attnwarp_eval.compare.snapshot import snapshot
@@ -183,7 +183,7 @@ def _run(folder: Path) -> tuple[Snapshot, Pictures, list[str]]:
 
 
 def _of_other_code(results: Results, folder: Path) -> list[str]:
-    """A line where the run was not computed by the code at hand: it says nothing about that."""
+    """A warning if the run was computed by other code, about which it says nothing."""
     from attnwarp_eval.cost import environment
     from attnwarp_eval.study.record import Environment
 
@@ -199,7 +199,7 @@ def _of_other_code(results: Results, folder: Path) -> list[str]:
 
 
 def _baseline(path: Path, run: Snapshot, common: bool) -> tuple[Snapshot, Pictures]:
-    """The baseline and its pictures; an unfinished one only where what both have is compared."""
+    """The baseline and its pictures; an unfinished one only for a comparison of common figures."""
     from attnwarp.errors import InputError
     from attnwarp_eval.compare import read_baseline
     from attnwarp_eval.compare.pictures import pictures_of_baseline
@@ -207,7 +207,7 @@ def _baseline(path: Path, run: Snapshot, common: bool) -> tuple[Snapshot, Pictur
     from attnwarp_eval.report.raw import read_raw
 
     if path.name == "results.jsonl" and (path.parent / "study.json").is_file():
-        path = path.parent  # a run's table of figures: the run itself has every one of them
+        path = path.parent  # a run's table of figures: the run has them all
     pictures: Pictures = {}
     raw = path.suffix == ".xz" and path.is_file()
     if raw or path.is_dir():
@@ -236,7 +236,7 @@ def _baseline(path: Path, run: Snapshot, common: bool) -> tuple[Snapshot, Pictur
 
 
 def _update(path: Path, run: Snapshot, pictures: Pictures) -> None:
-    """Write the baseline, and say what changed."""
+    """Write the baseline, and print the changes."""
     from attnwarp.errors import InputError
     from attnwarp_eval.compare import compare, read_baseline, write_baseline
     from attnwarp_eval.compare.pictures import write_pictures
@@ -266,7 +266,7 @@ def _update(path: Path, run: Snapshot, pictures: Pictures) -> None:
 
 
 def _print(comparison: Comparison) -> None:
-    """The comparison on a terminal, or as plain lines where there is none."""
+    """Print the comparison on a terminal, or as plain lines without one."""
     from attnwarp_eval.compare.write import document, summary
 
     for section in document(comparison).sections:

@@ -1,4 +1,4 @@
-"""The command that says what this machine has, and what each lack costs."""
+"""The command that lists this machine's abilities, and the cost of each lack."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def doctor(
 
 
 def lines(check: Check) -> str:
-    """A check on lines of a terminal: its state and name, then what there is, the cost, and the
+    """Text lines of a check: its state and name, then the finding, the cost, and the
     remedy.
     """
     text = textwrap.wrap(

@@ -142,8 +142,8 @@ def inspect(
 
 @contextmanager
 def _quick_start() -> Iterator[None]:
-    """Neither garbage collection, a fifth of the time of imports that leave no garbage, nor threads
-    of torch, which wait by spinning; the renderer has threads of its own.
+    """Turn off garbage collection, a fifth of the time of imports that leave no garbage, and
+    torch's threads, which wait by spinning; the renderer has separate threads.
     """
     gc.disable()
     import torch

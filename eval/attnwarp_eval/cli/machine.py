@@ -1,7 +1,7 @@
 """Abilities of this machine, and the cost of each lack: the checks of ``attnwarp-eval doctor``.
 
-What takes a heavy import runs in a child process, so that a library that ends its process cannot
-end this one, and the checks run side by side.
+Checks with a heavy import run in a child process, so that a library that aborts its process cannot
+abort this one, and the checks run side by side.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ WORKER_GB = 3
 
 @dataclass(frozen=True)
 class Check:
-    """One thing about the machine.
+    """Check of one ability of the machine.
 
     Attributes:
-        name: name of the thing.
+        name: name of the ability.
         state: "lack": everything runs without it, at a cost; "broken": something needed fails.
         text: finding.
         cost: cost of the lack, or the part that fails.
@@ -51,7 +51,7 @@ class Check:
 
 
 def checks() -> Iterator[Check]:
-    """Every check, those that take no time first."""
+    """Yield every check, instant ones first."""
     slow = (ray_casting, pictures, window, graphics_card, weights)
     with ThreadPoolExecutor(len(slow)) as pool:
         pending = [pool.submit(check) for check in slow]
@@ -118,14 +118,14 @@ def threads() -> Check:
 
 
 def _free_memory_gb() -> float:
-    """Memory that the system can still give, in GB."""
+    """Available memory, in GB."""
     lines = Path("/proc/meminfo").read_text().splitlines()
     kilobytes = next(line.split()[1] for line in lines if line.startswith("MemAvailable"))
     return int(kilobytes) * 1024 / 1e9
 
 
 def kernels() -> Check:
-    """Check that the renderer's kernels have been compiled before."""
+    """Check that the renderer's kernels are already compiled."""
     spec = util.find_spec("attnwarp")
     assert spec is not None and spec.submodule_search_locations
     folder = Path(next(iter(spec.submodule_search_locations))) / "render" / "_kernels"
@@ -198,10 +198,10 @@ print("works" if abs(distance - 2) < 1e-5 else f"a distance of {distance}, expec
 
 
 def pictures() -> Check:
-    """Mitsuba, and which of its variants renders."""
+    """Mitsuba, and the variant that renders."""
     from attnwarp_eval.truth import llvm
 
-    # llvm.variant() puts what works into this variable.
+    # llvm.variant() stores the working library in this variable.
     chosen = os.environ.get("ATTNWARP_MITSUBA")
     variant = llvm.variant()
     version = _version("mitsuba")
@@ -340,7 +340,7 @@ def _version(package: str) -> str:
 
 
 def _child(program: str) -> tuple[str, str]:
-    """The last line that a program printed, and in one line what went wrong."""
+    """The last line of a program's output, and its error in one line."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", program],

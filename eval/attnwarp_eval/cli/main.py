@@ -54,14 +54,14 @@ COMMANDS: dict[str, Any] = {
     "userstudy": None,
     "cache": cache.app,
 }
-"""Commands in the order of ``--help``; None keeps the place of one of the laboratory."""
+"""Commands in the order of ``--help``; None marks the position of a laboratory command."""
 
 GROUP = "attnwarp_eval.commands"
 """Group of entry points: each names a dictionary of commands by name, typer's apps or functions."""
 
 
 def plugin_commands() -> dict[str, Any]:
-    """Commands of installed packages. One that cannot be imported is named on stderr."""
+    """Commands of installed packages. Packages that cannot be imported are named on stderr."""
     found: dict[str, Any] = {}
     for entry in entry_points(group=GROUP):
         try:

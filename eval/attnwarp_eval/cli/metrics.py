@@ -1,4 +1,4 @@
-"""Commands that measure a person's own pictures, and list the encoders for it."""
+"""Commands that measure a user's pictures, and list the available encoders."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def run(
 
 
 def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
-    """The cells of a study by probe and variant, and how many of them are done."""
+    """Print a study's cells by probe and variant, and the number of finished ones."""
     from rich.console import Console
 
     from attnwarp_eval.document.model import Table
@@ -115,7 +115,7 @@ def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
 
 
 def _print_needed(planned: Plan, store: Store) -> None:
-    """By the cells that are done: scenes that each claim needs, hours and gigabytes of the rest."""
+    """Print, from finished cells, the scenes that each claim needs, and the cost of the rest."""
     from rich.console import Console
 
     from attnwarp_eval.document.write import terminal
@@ -139,14 +139,14 @@ def _print_needed(planned: Plan, store: Store) -> None:
 
 
 def _name_notices(planned: Plan) -> None:
-    """Say what a person should know of the scenes; their report has it too."""
+    """Print the notices on the scenes, which the report also has."""
     for scene, lines in planned.notices.items():
         for line in lines:
             warn(f"scene {scene}: {line}")
 
 
 def _name_untabulated(study: Study) -> None:
-    """Name the variants that a study measures and its report shows in no table or front."""
+    """Print the measured variants that no table or front of the report shows."""
     from attnwarp_eval.study.probe_report import report_of
 
     tabulated = {(a.probe, name) for a in study.ablations for name in (a.baseline, *a.variants)}
@@ -165,7 +165,7 @@ def _name_untabulated(study: Study) -> None:
 
 
 def _who(cell: Cell) -> str:
-    """The variants of a cell: names of one content, or those that it measures in turn."""
+    """The variants of a cell: names of one content, or variants timed in turn."""
     if cell.labels and cell.variant not in cell.labels:
         return f"{', '.join(cell.labels)} (in turn)"
     return " = ".join(cell.labels) or cell.variant
@@ -178,14 +178,14 @@ def run_study(
     scheduler: str | None = None,
     keep_going: bool = True,
 ) -> Results:
-    """Run a study and write its report; return what was measured.
+    """Run a study and write its report; return the results.
 
     Args:
-        load: reads the study, and says in one line what is wrong with it.
+        load: function that reads the study, with one-line errors.
         out: the run's folder; ``runs/<study>`` if None.
         jobs: worker processes.
         scheduler: address or file of a dask scheduler, whose workers compute instead.
-        keep_going: after a failed cell.
+        keep_going: whether to continue after a failed cell.
     """
     from attnwarp_eval.cache import limit_bytes
     from attnwarp_eval.report import problems, read_results
@@ -193,7 +193,7 @@ def run_study(
     from attnwarp_eval.study.store import Store
 
     with clear_errors():
-        limit_bytes()  # a limit that is no number would make every cell fail
+        limit_bytes()  # an invalid limit would make every cell fail
         loaded = load()
         store = Store(out or Path("runs") / loaded.name)
         store.refuse_strangers()
@@ -236,7 +236,7 @@ def run_study(
 def _watch(
     planned: Plan, store: Store, jobs: int, scheduler: str | None, keep_going: bool
 ) -> Summary:
-    """Run with a progress bar on a terminal, or a line a cell where there is none."""
+    """Run with a progress bar on a terminal, or one line per cell without one."""
     from attnwarp_eval.study.run import execute
 
     with reporter(every=True) as report:
@@ -262,7 +262,7 @@ def _print_failures(summary: Summary) -> None:
 
 
 def _print_answer(results: Results) -> None:
-    """The report's answer on the terminal: sentences, and one table."""
+    """Print the report's answer on the terminal: sentences, and one table."""
     from rich.console import Console
 
     from attnwarp_eval.document.write import terminal

@@ -161,7 +161,7 @@ def draw(
 
 
 def _say_open_bounces(scene: Scene) -> None:
-    """One line where the scene's file leaves the number of bounces open."""
+    """Print one line if the scene's file leaves the number of bounces open."""
     from attnwarp_eval.truth.plan import open_bounces
 
     for line in open_bounces(scene):
@@ -169,7 +169,7 @@ def _say_open_bounces(scene: Scene) -> None:
 
 
 def _check_no_capture(folder: Path) -> None:
-    """Refuse to write over the poses or the points of a capture, which nothing could bring back.
+    """Refuse to overwrite the poses or points of a capture, which could not be recovered.
 
     Raises:
         InputError: the folder's transforms.json names other views than an export does, or there are
@@ -188,7 +188,7 @@ def _check_no_capture(folder: Path) -> None:
         except (ValueError, LookupError, TypeError):
             views = [""]
         exported = all(EXPORTED.fullmatch(view) for view in views)
-    else:  # the export did not end
+    else:  # unfinished export
         path, pictures = points, (folder / "images").glob("*")
         exported = not points.exists() or any(EXPORTED.fullmatch(p.name) for p in pictures)
     if not exported:
@@ -236,7 +236,7 @@ def calibrate(
             report.step(0, 0, f"{world.name}: measuring how often its light bounces")
             found = search(world)
             numbers[which] = found.bounces
-            # After each, so that what was measured outlives an interruption.
+            # After each scene, so that results survive an interruption.
             write_atomic(path, with_bounces(read_text(path), numbers).encode())
             typer.echo(f"{world.name}: {found.words}")
         for which, world in worlds(load_scene(path)):
@@ -387,7 +387,7 @@ def time_(
                 report=report,
             ):
                 times.append(taken)
-                # All of them take minutes, so each is printed as soon as it is measured.
+                # All scenes take minutes, so each is printed as soon as it is measured.
                 report.log(f"{taken.scene}: {sum(taken.wall.values()):.1f} s")
     if as_json:
         typer.echo(json.dumps(suite.to_dict(times), indent=1))

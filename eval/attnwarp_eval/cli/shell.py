@@ -1,4 +1,4 @@
-"""The shell of both commands, and what the harness adds to it: exit codes, and runs."""
+"""The shell shared by both commands, with the harness's additions: exit codes, and runs."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from attnwarp.cli.shell import STOPPED, fail
 from attnwarp.process import stops_interrupt
 
 REGRESSION, TOO_LITTLE = 1, 3
-"""Exit codes beside those of attnwarp. 1 is reserved for a regression. A run that measured too
+"""Exit codes besides those of attnwarp. 1 is reserved for a regression. A run that measured too
 little, or with an instrument that is not calibrated, is 3."""
 
 
 OTHER_RUNS: dict[str, str] = {}
-"""Runs of no study: a file that marks their folders -> the module whose ``verify`` checks one, and
+"""Runs without a study: marker file of their folders -> the module whose ``verify`` checks one, and
 whose ``side_by_side`` compares two. Packages with commands add theirs."""
 
 
@@ -30,10 +30,10 @@ def other_run(*folders: Path) -> Any:
 
 
 class Regression(SystemExit):
-    """The end of a command that has seen a regression, with its exit code.
+    """Exit of a command that found a regression.
 
-    Typer ends a command whose output pipe is closed with the same code; only the type tells the
-    two apart.
+    Typer exits with the same code if a command's output pipe is closed; only the type
+    distinguishes the two.
     """
 
     def __init__(self) -> None:
@@ -41,10 +41,10 @@ class Regression(SystemExit):
 
 
 def check_not_of_run(out: Path, run: Path) -> None:
-    """Refuse to write a command's result over a file of a run.
+    """Refuse to overwrite a file of a run.
 
     Raises:
-        InputError: the file says what the run is, or is its report; or it would lie among its cells
+        InputError: the file is the run's study or report, or is among its cells
             or pictures.
     """
     from attnwarp.errors import InputError
@@ -67,7 +67,7 @@ def resumable(state: Callable[[], str]) -> Iterator[None]:
     """Turn Ctrl-C, a polite kill or the terminal's end into one clear line and exit code 130.
 
     Args:
-        state: finished work that stays, such as "3 cells are kept"; asked after the interrupt.
+        state: description of kept work, such as "3 cells are kept"; called after the interrupt.
     """
     try:
         with stops_interrupt():
@@ -82,8 +82,8 @@ def scheduler_lost(scheduler: str | None, kept: Callable[[], int]) -> Iterator[N
     """Turn a broken connection to a scheduler into one clear line and exit code 3.
 
     Args:
-        scheduler: its address or file.
-        kept: counts the cells that are stored.
+        scheduler: address or file of the scheduler.
+        kept: function that counts stored cells.
     """
     from attnwarp_eval.study.cluster import ClusterLost
 
@@ -103,7 +103,7 @@ def names(text: str | None) -> list[str] | None:
 
 
 def whole_numbers(text: str | None, option: str) -> list[int] | None:
-    """Those of a comma-separated option; None if it was left out."""
+    """Whole numbers of a comma-separated option; None if it was left out."""
     parts = names(text)
     if parts is None:
         return None

@@ -1,4 +1,4 @@
-"""The command that holds a capture's warps against tracks of structure from motion."""
+"""The command that compares a capture's warps with tracks of structure from motion."""
 
 from __future__ import annotations
 

@@ -95,8 +95,8 @@ def surface_splats(
             holes and reach further beyond outlines (reports/splats/surface.md).
         thickness: the third standard deviation of "3d" splats, in local spacings.
         focus: the radius about the scene's centre, in scene units, within which points are about
-            equally dense; further out the density falls with the square of the distance. A third of
-            the cameras' orbit if left out.
+            equally dense; further out the density falls with the square of the distance. By
+            default a third of the cameras' orbit.
         geometry: ``Geometry(scene)``, if there is one already.
         samples: samples of :func:`colored_samples` with this count, seed and focus, if there are
             some already: splats of every kind and noise share them.

@@ -32,7 +32,7 @@ ROOMS = [
     f"attnwarp_eval.stability.cases.{room}"
     for room in ("splats", "warps", "lifting", "truth", "metrics", "editing", "gradients")
 ]
-"""Modules with ``CASES``, by room of the library. A plugin appends its own."""
+"""Modules with ``CASES``, by package of the library. Plugins append theirs."""
 
 
 @cache
@@ -53,10 +53,10 @@ def hard_cases() -> dict[str, Case]:
 
 
 def hard_case(name: str) -> Case:
-    """The case of a name.
+    """Look up a case by name.
 
     Raises:
-        InputError: there is none.
+        InputError: no such case.
 
     Example:
         >>> from attnwarp_eval.stability import Way, hard_case

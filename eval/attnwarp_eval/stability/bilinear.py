@@ -20,16 +20,16 @@ Extended = npt.NDArray[Any]
 
 
 def extended(values: torch.Tensor) -> Extended:
-    """Convert to long doubles: float64 is itself a type that is judged."""
+    """Convert to long doubles: float64 is among the types under test."""
     return values.detach().double().numpy().astype(np.longdouble)
 
 
 def sampling_matrix(xy: Extended, height: int, width: int) -> Extended:
-    """(N, h w) what each pixel of an h x w grid adds to each position.
+    """(N, h w) weight of each pixel of an h x w grid at each position.
 
     Args:
-        xy: (..., 2) positions in pixels of the grid; beyond the border its value is taken, and NaN
-            reads nothing.
+        xy: (..., 2) positions in pixels of the grid; beyond the border the border's value is taken,
+            and NaN reads nothing.
         height, width: height and width of the grid.
 
     Example:

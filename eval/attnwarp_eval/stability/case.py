@@ -20,17 +20,17 @@ Direction = Literal["forward", "backward"]
 Verdict = Literal["holds", "breaks", "refused"]
 
 DECADES = 3.0
-"""Margins are cut here: a factor of 1000 on either side of a tolerance tells enough, and rounding
+"""Margins are clipped here: a factor of 1000 on either side of a tolerance is enough, and rounding
 errors far below a tolerance differ between processors."""
 
 
 @dataclass(frozen=True)
 class Way:
-    """One implementation of what a case asks for.
+    """One implementation under test in a case.
 
     Attributes:
-        backend: ``reference``, ``cpu`` or ``gpu`` for what the library computes with several;
-            else the module that answers, such as ``raycast`` or ``metrics``.
+        backend: ``reference``, ``cpu`` or ``gpu`` for computations with several backends;
+            else the module under test, such as ``raycast`` or ``metrics``.
         precision: type of the input: ``float64``, ``float32``, ``float16`` or ``bfloat16``.
         direction: the values, or their gradient.
 
@@ -79,12 +79,12 @@ def both_directions(forward: tuple[Way, ...]) -> tuple[Way, ...]:
 
 @dataclass(frozen=True)
 class Bound:
-    """Largest error that is allowed.
+    """Largest allowed error.
 
     Attributes:
         unit: unit of the error.
-        tolerance: in that unit; a function of the level where it depends on it.
-        reason: for the tolerance.
+        tolerance: tolerance in that unit, or a function of the level.
+        reason: reason for the tolerance.
 
     Example:
         >>> Bound("px", lambda offset: 1e-3 + 1e-16 * offset, "what float64 holds").at(1e6)
@@ -101,32 +101,32 @@ class Bound:
 
 
 def exact(unit: str, reason: str = "a label, a mask or a bit is right or wrong") -> Bound:
-    """A bound on a count of wrong things: none may be wrong, so half of one is the limit."""
+    """A bound on a count of wrong things: none may be wrong, so the limit is 0.5."""
     return Bound(unit, 0.5, reason)
 
 
 @dataclass(frozen=True)
 class Case:
-    """A numerically hard input, swept over its hardness until what is computed breaks.
+    """A numerically hard input, swept over its hardness until the computation breaks.
 
     Attributes:
-        number: in the report of reports/stability; several cases may share one.
-        name: for commands and records.
-        title: one line for people.
-        input: input that is built.
-        oracle: reference for the result; no code under test.
+        number: number in the report of reports/stability; several cases may share one.
+        name: name in commands and records.
+        title: title in one line.
+        input: description of the input.
+        oracle: description of the reference result, computed without code under test.
         hardness: swept quantity, with its unit.
         levels: levels of hardness, the easiest first.
-        required: the last level whose values must hold; what comes after it is there to break.
+        required: the last level whose values must hold; later levels are meant to break.
         quick: the levels of a short sweep.
-        bounds: by direction.
-        ways: the implementations.
-        measure: the error of a way at a level, in the bound's unit; raises ValueError where the
+        bounds: bounds by direction.
+        ways: the implementations under test.
+        measure: error of a way at a level, in the bound's unit; raises ValueError if the
             input is refused.
         must_refuse: whether a way must refuse a level.
-        required_backward: the last level whose gradients must hold, ``required`` if left out.
-        limit: why it ends where it does; empty where it holds at every level.
-        version: raise it when the errors change meaning.
+        required_backward: the last level whose gradients must hold, by default ``required``.
+        limit: reason for the limit of hardness; empty if every level holds.
+        version: version, raised when the errors change meaning.
 
     Example:
         >>> import numpy as np
@@ -199,13 +199,13 @@ class Case:
         return self.judge(level, way, error, refusal)
 
     def judge(self, level: float, way: Way, error: float, refusal: str) -> Outcome:
-        """An error held against this case's bound.
+        """Judge an error by this case's bound.
 
         Args:
             level: one of ``levels``.
             way: one of ``ways``.
-            error: in the bound's unit; NaN where the result is not finite, and where refused.
-            refusal: message where the input was refused, else empty.
+            error: error in the bound's unit; NaN if the result is not finite, or refused.
+            refusal: message of the refusal, else empty.
         """
         return Outcome(
             level,
@@ -223,11 +223,11 @@ class Outcome:
 
     Attributes:
         level: level of hardness.
-        required: whether it must hold.
-        error: in the bound's unit; infinite where the result is not finite, NaN where refused.
-        tolerance: in the same unit.
-        refusal: the error message where the input was refused, else empty.
-        must_refuse: whether it had to be.
+        required: whether the level must hold.
+        error: error in the bound's unit; infinite if the result is not finite, NaN if refused.
+        tolerance: tolerance in the same unit.
+        refusal: message of the refusal, else empty.
+        must_refuse: whether the input had to be refused.
 
     Example:
         >>> Outcome(1.0, True, 1e-7, 1e-5, "", False).verdict
@@ -250,7 +250,7 @@ class Outcome:
 
     @property
     def margin(self) -> float:
-        """Decades between the error and its tolerance, cut at :data:`DECADES`; negative where the
+        """Decades between the error and its tolerance, clipped at :data:`DECADES`; negative if the
         tolerance is exceeded, NaN where a level that need not hold is refused.
         """
         if self.refusal or self.must_refuse:
@@ -265,7 +265,7 @@ class Outcome:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict in one word; what must be refused and is holds."""
+        """Verdict in one word; a required refusal counts as "holds"."""
         margin = self.margin
         return "refused" if math.isnan(margin) else "holds" if margin >= 0 else "breaks"
 
@@ -289,7 +289,7 @@ def hard(
     must_refuse: Callable[[float, Way], bool] = lambda level, way: False,
     package: str = "attnwarp_eval.stability",
 ) -> Case:
-    """The case whose texts and levels stand in a row of cases.yaml.
+    """Case with the texts and levels of a row of cases.yaml.
 
     Args:
         name: row of the table.
@@ -309,7 +309,7 @@ def hard(
 
 
 def level_name(level: float) -> str:
-    """A level as records and tables name it.
+    """Name of a level in records and tables.
 
     Example:
         >>> level_name(89.9999), level_name(1e6)

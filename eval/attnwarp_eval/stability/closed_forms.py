@@ -21,7 +21,7 @@ def orbit(
     height: float = 0.0,
     width: int | None = None,
 ) -> Camera:
-    """A camera on a circle about the origin, which it looks at.
+    """A camera on a circle around the origin, looking at the origin.
 
     Args:
         yaw: degrees.

@@ -35,8 +35,8 @@ class Pixel:
 
     Attributes:
         alpha: sum of the weights.
-        depth: expected depth; None where nothing is drawn.
-        nearest_threshold: smallest distance of an alpha from the cut-off 1/255; where it is small,
+        depth: expected depth; None if nothing is drawn.
+        nearest_threshold: smallest distance of an alpha from the cut-off 1/255; if it is small,
             rounding decides.
     """
 
@@ -50,8 +50,8 @@ class ExactSplats:
 
     Args:
         gaussians: few splats; their stored values are taken as exact.
-        camera: the same.
-        near: nothing nearer is drawn.
+        camera: camera of the picture.
+        near: near-plane depth.
         antialiased: screen filter of 3D splats.
         depth: the mode, as in :func:`attnwarp.render.render`.
     """
@@ -91,11 +91,11 @@ class ExactSplats:
         """Derivatives of sum_p a_p alpha_p + b_p depth_p, by field.
 
         Args:
-            pixels: (x, y) of each.
-            weights: (a, b) of each.
+            pixels: (x, y) of each pixel.
+            weights: (a, b) of each pixel.
         """
         with mpmath.workdps(DIGITS):
-            # One splat moves at a time; the others stay as they are drawn here.
+            # One splat moves at a time; the others are fixed.
             still = [self._splats(x, y) for x, y in pixels]
             gradient = {}
             for name in FIELDS:
@@ -122,7 +122,7 @@ class ExactSplats:
         return [self._splat(k, x, y) for k in range(len(self.values["means"]))]
 
     def _splat(self, k: int, x: float, y: float) -> Drawn:
-        """One splat at a pixel; its alpha is 0 where it is not drawn."""
+        """One splat at a pixel; its alpha is 0 if it is not drawn."""
         mean, quat, scale = (self.values[name][k] for name in ("means", "quats", "scales"))
         opacity = self.values["opacities"][k][0]
         center = [a + b for a, b in zip(_apply(self.R, mean), self.shift, strict=True)]

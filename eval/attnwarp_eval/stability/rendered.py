@@ -1,4 +1,4 @@
-"""Splats rendered by a backend, held against the same splats with 50 digits."""
+"""Splats rendered by a backend, compared with the same splats at 50 digits."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class Shot:
     Attributes:
         gaussians: in float64; a way converts them.
         camera: camera of the picture.
-        pixels: (row, column) of each.
-        options: options of :func:`attnwarp.render.render` beside the backend: ``near``,
+        pixels: (row, column) of each pixel.
+        options: options of :func:`attnwarp.render.render` besides the backend: ``near``,
             ``antialiased`` and ``depth``.
-        unmoved: the same shot where it is not hard, for the oracle; itself if None.
+        unmoved: an easy version of the shot, for the oracle; None for the shot itself.
     """
 
     gaussians: Gaussians
@@ -113,7 +113,7 @@ def against_exact(
     """The measure of a case whose oracle is :class:`ExactSplats`.
 
     Args:
-        build: build of a level.
+        build: function that builds the shot of a level.
         outputs: ``alpha``, ``depth`` or both. Alpha counts absolutely, depth relatively.
     """
 
@@ -163,7 +163,7 @@ def relative_gradient(result: dict[str, np.ndarray], exact: dict[str, np.ndarray
 
 
 def _weights(pixels: Sequence[Pixel], outputs: Sequence[str]) -> list[tuple[float, float]]:
-    """Weights of the loss: other ones for each pixel, so that no two errors cancel. Every second
+    """Weights of the loss: different for each pixel, so that no two errors cancel. Every second
     pixel takes part, since the exact gradient costs most of a sweep.
     """
     return [

@@ -26,8 +26,8 @@ class Labels:
     """Labels of the target's pixels by each rule.
 
     Attributes:
-        rules: (H, W) bool by the rule's name; the pixel passes.
-        undecided: by the same names, pixels at which rounding decides.
+        rules: (H, W) bool by the rule's name, True for pixels that pass.
+        undecided: pixels at which rounding decides, by the same names.
     """
 
     rules: dict[str, npt.NDArray[np.bool_]]
@@ -49,7 +49,7 @@ def exact_labels(
 
     Args:
         source, target: cameras of pictures of one size (H, W).
-        source_depth, target_depth: (H, W) as stored, NaN where nothing is seen.
+        source_depth, target_depth: (H, W) as stored, NaN without a surface.
         target_normal: (H, W, 3) in world axes.
         relative, slope, spread: tolerances of :class:`attnwarp.warp.WarpSettings`.
     """

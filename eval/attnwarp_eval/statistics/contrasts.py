@@ -17,7 +17,7 @@ from attnwarp_eval.statistics.signflips import FEWEST, SignFlips
 Verdict = Literal["better", "worse", "equal", "can't tell"]
 
 EQUAL_LEVEL = 0.9
-"""Level of the interval that lies within a bound of equality: two one-sided tests at 5 %."""
+"""Level of the interval for equality within a bound: two one-sided tests at 5 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +26,12 @@ class Contrast:
 
     Attributes:
         scale: scale of the differences; those of ``ratio`` and ``odds`` are logarithms.
-        views: pairs of views in it.
-        undefined: views that one side alone has, or where it is undefined.
+        views: number of pairs of views.
+        undefined: number of views present or defined on only one side.
         by_scene: mean over a scene's views; scenes without a pair are left out.
         flips: the sign-flip test of ``by_scene``.
-        student: Student's t beside it, on the same scale.
-        plain: the sign-flip test of plain differences, in which a bound of shares is.
+        student: Student's t on the same scale.
+        plain: the sign-flip test of plain differences, the scale of bounds of shares.
 
     Example:
         >>> ours = {f"s{k}": {"v": 1.0 + k} for k in range(6)}
@@ -63,7 +63,7 @@ class Contrast:
         return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
 
     def shown(self, level: float = 0.95) -> tuple[float, float, float]:
-        """Mean and bounds as a reader is shown them: b / a of ``ratio`` and ``odds``, else b - a.
+        """Mean and bounds for display: b / a for ``ratio`` and ``odds``, else b - a.
 
         0 (or a factor of 1) lies inside exactly if the test at that level cannot tell.
         """
@@ -80,7 +80,7 @@ class Contrast:
         return values
 
     def level(self, adjusted_p: float) -> float:
-        """Level that adjusting for other tests leaves: its interval agrees with the verdict."""
+        """Level after adjustment for other tests: its interval agrees with the verdict."""
         if not (0 < self.flips.p < adjusted_p):
             return 0.95
         return 1 - 0.05 * self.flips.p / adjusted_p
@@ -92,13 +92,13 @@ class Contrast:
         adjusted_p: float | None = None,
         bound: float | None = None,
     ) -> Verdict:
-        """Verdict in general, for scenes like these.
+        """Verdict for the population of scenes.
 
         Args:
             direction: which values are better.
-            adjusted_p: the p-value adjusted for other tests; that of this one if left out.
-            bound: differences up to which arms are equal, on the scale, of ``odds`` as a share;
-                none are if left out.
+            adjusted_p: the p-value adjusted for other tests; by default unadjusted.
+            bound: differences up to which arms are equal, on the scale, for ``odds`` as a share;
+                by default none.
         """
         p = self.flips.p if adjusted_p is None else adjusted_p
         if self.scenes < FEWEST:
@@ -111,18 +111,18 @@ class Contrast:
 
     @property
     def _bounded(self) -> SignFlips:
-        """Differences that a bound of equality speaks of."""
+        """Test on the scale of a bound of equality."""
         return self.plain if self.scale == "odds" else self.flips
 
     def needed(self, adjusted_p: float, bound: float | None = None) -> int:
-        """Scenes that would settle what these cannot tell, in 80 % of studies, were the difference
-        and its spread those seen here: by a difference, or by a bound that holds it.
+        """Scenes that would give a verdict in 80 % of studies if the true difference and
+        its spread were those seen here: on a difference, or on equality within a bound.
 
         Args:
             adjusted_p, bound: as for :meth:`verdict`.
         """
         level = self.level(adjusted_p)
-        # No flips of fewer scenes' signs are as rare as the level asks: p is at least 2 / 2**n.
+        # With fewer scenes no sign pattern is rare enough for the level: p is at least 2 / 2**n.
         fewest = math.ceil(1 - math.log2(1 - level))
         by = [max(fewest, scenes_needed(self.flips.mean, self.deviation, level=level))]
         own = self._bounded
@@ -144,8 +144,8 @@ def contrast(
 
     Args:
         a, b: scene -> view (and seed) -> value, NaN where undefined.
-        scale, floor: see :func:`~attnwarp_eval.statistics.scales.compared`.
-        counts: things that each share of a and of b is of; shares are then compared by their odds.
+        scale, floor: as for :func:`~attnwarp_eval.statistics.scales.compared`.
+        counts: denominators of the shares of a and of b; shares are then compared by their odds.
     """
     if scale == "share" and counts is not None:
         scale = "odds"
@@ -180,7 +180,7 @@ def contrast(
 def _pairs(
     scene: str, a: ByView, b: ByView, counts: tuple[ByView, ByView] | None
 ) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
-    """Figures of each view of a scene, and the counts that they are of."""
+    """Figures of each view of a scene, and their denominators."""
     sides = (a, b, *(counts or ({}, {})))
     left, right, *of = (side.get(scene, {}) for side in sides)
     for view in sorted({*left, *right}):

@@ -1,7 +1,7 @@
 """Tests of two means: whether they differ, and whether they are equal within a margin. Pure
 functions.
 
-A test that finds no difference says nothing of equality: it may only lack samples. Equality is
+A test without a significant difference does not show equality: it may lack samples. Equality is
 shown by two one-sided tests (:func:`equivalence`).
 """
 
@@ -28,7 +28,7 @@ class Welch:
 
     Attributes:
         difference: mean(b) - mean(a).
-        error: its standard error.
+        error: standard error of the difference.
         freedom: Satterthwaite's degrees of freedom.
         p: two-sided probability of a difference this large if there were none.
 
@@ -51,8 +51,8 @@ def welch(a: npt.ArrayLike, b: npt.ArrayLike) -> Welch:
     Args:
         a, b: (n, ...) and (m, ...) independent samples, n, m >= 2. Values that do not vary at all
             have p = 1 where they are equal within ``ROUNDING`` and 0 elsewhere. Values that vary by
-            less than ``ROUNDING``, such as those of a smooth sky, are tested as all others are, but
-            for a part of their difference that may be rounding.
+            less than ``ROUNDING``, such as those of a smooth sky, are tested like all others,
+            except for the part of their difference that may be rounding.
 
     Raises:
         ValueError: fewer than two samples on a side.
@@ -79,8 +79,8 @@ def welch(a: npt.ArrayLike, b: npt.ArrayLike) -> Welch:
 
 
 def _beyond(difference: Array, error: Array, rounding: Array) -> Array:
-    """Part of a difference that noise must explain: all of it, or only what exceeds the rounding
-    where the noise is smaller.
+    """Part of a difference that noise must explain: all of it, or only the excess over rounding
+    if the noise is smaller.
     """
     return np.where(
         error > rounding, np.abs(difference), np.maximum(np.abs(difference) - rounding, 0.0)
@@ -108,7 +108,7 @@ def welch_interval(
 
     test = welch(a, b)
     difference = float(test.difference)
-    # Samples without noise: what is left is the rounding of equal numbers, whatever their unit.
+    # Samples without noise: the rest is the rounding of equal numbers, in any unit.
     if test.error <= 1e-12 * max(np.abs(a).max(), np.abs(b).max()):
         return difference, difference, difference
     reach = float(stats.t.ppf(0.5 + level / 2, test.freedom) * test.error)
@@ -201,9 +201,9 @@ class PairedTest:
     """A t-test on differences of pairs.
 
     Attributes:
-        difference, error: shares of the mean.
-        p: two-sided.
-        pairs: how many.
+        difference, error: difference and standard error, as shares of the mean.
+        p: two-sided p-value.
+        pairs: number of pairs.
 
     Example:
         >>> result = paired_test([1.0, 2.0, 3.0], [1.5, 2.5, 3.6])
@@ -221,11 +221,11 @@ def paired_test(a: npt.ArrayLike, b: npt.ArrayLike) -> PairedTest:
     """Student's t-test (1908) on mean(b_k) - mean(a_k).
 
     Args:
-        a, b: (n, ...) samples of which the k-th belong together, such as pictures of one seed, n >=
-            2; each counts by its mean.
+        a, b: (n, ...) samples paired by index, such as pictures of one seed, n >=
+            2; each is reduced to its mean.
 
     Raises:
-        ValueError: another number of samples on a side, or fewer than two.
+        ValueError: different numbers of samples, or fewer than two.
 
     Example:
         >>> result = paired_test([1.0, 2.0, 3.0], [1.5, 2.5, 3.6])

@@ -25,15 +25,15 @@ class Interval:
     """A mean with its 95 % interval.
 
     Attributes:
-        mean: mean over scenes of the mean over views; NaN where nothing was defined.
+        mean: mean over scenes of the mean over views; NaN if nothing is defined.
         low, high: the interval; NaN with fewer than two scenes.
-        scenes, views: how many of each went in.
-        undefined: values that were NaN, left out and counted.
+        scenes, views: numbers of scenes and of views.
+        undefined: number of NaN values, which are left out.
         detectable: the smallest difference with a power of 80 % at 5 %; NaN with under two
             scenes.
-        p: two-sided probability of a mean this far from 0 were the truth 0 (Student's t); NaN with
-            under two scenes.
-        least, most: the lowest and the highest scene; NaN where nothing was defined.
+        p: two-sided probability of a mean this far from 0 if the true mean is 0 (Student's t); NaN
+            with fewer than two scenes.
+        least, most: the lowest and the highest scene; NaN if nothing is defined.
 
     Example:
         >>> value = interval({"bear": [1.0, 3.0], "fence": [4.0]})
@@ -54,17 +54,17 @@ class Interval:
 
     @property
     def bounded(self) -> bool:
-        """True if both bounds are finite: of one scene there is no interval, nor of a few equal
-        differences.
+        """True if both bounds are finite: one scene, or a few equal differences, give no
+        interval.
         """
         return bool(np.isfinite(self.low) and np.isfinite(self.high))
 
 
 Table = Mapping[str, Sequence[float]]
-"""Values by scene: one number a view (and seed), NaN where the metric is undefined."""
+"""Values by scene: one number per view (and seed), NaN if the metric is undefined."""
 
 ByView = Mapping[str, Mapping[str, float]]
-"""Scene -> view (and seed) -> value, for what is paired."""
+"""Scene -> view (and seed) -> value, for paired comparisons."""
 
 
 def interval(values: Table, *, level: float = 0.95) -> Interval:
@@ -98,7 +98,7 @@ def interval(values: Table, *, level: float = 0.95) -> Interval:
         return Interval(mean, np.nan, np.nan, count, views, undefined, np.nan, np.nan, mean, mean)
     error = float(means.std(ddof=1) / np.sqrt(count))
     if error <= 1e-13 * abs(mean):
-        error = 0.0  # the rounding of equal means, which is no spread
+        error = 0.0  # rounding of equal means, not spread
     half = error * float(stats.t.ppf(0.5 + level / 2, count - 1))
     p = float(2 * stats.t.sf(abs(mean) / error, count - 1)) if error > 0 else float(mean == 0)
     return Interval(
@@ -126,11 +126,11 @@ def _power_factor(scenes: int) -> float:
 
 
 ROUNDING = 2e-14
-"""Differences that vary by less than this share of the values they are of vary by rounding."""
+"""Relative spread below which differences vary only by rounding."""
 
 
 def paired(a: ByView, b: ByView) -> Interval:
-    """Interval of b - a over the views that both have.
+    """Interval of b - a over the shared views.
 
     Student's t needs a spread, and shares often differ by exactly as much in every scene. The
     p-value and the interval are then those of the sign test; below six scenes it has no bounds at
@@ -151,7 +151,7 @@ def paired(a: ByView, b: ByView) -> Interval:
         (0.5, False)
     """
     differences: dict[str, list[float]] = {}
-    largest = 0.0  # of the values that differences are of
+    largest = 0.0  # largest of the compared values
     for scene in sorted(set(a) | set(b)):
         left, right = a.get(scene, {}), b.get(scene, {})
         pairs = [(left.get(v, np.nan), right.get(v, np.nan)) for v in sorted({*left, *right})]
@@ -198,11 +198,11 @@ def common(tables: Sequence[ByView]) -> list[dict[str, dict[str, float]]]:
 
 @dataclass(frozen=True)
 class Ratio:
-    """Ratio of the times that two things took.
+    """Ratio of two contestants' times.
 
     Attributes:
         ratio: median over rounds of the ratio within a round, geometric mean over groups (scenes).
-        low, high: 95 % interval; NaN where a group has fewer than :data:`FEWEST_ROUNDS`.
+        low, high: 95 % interval; NaN if a group has fewer than :data:`FEWEST_ROUNDS`.
 
     Example:
         >>> value = time_ratio([[2.0, 4.0, 6.0, 8.0, 8.0, 8.0]], [[1.0, 2.0, 3.0, 4.0, 4.0, 4.0]])
@@ -229,14 +229,14 @@ RATIO_INTERVAL = (
     "the interval is that of the median at 95 %, by order statistics, and needs"
     f" {FEWEST_ROUNDS} rounds."
 )
-"""Description, for a report, of what :func:`time_ratio` gives."""
+"""Description of :func:`time_ratio` for a report."""
 
 
 def time_ratio(a: Sequence[Sequence[float]], b: Sequence[Sequence[float]]) -> Ratio:
-    """Seconds of ``a`` over those of ``b``, taken in turn: one sequence of rounds a group, paired
+    """Seconds of ``a`` over those of ``b``, taken in turn: one sequence of rounds per group, paired
     round by round.
 
-    The interval is that of the median by order statistics, whatever the distribution of seconds is.
+    The interval is that of the median by order statistics, for any distribution of seconds.
     Over several groups the distances of their medians to their bounds add as squares (Zou &
     Donner 2008).
 
@@ -244,7 +244,7 @@ def time_ratio(a: Sequence[Sequence[float]], b: Sequence[Sequence[float]]) -> Ra
         a, b: groups of rounds, seconds > 0.
 
     Raises:
-        ValueError: other numbers of groups or rounds, or seconds that are not positive.
+        ValueError: different numbers of groups or rounds, or seconds that are not positive.
 
     Example:
         >>> slow = [[2.0, 4.0, 60.0], [8.0, 8.0, 8.0]]  # two scenes, one hiccup
@@ -282,9 +282,9 @@ def _bounds_of_median(values: npt.NDArray[np.float64]) -> tuple[float, float]:
 
 
 def agreement(a: ByView, b: ByView, sign: int) -> tuple[int, int]:
-    """Number of the views that both have in which b - a has the given sign: (those, all).
+    """Number of shared views in which b - a has the given sign: (those, all).
 
-    It says what was seen on these scenes, without speaking of others. What is within the rounding
+    A statement about these scenes only. A difference within the rounding
     of the values (:data:`ROUNDING`) has no sign.
 
     Example:
@@ -330,7 +330,7 @@ def verdict(
     """Verdict on a paired difference (ours - theirs): better, worse, or can't tell; never "equal".
 
     Args:
-        difference: from :func:`paired`.
+        difference: result of :func:`paired`.
         direction: which values of the metric are better.
         atol: an interval that reaches into [-atol, atol] gives "can't tell".
         adjusted_p: the difference's p-value adjusted for the other tests of its table; above 0.05

@@ -1,4 +1,4 @@
-"""Scenes needed before a difference can be told. Pure functions: numbers in, numbers out."""
+"""Scenes needed to detect a difference. Pure functions: numbers in, numbers out."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ MOST_SCENES = 1000
 
 
 def scenes_needed(mean: float, deviation: float, *, power: float = 0.8, level: float = 0.95) -> int:
-    """The fewest scenes with which a paired test would tell a difference from 0.
+    """The fewest scenes with which a paired test detects a difference from 0.
 
     The test is Student's t, two-sided. Its power follows the noncentral t distribution (Cohen 1988,
     Statistical Power Analysis for the Behavioral Sciences, ch. 2).
@@ -17,11 +17,11 @@ def scenes_needed(mean: float, deviation: float, *, power: float = 0.8, level: f
     Args:
         mean: the true difference.
         deviation: the standard deviation of the scenes' true differences, >= 0.
-        power: the probability that the test tells, in (0, 1).
-        level: 1 minus the rate at which it tells where nothing is, in (0, 1).
+        power: the probability of detection, in (0, 1).
+        level: 1 minus the false positive rate, in (0, 1).
 
     Returns:
-        At least 2; :data:`MOST_SCENES` + 1 where more than those are needed.
+        At least 2; :data:`MOST_SCENES` + 1 if more are needed.
 
     Raises:
         ValueError: a number that is not finite, or a negative deviation.
@@ -35,7 +35,7 @@ def scenes_needed(mean: float, deviation: float, *, power: float = 0.8, level: f
             f"mean, deviation: got {mean} and {deviation}, expected finite numbers and no negative"
             " deviation"
         )
-    low, high = 2, MOST_SCENES + 1  # more scenes never tell less
+    low, high = 2, MOST_SCENES + 1  # power never falls with more scenes
     while low < high:
         middle = (low + high) // 2
         if _power(abs(mean), deviation, middle, level) >= power:

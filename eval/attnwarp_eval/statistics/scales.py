@@ -19,19 +19,19 @@ def compared(
     floor: float = 0.0,
     counts: tuple[float, float] = (math.nan, math.nan),
 ) -> float:
-    """Difference of two figures on a scale: b against a; NaN where either is undefined.
+    """Difference of two figures on a scale: b against a; NaN if either is undefined.
 
-    - ``ratio``, of errors that are never negative: log(b / a). An error below the floor, which is
-      that of the calibration, is as large as the floor; two such are a tie.
-    - ``odds``, of shares with the numbers of things that they are of: the difference of empirical
+    - ``ratio``, of errors that are never negative: log(b / a). An error below the floor, given
+      by the calibration, counts as the floor; two such errors tie.
+    - ``odds``, of shares with their denominators: the difference of empirical
       logits, log((k + 1/2) / (n - k + 1/2)) (Haldane 1956; Cox & Snell 1989, section 2.1.6).
     - ``share`` and ``plain``: b - a. A sign-flip interval of shares never leaves -1 to 1.
 
     Args:
         a, b: the figures.
         scale: scale of their metric.
-        floor: smallest error that means anything, above 0, for ``ratio``.
-        counts: things that each share is of, for ``odds``.
+        floor: smallest meaningful error, above 0, for ``ratio``.
+        counts: denominators of the shares, for ``odds``.
 
     Example:
         >>> round(math.exp(compared(0.2, 0.1, "ratio")), 9)

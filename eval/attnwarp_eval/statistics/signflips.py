@@ -1,6 +1,6 @@
 """Sign-flip test of paired differences over scenes, and the interval that inverts it.
 
-If two arms are alike, the difference of each scene is as likely to have the other sign. The
+If two arms are equal, the difference of each scene has either sign with equal chance. The
 p-value is the share of sign patterns whose sum is at least as far from 0 as the one seen (Fisher
 1935, The Design of Experiments, section 21; Lehmann & Romano 2005, Testing Statistical Hypotheses,
 section 5.8). Beyond symmetry it assumes no distribution, so one scene with a huge difference does
@@ -19,14 +19,14 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 ENUMERATED = 20
-"""Up to so many scenes all sign patterns are counted; beyond, :data:`DRAWS` are drawn."""
+"""Scenes up to which all sign patterns are counted; beyond, :data:`DRAWS` are drawn."""
 
 DRAWS = 100_000
 
 SEED = 1
 
 FEWEST = 6
-"""Scenes below which no pattern is rarer than 5 %: the interval has no bounds."""
+"""Number of scenes below which no pattern is rarer than 5 %: the interval has no bounds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +34,8 @@ class SignFlips:
     """Test and intervals of the mean of paired differences.
 
     Attributes:
-        differences: (n,) one a scene.
-        rounding: differences that are not larger count as 0.
+        differences: (n,) one per scene.
+        rounding: size up to which differences count as 0.
 
     Example:
         >>> test = SignFlips(np.array([1.0, 2.0, 1.5, 1.0, 3.0, 2.5]))
@@ -52,7 +52,7 @@ class SignFlips:
 
     @property
     def mean(self) -> float:
-        """The mean difference; NaN of none."""
+        """The mean difference; NaN without any."""
         return float(self._clean.mean()) if len(self._clean) else math.nan
 
     @cached_property
@@ -76,7 +76,7 @@ class SignFlips:
 
     @property
     def p(self) -> float:
-        """Two-sided probability of a mean this far from 0 were arms alike; NaN below two scenes."""
+        """Two-sided probability of a mean this far from 0 for equal arms; NaN below two scenes."""
         if len(self._clean) < 2:
             return math.nan
         if self.mean == 0:
@@ -89,9 +89,9 @@ class SignFlips:
         return (1 + beyond) / (1 + len(low))
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Means that the test does not refuse; NaN where it can refuse none.
+        """Means that the test does not refuse; NaN if it can refuse none.
 
-        0 lies inside exactly if ``p`` is above 1 - ``level``.
+        The interval contains 0 exactly if ``p`` is above 1 - ``level``.
 
         Args:
             level: coverage, in (0, 1).
@@ -129,7 +129,7 @@ def _means_of_parts(values: Array) -> tuple[Array, Array]:
         for value in values[1:]:
             sums = np.concatenate([sums, sums + value])
             sizes = np.concatenate([sizes, sizes + 1])
-        sums, sizes = sums[1:], sizes[1:]  # without the split that turns no sign
+        sums, sizes = sums[1:], sizes[1:]  # without the split that flips no sign
     else:
         rng = np.random.default_rng(SEED)
         sums, sizes = np.empty(DRAWS), np.empty(DRAWS)
@@ -139,7 +139,7 @@ def _means_of_parts(values: Array) -> tuple[Array, Array]:
             sums[start : start + len(turned)] = turned @ values
             sizes[start : start + len(turned)] = turned.sum(axis=1)
         whole = (sizes == 0) | (sizes == count)
-        # Such a pattern is the one seen, whatever the true mean is.
+        # Such a pattern equals the observed one for any true mean.
         sums, sizes = np.where(whole, np.nan, sums), np.where(whole, 1, sizes)
     first, second = sums / sizes, (total - sums) / (count - sizes)
     low, high = np.minimum(first, second), np.maximum(first, second)

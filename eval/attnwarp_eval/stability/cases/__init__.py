@@ -1,1 +1,1 @@
-"""The hard cases, by room of the library."""
+"""The hard cases, by package of the library."""

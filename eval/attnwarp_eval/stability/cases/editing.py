@@ -43,7 +43,7 @@ def _layer(way: Way, mask: torch.Tensor | None = None) -> FeatureWarp:
 
 
 def _view(source: Camera, target: Camera, depth: np.ndarray, way: Way) -> WarpedView:
-    """A warp by positions alone."""
+    """A warp by positions only."""
     surface = Surface(torch.from_numpy(depth))
     return warp_surfaces(
         source, target, surface, None, BOUNDS_ONLY, backend=engine_of(way), warn_empty=False
@@ -59,7 +59,7 @@ def _tokens(way: Way, magnitude: float = 1.0) -> tuple[torch.Tensor, torch.Tenso
 def first_step(
     layer: FeatureWarp, source: torch.Tensor, new: torch.Tensor, a0: float
 ) -> torch.Tensor:
-    """(1, H W, C) tokens at the first step of an edit, by the method's own weight and blend."""
+    """(1, H W, C) tokens at the first step of an edit, by the method's weight and blend."""
     return blended(blend, layer, source, new, a_t(0, 1, replace(CORRECTED, a0=a0)))
 
 
@@ -81,7 +81,7 @@ def _magnitude(magnitude: float, way: Way) -> float:
 
 
 def _weight(weight: float, way: Way) -> float:
-    """Error in steps of the type; at 0 and 1 the bits must be those of the two sides."""
+    """Error in steps of the type; at 0 and 1 the result must equal one side bit for bit."""
     layer, (source, new) = _layer(way), _tokens(way)
     result = first_step(layer, source, new, weight)
     if weight in (0, 1):
@@ -92,7 +92,7 @@ def _weight(weight: float, way: Way) -> float:
 
 
 def _outside(share: float, way: Way) -> float:
-    """Values outside a mask that a blend changes, and values inside that it leaves."""
+    """Number of values changed outside a mask, and left unchanged inside, by a blend."""
     chosen = np.random.default_rng(0).permutation(SIZE * SIZE)[: round(SIZE * SIZE * share)]
     mask = torch.zeros(SIZE * SIZE, dtype=torch.bool)
     mask[torch.from_numpy(chosen)] = True
@@ -105,7 +105,7 @@ def _outside(share: float, way: Way) -> float:
 
 
 class Unet(torch.nn.Module):
-    """Least UNet that hooks need: an attention module by its name, called with latents and a
+    """Minimal UNet for hooks: an attention module with the right name, called with latents and a
     timestep.
     """
 
@@ -140,7 +140,7 @@ def layer_weights(unet: Unet) -> tuple[Extended, Extended]:
 
 
 def exact_tokens(unet: Unet, latents: torch.Tensor) -> Extended:
-    """(B, H W, C) what the layer gives, in long double."""
+    """(B, H W, C) output of the layer, in long double."""
     weights, bias = layer_weights(unet)
     values: Extended = extended(latents.flatten(2).transpose(1, 2)) @ weights.T + bias
     return values
@@ -203,7 +203,7 @@ def _apart(yaw: float, way: Way) -> float:
     source = Camera(K, pose, SIZE, SIZE)
     depth = np.full((SIZE, SIZE), 4.0)
     view = _view(source, target, depth, way)
-    # A turn moves a direction's azimuth by the yaw, whatever its depth.
+    # A turn moves a direction's azimuth by the yaw, at any depth.
     x, y, _ = np.moveaxis(target.directions(), -1, 0)
     azimuth = np.arctan2(x, 1) - angle
     u = np.tan(azimuth)
@@ -267,7 +267,7 @@ def _step(alpha: float, way: Way) -> float:
     worst = 0.0
     for prediction in get_args(Prediction):
         if prediction == "epsilon" and not alpha:
-            continue  # noise alone tells nothing of x_0
+            continue  # noise alone does not determine x_0
         result = DDIM(alphas, prediction, 1.0).step(output, x, 1, 0)
         for got, one, out in zip(result.double(), x.double(), output.double(), strict=True):
             terms = _step_terms(prediction, float(one), float(out), *map(float, alphas))

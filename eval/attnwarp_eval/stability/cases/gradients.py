@@ -39,7 +39,7 @@ WHOLE, HALF = backward("float64", "float32"), backward(*HALVES)
 
 
 def _camera(height: int, width: int) -> Camera:
-    """Camera whose grid is all that a warp takes of it."""
+    """Camera of which a warp uses only the grid."""
     return orbit(0, size=height, width=width)
 
 
@@ -64,7 +64,7 @@ def _shifted(share: float) -> torch.Tensor:
 
 def steps_between(result: torch.Tensor, expected: Extended, way: Way) -> float:
     """The largest error in steps of the type; where a value is subnormal its step is that of the
-    smallest normal number. Where nothing is expected a 0 must come.
+    smallest normal number. Where the expected value is 0, the result must be 0.
     """
     kind = torch.finfo(way.dtype)
     values = extended(result).reshape(expected.shape)
@@ -80,7 +80,7 @@ def _of_maps(
     """Gradients (C, h w) in the features (C, h, w), sampled as maps and as tokens.
 
     Args:
-        upstream: (C, H, W) gradient in what is warped.
+        upstream: (C, H, W) gradient in the warped features.
     """
     leaves = [features.clone().requires_grad_() for _ in range(2)]
     warp.warp(leaves[0]).backward(upstream)
@@ -94,8 +94,8 @@ def _of_maps(
 def _gradient_error(
     xy: torch.Tensor, size: tuple[int, int], upstream: torch.Tensor, way: Way
 ) -> float:
-    """Error of the gradient in features, infinite or NaN where no position reads them; the gradient
-    in what has no position is NaN.
+    """Error of the gradient in features, infinite or NaN if unread features get one; the gradient
+    in pixels without a position is NaN.
     """
     shares = sampling_matrix(extended(xy), *size)
     undefined = torch.isnan(xy).any(-1)
@@ -136,7 +136,7 @@ def _readers(count: float, way: Way) -> float:
 
 
 def _held(weight: float, way: Way) -> np.longdouble:
-    """A weight as the sums' type holds it: near 1, what it leaves of 1 has few digits."""
+    """A weight rounded to the sums' type: near 1, its complement has few digits."""
     return np.longdouble(torch.tensor(weight, dtype=work_type(way.dtype)).item())
 
 
@@ -201,7 +201,7 @@ def _near_equal_depth(gap: float, way: Way) -> float:
 
 def _injected(weight: float, way: Way) -> float:
     """Error of the gradient in a target's latents, through a layer into which features are
-    injected, in steps of the type at the sum of magnitudes; a token that is replaced whole must
+    injected, in steps of the type at the sum of magnitudes; a fully replaced token must
     have none.
     """
     unet = Unet(CHANNELS, way.dtype)

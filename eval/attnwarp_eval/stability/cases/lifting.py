@@ -1,4 +1,4 @@
-"""Hard cases of masks that are lifted through splats."""
+"""Hard cases of masks lifted through splats."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Mask = npt.NDArray[np.bool_]
 
 
 def _ball() -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) evenly spread points of the unit sphere, which are their own normals."""
+    """(N, 3) evenly spread points of the unit sphere, equal to their normals."""
     k = np.arange(BALL) + 0.5
     z, turn = 1 - 2 * k / BALL, np.pi * (1 + 5**0.5) * k
     ring = np.sqrt(1 - z * z)
@@ -48,7 +48,7 @@ def _wall(x: float, half: tuple[float, float], step: float) -> tuple[np.ndarray,
 
 
 def _scene(way: Way, *parts: tuple[tuple[np.ndarray, np.ndarray], float]) -> Gaussians:
-    """Discs of one grey: nothing but their places and normals tells the parts apart."""
+    """Discs of one grey: the parts differ only in positions and normals."""
     points = np.concatenate([points for (points, _), _ in parts])
     normals = np.concatenate([normals for (_, normals), _ in parts])
     scales = np.concatenate([np.full((len(points), 2), scale) for (points, _), scale in parts])
@@ -128,7 +128,7 @@ def _part(side: float, way: Way) -> float:
     step = 8 / WALL
     scene = _scene(way, (_wall(0, (4, 4), step), step / 2))
     source, half = _view(SOURCE), _half(side)
-    if side == SIZE:  # everything, also what the source does not show
+    if side == SIZE:  # everything, also surfaces hidden from the source
         half = np.inf
     return _far_off(
         _lifted(scene, _square_mask(source, half), way), _square_mask(_view(TARGET), half)

@@ -1,4 +1,4 @@
-"""Hard cases of the metrics: nothing to measure, nothing that differs, lengths without a
+"""Hard cases of the metrics: nothing to measure, no differences, lengths without a
 direction.
 """
 
@@ -36,7 +36,7 @@ def _vectors() -> tuple[np.ndarray, np.ndarray]:
 
 
 def against(expected: float, result: float) -> float:
-    """Their difference; infinite where only one of them is undefined, or infinite."""
+    """Absolute difference; infinite if only one of the two is undefined or infinite."""
     if math.isnan(expected) or math.isnan(result):
         return 0.0 if math.isnan(expected) and math.isnan(result) else math.inf
     if math.isinf(expected) or math.isinf(result):
@@ -97,7 +97,7 @@ def _decibels(a: float, b: float) -> float:
 
 
 def _masked(outside: Callable[[np.ndarray], None]) -> Callable[[float, Way], float]:
-    """Error of the PSNR under a mask, whatever stands outside of it."""
+    """Error of the PSNR under a mask, for any values outside the mask."""
 
     def measure(pixels: float, way: Way) -> float:
         mask = np.zeros((64, 64), bool)
@@ -157,7 +157,7 @@ def _baseline(distance: float, way: Way) -> float:
 
 
 def _symmetric_distances(cameras: list[Camera], pixels: list[np.ndarray]) -> list[float]:
-    """Epipolar distances from the cameras' own matrices with 60 digits: each line runs through the
+    """Epipolar distances from the cameras' matrices with 60 digits: each line runs through the
     images of the other's centre and of a point on the match's ray.
     """
     with mpmath.workdps(60):
@@ -188,7 +188,7 @@ def _symmetric_distances(cameras: list[Camera], pixels: list[np.ndarray]) -> lis
 
 
 def _matches(count: float, way: Way) -> float:
-    """Error of the median and the share of a pair with few matches, beside one with many."""
+    """Error of the median and the share of a pair with few matches, next to one with many."""
     distances = [Fraction(k * k, 7) for k in range(int(count))]
     values = np.array([float(one) for one in distances], way.numpy)
     result = metrics.tsed([values, np.full(20, 0.5, way.numpy)])
@@ -204,8 +204,8 @@ def _matches(count: float, way: Way) -> float:
 
 
 def _contrast(contrast: float, way: Way) -> float:
-    """Error in px of what SIFT finds in a wall and in the same moved by 16 px; a pair is undefined
-    and counted where it finds too little, and nothing is found in black.
+    """Error in px of SIFT matches between a wall and the wall moved by 16 px; a pair is undefined
+    and counted if there are too few matches, and a black picture has none.
     """
     wall = np.kron(np.random.default_rng(0).random((24, 24, 3)), np.ones((8, 8, 1)))
     wall = (contrast * wall).astype(way.numpy)

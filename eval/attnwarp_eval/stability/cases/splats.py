@@ -203,7 +203,7 @@ def _facing_discs(
     (H, W) bool where no cut-off is too close to call.
 
     Equal depths are drawn by x: the order's definition, whose first key this is. Discs here are
-    wider than a pixel, so that the screen filter has no say.
+    wider than a pixel, so that the screen filter has no effect.
     """
     means, scales = (value.double().numpy() for value in (made.means, made.scales))
     points = camera.directions() * depth

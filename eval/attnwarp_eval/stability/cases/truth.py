@@ -1,4 +1,4 @@
-"""Hard cases of the instrument's own truth: rays and surfaces."""
+"""Hard cases of the instrument's truth: rays and surfaces."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _coplanar(gap: float, way: Way) -> float:
 
 
 def _ties(gap: float, way: Way) -> float:
-    """Pixels that blame the lower square without a tie, and ties that do not name it."""
+    """Pixels assigned to the lower square without a tie, and ties without the lower square."""
     geometry, view = _squares(gap, way)
     ties, lowest = geometry.ties(view)
     blamed = (geometry.trace(view).object_id != 1) & ~ties

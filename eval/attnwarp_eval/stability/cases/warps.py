@@ -239,7 +239,7 @@ def _small_picture(size: float) -> Pair:
 
 
 def _behind(distance: float, way: Way) -> float:
-    """Wrong labels of points that lie before, in and behind the plane of the source camera."""
+    """Wrong labels of points in front of, in and behind the plane of the source camera."""
     target = Camera(np.array([[1.0, 0, 2.5], [0, 1.0, 0.5], [0, 0, 1]]), np.eye(4), 5, 1)
     pose = np.eye(4)
     pose[2, 3] = -3.0
@@ -251,7 +251,7 @@ def _behind(distance: float, way: Way) -> float:
 
 
 def _undefined_depth(share: float, way: Way) -> float:
-    """Wrong labels, and values that were made up, where some of the depths are none."""
+    """Number of wrong labels and invented values if some depths are undefined."""
     camera = orbit(10, size=8)
     depth = _depth(camera)
     bad = [0.0, np.nan, np.inf, -1.0, -np.inf, -0.0]
@@ -285,7 +285,7 @@ def random_features(
 
 
 def before_a_plane(size: int) -> Pair:
-    """Two cameras, 25 degrees apart, and a plane through what they look at."""
+    """Two cameras, 25 degrees apart, and a plane through their look-at point."""
     source, target = orbit(0, size=size, height=1), orbit(25, size=size, height=1)
     return Pair(source, target, plane_depth(target, (1, 0, 0), 0.0))
 
@@ -324,7 +324,7 @@ def _opposed(yaw: float, way: Way) -> float:
 
 
 def _rules_of_scale(exponent: float, way: Way) -> tuple[tuple[Camera, Surface], ...]:
-    """Source and target, each with what it sees: a sphere before a wall, in other units, with a
+    """Source and target, each with its view: a sphere in front of a wall, in other units, with a
     hole in each depth map.
     """
     size = 2.0**exponent
@@ -343,8 +343,8 @@ def _rules_of_scale(exponent: float, way: Way) -> tuple[tuple[Camera, Surface], 
 
 @cache
 def _labels_of_rules(precision: str) -> Labels:
-    """Labels of the scene in its own units. Each rule compares lengths with lengths and shares with
-    shares, and a power of two scales lengths exactly: in any units the labels are these.
+    """Labels of the scene in its original units. Each rule compares lengths with lengths and shares
+    with shares, and a power of two scales lengths exactly: in any units the labels are these.
     """
     (source, seen), (target, surface) = _rules_of_scale(0, Way("reference", precision))
     return exact_labels(
@@ -412,7 +412,7 @@ def _step(ratio: float, way: Way) -> float:
     )  # centres at 1, 3, 5: one on the step
     sides = depth.astype(way.numpy).astype(np.float64)[0, [0, 5]]
     off = np.abs(result[..., None] / sides - 1).min(axis=-1)
-    # A step has no depth of its own; the two columns beside it have.
+    # The step has no depth; the two adjacent columns have one.
     beside = np.array([True, False, True])
     wrong = np.isfinite(result) & (off > 1e-12) | (beside & ~np.isfinite(result))
     return float(wrong.sum())
@@ -466,7 +466,7 @@ def grid_sampled(result: Correspondence, features: torch.Tensor) -> torch.Tensor
 
 
 def _grid_type(position: float, way: Way) -> float:
-    """Distance in px from where a grid of this type reads a ramp to the wanted position."""
+    """Distance in px from where a grid of this type reads a ramp to the intended position."""
     width = int(position) + 4
     ramp = (torch.arange(width, dtype=torch.float64) + 0.5).reshape(1, 1, width)
     xy = torch.tensor([[[position + 0.37, 0.5]]], dtype=torch.float64).to(way.dtype)
@@ -474,7 +474,7 @@ def _grid_type(position: float, way: Way) -> float:
 
 
 def _nan_positions(share: float, way: Way) -> float:
-    """Values that positions without a place in the source make up or change."""
+    """Number of values invented or changed by positions outside the source."""
     source, target = orbit(0, size=16, height=1), orbit(25, size=16, height=1)
     whole = positions(Pair(source, target, np.full((16, 16), 4.0)), Way(way.backend))
     xy = whole.xy.clone()
