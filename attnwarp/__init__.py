@@ -3,10 +3,10 @@
 - :mod:`attnwarp.io`: splats and posed pictures from files and to files.
 - :mod:`attnwarp.fit` and :mod:`attnwarp.render`: pictures to splats, and splats to pictures.
 - :mod:`attnwarp.warp`: correspondences, visibility and sampling between two views.
-- :mod:`attnwarp.editing`: editors, and their attention recorded, warped and injected.
+- :mod:`attnwarp.editing`: editors, and recording, warping and injection of their attention.
 - :mod:`attnwarp.methods`: Algorithm 1 (:mod:`attnwarp.methods.attention_warping`), from one edited
-  view to an edited scene, and the methods that it is compared with.
-- :mod:`attnwarp.encoders` and :mod:`attnwarp.losses`: what tuning and metrics need.
+  view to an edited scene, and its baselines.
+- :mod:`attnwarp.encoders` and :mod:`attnwarp.losses`: helpers of tuning and metrics.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
-    # On first use: torch takes a second to import, which `attnwarp --help` should not.
+    # Imported on first use, so that `attnwarp --help` need not wait a second for torch.
     if name == "Camera":
         from attnwarp.camera import Camera
 

@@ -1,4 +1,4 @@
-"""`python -m attnwarp` is the command attnwarp, and its entry point."""
+"""Entry point of `python -m attnwarp`, the command attnwarp."""
 
 from attnwarp.cli.entry import enter
 

@@ -25,14 +25,14 @@ well below it.
 """
 
 EXACT_ROTATION = 1e-12
-"""Up to here a rotation's error is float64 rounding, and it is kept bit for bit."""
+"""Largest error of a rotation that counts as float64 rounding and is kept bit for bit."""
 
 SAME_PLACE = 1e-12
-"""Share of two centres' coordinates below which their distance is rounding."""
+"""Distance of two centres, over their coordinates, below which the distance is rounding."""
 
 
 def nearest_orthonormal(R: Array) -> Array:
-    """The orthonormal (3, 3) matrix nearest to ``R``, by SVD."""
+    """Compute the orthonormal (3, 3) matrix nearest to ``R``, by SVD."""
     U, _, Vt = np.linalg.svd(R)
     nearest: Array = U @ Vt
     return nearest
@@ -40,7 +40,7 @@ def nearest_orthonormal(R: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera without lens distortion.
+    """Pinhole camera without lens distortion.
 
     Args:
         K: (3, 3) intrinsics in pixels: [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]. The principal
@@ -49,12 +49,12 @@ class Camera:
             forward). A rotation that is orthonormal to 1e-12 is kept bit for bit; another is
             replaced by the nearest one, about the same centre of projection.
         width, height: image size in pixels, at least 1.
-        name: a label for people; it takes no part in any computation.
+        name: label for messages; unused in computations.
 
     Raises:
-        ValueError: a wrong shape, a value that is not finite, a size that is no whole number, a
-            focal length that is not positive, a last row that is not [0, 0, 0, 1] ([0, 0, 1] for
-            K), a rotation that is not orthonormal to 1e-5 or mirrors.
+        ValueError: a wrong shape, a non-finite value, a size that is not an integer, a focal length
+            that is not positive, a last row other than [0, 0, 0, 1] ([0, 0, 1] for K), or a
+            rotation that is not orthonormal to 1e-5 or mirrors.
 
     Example:
         >>> from attnwarp import Camera
@@ -113,7 +113,7 @@ class Camera:
                 " pose"
             )
         if error > EXACT_ROTATION:
-            # R^T stands for the inverse of R, and its error times |t| for the camera's place.
+            # R^T replaces the inverse of R; its error times |t| displaces the camera.
             center = -np.linalg.solve(R, pose[:3, 3])
             pose[:3, :3] = nearest_orthonormal(R)
             pose[:3, 3] = -pose[:3, :3] @ center
@@ -136,13 +136,13 @@ class Camera:
         up: Sequence[float] = (0.0, 0.0, 1.0),
         name: str = "",
     ) -> Camera:
-        """Camera at ``position`` looking at ``target`` with square pixels and a centred principal
-        point.
+        """Create a camera at ``position`` that looks at ``target``, with square pixels and a
+        centred principal point.
 
         Args:
             position, target: (3,) world points.
             fov_y: vertical field of view in degrees, in (0, 180).
-            up: (3,) world direction that points up in the image; must not be parallel to the view.
+            up: (3,) world direction that points up in the image; not parallel to the view.
         """
         if not 0 < fov_y < 180:
             raise ValueError(f"fov_y: got {fov_y}, expected degrees in (0, 180)")
@@ -178,19 +178,19 @@ class Camera:
         axes: Literal["opencv", "opengl"] = "opencv",
         name: str = "",
     ) -> Camera:
-        """Camera from a camera-to-world pose, as Nerfstudio, Blender and many loaders give it.
+        """Create a camera from a camera-to-world pose, as in Nerfstudio, Blender and many loaders.
 
         Args:
             camera_to_world: (4, 4) or (3, 4) rigid transform.
             K: (3, 3) intrinsics in pixels.
             width, height: image size in pixels.
-            axes: "opencv" (x right, y down, z forward) or "opengl" (x right, y up, z backward), in
-                which Nerfstudio and Blender write poses.
-            name: see :class:`Camera`.
+            axes: "opencv" (x right, y down, z forward) or "opengl" (x right, y up, z backward), the
+                convention of Nerfstudio and Blender.
+            name: label of the camera, see :class:`Camera`.
 
         Raises:
-            ValueError: another shape or name of axes, a pose that is singular, and all that
-                :class:`Camera` refuses.
+            ValueError: a wrong shape or name of axes, a singular pose, or any value refused by
+                :class:`Camera`.
 
         Example:
             >>> import numpy as np
@@ -216,27 +216,27 @@ class Camera:
 
     @property
     def rotation(self) -> Array:
-        """(3, 3) world-to-camera rotation."""
+        """World-to-camera rotation, (3, 3)."""
         return self.world_to_camera[:3, :3]
 
     @property
     def translation(self) -> Array:
-        """(3,) world-to-camera translation."""
+        """World-to-camera translation, (3,)."""
         return self.world_to_camera[:3, 3]
 
     @property
     def position(self) -> Array:
-        """(3,) centre of projection in world coordinates."""
+        """Centre of projection in world coordinates, (3,)."""
         return -self.rotation.T @ self.translation
 
     @property
     def forward(self) -> Array:
-        """(3,) unit viewing direction in world coordinates."""
+        """Unit viewing direction in world coordinates, (3,)."""
         return self.rotation[2].copy()
 
     def resize(self, width: int, height: int) -> Camera:
-        """Resample the image: a camera with its image resampled to ``width`` x ``height``; u' = u *
-        s exactly on each axis.
+        """Resample the image to ``width`` x ``height``: return the camera of the resized image,
+        with u' = u * s exactly on each axis.
         """
         sx, sy = width / self.width, height / self.height
         return Camera(
@@ -244,17 +244,17 @@ class Camera:
         )
 
     def moved(self, offset: Sequence[float]) -> Camera:
-        """Move the origin of the world: the camera in a world whose origin was moved: world points
-        p become p + ``offset``.
+        """Move the origin of the world: return the camera in a world whose points p become
+        p + ``offset``.
         """
         pose = self.world_to_camera.copy()
         pose[:3, 3] = self.translation - self.rotation @ np.asarray(offset, dtype=np.float64)
         return Camera(self.K, pose, self.width, self.height, self.name)
 
     def relative_to(self, other: Camera) -> Array:
-        """(4, 4) transform from ``other``'s camera axes to this one's.
+        """Compute the (4, 4) transform from ``other``'s camera axes to this camera's.
 
-        It is formed from the difference of the two centres in float64. So a baseline of 1e-6 in a
+        The transform uses the difference of the two centres in float64, so a baseline of 1e-6 in a
         world at 1e6 keeps its digits. A product of the two 4x4 matrices would lose them.
         """
         pose = np.eye(4)
@@ -263,16 +263,16 @@ class Camera:
         return pose
 
     def pixel_centers(self) -> Array:
-        """(H, W, 2) coordinates (x, y) of the pixel centres."""
+        """Compute the pixel centres' coordinates (x, y), (H, W, 2)."""
         x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         return np.stack([x, y], axis=-1)
 
     def directions(self, xy: npt.ArrayLike | None = None) -> Array:
-        """Ray directions K^-1 (x, y, 1) in camera axes with z = 1, so that a point is direction *
-        depth.
+        """Compute ray directions K^-1 (x, y, 1) in camera axes with z = 1, so that a point is
+        direction * depth.
 
         Args:
-            xy: (..., 2) pixel coordinates; the pixel centres, (H, W, 2), if left out.
+            xy: (..., 2) pixel coordinates; by default the pixel centres, (H, W, 2).
 
         Returns:
             (..., 3) float64.
@@ -285,13 +285,13 @@ class Camera:
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def project(self, points: npt.ArrayLike) -> tuple[Array, Array]:
-        """World points to pixels.
+        """Project world points to pixels.
 
         Args:
             points: (..., 3) world coordinates.
 
         Returns:
-            xy: (..., 2) pixels; NaN where the point is not in front of the camera (z <= 0).
+            xy: (..., 2) pixels; NaN for points not in front of the camera (z <= 0).
             z: (...) depth along the optical axis, of either sign.
         """
         camera = (np.asarray(points, dtype=np.float64) - self.position) @ self.rotation.T
@@ -303,14 +303,14 @@ class Camera:
         return (normalised @ self.K.T)[..., :2], z
 
     def unproject(self, xy: npt.ArrayLike, depth: npt.ArrayLike) -> Array:
-        """(..., 3) world points at ``depth`` (along the optical axis) behind pixels ``xy`` (...,
-        2).
+        """Compute (..., 3) world points at ``depth`` (along the optical axis) behind pixels ``xy``
+        (..., 2).
         """
         camera = self.directions(xy) * np.asarray(depth, dtype=np.float64)[..., None]
         return camera @ self.rotation + self.position
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values that :meth:`from_dict` turns back into the same camera, bit for bit."""
+        """Convert to JSON values, from which :meth:`from_dict` restores the camera bit for bit."""
         return {
             "K": self.K.tolist(),
             "world_to_camera": self.world_to_camera.tolist(),
@@ -321,16 +321,16 @@ class Camera:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Camera:
-        """The camera that :meth:`to_dict` wrote."""
+        """Restore the camera from the result of :meth:`to_dict`."""
         return cls(**data)
 
 
 def fundamental(view: Camera, key: Camera) -> Array | None:
-    """(3, 3) float64 F with y^T F x = 0 for pixels x of ``view`` and y of ``key`` that see one
-    point; None where the centres of projection coincide and there is none.
+    """Compute the fundamental matrix F, (3, 3) float64: y^T F x = 0 for pixels x of ``view`` and y
+    of ``key`` that see one point; None if the centres of projection coincide.
 
     F = K_key^-T [t]_x R K_view^-1 with the motion (R, t) from ``view`` to ``key`` (Hartley and
-    Zisserman 2004, section 9.2). Its scale is that of t.
+    Zisserman 2004, section 9.2). F's scale is that of t.
 
     Example:
         >>> from attnwarp.camera import Camera, fundamental

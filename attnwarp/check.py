@@ -1,4 +1,4 @@
-"""Checks at the public doors, whose errors say which argument, what came and what was expected."""
+"""Argument checks of public functions; errors name the argument, its value and the expectation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import torch
 
 Array: TypeAlias = "torch.Tensor | np.ndarray[Any, Any]"
-"""Array of either library."""
+"""Array of torch or numpy."""
 
 
 def shape(
@@ -45,13 +45,13 @@ def shape(
 def same_aspect(size: tuple[int, int], full: tuple[int, int], name: str, remedy: str) -> None:
     """Raise ValueError unless a picture of ``full`` can have been resized to ``size``.
 
-    Each side of the smaller may be rounded in its own way, by less than a pixel.
+    Each side of the smaller picture may be rounded independently, by less than a pixel.
 
     Args:
-        size: (h, w) that came.
-        full: (H, W) of the picture.
+        size: (h, w) of the given picture.
+        full: (H, W) of the full picture.
         name: name of the argument.
-        remedy: the end of the message.
+        remedy: end of the message.
 
     Example:
         >>> from attnwarp import check
@@ -69,8 +69,8 @@ def same_aspect(size: tuple[int, int], full: tuple[int, int], name: str, remedy:
 
 
 def finite(value: torch.Tensor | np.ndarray, name: str) -> None:
-    """Raise ValueError naming the first row of ``value`` that holds a NaN or an infinity."""
-    # torch is not imported for the question: what checks arrays alone should be there at once.
+    """Raise ValueError naming the first row of ``value`` with a NaN or an infinity."""
+    # torch is not imported here, so that checks of numpy arrays stay fast.
     array = value.detach().cpu().numpy() if hasattr(value, "detach") else np.asarray(value)
     bad = ~np.isfinite(array)
     if bad.any():
@@ -82,10 +82,10 @@ def finite(value: torch.Tensor | np.ndarray, name: str) -> None:
 
 
 def tensor(value: Array, name: str) -> torch.Tensor:
-    """Take a tensor as it is, and an array as one that shares its memory where torch can read it.
+    """Return a tensor unchanged; convert an array, sharing its memory if torch can read it.
 
     Raises:
-        TypeError: neither.
+        TypeError: the value is neither a tensor nor an array.
 
     Example:
         >>> import numpy as np
@@ -100,7 +100,7 @@ def tensor(value: Array, name: str) -> torch.Tensor:
         raise TypeError(
             f"{name}: got {type(value).__name__}, expected a torch.Tensor or a NumPy array"
         )
-    # torch takes no array that is flipped, of the other byte order or may not be written.
+    # torch accepts no array that is flipped, of foreign byte order or read-only.
     native = value.dtype.newbyteorder("=")
     if min(value.strides, default=0) < 0:  # also along a side of 1, where NumPy sees no flip
         value = value.copy()
@@ -112,9 +112,9 @@ def instance(value: Any, kind: type, name: str, expected: str) -> None:
 
     Args:
         value: value of the argument.
-        kind: expected kind.
+        kind: expected class.
         name: name of the argument.
-        expected: the kind for the reader, as it is imported.
+        expected: description of the class for the message, as it is imported.
 
     Example:
         >>> from attnwarp import check
@@ -127,12 +127,12 @@ def instance(value: Any, kind: type, name: str, expected: str) -> None:
 
 
 LARGEST = sys.float_info.max
-"""Beyond it a whole number has no float, which every formula takes."""
+"""Largest float; larger integers have no float, which every formula needs."""
 
 
 def is_number(value: Any, *, whole: bool = False) -> bool:
-    """Return True if ``value`` is a number of Python or numpy, of a whole type if asked; no bool
-    is.
+    """Return True if ``value`` is a number of Python or numpy, and an integer if ``whole``; False
+    for a bool.
 
     Example:
         >>> from attnwarp import check
@@ -144,12 +144,12 @@ def is_number(value: Any, *, whole: bool = False) -> bool:
 
 
 def number(value: Any, low: float, high: float, name: str, *, whole: bool = False) -> float:
-    """``value`` as Python's own number, if it is finite and in [low, high], and whole if asked.
+    """Convert ``value`` to a Python number; it must be finite, in [low, high], and whole if asked.
 
-    Numbers of numpy are taken too. A whole number stays an int, so that settings keep their JSON.
+    Numbers of numpy are accepted. A whole number stays an int, so that settings keep their JSON.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the value violates these conditions.
 
     Example:
         >>> import numpy as np
@@ -160,7 +160,7 @@ def number(value: Any, low: float, high: float, name: str, *, whole: bool = Fals
         Traceback (most recent call last):
         ValueError: steps: got 2.5, expected a whole number >= 0
     """
-    # As Python's own before it is compared: the largest float has no float32.
+    # Converted to Python's type before comparison, since the largest float has no float32.
     plain: float = math.nan
     if is_number(value, whole=whole):
         plain = int(value) if isinstance(value, numbers.Integral) else float(value)
@@ -174,10 +174,10 @@ def number(value: Any, low: float, high: float, name: str, *, whole: bool = Fals
 
 
 def size(value: Any, name: str) -> tuple[int, int]:
-    """``value`` as a (height, width) of whole numbers from 1.
+    """Convert ``value`` to a (height, width) of positive integers.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the value is something else.
 
     Example:
         >>> from attnwarp import check
@@ -219,7 +219,7 @@ def text(value: Any, name: str) -> None:
 
 
 def one_of(value: str, allowed: Sequence[str], name: str) -> str:
-    """Return ``value`` if it is among ``allowed``, else raise ValueError that lists what is."""
+    """Return ``value`` if it is among ``allowed``, else raise ValueError listing them."""
     if value not in allowed:
         raise ValueError(
             f"{name}: got {value!r}, expected one of {', '.join(map(repr, allowed))}"

@@ -1,4 +1,4 @@
-"""Colours as a person sees them: CIE Lab, and the difference of two colours."""
+"""Perceptual colours: CIE Lab, and the difference of two colours."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ RGB_TO_XYZ = np.array(
     [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
 )
 WHITE = np.array([0.95047, 1.0, 1.08883])
-"""Linear sRGB to CIE XYZ, and the white of the illuminant D65 for the observer of 2 degrees."""
+"""White of illuminant D65 for the 2 degree observer; ``RGB_TO_XYZ`` converts linear sRGB to XYZ."""
 
 
 def to_lab(srgb: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """CIE Lab of sRGB colours, by IEC 61966-2-1 and CIE 15. OpenCV's is off by up to 0.4.
+    """Convert sRGB to CIE Lab, by IEC 61966-2-1 and CIE 15. OpenCV's result is off by up to 0.4.
 
     Args:
         srgb: (..., 3), uint8 or floating in [0, 1].
@@ -38,15 +38,15 @@ def to_lab(srgb: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
 
 
 def ciede2000(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """CIEDE2000, dE00, of pairs of colours, by Sharma, Wu and Dalal, "The CIEDE2000
+    """Compute CIEDE2000, dE00, of pairs of colours, by Sharma, Wu and Dalal, "The CIEDE2000
     Color-Difference Formula", Color Research and Application 30, 2005. A difference of 1 is just
-    seen side by side.
+    visible side by side.
 
     Args:
-        a, b: (..., 3) in CIE Lab.
+        a, b: (..., 3) colours in CIE Lab.
 
     Returns:
-        (...) of the pairs.
+        (...) differences of the pairs.
 
     Example:
         >>> import numpy as np
@@ -55,18 +55,18 @@ def ciede2000(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[np.float6
     """
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     chroma = (np.hypot(a[..., 1], a[..., 2]) + np.hypot(b[..., 1], b[..., 2])) / 2
-    # Half of it is added to a, which rounds the neighbourhood of grey.
+    # Half of this factor is added to a, which makes neighbourhoods of grey rounder.
     stretch = 1 + (1 - np.sqrt(chroma**7 / (chroma**7 + 25.0**7))) / 2
     (L1, C1, h1), (L2, C2, h2) = (
         (v[..., 0], np.hypot(stretch * v[..., 1], v[..., 2]),
          np.arctan2(v[..., 2], stretch * v[..., 1]) % (2 * np.pi))
         for v in (a, b)
     )  # fmt: skip
-    # Of opposite hues rounding must not decide which way is the shorter.
+    # For opposite hues, rounding must not decide which direction is shorter.
     turn = h2 - h1 - 2 * np.pi * np.sign(h2 - h1) * (abs(h2 - h1) > np.pi + 1e-9)
     dH = 2 * np.sqrt(C1 * C2) * np.sin(turn / 2)
     L, C = (L1 + L2) / 2, (C1 + C2) / 2
-    h = np.where(C1 * C2 > 0, h1 + turn / 2, h1 + h2)  # a grey has no hue: the other's
+    h = np.where(C1 * C2 > 0, h1 + turn / 2, h1 + h2)  # a grey has no hue: take the other colour's
     T = (
         1 - 0.17 * np.cos(h - np.radians(30)) + 0.24 * np.cos(2 * h)
         + 0.32 * np.cos(3 * h + np.radians(6)) - 0.2 * np.cos(4 * h - np.radians(63))

@@ -1,4 +1,4 @@
-"""The device and the precision that a command computes in, by their names."""
+"""Device and precision of a command, by name."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ TYPES = ("auto", "float32", "float16", "bfloat16")
 
 
 def device_of(name: str) -> torch.device:
-    """A device by its name, "cpu", "cuda" or "cuda:1".
+    """Find a device by name, "cpu", "cuda" or "cuda:1".
 
     Raises:
-        InputError: there is none of that name.
+        InputError: no device has this name.
 
     Example:
         >>> device_of("cpu")
@@ -43,16 +43,16 @@ def device_of(name: str) -> torch.device:
 
 
 def choose(name: str, report: Reporter = SILENT, *, splats: bool = True) -> str:
-    """The device of a command's ``--device``: "auto" is the GPU where there is one.
+    """Resolve a command's ``--device``: "auto" is the GPU if there is one.
 
     Args:
-        name: "auto", or as of :func:`device_of`.
-        report: receives a line where "auto" finds a GPU.
-        splats: they are rendered there too, which takes the extra ``gpu``.
+        name: "auto", or a name of :func:`device_of`.
+        report: receiver of a line if "auto" finds a GPU.
+        splats: True if splats are rendered there too, which needs the extra ``gpu``.
 
     Raises:
-        InputError: no such device.
-        MissingExtraError: a GPU is named, and the extra is missing.
+        InputError: the device does not exist.
+        MissingExtraError: a GPU is requested, but the extra is missing.
 
     Example:
         >>> choose("cpu")
@@ -76,15 +76,15 @@ def choose(name: str, report: Reporter = SILENT, *, splats: bool = True) -> str:
 
 
 def type_of(name: str, device: str) -> torch.dtype:
-    """The precision of an editor's networks.
+    """Resolve the precision of an editor's networks.
 
     Args:
         name: "float32", "float16", "bfloat16" or "auto": float16 on a GPU, float32 elsewhere. Edits
             by the bundled editors stay within 71 dB of float32 in float16, and 51 dB in bfloat16.
-        device: as :func:`choose` gives it.
+        device: device name, as returned by :func:`choose`.
 
     Raises:
-        InputError: no such precision.
+        InputError: the precision is unknown.
 
     Example:
         >>> type_of("auto", "cpu"), type_of("auto", "cuda"), type_of("bfloat16", "cpu")
@@ -101,7 +101,7 @@ def type_of(name: str, device: str) -> torch.dtype:
 
 
 def peak_memory(device: str) -> str:
-    """The most memory of a GPU that torch held so far, for the end of a line; nothing for a CPU.
+    """Describe torch's peak memory on a GPU, for the end of a line; empty for a CPU.
 
     Example:
         >>> peak_memory("cpu")
@@ -115,8 +115,8 @@ def peak_memory(device: str) -> str:
 
 
 def on_cpu_unless_named(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorate a function so that tensors whose device it does not name lie on the CPU, also in a
-    process that makes them elsewhere (``torch.set_default_device``).
+    """Decorate a function so that tensors without a named device are created on the CPU, even if
+    the process's default differs (``torch.set_default_device``).
 
     Example:
         >>> import torch
@@ -132,7 +132,7 @@ def on_cpu_unless_named(function: Callable[P, T]) -> Callable[P, T]:
     def called(*arguments: P.args, **named: P.kwargs) -> T:
         import torch
 
-        # Under a context every call of torch passes through Python, so it is entered where needed.
+        # The context slows every torch call, so it is entered only if needed.
         if torch.get_default_device().type == "cpu":
             return function(*arguments, **named)
         with torch.device("cpu"):

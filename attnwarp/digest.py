@@ -1,4 +1,4 @@
-"""SHA-256 of inputs: whether what is taken up again belongs to the same ones."""
+"""SHA-256 of inputs, to check that a resumed run has the same inputs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def digest(*parts: Any) -> str:
-    """SHA-256 of arrays, bytes and JSON values, one after another.
+    """Hash arrays, bytes and JSON values in sequence (SHA-256).
 
     Example:
         >>> import numpy as np
@@ -24,7 +24,7 @@ def digest(*parts: Any) -> str:
 
 
 def digest_each(parts: Iterable[Any]) -> str:
-    """:func:`digest` of parts that are made one at a time, so that none needs to be kept.
+    """Compute :func:`digest` of parts from an iterator, keeping one part at a time.
 
     Example:
         >>> digest_each(number for number in (1, 2)) == digest(1, 2)

@@ -1,4 +1,4 @@
-"""Errors and warnings about a person's input: the command line shows their message, and exits with
+"""Errors and warnings about user input: the command line prints their message, and exits with
 code 2 after an error.
 """
 
@@ -15,11 +15,11 @@ V = TypeVar("V")
 
 @dataclass(frozen=True)
 class Extra:
-    """An extra of pyproject.toml.
+    """Optional dependency group (extra) of pyproject.toml.
 
     Attributes:
-        modules: that it brings and the plain package lacks.
-        lack: cost of its lack.
+        modules: modules that only the extra installs.
+        lack: consequence of a missing extra.
     """
 
     modules: tuple[str, ...]
@@ -48,11 +48,11 @@ EXTRAS = {
     ),
     "colmap": Extra(("pycolmap",), "no reconstruction of edited pictures by COLMAP"),
 }  # fmt: skip
-"""Every extra that a user may lack, by its name in pyproject.toml."""
+"""All extras, by their names in pyproject.toml."""
 
 
 def install_command(*extras: str) -> str:
-    """Command that installs extras. The package is not published, so a checkout is what there is.
+    """Write the command that installs extras; it needs a checkout, as the package is unpublished.
 
     Example:
         >>> print(install_command("edit", "eval"))
@@ -62,17 +62,18 @@ def install_command(*extras: str) -> str:
 
 
 class InputError(ValueError):
-    """An input that cannot be used. The message names the file, what came, what was expected, and
-    the remedy.
+    """Error for an unusable input. The message names the file, its value, the expectation and the
+    remedy.
     """
 
 
 class MissingExtraError(InputError):
-    """A package that is not installed since only some users need it. The message names its extra.
+    """Error for a package that is not installed, since it belongs to an extra. The message names
+    the extra.
 
     Args:
         module: top-level name of the missing module, one of :data:`EXTRAS`.
-        extra: the extra that brings it.
+        extra: name of the extra.
     """
 
     def __init__(self, module: str, extra: str) -> None:
@@ -85,7 +86,7 @@ class MissingExtraError(InputError):
 
 
 def missing_extra(error: ImportError) -> MissingExtraError | None:
-    """The error to show instead of a failed import; None if no extra brings the module.
+    """Convert a failed import into the error to show; None if no extra has the module.
 
     Example:
         >>> error = missing_extra(ModuleNotFoundError(name="diffusers"))
@@ -101,7 +102,7 @@ def missing_extra(error: ImportError) -> MissingExtraError | None:
 
 @contextmanager
 def optional_imports() -> Iterator[None]:
-    """Imports of packages that an extra brings; where one is missing, the error names the extra.
+    """Wrap imports of an extra's packages, so that the error for a missing one names the extra.
 
     Raises:
         MissingExtraError: the package is not installed.
@@ -120,13 +121,13 @@ def optional_imports() -> Iterator[None]:
 
 
 class InputWarning(UserWarning):
-    """An input that is used, though perhaps not as it was meant. The message names the file, and
-    what was left out or changed.
+    """Warning for an input that is used, though perhaps not as intended. The message names the
+    file, and the ignored or changed part.
     """
 
 
 class Named(dict[str, V]):
-    """A dictionary whose error for an unknown name lists the known ones, and the nearest.
+    """Dictionary whose error for an unknown name lists the known names and the nearest.
 
     Example:
         >>> Named(corrected=1, paper=2)["correct"]
@@ -141,7 +142,7 @@ class Named(dict[str, V]):
 
 
 def suggest(word: str, allowed: Sequence[str]) -> str:
-    """The end of a message: the allowed word nearest to a misspelt one; empty where none is near.
+    """Write a message's end with the allowed word nearest to a misspelt one; empty if none is near.
 
     Example:
         >>> suggest("lr_mean", ["lr_means", "ssim"])
@@ -152,5 +153,5 @@ def suggest(word: str, allowed: Sequence[str]) -> str:
 
 
 def nearest(word: str, allowed: Sequence[str]) -> str | None:
-    """The allowed word nearest to a misspelt one; None where none is near."""
+    """Find the allowed word nearest to a misspelt one; None if none is near."""
     return next(iter(difflib.get_close_matches(word, allowed, n=1)), None)

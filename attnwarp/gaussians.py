@@ -1,4 +1,4 @@
-"""Gaussians: a scene as 2D (surfel) or 3D Gaussian splats."""
+"""Gaussians: scenes as 2D (surfel) or 3D Gaussian splats."""
 
 from __future__ import annotations
 
@@ -25,36 +25,36 @@ SCREEN_FILTER = 0.3
 """Variance in square pixels that 3DGS adds to a projected splat."""
 
 LEAST_FILTER, LARGEST_FILTER = 1e-4, 100.0
-"""Limits of the screen filter, px^2: without any, a splat seen edge-on would have no width."""
+"""Limits of the screen filter, px^2: without a filter, a splat seen edge-on has no width."""
 
 
 @dataclass(eq=False)
 class Gaussians:
-    """N Gaussian splats.
+    """Set of N Gaussian splats.
 
     Args:
         kind: "2d" for flat discs with two scales (2DGS), "3d" for ellipsoids with three (3DGS).
         means: (N, 3) centres, float32 or float64, relative to ``origin``, in scene units.
-        quats: (N, 4) rotations as wxyz, any length but zero. They turn the splat's own axes into
+        quats: (N, 4) rotations as wxyz, any length but zero. They rotate the splat's axes into
             world axes; the third axis of a 2D splat is its normal.
         scales: (N, 2) for "2d", (N, 3) for "3d": standard deviations, linear, positive, in scene
             units.
         opacities: (N,) in [0, 1].
         sh: (N, (degree + 1)^2, 3) spherical-harmonic coefficients of sRGB colour, degree 0 to 3, in
             the layout of the common PLY files: colour = max(0, sum_k sh_k Y_k(direction) + 0.5).
-        origin: (3,) float64 world position of the coordinate zero of ``means``. Keeps far-away
-            scenes exact.
-        antialiased: the splats were fitted with the antialiased (opacity-compensated) 3DGS
+        origin: (3,) float64 world position of the zero of ``means``, which keeps far-away scenes
+            exact.
+        antialiased: True for splats fitted with the antialiased (opacity-compensated) 3DGS
             rasteriser.
-        screen_filter: variance in square pixels that is added to a projected 3D splat: 0.3 of 3DGS,
-            0.1 of Mip-Splatting. A model is drawn with that which it was fitted with. 2D splats
-            have a filter of their own.
+        screen_filter: variance in square pixels added to a projected 3D splat: 0.3 in 3DGS, 0.1 in
+            Mip-Splatting. A model must be drawn with the filter it was fitted with. 2D splats use
+            a separate filter.
 
     Raises:
-        ValueError: a wrong shape, a value that is not finite, a zero quaternion, a scale that is
-            not positive, an opacity outside [0, 1]; the message names the argument and the first
+        ValueError: a wrong shape, a non-finite value, a zero quaternion, a scale that is not
+            positive, or an opacity outside [0, 1]; the message names the argument and the first
             bad row.
-        TypeError: neither a tensor nor a NumPy array, which becomes one.
+        TypeError: an argument is neither a tensor nor a NumPy array (which is converted).
 
     Example:
         >>> import torch
@@ -131,14 +131,14 @@ class Gaussians:
 
     @staticmethod
     def sh_from_rgb(rgb: check.Array) -> torch.Tensor:
-        """(N, 1, 3) degree-0 coefficients of (N, 3) sRGB colours in [0, 1]."""
+        """Convert (N, 3) sRGB colours in [0, 1] to degree-0 coefficients, (N, 1, 3)."""
         rgb = check.tensor(rgb, "rgb")
         check.shape(rgb, ("N", 3), "rgb")
         return ((rgb - 0.5) / SH_C0)[:, None, :]
 
     def rotations(self) -> torch.Tensor:
-        """(N, 3, 3) rotation matrices; column k is the splat's axis k in world coordinates."""
-        # Squares of tiny or huge numbers leave the float's range. A power of two costs no bit.
+        """Compute rotation matrices, (N, 3, 3); column k is the splat's axis k in the world."""
+        # Squares of tiny or huge numbers overflow or underflow; scaling by a power of two is exact.
         largest = self.quats.detach().abs().amax(dim=-1, keepdim=True)
         scale = torch.frexp(largest).mantissa / largest
         quats = self.quats * scale.clamp(max=1 / torch.finfo(scale.dtype).tiny)
@@ -151,9 +151,9 @@ class Gaussians:
         return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
 
     def normals(self) -> torch.Tensor:
-        """(N, 3) unit normals in world coordinates, of arbitrary sign.
+        """Compute unit normals in world coordinates, (N, 3), of arbitrary sign.
 
-        The third axis of a 2D splat, the axis of the smallest scale of a 3D one.
+        A normal is the third axis of a 2D splat, the axis of the smallest scale of a 3D splat.
         """
         R = self.rotations()
         if self.kind == "2d":
@@ -162,21 +162,21 @@ class Gaussians:
         return R.gather(2, axis[:, None, None].expand(-1, 3, 1))[:, :, 0]
 
     def world_means(self) -> npt.NDArray[np.float64]:
-        """(N, 3) float64 centres in world coordinates, origin included."""
+        """Compute centres in world coordinates, (N, 3) float64, origin included."""
         return self.means.detach().cpu().numpy().astype(np.float64) + self.origin
 
     def select(self, index: torch.Tensor) -> Gaussians:
-        """The splats that a (N,) boolean mask or (M,) integer index names, in that order."""
+        """Select splats by an (N,) boolean mask or an (M,) integer index, in that order."""
         return self._map(lambda tensor: tensor[index])
 
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> Gaussians:
-        """A copy in another floating dtype or on another device."""
+        """Copy the splats to another floating dtype or device."""
         return self._map(lambda tensor: tensor.to(dtype=dtype, device=device))
 
     def with_sh_degree(self, degree: int) -> Gaussians:
-        """The splats with harmonics up to ``degree``: further ones are cut, missing ones are 0.
+        """Limit or extend harmonics to ``degree``: higher ones are dropped, missing ones are 0.
 
         Example:
             >>> import torch
@@ -195,7 +195,7 @@ class Gaussians:
         return replace(self, sh=torch.cat([self.sh[:, :count], missing], dim=1))
 
     def used_sh_degree(self) -> int:
-        """The highest degree of the harmonics with a coefficient that is not 0.
+        """Find the highest degree of the harmonics with a nonzero coefficient.
 
         Example:
             >>> import torch
@@ -211,13 +211,13 @@ class Gaussians:
         return math.isqrt(int(used.max())) if len(used) else 0
 
     def digest(self) -> str:
-        """SHA-256 of the splats, as hexadecimal digits."""
+        """Hash the splats (SHA-256), as hexadecimal digits."""
         names = ("means", "quats", "scales", "opacities", "sh")
         arrays = [getattr(self, name).detach().cpu().numpy() for name in names]
         return digest(self.kind, self.antialiased, self.screen_filter, self.origin, *arrays)
 
     def detach(self) -> Gaussians:
-        """Detach the splats: their values, outside autograd."""
+        """Detach the splats from autograd."""
         return self._map(torch.Tensor.detach)
 
     def _map(self, change: Any) -> Gaussians:

@@ -1,5 +1,5 @@
-"""Losses of a fit: differences of pictures, and regularisers of the surface that the splats
-describe.
+"""Losses of a fit: differences of pictures, and regularisers of the surface described by the
+splats.
 
 Pictures are H x W x C, sRGB in [0, 1]. Every loss is a mean over pixels, so that its weight does
 not depend on the image's size.
@@ -29,17 +29,17 @@ SSIM_SIGMA = 1.5
 
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
-"""Its two stabilising constants, for values in [0, 1]."""
+"""Stabilising constants of SSIM, for values in [0, 1]."""
 
 
 def l1(image: check.Array, target: check.Array) -> Tensor:
-    """Mean absolute difference of two pictures, over pixels and channels.
+    """Compute the mean absolute difference of two pictures, over pixels and channels.
 
     Args:
-        image, target: (H, W, C) of one shape, of any range.
+        image, target: (H, W, C) pictures of one shape, of any range.
 
     Raises:
-        ValueError: different shapes.
+        ValueError: the shapes differ.
 
     Example:
         >>> import torch
@@ -51,14 +51,14 @@ def l1(image: check.Array, target: check.Array) -> Tensor:
 
 
 def psnr(image: check.Array, target: check.Array) -> float:
-    """Peak signal-to-noise ratio in dB, -10 log10 of the mean squared error; infinite when they are
-    equal. The error is a mean in float64.
+    """Compute the peak signal-to-noise ratio in dB, -10 log10 of the mean squared error in float64;
+    infinite for equal pictures.
 
     Args:
-        image, target: (H, W, C) of one shape, in [0, 1].
+        image, target: (H, W, C) pictures of one shape, in [0, 1].
 
     Raises:
-        ValueError: different shapes.
+        ValueError: the shapes differ.
 
     Example:
         >>> import torch
@@ -71,7 +71,7 @@ def psnr(image: check.Array, target: check.Array) -> float:
 
 
 def psnr_of_mse(error: float) -> float:
-    """-10 log10 of a mean squared error of values in [0, 1]; infinite for 0, NaN for NaN.
+    """Compute -10 log10 of a mean squared error of values in [0, 1]; infinite for 0, NaN for NaN.
 
     To average views, average the error.
 
@@ -83,20 +83,20 @@ def psnr_of_mse(error: float) -> float:
 
 
 def ssim(image: check.Array, target: check.Array) -> Tensor:
-    """Mean structural similarity (Wang et al. 2004) of two (H, W, C) pictures in [0, 1]; 1 when
-    they are equal.
+    """Compute the mean structural similarity (Wang et al. 2004) of two (H, W, C) pictures in [0,
+    1]; 1 for equal pictures.
 
-    A mean over the windows that lie wholly inside the picture and over channels, as in the authors'
-    own code and in scikit-image's ``structural_similarity(gaussian_weights=True, sigma=1.5,
-    use_sample_covariance=False)``. The code of 3DGS pads with zeros instead and so also scores
-    windows that are partly outside. Differentiable in both.
+    The mean covers channels and all windows completely inside the picture, as in the authors' code
+    and in scikit-image's ``structural_similarity(gaussian_weights=True, sigma=1.5,
+    use_sample_covariance=False)``. The code of 3DGS pads with zeros instead, so it also scores
+    windows that are partly outside. The result is differentiable in both.
 
     Args:
-        image, target: image and target of one shape, at least 11 x 11 pixels, float32 or float64.
+        image, target: pictures of one shape, at least 11 x 11 pixels, float32 or float64.
 
     Raises:
-        ValueError: different shapes, another type, or a picture smaller than the window, for which
-            it is undefined.
+        ValueError: the shapes differ, the type is not supported, or a picture is smaller than the
+            window.
 
     Example:
         >>> import torch
@@ -108,7 +108,7 @@ def ssim(image: check.Array, target: check.Array) -> Tensor:
 
 
 def ssim_map(image: check.Array, target: check.Array) -> Tensor:
-    """(H - 10, W - 10, C) structural similarity of each window; see :func:`ssim`.
+    """Compute the structural similarity of each window, (H - 10, W - 10, C); see :func:`ssim`.
 
     Args:
         image, target: as :func:`ssim`.
@@ -128,7 +128,7 @@ def ssim_map(image: check.Array, target: check.Array) -> Tensor:
 
 
 def ssim_terms(image: check.Array, target: check.Array) -> tuple[Tensor, Tensor]:
-    """The two factors of :func:`ssim_map`, which scales weigh apart in MS-SSIM: luminance, and
+    """Compute the two factors of :func:`ssim_map`, weighted separately in MS-SSIM: luminance, and
     contrast and structure.
 
     Args:
@@ -153,13 +153,13 @@ def ssim_terms(image: check.Array, target: check.Array) -> tuple[Tensor, Tensor]
 
 
 def check_sizes(cameras: Sequence[Camera], smallest: int, loss: str, setting: str) -> None:
-    """Raise ValueError that names the first view that is too small for a loss.
+    """Raise ValueError, naming the first such view, if a view is too small for a loss.
 
     Args:
         cameras: cameras of the views.
-        smallest: side in px that the loss takes.
-        loss: for the message.
-        setting: the loss's weight.
+        smallest: smallest side in px accepted by the loss.
+        loss: name of the loss, for the message.
+        setting: name of the loss's weight.
 
     Example:
         >>> import numpy as np
@@ -178,7 +178,7 @@ def check_sizes(cameras: Sequence[Camera], smallest: int, loss: str, setting: st
 
 
 def _windowed(image: check.Array, target: check.Array) -> tuple[Tensor, Tensor]:
-    """Two pictures that SSIM is defined for, as tensors."""
+    """Check that SSIM is defined for two pictures, and convert them to tensors."""
     image, target = _same(image, target)
     if image.ndim != 3:
         raise ValueError(f"image: got shape {tuple(image.shape)}, expected (H, W, C)")
@@ -197,7 +197,7 @@ def _windowed(image: check.Array, target: check.Array) -> tuple[Tensor, Tensor]:
 
 
 def _moments(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """mu_x, mu_y and the a1, a2, b1, b2 of similarity = a1 a2 / (b1 b2), for each window."""
+    """Compute mu_x, mu_y and a1, a2, b1, b2 of similarity = a1 a2 / (b1 b2), for each window."""
     mu_x, mu_y = _blur(x), _blur(y)
     var_x = _blur(x * x) - mu_x * mu_x
     var_y = _blur(y * y) - mu_y * mu_y
@@ -208,7 +208,7 @@ def _moments(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tens
 
 
 class _Ssim(torch.autograd.Function):
-    """SSIM with its own backward pass: eight blurs in place of ten, and few passes over memory.
+    """SSIM with an explicit backward pass: eight blurs instead of ten, and few memory passes.
 
     With mu = blur(x), e = blur(x^2), e12 = blur(x y) the similarity is a function of the five
     blurred images, and the blur is its own adjoint: dx = blur(dmu) + 2 x blur(de) + y blur(de12).
@@ -249,7 +249,7 @@ def _kernel() -> npt.NDArray[np.float64]:
 
 
 def _filter(values: Tensor) -> Tensor:
-    """Gaussian blur of (H, W, C), zeros outside. OpenCV's is 10 times as fast as a torch
+    """Blur (H, W, C) by a Gaussian, zeros outside. OpenCV's filter is 10 times as fast as a torch
     convolution on a CPU.
     """
     if values.device.type != "cpu":
@@ -262,9 +262,9 @@ def _filter(values: Tensor) -> Tensor:
 
 
 def _convolved(values: Tensor) -> Tensor:
-    """:func:`_filter` by two convolutions, which need no way over main memory."""
+    """Compute :func:`_filter` by two convolutions, without a copy to main memory."""
     weights = torch.tensor(_kernel(), dtype=values.dtype, device=values.device).reshape(1, 1, -1, 1)
-    # In true float32: cuDNN would take TF32, of 10 bits, by default.
+    # Full float32, since cuDNN defaults to TF32 with 10 bits.
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
         rows = torch.nn.functional.conv2d(values.permute(2, 0, 1)[:, None], weights, padding="same")
         both = torch.nn.functional.conv2d(rows, weights.transpose(2, 3), padding="same")
@@ -272,22 +272,22 @@ def _convolved(values: Tensor) -> Tensor:
 
 
 def _blur(values: Tensor) -> Tensor:
-    """(H - 10, W - 10, C): weighted means over the windows inside the picture."""
+    """Compute weighted means over the windows inside the picture, (H - 10, W - 10, C)."""
     edge = SSIM_WINDOW // 2
     return _filter(values)[edge:-edge, edge:-edge]
 
 
 def _spread(values: Tensor) -> Tensor:
-    """The adjoint of :func:`_blur`: (H - 10, W - 10, C) to (H, W, C)."""
+    """Apply the adjoint of :func:`_blur`: (H - 10, W - 10, C) to (H, W, C)."""
     edge = SSIM_WINDOW // 2
     return _filter(torch.nn.functional.pad(values, (0, 0, edge, edge, edge, edge)))
 
 
 def normal_consistency(view: Render) -> Tensor:
-    """Mean over pixels of sum_i w_i (1 - n_i . N), N the normal of the rendered depth (2DGS).
+    """Average sum_i w_i (1 - n_i . N) over pixels, N the normal of the rendered depth (2DGS).
 
-    That sum is alpha - (sum_i w_i n_i) . N. Pixels where N is undefined (the image's border, edges
-    of what is drawn) count as 0. Gradients flow through both normals. Source: Huang et
+    The sum equals alpha - (sum_i w_i n_i) . N. Pixels with undefined N (the image's border, edges
+    of the drawn surface) count as 0. Gradients flow through both normals. Source: Huang et
     al. 2024 (2DGS).
 
     Args:
@@ -305,7 +305,7 @@ def normal_consistency(view: Render) -> Tensor:
         True
     """
     if view.backend == "cpu" and not view._pose.requires_grad:
-        # Here, as numba takes its time to import.
+        # Imported here, since numba is slow to import.
         from attnwarp.render import consistency
 
         pose = view._pose[:3, :3]
@@ -319,7 +319,7 @@ def normal_consistency(view: Render) -> Tensor:
 
 
 def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.0) -> Tensor:
-    """Mean over pixels of the spread of the splats that share a ray.
+    """Average over pixels the depth spread of the splats along a ray.
 
     Args:
         view: rendered view.
@@ -327,11 +327,11 @@ def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.
             w_i |sum_{j<i} w_j (z_i - z_j)|, j composited before i: cheaper, and less where splats
             intersect. "l2_ndc", sum_{j<i} w_i w_j (m_i - m_j)^2, each pair once, with depths mapped
             to [0, 1] (the original 2DGS code).
-        scale: a length in scene units that "l1" and "ordered" are divided by, so that their weight
+        scale: length in scene units by which "l1" and "ordered" are divided, so that their weight
             does not depend on the scene's unit.
 
     Raises:
-        ValueError: another form.
+        ValueError: the form is unknown.
 
     Example:
         >>> import torch
@@ -351,7 +351,7 @@ def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.
 
 
 def _same(image: check.Array, target: check.Array) -> tuple[Tensor, Tensor]:
-    """Two pictures of one shape, as tensors."""
+    """Check that two pictures have one shape, and convert them to tensors."""
     image, target = check.tensor(image, "image"), check.tensor(target, "target")
     if image.shape != target.shape:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Place of compiled kernels: beside their modules, or where this user can write."""
+"""Folder of compiled kernels: next to their modules, or a folder writable by this user."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ HERE = Path(__file__).parent
 
 
 def kernel_folder() -> Path | None:
-    """The folder of compiled kernels; None for numba's own choice, beside each module.
+    """Choose the folder of compiled kernels; None for numba's default, next to each module.
 
-    In a container or an installation of another user nothing can be written there, and numba then
+    In a container or another user's installation the default folder is not writable, and numba then
     refuses to compile at all.
     """
     if os.environ.get("NUMBA_CACHE_DIR"):
@@ -24,7 +24,7 @@ def kernel_folder() -> Path | None:
 
 
 def _chosen() -> bool:
-    """Tell numba the folder; False where nothing can be kept."""
+    """Set numba's cache folder; return False if no folder is writable."""
     import numba
 
     folder = kernel_folder()
@@ -34,4 +34,4 @@ def _chosen() -> bool:
 
 
 CACHE = _chosen()
-"""numba's option ``cache`` for every kernel."""
+"""Value of numba's option ``cache`` for every kernel."""

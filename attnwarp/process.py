@@ -17,19 +17,19 @@ from typing import Any
 from attnwarp.reporting import SILENT, Reporter
 
 RETRY_SECONDS = 0.01
-"""Pause before a lost interrupt is sent again: the destructor that lost it is left by then."""
+"""Pause before a lost interrupt is sent again, by when the destructor that lost it has ended."""
 
 
 def skip_last_collection() -> None:
-    """End this process without a last search for garbage.
+    """End this process without a last garbage collection.
 
-    The interpreter searches once more as it ends: half a second of torch's objects.
+    The interpreter collects once more at exit: half a second for torch's objects.
     """
     atexit.register(gc.freeze)
 
 
 def core_count() -> int:
-    """Cores that this process may use; all of the machine's where the system cannot tell (macOS).
+    """Count the cores available to this process; all cores if the system cannot tell (macOS).
 
     Example:
         >>> core_count() >= 1
@@ -40,24 +40,24 @@ def core_count() -> int:
 
 
 def cache_dir() -> Path:
-    """The folder of derived files: ``$ATTNWARP_CACHE``, else ``$XDG_CACHE_HOME/attnwarp``, else
-    ``~/.cache/attnwarp``.
+    """Return the folder of derived files: ``$ATTNWARP_CACHE``, else ``$XDG_CACHE_HOME/attnwarp``,
+    else ``~/.cache/attnwarp``.
 
-    Everything in it can be recomputed and may be deleted at any time.
+    All its files can be recomputed and may be deleted at any time.
     """
     if folder := os.environ.get("ATTNWARP_CACHE"):
         return Path(folder).expanduser()
-    # Not Path.home(), which raises where a container's user has none.
+    # Not Path.home(), which raises for a container's user without a home.
     home = os.path.expanduser("~/.cache")  # noqa: PTH111
     return Path(os.environ.get("XDG_CACHE_HOME") or home) / "attnwarp"
 
 
 def kernel_folders(name: str) -> Iterator[Path]:
-    """Folders for compiled kernels that belong to this user, made if need be: in the cache, then in
-    the temporary folder.
+    """Iterate over this user's folders for compiled kernels, created if missing: in the cache, then
+    in the temporary folder.
 
-    What lies there is run, and in a shared place another user may have made the folder, or one
-    between it and the temporary folder: there is none.
+    Files there are executed, so a folder is skipped if another user may have created it, or a
+    parent between it and the temporary folder.
 
     Args:
         name: name of the compiler, such as "numba".
@@ -73,11 +73,11 @@ def kernel_folders(name: str) -> Iterator[Path]:
 
 
 def resend_lost_interrupts() -> None:
-    """Send Ctrl-C again where a destructor has swallowed it.
+    """Send Ctrl-C again if a destructor has swallowed it.
 
-    Python raises KeyboardInterrupt in whatever runs. Out of a destructor no exception leaves, so
-    it is printed as ignored and the program goes on. The renderer's memory pool runs one for every
-    freed array.
+    Python raises KeyboardInterrupt in the running code. An exception cannot leave a destructor, so
+    it is printed as ignored and the program continues. The renderer's memory pool runs a destructor
+    for every freed array.
     """
     report, main = sys.unraisablehook, threading.get_ident()
 
@@ -91,24 +91,24 @@ def resend_lost_interrupts() -> None:
 
 
 STOPS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
-"""Signals that ask a program to end, besides Ctrl-C: a polite kill, and the terminal's end where it
-has one (not on Windows).
+"""Signals that ask a program to end, besides Ctrl-C: SIGTERM, and SIGHUP where it exists (not on
+Windows).
 """
 
 
 def heeded(numbers: tuple[int, ...]) -> list[int]:
-    """Those that this process does not ignore: a shell has its background jobs ignore Ctrl-C, and
-    nohup the terminal's end.
+    """Select the signals that this process does not ignore: background jobs of a shell ignore
+    Ctrl-C, and nohup makes SIGHUP ignored.
     """
     return [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 interrupted = False
-"""True after a stop. An import that it meets may end in an error of its own, such as numpy's."""
+"""True after a stop signal, which may make an interrupted import fail with another error."""
 
 
 def interrupt(*_: Any) -> None:
-    """Raise KeyboardInterrupt, and remember it: the handler of a signal."""
+    """Handle a signal: record it and raise KeyboardInterrupt."""
     global interrupted
     interrupted = True
     raise KeyboardInterrupt
@@ -116,7 +116,7 @@ def interrupt(*_: Any) -> None:
 
 @contextmanager
 def stops_interrupt() -> Iterator[None]:
-    """A polite kill, or the terminal's end, raises KeyboardInterrupt inside, as Ctrl-C does."""
+    """Make SIGTERM and SIGHUP raise KeyboardInterrupt inside the block, like Ctrl-C."""
     handlers = {number: signal.signal(number, interrupt) for number in heeded(STOPS)}
     try:
         yield
@@ -127,11 +127,11 @@ def stops_interrupt() -> Iterator[None]:
 
 @contextmanager
 def asked_to_stop(report: Reporter = SILENT) -> Iterator[Callable[[], bool]]:
-    """Yield a function that is True once Ctrl-C, a polite kill or the terminal's end came; a second
-    one stops at once, as it would without this.
+    """Yield a function that returns True after Ctrl-C, SIGTERM or SIGHUP; a second signal stops at
+    once, as by default.
 
     Args:
-        report: receives a line at the first.
+        report: receiver of a line at the first signal.
     """
     asked = False
 

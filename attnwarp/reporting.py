@@ -1,4 +1,4 @@
-"""Reports of long work to people: a bar on a terminal, a line now and then elsewhere."""
+"""Progress reports of long work: a bar on a terminal, occasional lines elsewhere."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ if TYPE_CHECKING:
     from rich.progress import Progress, Task
 
 LINE_SECONDS = 10.0
-"""Seconds between two lines where there is no terminal."""
+"""Seconds between two lines without a terminal."""
 
 PACE_SECONDS = 5.0
-"""The time left is not told earlier."""
+"""Seconds before the first estimate of the time left."""
 
 FEWEST = 4
-"""Steps of which the latter half alone tells the pace; of fewer, one would decide."""
+"""Number of steps from which only the latter half sets the pace; for fewer, one would decide."""
 
 
 class Reporter:
-    """Receives how work stands. This one shows nothing; subclasses do.
+    """Receiver of progress. This class shows nothing; subclasses do.
 
     Example:
         >>> from attnwarp.reporting import Reporter
@@ -36,30 +36,30 @@ class Reporter:
     """
 
     def step(self, done: int, total: int, text: str, left: float | None = None) -> None:
-        """Receive how many steps are done, and what is at work.
+        """Receive the number of finished steps, and the current step.
 
         Args:
-            done: steps.
-            total: steps in all; 0 while their number is unknown.
-            text: name of the step at work, or of the one that has just ended.
-            left: seconds, where the work knows more of them than its pace tells; NaN while it
-                does not know them.
+            done: number of finished steps.
+            total: total number of steps; 0 while unknown.
+            text: name of the current step, or of the step that has just ended.
+            left: seconds left, if the work knows better than the pace; NaN while it does not
+                know.
         """
 
     def log(self, text: str) -> None:
-        """Receive a line that stays to be read."""
+        """Receive a line that stays on the screen."""
 
 
 SILENT = Reporter()
 
 
 class Part(Reporter):
-    """Reports one of many works: what it says is shown with the count of all of them.
+    """Reporter of one part of several works: its messages are shown with the count of all works.
 
     Args:
-        report: report of all works.
-        done: works that ended before.
-        total: works in all.
+        report: reporter of all works.
+        done: number of finished works.
+        total: total number of works.
 
     Example:
         >>> from attnwarp.reporting import Part, reporter
@@ -74,7 +74,7 @@ class Part(Reporter):
         self._report, self._done, self._total = report, done, total
 
     def step(self, done: int, total: int, text: str, left: float | None = None) -> None:
-        """Name what is at work."""
+        """Report the current step."""
         self._report.step(self._done, self._total, text)
 
     def log(self, text: str) -> None:
@@ -83,9 +83,9 @@ class Part(Reporter):
 
 
 class Pace:
-    """Tells the time left by the mean pace of the latter half of what was done since the first
-    count, that of a resumed work: the first steps compile, and say little of the others. Of fewer
-    than :data:`FEWEST` steps all count.
+    """Estimator of the time left from the mean pace of the latter half of the steps since the first
+    count, where a resumed work began: the first steps compile and are not typical. With fewer than
+    :data:`FEWEST` steps, all count.
 
     Example:
         >>> from attnwarp.reporting import Pace
@@ -97,10 +97,10 @@ class Pace:
         self._counts: list[tuple[float, int]] = []
 
     def left(self, done: int, total: int) -> float | None:
-        """Seconds; None while they cannot be told."""
+        """Estimate the seconds left; None while unknown."""
         now = time.perf_counter()
         if self._counts and done < self._counts[-1][1]:
-            self._counts.clear()  # other work
+            self._counts.clear()  # a different work
         if not self._counts or done > self._counts[-1][1]:
             self._counts.append((now, done))
         began, before = self._counts[0]
@@ -118,7 +118,7 @@ def _duration(seconds: float) -> str:
 
 
 class _Shown(Reporter):
-    """Shows steps where a kind of output wants them: `show` is the subclass's."""
+    """Reporter that forwards steps to `show`, which subclasses implement per output."""
 
     def __init__(self, console: Console, title: str) -> None:
         self.console, self.title = console, title
@@ -133,7 +133,7 @@ class _Shown(Reporter):
         raise NotImplementedError
 
     def log(self, text: str) -> None:
-        # Whole, so that it can be searched.
+        # Unwrapped, so that the line can be searched.
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
@@ -163,7 +163,7 @@ class _Bar(_Shown):
         self._bar: Progress | None = None
 
     def show(self, done: int, total: int, text: str, left: float | None) -> None:
-        if self._bar is None:  # what comes before the first step needs none
+        if self._bar is None:  # lines before the first step need no bar
             self._bar = self._stack.enter_context(_bar(self.console))
             self._bar.add_task(self.title, total=None, text=text, count="", ends=None)
         self._bar.update(
@@ -190,7 +190,7 @@ def _bar(console: Console) -> Progress:
     def text(name: str, **column: Any) -> TextColumn:
         return TextColumn(name, markup=False, table_column=Column(**column))
 
-    # On a narrow terminal the text goes over two lines rather than the counts losing their digits.
+    # On a narrow terminal the text wraps, so that the counts keep their digits.
     return Progress(
         text("{task.description}", no_wrap=True),
         BarColumn(bar_width=12, table_column=Column(no_wrap=True)),
@@ -206,12 +206,12 @@ def _bar(console: Console) -> Progress:
 def reporter(
     console: Console | None = None, *, title: str = "", every: bool = False
 ) -> Iterator[Reporter]:
-    """Report on stderr, or on another console: a bar on a terminal, a line now and then elsewhere.
+    """Report on stderr or another console: a bar on a terminal, occasional lines elsewhere.
 
     Args:
         console: console of rich.
         title: title of the work.
-        every: each step that is done gets a line where there is no terminal.
+        every: True prints a line for each finished step without a terminal.
 
     Example:
         >>> import sys

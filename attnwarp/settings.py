@@ -1,4 +1,4 @@
-"""The base of settings: frozen dataclasses whose annotations say what each field takes."""
+"""Base of settings: frozen dataclasses whose annotations define each field's valid values."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 
 class Settings:
-    """Checks each field against its annotation when an instance is made.
+    """Base class that checks each field against its annotation when an instance is created.
 
-    ``Literal`` lists choices, ``Annotated[int, Range(1)]`` has limits, ``X | None`` may be left
-    empty, a tuple may come as a list, and other settings may come as a dictionary. Numbers of numpy
-    become Python's own.
+    ``Literal`` lists choices, ``Annotated[int, Range(1)]`` has limits, ``X | None`` accepts None, a
+    tuple accepts a list, and other settings accept a dictionary. Numbers of numpy become Python
+    numbers.
 
     Raises:
-        ValueError: a value that its annotation does not allow; the message names the field.
+        ValueError: a value violates its annotation; the message names the field.
 
     Example:
         >>> from dataclasses import dataclass
@@ -63,16 +63,16 @@ class Settings:
             object.__setattr__(self, name, _checked(getattr(self, name), hint, name))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values in the order of the fields; equal settings give equal dictionaries."""
+        """Convert to JSON values in field order; equal settings give equal dictionaries."""
         values = asdict(self)  # type: ignore[call-overload]
         return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
 
     @classmethod
     def from_dict(cls: type[S], data: dict[str, Any]) -> S:
-        """Settings from what :meth:`to_dict` wrote; fields left out take their default.
+        """Restore settings from the result of :meth:`to_dict`; missing fields take their default.
 
         Raises:
-            ValueError: a key that is no field, or a value out of range.
+            ValueError: a key is not a field, or a value is out of range.
         """
         _check_names(cls, data)
         return cls(**data)
@@ -81,7 +81,7 @@ class Settings:
         """Copy the settings with some fields changed.
 
         Raises:
-            ValueError: no such field, or a value out of range; the message names it.
+            ValueError: a field is unknown, or a value is out of range; the message names the field.
         """
         _check_names(type(self), changes)
         return replace(self, **changes)  # type: ignore[type-var]
@@ -93,7 +93,7 @@ def _check_names(kind: Any, data: dict[str, Any]) -> None:
 
 
 def _checked(value: Any, hint: Any, name: str) -> Any:
-    """``value`` as the annotation has it."""
+    """Convert ``value`` to the type of its annotation."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         if value is None and type(None) in arguments:
@@ -109,7 +109,7 @@ def _checked(value: Any, hint: Any, name: str) -> Any:
     if origin is tuple:
         if not isinstance(value, list | tuple):
             raise ValueError(f"{name}: got {value!r}, expected a list")
-        # Numbers of numpy have no JSON.
+        # Numbers of numpy are not JSON-serialisable.
         return tuple(v.item() if isinstance(v, np.generic) else v for v in value)
     if hint is bool:
         if not isinstance(value, bool):

@@ -1,12 +1,12 @@
-"""A run's folder: whose it is, its records, checkpoints and seconds; how a stopped run goes on.
+"""Folder of a run: its owner, records, checkpoints and seconds, from which a stopped run resumes.
 
-Every file is whole or absent. What is done stands in the folder and nothing else is remembered, so
-a run that was killed goes on from its files. Fits and all methods keep theirs here:
+Every file is complete or absent. The folder is the only state, so a killed run resumes from its
+files. Fits and all methods store:
 
-manifest.json       what the run was asked for, with hashes of its inputs
-NAME.png NAME.json  a picture, and the record by which it counts as made
+manifest.json       settings of the run, with hashes of its inputs
+NAME.png NAME.json  a picture, and the record that marks it as finished
 *.pt                a checkpoint
-times.json          seconds by part, over all sittings
+times.json          seconds by part, over all processes
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from attnwarp.io.lock import alone_in
 from attnwarp.settings import Number, Settings, Weight
 
 FORMAT = 4
-"""Raised when files of a run's folder, or what a run does, change meaning; folders of another
-format are then refused."""
+"""Format version, raised when files of a run's folder, or a run's results, change meaning; folders
+of another format are refused."""
 
 MANIFEST = "manifest.json"
 TIMES = "times.json"
 
 CHECKPOINT_SHARE = 0.05
-"""Share of the time that checkpoints may take."""
+"""Largest share of the time spent on checkpoints."""
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,14 @@ class Budget(Settings):
     """Limits of a run. No batch of edits and no iteration of tuning begins beyond them.
 
     Args:
-        seconds: seconds of editing and tuning, over all sittings; None for no limit. A run that was
-            cut short by seconds depends on the machine. A method that tunes after all of its edits
-            may end before it has tuned.
-        network_rows: rows through the UNet; None for no limit. A batch of edits that would go
-            beyond does not begin, and the round's tuning is the last.
+        seconds: limit on seconds of editing and tuning, over all processes; None for no limit. A
+            run cut by seconds depends on the machine. A method that tunes after all of its edits
+            may end before tuning.
+        network_rows: limit on rows through the UNet; None for no limit. A batch of edits that would
+            exceed it does not begin, and the round's tuning is the last.
 
     Raises:
-        ValueError: no number, a negative one, or one that is not finite; rows that are not whole.
+        ValueError: a limit is not a finite number >= 0, or rows are not an integer.
 
     Example:
         >>> from attnwarp.workdir import Budget
@@ -70,10 +70,10 @@ class Budget(Settings):
 
 @contextmanager
 def results_in(folder: Path | str | None) -> Iterator[Path]:
-    """Hold a folder that no other run writes to meanwhile; a temporary one for None.
+    """Hold a folder against writes by other runs; None holds a temporary folder.
 
     Raises:
-        InputError: another run writes to it.
+        InputError: another run writes to the folder.
     """
     if folder:
         with alone_in(folder):
@@ -84,17 +84,17 @@ def results_in(folder: Path | str | None) -> Iterator[Path]:
 
 
 class Workdir:
-    """The folder of one run.
+    """Folder of one run.
 
     Args:
-        path: made by :meth:`claim` if need be.
-        what: the run, for messages: "a fit", "an edit".
-        folders: inside it, made likewise.
-        results: files where results go, besides those in ``folders``.
+        path: path of the folder, created by :meth:`claim` if missing.
+        what: description of the run, for messages: "a fit", "an edit".
+        folders: subfolders, created likewise.
+        results: result files, besides those in ``folders``.
 
     Attributes:
-        path, what: file, and the words for it in messages.
-        seconds: by part.
+        path, what: path and description of the run.
+        seconds: seconds by part.
     """
 
     def __init__(
@@ -108,10 +108,10 @@ class Workdir:
         self.folders, self.results = folders, results
         self.seconds = Seconds(self)
 
-    # --- whose it is
+    # --- ownership
 
     def claim(self, manifest: dict[str, Any]) -> None:
-        """Write the manifest, or hold the one that is there against it; make the folders.
+        """Write the manifest, or compare it with the existing one; create the folders.
 
         Raises:
             InputError: see :meth:`check_claimed`.
@@ -124,15 +124,15 @@ class Workdir:
             self.write_json(MANIFEST, manifest)
 
     def check_claimed(self, known: dict[str, Any], *, whole: bool = False) -> None:
-        """Hold what is known of a run, before its work, against the folder.
+        """Compare the known settings of a run with the folder, before any work.
 
         Args:
             known: entries of the manifest.
-            whole: they are all that it has.
+            whole: True if the entries are the complete manifest.
 
         Raises:
-            InputError: the folder holds a run of other settings or inputs, by name; or files where
-                results go, and no manifest that says whose they are.
+            InputError: the folder holds a run of other settings or inputs, which the message lists;
+                or result files without a manifest that identifies their run.
         """
         self.check_unclaimed()
         if not self.has(MANIFEST):
@@ -152,11 +152,11 @@ class Workdir:
             )
 
     def check_unclaimed(self) -> None:
-        """Refuse files where results go, in a folder without a manifest: they would be written
-        over, or taken for results of this run.
+        """Refuse result files in a folder without a manifest: they would be overwritten, or taken
+        for results of this run.
 
         Raises:
-            InputError: there is such a file.
+            InputError: a result file exists.
         """
         if self.has(MANIFEST):
             return
@@ -174,7 +174,7 @@ class Workdir:
     # --- files
 
     def has(self, name: str) -> bool:
-        """True for a file that is there, and so whole."""
+        """Return True if a file exists, and is therefore complete."""
         return (self.path / name).is_file()
 
     def write_json(self, name: str, value: Any) -> None:
@@ -186,10 +186,10 @@ class Workdir:
         """Read the object of a JSON file.
 
         Raises:
-            FileFormatError: it is damaged.
+            FileFormatError: the file is damaged.
         """
         path = self.path / name
-        # Without its manifest, a folder's results are of no known settings.
+        # Without its manifest, a folder's results have unknown settings.
         remedy = "name another folder" if name == MANIFEST else "remove it, it is made anew"
         try:
             value = json.loads(path.read_text(encoding="utf-8"))
@@ -205,10 +205,10 @@ class Workdir:
         write_atomically(self.path / name, lambda stream: stream.write(data))
 
     def read_picture(self, name: str) -> npt.NDArray[np.uint8]:
-        """(H, W, 3) uint8 of a PNG that :meth:`write_picture` wrote.
+        """Read a PNG written by :meth:`write_picture`, (H, W, 3) uint8.
 
         Raises:
-            FileFormatError: it is damaged.
+            FileFormatError: the file is damaged.
         """
         path = self.path / name
         try:
@@ -216,26 +216,26 @@ class Workdir:
         except FileFormatError:
             raise FileFormatError(path, "damaged; remove it, it is made anew") from None
 
-    # --- pictures that are made once
+    # --- pictures written once
 
     def write_record(
         self, picture: str, pixels: npt.NDArray[np.uint8], about: dict[str, Any]
     ) -> None:
-        """Write a picture, then its record: by the record, which has its hash, it counts as made.
-        A picture that is made again has to be the same: what came after rests on the former one.
+        """Write a picture, then its record, which has its hash and marks it as finished. A picture
+        written again must be the same, since later results depend on the first version.
 
         Raises:
-            InputError: it is another one.
+            InputError: the picture differs.
         """
         self.check_same(picture, pixels)
         self.write_picture(picture, pixels)
         self.write_json(record_of(picture), {**about, "sha256": digest(pixels)})
 
     def check_same(self, picture: str, pixels: npt.NDArray[np.uint8]) -> None:
-        """Hold a picture that is made again against its record, if there is one.
+        """Compare a picture computed again with its record, if any.
 
         Raises:
-            InputError: it is another one.
+            InputError: the picture differs.
         """
         if self.has(record_of(picture)) and self.record(picture)["sha256"] != digest(pixels):
             raise InputError(
@@ -244,10 +244,10 @@ class Workdir:
             )
 
     def record(self, picture: str) -> dict[str, Any]:
-        """The record of a picture.
+        """Read the record of a picture.
 
         Raises:
-            FileFormatError: it is no JSON, or no record.
+            FileFormatError: the file is not JSON, or not a record.
         """
         record: dict[str, Any] = self.read_json(record_of(picture))
         if "sha256" not in record:
@@ -256,17 +256,17 @@ class Workdir:
         return record
 
     def made(self, picture: str) -> bool:
-        """True for a picture with a record. The record's "pictures" are files that were written
-        with it.
+        """Return True for a picture with a record. The record's "pictures" are files written with
+        the picture.
 
-        A picture that is missing or another one all the same is made again, and its record says
-        what has to come out.
+        A missing or changed picture with a record is computed again, and must match the
+        record.
 
         Raises:
             FileFormatError: the record or the picture is damaged.
 
         Warns:
-            InputWarning: a picture is made again.
+            InputWarning: a picture will be computed again.
         """
         if not self.has(record_of(picture)):
             return False
@@ -284,7 +284,7 @@ class Workdir:
     # --- checkpoints
 
     def save(self, name: str, state: dict[str, Any]) -> None:
-        """Write a checkpoint: tensors and plain values, by a line with the SHA-256 of the rest."""
+        """Write a checkpoint: a line with the SHA-256, then tensors and plain values."""
         import torch
 
         buffer = io.BytesIO()
@@ -299,15 +299,15 @@ class Workdir:
         write_atomically(self.path / name, write)
 
     def load(self, name: str, remedy: str = "remove it to begin again") -> dict[str, Any]:
-        """Load a file that :meth:`save` wrote. Only tensors and plain values are read; a file
+        """Load a file written by :meth:`save`. Only tensors and plain values are read; a file
         cannot run code.
 
         Args:
             name: name of the file.
-            remedy: the end of a message.
+            remedy: end of the error message.
 
         Raises:
-            FileFormatError: it is damaged, made by an older version, or no checkpoint.
+            FileFormatError: the file is damaged, from an older version, or not a checkpoint.
         """
         import torch
 
@@ -331,8 +331,8 @@ _MAGIC = b"attnwarp checkpoint"
 
 
 class CheckpointClock:
-    """Clock of the next checkpoint: ``seconds`` after the last, and later where one takes long, so
-    that checkpoints take at most :data:`CHECKPOINT_SHARE` of the time.
+    """Clock of checkpoints: the next is due ``seconds`` after the last, or later if writing is
+    slow, so that checkpoints take at most :data:`CHECKPOINT_SHARE` of the time.
     """
 
     def __init__(self, seconds: float) -> None:
@@ -340,13 +340,13 @@ class CheckpointClock:
 
     @property
     def due(self) -> bool:
-        """True once a checkpoint should be written."""
+        """True if a checkpoint is due."""
         wait = max(self.seconds, self._cost * (1 / CHECKPOINT_SHARE - 1))
         return time.perf_counter() - self._last >= wait
 
     @contextmanager
     def saving(self) -> Iterator[None]:
-        """Count a block as the writing of a checkpoint."""
+        """Time a block as the writing of a checkpoint."""
         began = time.perf_counter()
         yield
         self._last = time.perf_counter()
@@ -354,7 +354,7 @@ class CheckpointClock:
 
 
 class Seconds:
-    """Seconds by part of a run's work, in a file of its folder; former sittings' are read from it.
+    """Seconds by part of a run's work, stored in its folder and summed over its processes.
 
     Args:
         folder: path of the run.
@@ -367,7 +367,7 @@ class Seconds:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Count a block's seconds as those of a part, and not of one that it lies in."""
+        """Count a block's seconds for a part, and not for an enclosing part."""
         outer = self._begin(name)
         try:
             yield
@@ -375,19 +375,19 @@ class Seconds:
             self._begin(outer)
 
     def _begin(self, name: str) -> str:
-        """Count from now on for a part; return the one before."""
+        """Start counting for a part; return the previous part."""
         before, self._ended = self._part, self._exact()
         self._part, self._since = name, time.perf_counter()
         return before
 
     def write(self) -> None:
-        """Write the file; the part at work counts up to now."""
+        """Write the file; the current part counts up to now."""
         self.folder.write_json(TIMES, self.parts)
 
     @property
     def parts(self) -> dict[str, float]:
-        """Seconds by part, the part at work up to now, as the file has them: a limit in the seconds
-        of a finished run is then the same in every sitting.
+        """Seconds by part, the current part up to now, rounded as in the file, so that a finished
+        run compares with a limit alike in every process.
         """
         return {part: round(seconds, 3) for part, seconds in self._exact().items()}
 
@@ -400,7 +400,7 @@ class Seconds:
 
 
 def record_of(picture: str) -> str:
-    """The record's file, of the file of its picture.
+    """Return the file of a picture's record.
 
     Example:
         >>> record_of("views/a.1.png")
@@ -410,14 +410,14 @@ def record_of(picture: str) -> str:
 
 
 def _part(stored: Any, known: Any) -> Any:
-    """Those entries of JSON that something else has too."""
+    """Restrict JSON entries to the keys of another value."""
     if not isinstance(stored, dict) or not isinstance(known, dict):
         return stored
     return {key: _part(stored.get(key), value) for key, value in known.items()}
 
 
 def _differences(stored: Any, now: Any, name: str = "") -> list[str]:
-    """Differences between two JSON values, by the path of its key."""
+    """List differences between two JSON values, by the path of the key."""
     if isinstance(stored, dict) and isinstance(now, dict):
         return [
             line
@@ -426,7 +426,7 @@ def _differences(stored: Any, now: Any, name: str = "") -> list[str]:
         ]
     if stored == now:
         return []
-    # A hash tells a person nothing.
+    # The value of a hash is meaningless to a user.
     hashes = name.startswith("inputs.")
     return [name if hashes else f"{name} ({_short(stored)}, now {_short(now)})"]
 
