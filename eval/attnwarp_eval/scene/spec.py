@@ -52,8 +52,8 @@ class Repeat(Spec):
 
 
 class BoxSpec(Spec):
-    """A box of ``size`` (x, y, z), turned by ``yaw`` about the upright and tilted by ``pitch``
-    about its own y.
+    """A box of ``size`` (x, y, z), turned by ``yaw`` about the vertical and tilted by ``pitch``
+    about its local y.
     """
 
     type: Literal["box"]
@@ -88,7 +88,7 @@ class ObjectSpec(Spec):
     """One object: its index in the list is its object id.
 
     ``texture`` colours diffuse and plastic things; mirrors, metal and glass have a ``tint``, and
-    what shines is black.
+    lamps are black.
     """
 
     name: str = Field(min_length=1)
@@ -133,7 +133,7 @@ class SunSpec(Spec):
 
 
 class SkySpec(Spec):
-    """Light from all around, and what a camera sees where it hits nothing: a ramp from ``horizon``
+    """Light from all directions, visible to cameras as the background: a ramp from ``horizon``
     to ``zenith``.
     """
 
@@ -150,11 +150,9 @@ Pixels = Annotated[int, Field(le=65536)]
 
 
 class ViewSpec(Spec):
-    """One camera on the orbit; what it leaves out comes from ``cameras``."""
+    """One camera on the orbit; missing fields come from ``cameras``."""
 
-    name: str | None = Field(
-        None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
-    )  # it becomes part of file names
+    name: str | None = Field(None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")  # part of file names
     yaw: float
     height: Coordinate
     radius: Positive | None = None
@@ -163,7 +161,7 @@ class ViewSpec(Spec):
 
 
 class CamerasSpec(Spec):
-    """An orbit about the upright through ``look_at``: horizontal ``radius``, vertical ``fov``, one
+    """An orbit about the vertical through ``look_at``: horizontal ``radius``, vertical ``fov``, one
     source, targets.
     """
 
@@ -193,7 +191,7 @@ Bounces = Annotated[
 class AppearanceSpec(Spec):
     """Settings of the pictures: light bounces (1 is direct light only) and samples a pixel.
 
-    ``bounces: unlimited`` follows light until it is gone, and so does a file without a number.
+    ``bounces: unlimited`` follows light without a cap, as does a file without a number.
     ``attnwarp-eval scenes calibrate`` writes the fewest bounces that hold every view's light within
     1 %. Every surface and every scattering counts as a bounce.
     """
@@ -203,10 +201,10 @@ class AppearanceSpec(Spec):
 
 
 class ObjectChange(Spec):
-    """Change of one object by an edit. Its shape stays.
+    """Change of one object by an edit. The shape is unchanged.
 
-    ``recolor`` replaces colours by others wherever the object says them; ``paint`` makes all its
-    colours shades of one, but for those of its parts that ``keep`` lists.
+    ``recolor`` replaces colours of the object by others; ``paint`` makes all its colours shades
+    of one, except those of the parts listed under ``keep``.
     """
 
     object: str
@@ -243,10 +241,10 @@ class AnswerSpec(Spec):
 
 
 class EditSpec(Spec):
-    """An edit whose result is known: what is asked for, the prompts, and what it does to the scene.
+    """An edit with a known result: instruction, prompts, and changes of the scene.
 
-    An ambiguous instruction has several ``answers``, each as right as the others. ``bounces`` are
-    those of the edited scene's pictures; left out, the scene's.
+    An ambiguous instruction has several equally right ``answers``. ``bounces`` applies to the
+    edited scene's pictures; the default is the scene's number.
     """
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
@@ -275,7 +273,7 @@ class EditSpec(Spec):
 
 
 class SceneSpec(Spec):
-    """A whole file."""
+    """Model of a whole scene file."""
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
     title: str

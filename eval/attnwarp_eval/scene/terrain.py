@@ -1,4 +1,4 @@
-"""Uneven ground, and the small things that lie and grow on it: meshes made from a few numbers and a
+"""Uneven ground, with small things on it: meshes generated from a few numbers and a
 seed.
 """
 
@@ -18,7 +18,7 @@ from attnwarp_eval.scene.textures import fractal_noise, lattice_noise
 
 Array = npt.NDArray[np.float64]
 Height = Callable[[Array], Array]
-"""(N, 2) places to (N,) heights."""
+"""Function from (N, 2) positions to (N,) heights."""
 
 FOCUS = 2.2
 """Factor by which the middle of a terrain is meshed finer than its rim: cosh of it, 4.6 times."""
@@ -85,17 +85,17 @@ class TerrainSpec(Spec):
 
 
 class ScatterSpec(Spec):
-    """``count`` small things strewn evenly between two radii about ``center``, on the object named
-    ``on``.
+    """``count`` small things scattered evenly between two radii about ``center``, on the object
+    named ``on``.
 
     Attributes:
         kind: stones, tufts of grass, flowers, or fallen leaves.
         size: smallest and largest; a stone's radius, the height of grass and flowers, the length of
             a leaf.
-        radius: [inner, outer] of the ring that they lie in.
-        avoid: discs [x, y, radius] that stay free.
-        colors: each thing takes one of them; they multiply the object's texture.
-        on: a terrain or a level rectangle to stand on; the height of ``center`` if left out.
+        radius: [inner, outer] of the ring.
+        avoid: discs [x, y, radius] to keep free.
+        colors: one is chosen for each thing, and multiplies the object's texture.
+        on: supporting terrain or horizontal rectangle; by default the height of ``center``.
     """
 
     type: Literal["scatter"]
@@ -117,7 +117,7 @@ class ScatterSpec(Spec):
         return self
 
     def places(self) -> Array:
-        """(M, 2) where the things stand: of ``count`` tries those that ``avoid`` leaves."""
+        """(M, 2) positions of the things: those of ``count`` samples outside ``avoid``."""
         dice = self._dice(3)
         inner, outer = self.radius
         r = np.sqrt(inner**2 + dice[:, 0] * (outer**2 - inner**2))  # even over the area
@@ -131,7 +131,7 @@ class ScatterSpec(Spec):
         return xy[free]
 
     def _dice(self, columns: int, salt: int = 0) -> Array:
-        # The hash behind the textures: the same numbers on every machine and with every version of
+        # The hash used for textures: the same numbers on every machine and with every version of
         # numpy.
         grid = np.stack(
             np.meshgrid(np.arange(self.count), np.arange(columns), indexing="ij"), axis=-1
@@ -140,13 +140,13 @@ class ScatterSpec(Spec):
         return lattice_noise(cells, self.seed).reshape(self.count, columns)
 
     def mesh(self, height: Height) -> Mesh:
-        """All of them as one mesh.
+        """All things as one mesh.
 
         Args:
             height: the ground below.
 
         Raises:
-            ValueError: ``avoid`` leaves no room.
+            ValueError: ``avoid`` excludes every position.
         """
         xy = self.places()
         if not len(xy):
@@ -175,7 +175,7 @@ class ScatterSpec(Spec):
 
 
 Piece = tuple[Array, npt.NDArray[np.int64], Array]
-"""Vertices, faces and colours (a vertex's, or one for all) of a piece of a thing that stands at the
+"""Vertices, faces and colours (one per vertex, or one for all) of a part of a thing at the
 origin.
 """
 

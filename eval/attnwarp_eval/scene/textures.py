@@ -1,7 +1,7 @@
 """Procedural albedo: a colour for every point of space.
 
 A texture is a pure function of the world position, so the same surface point has the same colour in
-every view, whatever mesh or picture it is baked into for rendering.
+every view, for any mesh or picture it is baked into.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Bricks(_Texture):
 
 
 class Rings(_Texture):
-    """Rings of the given colours, each ``size`` wide, about the upright through ``center``: the
+    """Rings of the given colours, each ``size`` wide, about the vertical through ``center``: the
     year rings of wood.
     """
 
@@ -85,7 +85,7 @@ class Rings(_Texture):
 
 
 class Cells(_Texture):
-    """One colour around each of some points: what is nearest to a point has its colour."""
+    """Voronoi cells: each location has the colour of its nearest point."""
 
     type: Literal["cells"]
     centers: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = Field(min_length=1)
@@ -113,7 +113,7 @@ def nearest(points: Array, centers: Array) -> npt.NDArray[np.int64]:
         >>> nearest(np.array([[0.1, 0, 0], [0.9, 0, 0]]), np.array([[0.0, 0, 0], [1, 0, 0]]))
         array([0, 1])
     """
-    # |p - c|^2 without |p|^2, about the centres' mean, so that far from the origin no digits go.
+    # |p - c|^2 without |p|^2, about the centres' mean, to keep precision far from the origin.
     middle = centers.mean(axis=0)
     away = centers - middle
     return ((away**2).sum(axis=1) - 2 * (points - middle) @ away.T).argmin(axis=1)
@@ -184,7 +184,7 @@ def albedo(texture: AnyTexture, points: npt.ArrayLike) -> Array:
                 :, None
             ]
         )
-    return np.clip(color, 0.0, 0.9)  # what real diffuse surfaces return at most
+    return np.clip(color, 0.0, 0.9)  # largest albedo of real diffuse surfaces
 
 
 def _palette(colors: tuple[str, ...]) -> Array:
@@ -228,7 +228,7 @@ def fractal_noise(points: Array, octaves: int, seed: int) -> Array:
     Args:
         points: (N, 3), in units of the coarsest feature.
         octaves: at least 1.
-        seed: another seed, another noise.
+        seed: seed of the noise.
 
     Returns:
         (N,) float64, with a mean of about one half.

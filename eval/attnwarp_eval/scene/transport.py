@@ -1,4 +1,4 @@
-"""Light transport that the words of a scene file call for, and their contradictions."""
+"""Light transport that a scene file needs, and contradictions in the file."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ OPEN = ("rectangle", "terrain")
 
 
 def called_for(spec: SceneSpec) -> dict[Effect, str]:
-    """The effects that the words of a scene file call for, each with the words.
+    """Effects that a scene file needs, each with the responsible words.
 
-    It reads the file alone, without rendering or loading anything;
-    :mod:`attnwarp_eval.effects.detect` looks closer.
+    Only the file is read, without rendering or loading anything;
+    :mod:`attnwarp_eval.effects.detect` also checks the loaded scene.
     """
     evidence_of: dict[Effect, str] = {"geometry": f"{len(spec.objects)} objects"}
 
@@ -168,8 +168,8 @@ def contradictions(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]
     bounces = spec.appearance.bounces
     for k, item in enumerate(spec.objects):
         if isinstance(item.material, PlasticMaterial) and item.shape.type in VERTEX_COLORED:
-            # Mitsuba's roughplastic asks its texture for a mean, which colours of vertices have
-            # none of.
+            # Mitsuba's roughplastic needs a texture's mean, which vertex colours do not
+            # have.
             yield (
                 (
                     f"objects: {item.name!r} is plastic and its shape a {item.shape.type}; plastic"
@@ -203,7 +203,7 @@ def contradictions(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]
 
 
 def fewest_bounces(spec: SceneSpec) -> int:
-    """The least number of bounces that shows what every object of a scene is made of."""
+    """The least number of bounces that shows every object's material."""
     materials = (item.material for item in spec.objects if not item.emission)
     return max((_bounces_needed(material)[0] for material in materials), default=1)
 
@@ -220,11 +220,11 @@ def _bounces_needed(material: Material) -> tuple[int, str]:
 
 
 def likely_bounces(spec: SceneSpec) -> int:
-    """A number of bounces that a scene of these materials and lights does not exceed, as a rule.
+    """A typical upper bound of the bounces for a scene's materials and lights.
 
-    It is read off the words; :mod:`attnwarp_eval.truth.bounces` measures the number. Light that
-    meets diffuse things alone is spent after three bounces, as their albedo is at most 0.9 and most
-    of it leaves for the sky. What reflects or refracts adds the bounces that it needs itself.
+    It follows from the file; :mod:`attnwarp_eval.truth.bounces` measures the number. Light between
+    diffuse surfaces fades within three bounces, as their albedo is at most 0.9 and most of it
+    leaves for the sky. Reflecting and refracting objects add the bounces that they need.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene

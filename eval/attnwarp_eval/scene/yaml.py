@@ -1,4 +1,4 @@
-"""YAML from people: one reader that refuses what is doubled or no value, with its line."""
+"""YAML reader that refuses duplicate keys and invalid values, with their line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TOO_DEEP = f"nested deeper than {DEEPEST} levels, or in itself; write it flat"
 
 
 class YamlError(ValueError):
-    """Text that is no usable YAML, with its line (from 1) where there is one."""
+    """Text that is not usable YAML, with the line (from 1) if known."""
 
     def __init__(self, message: str, line: int | None = None) -> None:
         self.line = line
@@ -25,7 +25,7 @@ class YamlError(ValueError):
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's own parser. A number is decimal, as in YAML 1.2: YAML 1.1 reads ``030`` as 24,
+    """PyYAML's parser. A number is decimal, as in YAML 1.2: YAML 1.1 reads ``030`` as 24,
     ``1:30`` as 90, ``no`` as false and ``1e3`` as text.
     """
 
@@ -47,8 +47,8 @@ for _kind, _pattern, _first in (
 if yaml.__with_libyaml__:
 
     class _Quick(Composer, yaml.CSafeLoader):
-        """libyaml's parser, four times as fast, with PyYAML's composer: libyaml's own ends the
-        process where a text is nested too deep.
+        """libyaml's parser, four times as fast, with PyYAML's composer: libyaml's aborts the
+        process if a text is nested too deep.
         """
 
         yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
@@ -59,8 +59,8 @@ if yaml.__with_libyaml__:
 
 
 def _root(text: str) -> yaml.Node | None:
-    """The root of a text, the same on every machine: what libyaml refuses, and tabs, which it takes
-    for spaces, are left to PyYAML's own parser.
+    """The root of a text, the same on every machine: texts that libyaml refuses, and tabs, which it
+    takes for spaces, are parsed by PyYAML.
     """
     if yaml.__with_libyaml__ and "\t" not in text:
         with suppress(yaml.YAMLError, UnicodeError):
@@ -84,14 +84,14 @@ Line = TypeVar("Line")
 
 
 def read_yaml(text: str) -> tuple[dict[Place, int], Any]:
-    """The line (from 1) of every place of a YAML text, and what the text means.
+    """Parse a YAML text into the line (from 1) of every key path, and the value.
 
     Numbers are decimal: ``030`` is 30. Other notations of numbers, such as ``0x1e`` or ``1:30``,
     are words; so are dates, and ``yes``, ``no``, ``on`` and ``off``. Every key is a word.
 
     Raises:
-        YamlError: the text is empty, no YAML or too deep; a key stands twice or is no word; or a
-            value is not what its tag says.
+        YamlError: the text is empty, not YAML or too deep; a key is duplicate or not a word; or a
+            value does not match its tag.
 
     Example:
         >>> lines, data = read_yaml("fov: 045\\nsize: [3e2, 0256]")
@@ -121,7 +121,7 @@ def read_yaml(text: str) -> tuple[dict[Place, int], Any]:
 
 
 class _Reading:
-    """Reading of nodes as values; an alias is read wherever it stands."""
+    """Reading of nodes as values; an alias is read at each occurrence."""
 
     def __init__(self) -> None:
         self.lines: dict[Place, int] = {}
@@ -151,13 +151,13 @@ class _Reading:
             line = key.start_mark.line + 1
             if not isinstance(key, yaml.ScalarNode):
                 raise YamlError("a key is a list or a mapping, expected a word", line)
-            if key.value in own:  # YAML itself lets the last win
+            if key.value in own:  # in YAML the last one wins
                 raise YamlError(
                     f"the key {key.value!r} stands here and on line {own[key.value]}; keep one",
                     line,
                 )
             own[key.value] = line
-        # What is merged comes first, so that own keys win.
+        # Merged keys come first, so that explicit keys win.
         for key, item in sorted(node.value, key=lambda entry: entry[0].tag != TAG + "merge"):
             if key.tag == TAG + "merge":
                 several = isinstance(item, yaml.SequenceNode)
@@ -175,11 +175,11 @@ class _Reading:
 BARE_COLOR = re.compile(
     r"""^(?:[^#'"]|'[^']*'|"[^"]*")*?(?:[:,]\s+|\[\s*|^\s*-\s+)#[0-9a-fA-F]{6}\b"""
 )
-"""A colour that YAML takes for a comment."""
+"""Pattern of a colour that YAML takes for a comment."""
 
 
 def _bare_color(text: str) -> str:
-    """End of an error's message where the text has a colour without quotes; else empty."""
+    """End of an error's message if the text has a colour without quotes; else empty."""
     for number, line in enumerate(text.splitlines(), 1):
         if BARE_COLOR.search(line):
             return f"; line {number} has a colour without quotes, which YAML takes for a comment"
@@ -187,8 +187,8 @@ def _bare_color(text: str) -> str:
 
 
 def line_of(lines: dict[Place, Line], loc: Sequence[int | str]) -> Line:
-    """Line (from 1) of the deepest place that ``loc`` leads to; the tags that unions put into a loc
-    lead nowhere.
+    """Line (from 1) of the deepest key path of ``loc``; the tags of unions in a loc
+    are skipped.
     """
     place: Place = ()
     for step in loc:

@@ -1,4 +1,4 @@
-"""Cells on a cluster of worker processes (dask): a local one, or the user's own."""
+"""Cells on a cluster of worker processes (dask): a local one, or the user's."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ Json = dict[str, Any]
 
 
 class Extra(Protocol):
-    """Entries that the records of one probe hold beside figures."""
+    """Entries that the records of one probe hold besides figures."""
 
     def to_json(self) -> Json:
         """Entries of the record; entries under ``cost`` go into the record's cost."""

@@ -1,7 +1,7 @@
-"""The renderings whose sum is a picture of a scene: the cheapest that are faithful to it.
+"""Passes whose sum is a picture of a scene: the cheapest faithful renderings.
 
-:func:`plan_passes` follows from what the scene file says, without loading anything, for a number of
-bounces; :mod:`attnwarp_eval.truth.plan` knows the scene's own number. docs/truth/truth.md has the
+:func:`plan_passes` depends only on the scene file, without loading anything, for a number of
+bounces; :mod:`attnwarp_eval.truth.plan` adds the scene's number. docs/truth/truth.md has the
 reasons.
 """
 
@@ -25,13 +25,13 @@ Bounces = int | Literal["unlimited"]
 SMALL = 0.15
 """A lamp counts as small when its radius is below this share of its distance from the glass. Paths
 from the camera find it by chance, about once in 4 / SMALL^2 = 180 tries, and the caustic comes out
-as single bright pixels."""
+as isolated bright pixels."""
 
 ROULETTE = 5
-"""Paths without a cap are ended at random from this many edges on; Mitsuba's own default."""
+"""Paths without a cap are ended at random from this many edges on; Mitsuba's default."""
 
 LIGHT_PATHS = 4
-"""Light paths for each camera sample: from the light, most paths end where no camera looks."""
+"""Light paths for each camera sample: most paths from the light end outside the cameras' views."""
 
 
 @dataclass(frozen=True)
@@ -40,19 +40,19 @@ class Pass:
 
     Attributes:
         integrator: Mitsuba's plugin.
-        lights: indices of the scene's lights that shine in it.
-        lamps: whether the objects with an ``emission`` shine in it.
+        lights: indices of the scene's lights used in the pass.
+        lamps: whether objects with an ``emission`` shine in the pass.
         max_depth: longest path in edges from the camera; 2 is direct light, -1 has no end.
         rr_depth: edges after which paths are ended at random; above ``max_depth`` never.
         emitter_samples, bsdf_samples: rays toward lights and along the material's lobe at each hit
             ("direct" only).
         spp: samples a pixel; for "ptracer" light paths a pixel.
-        first: which camera rays count. "any"; "smooth", those whose first surface is smooth glass,
-            metal or a mirror, a lamp, or none at all; or "rough", the others, which are also those
-            that a ptracer pass makes.
-        beam: light only what lies in the direction of the smooth objects (a point light becomes a
-            spot upon them).
-        sign: -1 for a pass that is taken away.
+        first: camera rays that count: "any"; "smooth", those whose first surface is smooth glass,
+            metal or a mirror, a lamp, or none at all; or "rough", the others, which also include
+            those that a ptracer pass makes.
+        beam: light only the directions of the smooth objects (a point light becomes a
+            spot on them).
+        sign: -1 for a subtracted pass.
         aims_at_sky: whether points are connected to the sky as to other lights; without it only
             rays spread by the materials find the sky.
     """
@@ -83,13 +83,13 @@ class Lens:
 
 @dataclass(frozen=True)
 class Plan:
-    """Plan of a picture, and why it suffices.
+    """Plan of a picture, with reasons.
 
     Attributes:
-        passes: the renderings that are added up; none where ray casting alone gives what is wanted.
-        media: whether fog and interiors are there.
+        passes: the renderings to add up; none if ray casting suffices.
+        media: whether fog and interiors are rendered.
         lens: None for a pinhole.
-        reasons: for a person.
+        reasons: reasons in words.
     """
 
     passes: tuple[Pass, ...]
@@ -99,7 +99,7 @@ class Plan:
 
     @property
     def integrator(self) -> str:
-        """The integrators in use, such as "direct" or "path + ptracer"; "raycast" where nothing is
+        """The integrators in use, such as "direct" or "path + ptracer"; "raycast" if nothing is
         rendered.
         """
         return " + ".join(dict.fromkeys(step.integrator for step in self.passes)) or "raycast"
@@ -110,9 +110,9 @@ class Plan:
         return "thinlens" if self.lens else "perspective"
 
     def identity(self) -> dict[str, Any]:
-        """Entries that decide the picture, without the reasons; goes into cache keys."""
+        """Entries that decide the picture, without the reasons; part of cache keys."""
         data = asdict(replace(self, reasons=()))
-        # Pictures of such passes were stratified once.
+        # Pictures of such passes used to be stratified.
         few = any(p.integrator == "volpath" and p.spp < FEWEST_STRATIFIED for p in self.passes)
         return {**data, "sampler": "independent"} if few else data
 
@@ -135,10 +135,10 @@ made fog too bright by 1.2 % ± 0.1, independent ones did not; 6 and more agree 
 
 
 def sampler(integrator: Integrator, spp: int) -> str:
-    """Stratified samples where ``spp`` splits into a grid as Mitsuba wants it; elsewhere it would
+    """Stratified samples if ``spp`` fits Mitsuba's grid; otherwise Mitsuba would
     render more.
     """
-    # Which cell of a light path's grid lands in which pixel is chance, so there is nothing to
+    # Light paths land in pixels at random, so there is nothing to
     # stratify.
     if integrator == "ptracer" or (integrator == "volpath" and spp < FEWEST_STRATIFIED):
         return "independent"
@@ -151,14 +151,14 @@ def sampler(integrator: Integrator, spp: int) -> str:
 
 
 def check_plannable(scene: Scene, spp: int | None) -> None:
-    """Refuse what no plan can be made of.
+    """Refuse scenes without a possible plan.
 
     Args:
-        spp: samples a pixel; None for the scene's own number.
+        spp: samples a pixel; None for the scene's number.
 
     Raises:
         ValueError: spp below 1.
-        SceneError: the scene pins, forbids or caps what it cannot.
+        SceneError: the scene pins, forbids or caps an effect that it cannot.
     """
     if spp is not None and spp < 1:
         raise ValueError(f"spp: got {spp}, expected at least 1")
@@ -169,16 +169,16 @@ def check_plannable(scene: Scene, spp: int | None) -> None:
 def plan_passes(
     scene: Scene, spp: int | None, bounces: Bounces, first_reasons: tuple[str, ...] = ()
 ) -> Plan:
-    """The cheapest rendering that shows what ``scene`` calls for in a number of bounces.
+    """The cheapest rendering with all effects that ``scene`` needs, for a number of bounces.
 
     Args:
-        spp: samples a pixel; the scene's own number if None.
-        bounces: in place of the scene's own.
-        first_reasons: the plan's reasons that come before those given here.
+        spp: samples a pixel; by default the scene's number.
+        bounces: replacement of the scene's number.
+        first_reasons: reasons to list before the plan's.
 
     Raises:
         ValueError: spp below 1.
-        SceneError: the scene pins, forbids or caps what it cannot.
+        SceneError: the scene pins, forbids or caps an effect that it cannot.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -198,7 +198,7 @@ def plan_passes(
     if optic:
         reasons.append("cameras.lens has an aperture: a thin lens instead of a pinhole")
     depth = -1 if bounces == "unlimited" else bounces + 1
-    # Roulette would end paths at random: unbiased, but noise that a short path is not worth.
+    # Roulette would end paths at random: unbiased, but too noisy for short paths.
     roulette = ROULETTE if depth < 0 else depth + 1
     if depth != 2 and not media and convex(scene):
         depth = 2
@@ -254,8 +254,8 @@ def plan_passes(
                 Pass(rest, "ptracer", depth, 1, 1, LIGHT_PATHS * spp, lamps, roulette),
             ]
         for k in points:
-            # Outside the beam no light meets anything smooth first, so that camera paths find all
-            # of it; inside, paths from the light do. Light adds up: all - beam (both by camera
+            # Outside the beam no light first meets a smooth surface, so camera paths find all of
+            # it; inside, paths from the light do. Light adds up: all - beam (both by camera
             # paths) + beam (by light paths).
             passes += [
                 Pass((k,), "path", depth, 1, 1, spp, False, roulette),
@@ -273,7 +273,7 @@ def plan_passes(
     reasons.append("one bounce: light sampled at each visible point is the whole sum")
     glossy = "glossy" in needed
     passes = []
-    # One direction or one point is one sample: its own pass has no noise but that of the pixel's
+    # One direction or one point is one sample: a separate pass has only the noise of the pixel's
     # area.
     exact = [k for k in everything if not isinstance(lights[k], SkySpec)]
     suns = [k for k in exact if lights[k].type == "sun"]
@@ -313,8 +313,8 @@ def convex(scene: Scene) -> bool:
 
 
 def small_lights(scene: Scene) -> str | None:
-    """Names the lights too small to be met by chance through smooth glass or a mirror; None where
-    there are none.
+    """Names of lights too small to be hit by chance through smooth glass or a mirror; None if
+    none.
     """
     names: list[str] = [light.type for light in scene.spec.lights if light.type != "sky"]
     names += [f"object {scene.spec.objects[k].name!r}" for k in small_lamps(scene)]
@@ -322,7 +322,7 @@ def small_lights(scene: Scene) -> str | None:
 
 
 def small_lamps(scene: Scene) -> list[int]:
-    """Indices of the objects that shine and are too small to be met by chance through smooth glass
+    """Indices of lamps too small to be hit by chance through smooth glass
     or a mirror.
     """
     small: list[int] = []
@@ -346,16 +346,16 @@ def small_lamps(scene: Scene) -> list[int]:
 
 
 BEAM_MARGIN = 1.05
-"""Factor by which a beam upon the smooth objects is wider than the sphere about them; Mitsuba's
+"""Factor by which a beam on the smooth objects is wider than the sphere about them; Mitsuba's
 spots fall off at their rim.
 """
 
 
 def beam(scene: Scene, light: int) -> tuple[Array, float] | None:
-    """The cone in which a point light sees all smooth objects: its axis (not unit) and half angle
+    """Cone from a point light around all smooth objects: its axis (not unit) and half angle
     in degrees.
 
-    None for other lights, or where the cone would be wider than 60 degrees: then it saves little.
+    None for other lights, or if the cone would be wider than 60 degrees and save little.
     """
     spec = scene.spec.lights[light]
     smooth = smooth_objects(scene)

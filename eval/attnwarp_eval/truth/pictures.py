@@ -1,4 +1,4 @@
-"""Pictures of a scene as its own file asks for them, kept on disk."""
+"""Pictures of a scene by the plan of its file, cached on disk."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ Image = npt.NDArray[np.float32]
 
 
 def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int = 0) -> Image:
-    """Render what ``camera`` sees, in linear RGB.
+    """Render the view of ``camera``, in linear RGB.
 
     Args:
         camera: square pixels and no skew; any principal point.
-        spp: samples a pixel; the scene's own number if left out.
+        spp: samples a pixel; by default the scene's number.
         seed: the same seed gives the same bits.
 
     Returns:
-        (H, W, 3) float32, not clipped; the sky where nothing is hit. Box-filtered over each pixel.
-        Kept on disk, see :mod:`attnwarp_eval.cache`.
+        (H, W, 3) float32, not clipped; the sky on a miss. Box-filtered over each pixel.
+        Cached on disk, see :mod:`attnwarp_eval.cache`.
 
     Raises:
         ValueError: a camera that Mitsuba cannot express.
@@ -51,7 +51,7 @@ def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int =
         scene.world_hash,
         texel_size(scene),
         build.TEXELS,
-        # Where the lens is sharp, and what the fog's own box holds, depend on the cameras.
+        # The lens's focus and the fog's box depend on the cameras.
         (
             scene.spec.cameras.model_dump(mode="json", exclude={"size"})
             if planned.lens or planned.media

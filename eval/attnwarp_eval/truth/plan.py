@@ -26,16 +26,16 @@ def plan(
     want: Literal["appearance", "geometry"] = "appearance",
     bounces: Bounces | None = None,
 ) -> Plan:
-    """The cheapest rendering that shows what ``scene`` calls for.
+    """The cheapest rendering with all effects that ``scene`` needs.
 
     Args:
-        spp: samples a pixel; the scene's own number if left out.
+        spp: samples a pixel; by default the scene's number.
         want: "geometry" (depth, normals, ids, visibility) needs no rendering, only rays.
-        bounces: in place of the scene's own.
+        bounces: replacement of the scene's number.
 
     Raises:
         ValueError: spp below 1.
-        SceneError: the scene pins, forbids or caps what it cannot.
+        SceneError: the scene pins, forbids or caps an effect that it cannot.
     """
     if want == "geometry":
         return Plan(
@@ -53,8 +53,8 @@ def plan(
 
 
 def bounces_of(scene: Scene) -> Bounces:
-    """Bounces of a scene's pictures: the number that its file names; without one, all that a path
-    can have: a single convex surface never lights itself.
+    """Bounces of a scene's pictures: the number in its file, else unlimited; 1 for a single convex
+    surface, which never lights itself.
     """
     named = scene.spec.appearance.bounces
     if named is not None:
@@ -63,7 +63,7 @@ def bounces_of(scene: Scene) -> Bounces:
 
 
 def open_bounces(scene: Scene) -> list[str]:
-    """One line where a scene's pictures follow light without an end, as its file names no number;
+    """One line if a scene's pictures have unlimited bounces, since its file names no number;
     else none.
 
     Example:
@@ -80,16 +80,16 @@ def open_bounces(scene: Scene) -> list[str]:
 
 
 def everything_on(scene: Scene, spp: int | None = None, *, capped: bool = True) -> Plan:
-    """Plan of a renderer that knows nothing of the scene: volpath for all lights at once, a lens
-    where one is said.
+    """Plan of a renderer without knowledge of the scene: volpath for all lights at once, with the
+    scene's lens, if any.
 
-    Where a caustic is called for ptracer is added: volpath alone would miss it, so "full" would not
+    If a caustic is needed, ptracer is added: volpath alone would miss it, so "full" would not
     be the truth. Never volpathmis, which is biased under roulette.
 
     Args:
-        spp: samples a pixel; the scene's own number if left out.
-        capped: keep the scene's own cap on bounces, which is part of what its truth means. Without
-            it light is followed until roulette ends it: what the cap saves.
+        spp: samples a pixel; by default the scene's number.
+        capped: whether to keep the scene's cap on bounces, which is part of its truth. Without
+            it light is followed until roulette ends it, which shows the cap's saving.
     """
     ours = plan(scene, spp)
     spp = spp or scene.spec.appearance.spp

@@ -1,9 +1,9 @@
-"""Exact geometry: what each pixel's central ray hits, and which points a camera can see.
+"""Exact geometry: hits of each pixel's central ray, and visibility of points from a camera.
 
 Open3D (Embree, float32) finds the triangle of a ray, and the triangle's plane in float64 gives the
 point. Spheres and rectangles are closed forms in float64. First the scene is moved to the middle of
-its bounding box and scaled to unit size, in float64. So neither the scene's place nor its unit
-changes an answer.
+its bounding box and scaled to unit size, in float64. So results depend neither on the scene's
+position nor on its unit.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 REACH_TOLERANCE = 1e-5
-"""A ray from an eye to a point reaches it when its first hit is at 1 +- this of the way. Open3D's
-own hits are off by up to 1.6e-5 of the scene, after refinement by far less; surfaces closer
+"""A ray from an eye to a point reaches it if its first hit is at 1 +- this of the way. Open3D's
+hits are off by up to 1.6e-5 of the scene, after refinement by far less; surfaces closer
 together than this along a ray count as one."""
 
 REFINEMENT_LIMIT = 1e-3
-"""Refinement may move a hit by this share of its distance. More happens only where the plane is
-seen edge on, and there Open3D's own answer is the better one."""
+"""Refinement may move a hit by this share of its distance. Larger moves happen only if the plane is
+seen edge-on, where Open3D's hit is more accurate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class RayHits:
     """First hits of N rays.
 
     Attributes:
-        t: (N,) where along the ray, in units of the direction's length; NaN on a miss.
+        t: (N,) position along the ray, in units of the direction's length; NaN on a miss.
         point: (N, 3) world; NaN on a miss.
         normal: (N, 3) unit geometric normal in world axes, turned against the ray; NaN on a miss.
         object_id: (N,) int32 index of the object in the scene, -1 on a miss.
@@ -68,7 +68,7 @@ class Geometry:
     """The surfaces of a scene, ready to be traced.
 
     Args:
-        scene: a :class:`~attnwarp_eval.scene.scene.Scene`, or the shapes themselves.
+        scene: a :class:`~attnwarp_eval.scene.scene.Scene`, or a sequence of shapes.
 
     Attributes:
         center: (3,) float64 middle of the bounding box.
@@ -146,15 +146,15 @@ class Geometry:
         self._traced: dict[bytes, Hits] = {}
 
     def flat_patches(self) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Everything flat as triangles: (T, 3, 3) world corners and (T,) primitive ids; a rectangle
-        is two of them.
+        """All flat surfaces as triangles: (T, 3, 3) world corners and (T,) primitive ids; a
+        rectangle is two of them.
         """
         q = self._rectangles
         c, u, v = q[:, None, 0:3], q[:, None, 3:6], q[:, None, 6:9]
         halves = np.concatenate(
             [np.concatenate([c - u - v, c + s * (u - v), c + u + v], axis=1) for s in (1, -1)]
         )
-        # The second half runs the other way round; turned, its normal agrees with the rectangle's.
+        # The second half winds the other way; reversed, its normal agrees with the rectangle's.
         halves[len(q) :] = halves[len(q) :, ::-1]
         first = len(self._faces) + len(self._spheres)
         corners = np.concatenate([self._vertices[self._faces], halves])
@@ -171,12 +171,12 @@ class Geometry:
         )
 
     def object_of(self, primitive_id: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
-        """(N,) index of the object that each primitive belongs to, -1 for -1."""
+        """(N,) index of the object of each primitive, -1 for -1."""
         return np.where(primitive_id >= 0, self._object[primitive_id], -1).astype(np.int32)
 
     def tint(self, points: Array, primitive_id: npt.NDArray[np.int64]) -> Array:
-        """(N, 3) vertex colours of the meshes (linear), interpolated at surface points; 1 where
-        there are none.
+        """(N, 3) vertex colours of the meshes (linear), interpolated at surface points; 1 if
+        absent.
         """
         tint = np.ones((len(points), 3))
         face = np.flatnonzero((primitive_id >= 0) & (primitive_id < len(self._faces)))
@@ -185,7 +185,7 @@ class Geometry:
         corners = self._faces[primitive_id[face]]
         a, b, c = (self._vertices[corners[:, k]] for k in range(3))
         p = self._local(points[face])
-        # Barycentric coordinates as areas over the triangle's own normal.
+        # Barycentric coordinates as areas over the triangle's normal.
         n = np.cross(b - a, c - a)
         nn = np.einsum("ij,ij->i", n, n)
         wb = np.einsum("ij,ij->i", np.cross(p - a, c - a), n) / nn
@@ -198,8 +198,8 @@ class Geometry:
         return (np.asarray(points, dtype=np.float64) - self.center) / self.extent
 
     def trace(self, camera: Camera) -> Hits:
-        """First hits of the rays through the pixel centres. The last few cameras' answers are
-        kept."""
+        """First hits of the rays through the pixel centres. The last few cameras' hits are
+        cached."""
         key = np.concatenate(
             [camera.K.ravel(), camera.world_to_camera.ravel(), [camera.width, camera.height]]
         ).tobytes()
@@ -210,7 +210,7 @@ class Geometry:
         return self._traced[key]
 
     def forget(self) -> None:
-        """Let go of the answers that are kept."""
+        """Clear the cached hits."""
         self._traced.clear()
 
     def _trace(self, camera: Camera) -> Hits:
@@ -232,16 +232,16 @@ class Geometry:
         )
 
     def ties(self, camera: Camera) -> tuple[Mask, npt.NDArray[np.int32]]:
-        """Pixels whose first hit lies on surfaces of several objects at once, so that whose it is
-        cannot be told.
+        """Pixels whose first hit lies on surfaces of several objects at once, so that its object is
+        ambiguous.
 
-        Depth, points and correspondences of such pixels are as exact as any; their ``object_id`` is
+        Depth, points and correspondences of such pixels are exact; their ``object_id`` is
         that of one of the objects.
 
         Returns:
             tied: (H, W) bool: another object's surface lies within ``REACH_TOLERANCE`` of the way.
-            lowest: (H, W) int32 the lowest object id there, the same whatever order the objects are
-                traced in; -1 on a miss.
+            lowest: (H, W) int32 the lowest object id at the hit, independent of the order in which
+                objects are traced in; -1 on a miss.
         """
         hits = self.trace(camera)
         directions = (camera.directions() @ camera.rotation).reshape(-1, 3)
@@ -344,15 +344,15 @@ class Geometry:
         """Mask of points, True where the way from an eye to a surface point is free.
 
         The ray is cast from the eye to the point, without any offset. The way is free if the first
-        hit is the point's own primitive, or lies at 1 +- ``REACH_TOLERANCE`` of the way.
+        hit is on the point's primitive, or lies at 1 +- ``REACH_TOLERANCE`` of the way.
 
         Args:
             eyes: (N, 3) or (3,) world coordinates.
             points: (N, 3) points on surfaces.
-            primitive_id: (N,) the primitive that each point lies on.
+            primitive_id: (N,) the primitive of each point.
 
         Returns:
-            (N,) bool. A sphere's far side counts as reached, so ask for the facing side as well.
+            (N,) bool. A sphere's far side counts as reached, so test the facing side too.
         """
         points = np.asarray(points, dtype=np.float64)
         eyes = np.broadcast_to(np.asarray(eyes, dtype=np.float64), points.shape)
@@ -366,12 +366,12 @@ class Geometry:
         primitive_id: npt.ArrayLike,
         eye: Camera | npt.ArrayLike,
     ) -> Mask:
-        """Mask of surface points that can be seen from ``eye``: reached, and on the side that
-        ``normals`` point to.
+        """Mask of surface points that can be seen from ``eye``: reached, from the side that
+        ``normals`` face.
 
         Args:
-            points, normals: (N, 3) world; the normal says which side of the surface is meant.
-            primitive_id: (N,) as :class:`Hits` has it.
+            points, normals: (N, 3) world; the normal selects the side of the surface.
+            primitive_id: (N,) as in :class:`Hits`.
             eye: a camera (its position counts, not its image) or a (3,) point.
 
         Returns:

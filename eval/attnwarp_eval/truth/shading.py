@@ -1,14 +1,14 @@
-"""Direct light on diffuse surfaces, by ray casting: what a surface point looks like from anywhere
-that sees it.
+"""Direct light on diffuse surfaces, by ray casting: the colour of a surface point, which is the
+same from every direction.
 
 For a diffuse surface under the sun and the sky without interreflection the outgoing radiance is
 albedo / pi * (E_sun max(0, n.s) V + integral of the sky's radiance times cosine over the free part
 of the hemisphere), the same in every direction. Mitsuba's pictures of such scenes converge to it,
 which the tests check.
 
-Points, spots and lamps add their own. What is not diffuse has no colour that is the same from
-everywhere: mirrors, metal and glass are given their tint as if it were paint, and block light;
-plastic is its base. Fog is not in it.
+Points, spots and lamps are added. Surfaces that are not diffuse have no view-independent colour:
+mirrors, metal and glass get their tint as paint, and block light; plastic is its base. Fog is
+ignored.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ def object_albedo(
     for k, item in enumerate(scene.spec.objects):
         pixels = objects == k
         if item.emission is not None or not pixels.any():
-            continue  # what shines reflects nothing
+            continue  # lamps reflect nothing
         tint = getattr(item.material, "tint", None)
         color[pixels] = albedo(item.texture, points[pixels]) if tint is None else linear_rgb(tint)
     return color * geometry.tint(points, primitive_id)
 
 
 def emitted(scene: Scene, geometry: Geometry, primitive_id: npt.NDArray[np.int64]) -> Array:
-    """(N, 3) radiance that surface points send out themselves: that of their lamp, else 0."""
+    """(N, 3) radiance emitted by surface points: that of their lamp, else 0."""
     objects = geometry.object_of(primitive_id)
     light = np.zeros((len(objects), 3))
     for k, item in enumerate(scene.spec.objects):
@@ -85,10 +85,10 @@ def irradiance(
 
     Args:
         points, normals: (N, 3) world, normals unit.
-        primitive_id: (N,) what each point lies on.
+        primitive_id: (N,) primitive of each point.
         rays: directions toward the sky a point (a rotated Hammersley set, cosine-weighted). 64
             differ from 1024 by 1 % in the median and 9 % at the 95th percentile (points in deep
-            shade), without bias. As many points are taken on each lamp.
+            shade), without bias. Each lamp gets as many points.
     """
     total = np.zeros((len(points), 3))
     for light in scene.spec.lights:
@@ -96,8 +96,8 @@ def irradiance(
             toward = sun_direction(light)
             cosine = normals @ toward
             lit = np.flatnonzero(cosine > 0)
-            # From outside the scene to the point, as everywhere: no offset from the surface is
-            # needed.
+            # Rays from outside the scene to the point need no offset from the
+            # surface.
             eyes = points[lit] + 2 * geometry.extent * toward
             lit = lit[geometry.reached(eyes, points[lit], primitive_id[lit])]
             total[lit] += cosine[lit, None] * light.irradiance * np.array(linear_rgb(light.color))
@@ -153,7 +153,7 @@ def _lamp_irradiance(
             continue
         for part in shape.rectangles() if isinstance(shape, Box) else [shape]:
             origins, facing, area = _spread(part, rays)
-            # Just off the lamp, which otherwise would hide the point from itself.
+            # Slightly off the lamp, which otherwise would occlude the point.
             eyes = origins + 1e-5 * geometry.extent * facing
             share = emission.radiance * area / rays
             for eye, turned in zip(eyes, facing, strict=True):
@@ -171,7 +171,7 @@ def _lamp_irradiance(
 
 
 def _spread(shape: Sphere | Rectangle | Mesh, count: int) -> tuple[Array, Array, float]:
-    """(count, 3) points spread evenly over a lamp, the directions they shine in, and the lamp's
+    """(count, 3) points spread evenly over a lamp, their directions of emission, and the lamp's
     area.
     """
     first = (np.arange(count) + 0.5) / count
@@ -220,19 +220,19 @@ def buried(
     primitive_id: npt.NDArray[np.int64],
     rays: int = 64,
 ) -> npt.NDArray[np.bool_]:
-    """Mask of surface points that no ray from outside the scene reaches: inside other objects, or
+    """Mask of surface points that rays from outside cannot reach: inside other objects, or
     where two of them touch.
 
     Args:
         points, normals, primitive_id: as in :func:`irradiance`.
-        rays: directions tried a point, at most.
+        rays: largest number of directions tried per point.
 
     Returns:
         (N,) bool.
     """
     left = np.arange(len(points))
     for start in range(0, rays, 8):
-        # Most points are out in the open: the first direction leaves few of them for the next.
+        # Most points are exposed: the first direction leaves few for the next.
         asked = left
         open_ = np.zeros(len(asked), dtype=bool)
         for direction in hemisphere(normals[asked], 8, start * 0.0477):
@@ -250,8 +250,8 @@ def hemisphere(normals: Array, rays: int, turn: float = 0.0) -> Iterator[Array]:
     """Cosine-weighted unit directions about each normal: ``rays`` arrays (N, 3) of a Hammersley
     set.
 
-    The set is turned by another angle for each point (a golden-ratio sequence), which makes its
-    bias noise.
+    The set is rotated by a different angle for each point (a golden-ratio sequence), which makes
+    its bias noise.
     """
     tangent, bitangent = frames(normals)
     offset = (np.arange(len(normals)) * 0.6180339887498949 + turn) % 1.0

@@ -1,4 +1,4 @@
-"""Scenes for a person: what one contains, in words, and what its cameras see, in pictures."""
+"""Display of scenes: contents in words, and views of the cameras in pictures."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def contents(scene: Scene) -> str:
     for item in spec.objects:
         if isinstance(item.shape, MeshSpec):
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", MeshNotice)  # the line itself says it
+                warnings.simplefilter("ignore", MeshNotice)  # the line reports it
                 lines.append(f"  {item.shape.file}: {read_mesh_file(scene.mesh_path(item.shape))}")
     reach = extent(scene)
     sides = " x ".join(f"{side:.4g}" for side in reach.high - reach.low)
@@ -76,16 +76,16 @@ def render_views(
     """Write each view's picture, depth and normals as PNG, and one sheet of them all.
 
     Args:
-        scene: at the image size wanted.
-        out: folder, made if it is missing.
-        views: names of cameras; all of them if left out.
-        spp: samples a pixel; the scene's own number if left out.
+        scene: scene at the image size of the output.
+        out: output folder, created if missing.
+        views: names of cameras; by default all.
+        spp: samples a pixel; by default the scene's number.
 
     Yields:
-        The files, as they are written; the sheet, ``sheet.png``, last.
+        Each written file; the sheet, ``sheet.png``, last.
 
     Raises:
-        InputError: ``views`` is empty, or names a camera that the scene does not have.
+        InputError: ``views`` is empty, or names a camera unknown to the scene.
     """
     from attnwarp_eval.colors import to_srgb
     from attnwarp_eval.files import write_picture
@@ -112,7 +112,7 @@ def render_views(
 
 
 def depth_picture(depth: npt.NDArray[np.float64]) -> Image:
-    """Depth in colour, near bright, on a scale of 1 / z between the view's own extremes; grey where
+    """Depth in colour, near bright, on a scale of 1 / z between the view's extremes; grey where
     undefined.
     """
     import matplotlib
