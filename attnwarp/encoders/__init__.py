@@ -81,13 +81,13 @@ REAL: dict[str, tuple[Kind, str]] = {
 """Encoders read from the user's files: pattern -> (kind, description)."""
 
 AUTHORS_SIDE = 518
-"""Side in px of the pictures that DINOv2 sees in the paper's figures."""
+"""Side in px of DINOv2's pictures in the paper's figures."""
 
 _SCHEMES = {pattern.partition(":")[0]: kind for pattern, (kind, _) in REAL.items()}
 
 
 def available() -> dict[str, str]:
-    """The bundled encoders: name -> description.
+    """List the bundled encoders: name -> description.
 
     Example:
         >>> list(available())
@@ -97,10 +97,10 @@ def available() -> dict[str, str]:
 
 
 def kind_of(name: str) -> Kind:
-    """The kind of an encoder by its name; nothing is loaded.
+    """Determine the kind of an encoder by its name, without loading it.
 
     Raises:
-        InputError: no such name.
+        InputError: the name is unknown.
 
     Example:
         >>> kind_of("dinov2:/models/dinov2-small")
@@ -122,10 +122,10 @@ def kind_of(name: str) -> Kind:
 
 
 def check_kind(name: str, kind: Kind) -> None:
-    """Refuse a name that is not of an encoder of this kind; nothing is loaded.
+    """Refuse a name that is not an encoder of this kind, without loading it.
 
     Raises:
-        InputError: no such name, or one of another kind.
+        InputError: the name is unknown, or the encoder is of another kind.
 
     Example:
         >>> check_kind("dino-small", "dino")
@@ -152,22 +152,22 @@ def load_encoder(name: str, kind: Kind | None = None, *, device: str = "cpu") ->
     """Load an encoder by name.
 
     Args:
-        name: a bundled one (``clip-small``, ``clip-parts``, ``dino-small``,
+        name: name of a bundled encoder (``clip-small``, ``clip-parts``, ``dino-small``,
             ``perceptual-small``), or ``clip:FOLDER``, ``dinov2:FOLDER``, ``lpips:FILE_OR_FOLDER``;
-            ``clip-whole:FOLDER`` and ``dinov2-518:FOLDER`` see pictures as the paper's authors
-            show them.
-        kind: the expected kind; an encoder of another kind is refused before it is loaded.
-        device: "cpu" or "cuda", for real ones. The bundled ones are small and stay on the CPU; the
-            loss of ``perceptual-small`` is computed where its pictures lie.
+            ``clip-whole:FOLDER`` and ``dinov2-518:FOLDER`` preprocess pictures as the paper's
+            authors do.
+        kind: expected kind; an encoder of another kind is refused before it is loaded.
+        device: "cpu" or "cuda", for real encoders. Bundled encoders are small and stay on the CPU;
+            the loss of ``perceptual-small`` is computed on its pictures' device.
 
     Returns:
         A :class:`TextImageEncoder` ("clip"), a :class:`TokenEncoder` ("dino") or a
         :class:`PerceptualDistance` ("perceptual").
 
     Raises:
-        InputError: no such name, another kind than expected, or weights that are missing or
-            invalid; the message says which files go where.
-        MissingExtraError: the encoder needs a package that only an extra brings.
+        InputError: the name is unknown, the kind differs from the expected one, or weights are
+            missing or invalid; the message names the required files.
+        MissingExtraError: the encoder needs a package of an extra.
 
     Example:
         >>> import numpy as np

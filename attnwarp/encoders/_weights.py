@@ -13,7 +13,7 @@ from attnwarp.errors import InputError
 
 
 def sha256_of(files: Sequence[Path]) -> str:
-    """SHA-256 of the files' bytes, concatenated in the order of their names."""
+    """Hash the files' bytes (SHA-256), concatenated in the order of their names."""
     total = hashlib.sha256()
     for path in sorted(files, key=lambda p: p.name):
         with path.open("rb") as stream:
@@ -23,10 +23,10 @@ def sha256_of(files: Sequence[Path]) -> str:
 
 
 def state_of(path: Path) -> dict[str, torch.Tensor]:
-    """The tensors of a .safetensors, .pth, .pt or .bin file, on the CPU; nothing in it is executed.
+    """Read the tensors of a .safetensors, .pth, .pt or .bin file to the CPU; run no code.
 
     Raises:
-        InputError: the file cannot be read, or holds anything but tensors by name.
+        InputError: the file is unreadable, or has anything but named tensors.
     """
     try:
         if path.suffix == ".safetensors":
@@ -34,7 +34,7 @@ def state_of(path: Path) -> dict[str, torch.Tensor]:
 
             return load_file(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # the two readers raise many kinds
+    except Exception as error:  # both readers raise many kinds of errors
         if isinstance(error, OSError) and error.filename is not None:
             raise
         raise InputError(
@@ -48,8 +48,8 @@ def state_of(path: Path) -> dict[str, torch.Tensor]:
 
 
 def reason_of(error: Exception) -> str:
-    """The first line of what a reader of weights says. torch's advice to load a file that may run
-    code is not passed on.
+    """Return the first line of a weight reader's error. torch's advice to load a file that may run
+    code is dropped.
     """
     text = str(error).strip()
     if "weights_only" in text or "Unsupported operand" in text:
@@ -59,8 +59,8 @@ def reason_of(error: Exception) -> str:
 
 @contextmanager
 def full_float32() -> Iterator[None]:
-    """No gradients, and true float32 in convolutions: cuDNN would take TF32, of 10 bits, by
-    default.
+    """Disable gradients, and use full float32 in convolutions: cuDNN defaults to TF32, of 10
+    bits.
     """
     with torch.inference_mode(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
         yield

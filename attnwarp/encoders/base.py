@@ -20,17 +20,17 @@ Image = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class EncoderInfo:
-    """Identity of an encoder, stored beside every result: figures of two encoders do not compare.
+    """Identity of an encoder, stored with every result: encoders' figures are not comparable.
 
     Attributes:
-        name: the argument of :func:`attnwarp.encoders.load_encoder`.
+        name: argument of :func:`attnwarp.encoders.load_encoder`.
         kind: "clip" (images and texts in one space), "dino" (images alone) or "perceptual" (a
             distance of images).
-        source: "bundled", or the folder or file that the weights were read from.
+        source: "bundled", or the folder or file of the weights.
         weights_sha256: SHA-256 of the weights' file, or of several files' bytes in the order
             of their names.
-        preprocessing: the steps before the network, in words.
-        size: side in px of the network's square input; None: pictures keep their size.
+        preprocessing: steps before the network, in words.
+        size: side in px of the network's square input; None if pictures keep their size.
         dim: length of an embedding; None for a distance.
 
     Example:
@@ -49,13 +49,13 @@ class EncoderInfo:
     dim: int | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Fields for JSON."""
+        """Convert the fields to JSON values."""
         return asdict(self)
 
 
 @runtime_checkable
 class ImageEncoder(Protocol):
-    """Pictures to embeddings.
+    """Encoder from pictures to embeddings.
 
     Example:
         >>> import numpy as np
@@ -71,21 +71,21 @@ class ImageEncoder(Protocol):
         ...
 
     def images(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
-        """(N, D) float64 embeddings, not normalised; (0, D) of an empty list.
+        """Embed pictures, (N, D) float64, not normalised; an empty list gives (0, D).
 
         Args:
             images: N pictures (H, W, 3), sRGB, floating, in [0, 1], of any sizes. A picture's
                 embedding does not depend on the others in the list.
 
         Raises:
-            ValueError: a picture of another shape, dtype or range; the message names its index.
+            ValueError: a picture has a wrong shape, dtype or range; the message names its index.
         """
         ...
 
 
 @runtime_checkable
 class TextImageEncoder(ImageEncoder, Protocol):
-    """Pictures and texts to one space, as CLIP.
+    """Encoder of pictures and texts into one space, such as CLIP.
 
     Example:
         >>> from attnwarp.encoders import TextImageEncoder, load_encoder
@@ -98,13 +98,13 @@ class TextImageEncoder(ImageEncoder, Protocol):
     """
 
     def texts(self, texts: Sequence[str]) -> npt.NDArray[np.float64]:
-        """(N, D) float64 embeddings, not normalised; (0, D) of an empty list."""
+        """Embed texts, (N, D) float64, not normalised; an empty list gives (0, D)."""
         ...
 
 
 @runtime_checkable
 class PlaceEncoder(Protocol):
-    """An encoder that tells, by words, which things each place of a picture shows.
+    """Encoder that scores, by words, which objects each region of a picture shows.
 
     Example:
         >>> import numpy as np
@@ -117,21 +117,21 @@ class PlaceEncoder(Protocol):
     """
 
     def shown(self, image: Image, texts: Sequence[str]) -> npt.NDArray[np.float64]:
-        """(h, w, T) float64 in [0, 1]: with which probability each text is true of each place.
+        """Estimate the probability of each text for each region, (h, w, T) float64 in [0, 1].
 
         Args:
             image: (H, W, 3) sRGB, floating, in [0, 1].
-            texts: T of them, none or all of which may be true of a place.
+            texts: T texts; any number of them may describe a region.
 
         Raises:
-            ValueError: a picture of another shape, dtype or range.
+            ValueError: the picture has a wrong shape, dtype or range.
         """
         ...
 
 
 @runtime_checkable
 class TokenEncoder(ImageEncoder, Protocol):
-    """Pictures to embeddings and to grids of patch embeddings, as DINO.
+    """Encoder from pictures to embeddings and grids of patch embeddings, such as DINO.
 
     Example:
         >>> import numpy as np
@@ -142,13 +142,13 @@ class TokenEncoder(ImageEncoder, Protocol):
     """
 
     def tokens(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
-        """(N, h, w, D) float64 embeddings of the patches of the preprocessed picture, by row."""
+        """Embed the patches of preprocessed pictures, (N, h, w, D) float64, by row."""
         ...
 
 
 @runtime_checkable
 class PerceptualDistance(Protocol):
-    """A distance of pictures that follows human judgement, as LPIPS.
+    """Distance of pictures that follows human judgement, such as LPIPS.
 
     Example:
         >>> import numpy as np
@@ -166,7 +166,7 @@ class PerceptualDistance(Protocol):
         ...
 
     def distance(self, a: Sequence[Image], b: Sequence[Image]) -> npt.NDArray[np.float64]:
-        """(N,) float64 distances, 0 for equal pictures.
+        """Compute distances, (N,) float64, 0 for equal pictures.
 
         Args:
             a, b: N pictures each, (H, W, 3), sRGB, floating, in [0, 1] (the scaling to [-1, 1]
@@ -174,8 +174,8 @@ class PerceptualDistance(Protocol):
                 pair.
 
         Raises:
-            ValueError: lists of different lengths, a pair of different sizes, a bad picture; the
-                message names the index.
+            ValueError: the lists differ in length, a pair differs in size, or a picture is invalid;
+                the message names the index.
         """
         ...
 
@@ -188,8 +188,8 @@ def checked_images(images: Sequence[Image], name: str = "images") -> list[npt.ND
 
     Raises:
         TypeError: one picture where a list was expected.
-        ValueError: not (H, W, 3), not floating, not finite, or out of [0, 1]; the message names the
-            index.
+        ValueError: a picture is not (H, W, 3), floating, finite and in [0, 1]; the message names
+            the index.
     """
     if isinstance(images, np.ndarray) and images.ndim == 3:
         raise TypeError(
@@ -199,7 +199,7 @@ def checked_images(images: Sequence[Image], name: str = "images") -> list[npt.ND
 
 
 def checked_image(image: Image, name: str = "image") -> npt.NDArray[np.float32]:
-    """Validate one picture and convert it to float32; raises as :func:`checked_images`."""
+    """Validate one picture and convert it to float32; errors as in :func:`checked_images`."""
     array = np.asarray(image)
     if array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
         raise ValueError(
@@ -209,7 +209,7 @@ def checked_image(image: Image, name: str = "image") -> npt.NDArray[np.float32]:
         raise ValueError(
             f"{name}: got {array.dtype}, expected floating sRGB in [0, 1]; divide 8 bits by 255"
         )
-    # Tested in its own dtype: a float64 of 1e300 is out of range, and must not overflow first.
+    # Tested before conversion: a float64 of 1e300 is out of range and must not overflow first.
     if not np.isfinite(array).all():
         raise ValueError(
             f"{name}: {int((~np.isfinite(array)).sum())} values are NaN or infinite, expected none"
@@ -226,8 +226,8 @@ def checked_pairs(
     """Validate pairs of pictures, equal in size within each pair, and convert them to float32.
 
     Raises:
-        TypeError, ValueError: as :func:`checked_images`; lists of different lengths; a pair of
-            different sizes.
+        TypeError, ValueError: as :func:`checked_images`; also if the lists differ in length or a
+            pair differs in size.
     """
     left, right = checked_images(a, "a"), checked_images(b, "b")
     if len(left) != len(right):
@@ -245,7 +245,7 @@ def checked_texts(texts: Sequence[str]) -> list[str]:
     """Validate a list of texts.
 
     Raises:
-        TypeError: one string where a list was expected, or something that is not a string.
+        TypeError: the argument is one string instead of a list, or an item is not a string.
     """
     if isinstance(texts, str):
         raise TypeError(f"texts: got one string {texts!r}, expected a list of strings")

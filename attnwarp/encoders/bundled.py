@@ -1,4 +1,4 @@
-"""The bundled encoders, trained from nothing by eval/training/; their weights lie in
+"""Bundled encoders, trained from scratch by eval/training/; their weights are in
 weights/.
 """
 
@@ -34,16 +34,16 @@ Array = npt.NDArray[np.float64]
 
 
 def load(name: str, folder: Path = WEIGHTS) -> BundledClip | BundledDino | BundledPerceptual:
-    """A bundled encoder by name: "clip-small", "clip-parts", "dino-small" or "perceptual-small".
+    """Load a bundled encoder: "clip-small", "clip-parts", "dino-small" or "perceptual-small".
 
     Args:
         name: name of the encoder.
-        folder: holds ``name``.safetensors, and for clip-small and clip-parts a tokenizer; the
-            package's own if left out.
+        folder: folder with ``name``.safetensors, and a tokenizer for clip-small and clip-parts; the
+            package's folder if omitted.
 
     Raises:
-        InputError: no such encoder, or weights that are missing, of another network, or other
-            than those that the model card beside them names.
+        InputError: the encoder is unknown, or its weights are missing, of another network, or
+            differ from those named in the model card.
     """
     kinds: dict[str, Callable[[str, Path], Any]] = {
         "clip-small": BundledClip, "clip-parts": BundledClipParts,
@@ -65,7 +65,7 @@ def _info(
 ) -> EncoderInfo:
     sha256 = sha256_of(files)
     card = files[0].with_name(f"{name}.md")
-    # A changed weight is a number like any other; its card alone tells what was trained.
+    # A changed weight is undetectable by itself; the card's hash identifies the trained weights.
     if card.is_file() and sha256 not in card.read_text(encoding="utf-8"):
         raise InputError(
             f"{files[0]}: not the weights that {card.name} names, or damaged; install the package"
@@ -80,7 +80,7 @@ def _read(net: torch.nn.Module, path: Path) -> None:
     from safetensors.torch import load_file
 
     try:
-        # A network is made in the process's default type, which may be float64.
+        # A network is created in the process's default dtype, which may be float64.
         net.to("cpu", torch.float32)
         net.load_state_dict({key: value.float() for key, value in load_file(path).items()})
     except FileNotFoundError:
@@ -95,7 +95,7 @@ def _read(net: torch.nn.Module, path: Path) -> None:
 
 
 class _OfSquares:
-    """Shared by the encoders whose input is a square: preprocessing in batches."""
+    """Base of the encoders with square input: preprocessing in batches."""
 
     about: EncoderInfo
     preprocess: Preprocessing
@@ -137,10 +137,10 @@ class BundledClip(_OfSquares):
         )
 
     def images(self, images: Sequence[Image]) -> Array:
-        """(N, D) float64 embeddings, not normalised.
+        """Embed pictures, (N, D) float64, not normalised.
 
-        Each is the mean of the picture's and its mirror image's: no training caption tells left
-        from right, so any difference between the two is error.
+        An embedding averages the picture's and its mirror image's: training captions never
+        distinguish left from right, so any difference between the two is an error.
         """
         with full_float32():
             embeddings = [
@@ -150,11 +150,11 @@ class BundledClip(_OfSquares):
         return np.concatenate(embeddings) if embeddings else np.zeros((0, self.about.dim or 0))
 
     def cut(self, text: str) -> int:
-        """Count of a text's tokens beyond the network's length, which are dropped."""
+        """Count a text's tokens beyond the network's length, which are dropped."""
         return sum(len(rest.ids) - 1 for rest in self.tokenizer.encode(text).overflowing)
 
     def texts(self, texts: Sequence[str]) -> Array:
-        """(N, D) float64 embeddings, not normalised; unknown words are split into known pieces."""
+        """Embed texts, (N, D) float64, not normalised; unknown words are split into pieces."""
         checked = checked_texts(texts)
         if not checked:
             return np.zeros((0, self.about.dim or 0))
@@ -166,16 +166,16 @@ class BundledClip(_OfSquares):
 
 
 class BundledClipParts(BundledClip):
-    """clip-parts: as clip-small, and a :class:`~attnwarp.encoders.base.PlaceEncoder`."""
+    """clip-parts: clip-small that is also a :class:`~attnwarp.encoders.base.PlaceEncoder`."""
 
     network = ClipParts
     net: ClipParts
 
     def shown(self, image: Image, texts: Sequence[str]) -> Array:
-        """(h, w, T) float64 probabilities, see :class:`~attnwarp.encoders.base.PlaceEncoder`.
+        """Estimate probabilities, (h, w, T), see :class:`~attnwarp.encoders.base.PlaceEncoder`.
 
-        A place has 8 x 8 px. The picture is resized to multiples of 32 px. Its mirror image counts
-        as much.
+        A region has 8 x 8 px. The picture is resized to multiples of 32 px. Results are averaged
+        with the mirror image's.
         """
         (picture,) = checked_images([image])
         height, width = (max(1, round(side / 32)) * 32 for side in picture.shape[:2])
@@ -204,14 +204,14 @@ class BundledDino(_OfSquares):
         )
 
     def images(self, images: Sequence[Image]) -> Array:
-        """(N, D) float64 class tokens, not normalised."""
+        """Compute class tokens, (N, D) float64, not normalised."""
         with full_float32():
             embeddings = [self.net(batch)[0].double().numpy() for batch in self._batches(images)]
         return np.concatenate(embeddings) if embeddings else np.zeros((0, self.net.dim))
 
     def tokens(self, images: Sequence[Image]) -> Array:
-        """(N, 8, 8, D) float64 patch tokens of the central square, each of 16 x 16 px of 128 x
-        128."""
+        """Compute patch tokens of the central square, (N, 8, 8, D) float64; a patch has 16 x 16 of
+        128 x 128 px."""
         with full_float32():
             grids = [
                 self.net(batch)[1].permute(0, 2, 3, 1).double().numpy()
@@ -225,7 +225,7 @@ class BundledPerceptual:
     """perceptual-small: a :class:`~attnwarp.encoders.base.PerceptualDistance`.
 
     Attributes:
-        smallest: shortest side in px of a picture that it takes.
+        smallest: shortest accepted side of a picture, px.
     """
 
     smallest = 1
@@ -237,8 +237,8 @@ class BundledPerceptual:
         self.about = _info(name, "perceptual", [weights], "as it is, at its own size", None, None)
 
     def distance(self, a: Sequence[Image], b: Sequence[Image]) -> Array:
-        """(N,) float64 distances, 0 for equal pictures; about (strength of the distortion / 5)^2,
-        see the model card.
+        """Compute distances, (N,) float64, 0 for equal pictures; about (strength of the
+        distortion / 5)^2, see the model card.
         """
         distances = []
         self.net.to("cpu")
@@ -249,14 +249,14 @@ class BundledPerceptual:
         return np.array(distances, dtype=np.float64)
 
     def loss(self, image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """() the distance of two (H, W, 3) pictures in [0, 1], differentiable."""
+        """Compute the distance () of two (H, W, 3) pictures in [0, 1], differentiable."""
         return self.between(self.features(image), self.features(target))
 
     def features(self, picture: torch.Tensor) -> list[torch.Tensor]:
-        """Features for :meth:`between` of a picture (H, W, 3) in [0, 1], differentiable. The
-        network goes to the picture's device."""
+        """Compute features for :meth:`between` of a picture (H, W, 3) in [0, 1], differentiable.
+        The network moves to the picture's device."""
         return self.net.to(picture.device).stack(picture.permute(2, 0, 1)[None])
 
     def between(self, image: list[torch.Tensor], target: list[torch.Tensor]) -> torch.Tensor:
-        """() the distance of two pictures by their :meth:`features`."""
+        """Compute the distance () of two pictures from their :meth:`features`."""
         return self.net.between(image, target)[0]

@@ -39,14 +39,14 @@ SUFFIXES = (".pth", ".pt", ".bin", ".safetensors")
 
 @dataclass(frozen=True)
 class Backbone:
-    """One of the three networks.
+    """Backbone network, one of three.
 
     Attributes:
-        name: in LPIPS.
-        file: file of its weights in torchvision.
+        name: name in LPIPS.
+        file: file of the weights in torchvision.
         taps: index of the last layer of each stage in torchvision's ``features``.
         channels: channel counts of each stage.
-        smallest: shortest side in px of a picture that reaches the last stage.
+        smallest: shortest side in px for which a picture reaches the last stage.
     """
 
     name: str
@@ -84,14 +84,14 @@ class Fire(nn.Module):
         self.expand3x3 = nn.Conv2d(narrow, wide, 3, padding=1)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(N, inputs, h, w) to (N, 2 wide, h, w)."""
+        """Map (N, inputs, h, w) to (N, 2 wide, h, w)."""
         x = self.squeeze(x).relu()
         return torch.cat([self.expand1x1(x).relu(), self.expand3x3(x).relu()], dim=1)
 
 
 def features(name: str) -> nn.Sequential:
-    """torchvision's ``features`` of a network up to LPIPS's last stage; its tensors are named as
-    there, ``0.weight``.
+    """Build torchvision's ``features`` of a network up to LPIPS's last stage; its tensors are named
+    like torchvision's, ``0.weight``.
     """
     if name == "alex":
         layers: list[nn.Module] = [
@@ -136,17 +136,17 @@ def features(name: str) -> nn.Sequential:
 
 
 class Lpips:
-    """The distance; see :class:`attnwarp.encoders.PerceptualDistance`.
+    """LPIPS distance; see :class:`attnwarp.encoders.PerceptualDistance`.
 
     Args:
-        backbone: which network.
-        network: its ``features``, see :func:`features`.
-        weights: the linear layers, one (channels,) tensor a stage.
+        backbone: backbone network.
+        network: ``features`` of the backbone, see :func:`features`.
+        weights: linear layers, one (channels,) tensor per stage.
         about: identity, stored with results.
         device: device of the computation.
 
     Attributes:
-        smallest: shortest side in px of a picture that it takes.
+        smallest: shortest accepted side of a picture, px.
     """
 
     def __init__(
@@ -165,10 +165,10 @@ class Lpips:
         self._weights = [w.to(self._device, torch.float32).reshape(1, -1, 1, 1) for w in weights]
 
     def distance(self, a: Sequence[Image], b: Sequence[Image]) -> npt.NDArray[np.float64]:
-        """(N,) float64; see :class:`attnwarp.encoders.PerceptualDistance`.
+        """Compute distances, (N,) float64; see :class:`attnwarp.encoders.PerceptualDistance`.
 
         Raises:
-            ValueError: also for pictures smaller than the network can take.
+            ValueError: as there, or a picture is smaller than the network's limit.
         """
         pairs = checked_pairs(a, b)
         for i, (first, _) in enumerate(pairs):
@@ -182,25 +182,25 @@ class Lpips:
 
     def _pair(self, a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> float:
         if np.array_equal(a, b):
-            return 0.0  # exactly: a kernel may sum the two halves of a batch in different orders
+            return 0.0  # exactly 0: a kernel may sum the two halves of a batch in different orders
         with full_float32():
             both = self._units(torch.from_numpy(np.stack([a, b])).permute(0, 3, 1, 2))
             return float(sum(self._parts([x[0] for x in both], [x[1] for x in both])))
 
     def loss(self, image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """() the distance of two (H, W, 3) pictures in [0, 1], differentiable."""
+        """Compute the distance () of two (H, W, 3) pictures in [0, 1], differentiable."""
         return self.between(self.features(image), self.features(target))
 
     def features(self, picture: torch.Tensor) -> list[torch.Tensor]:
-        """Features for :meth:`between` of a picture (H, W, 3) in [0, 1], differentiable."""
+        """Compute features of a picture (H, W, 3) for :meth:`between`, differentiable."""
         return [x[0] for x in self._units(picture.permute(2, 0, 1)[None])]
 
     def between(self, image: list[torch.Tensor], target: list[torch.Tensor]) -> torch.Tensor:
-        """() the distance of two pictures by their :meth:`features`."""
+        """Compute the distance () of two pictures from their :meth:`features`."""
         return torch.stack(self._parts(image, target)).sum()
 
     def _units(self, pictures: torch.Tensor) -> list[torch.Tensor]:
-        """(N, C_k, h_k, w_k) unit features of each stage, of pictures (N, 3, H, W) in [0, 1]."""
+        """Compute unit features of each stage, (N, C_k, h_k, w_k), of pictures (N, 3, H, W)."""
         shift, scale = (
             torch.tensor(v, dtype=torch.float32, device=self._device).reshape(1, 3, 1, 1)
             for v in (SHIFT, SCALE)
@@ -214,7 +214,7 @@ class Lpips:
         return units
 
     def _parts(self, a: list[torch.Tensor], b: list[torch.Tensor]) -> list[torch.Tensor]:
-        """() float64 of each stage, of two pictures' unit features (C_k, h_k, w_k)."""
+        """Compute each stage's distance, () float64, from two pictures' unit features."""
         return [
             (((x - y) ** 2)[None] * weight).sum(1).mean(dtype=torch.float64)
             for x, y, weight in zip(a, b, self._weights, strict=True)
@@ -222,19 +222,19 @@ class Lpips:
 
 
 def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
-    """LPIPS from one file that holds everything, or from a folder with a backbone and linear
+    """Load LPIPS from one complete file, or from a folder with a backbone and linear
     layers.
 
     Args:
-        place: a state dict saved from an LPIPS network (``net.slice1.0.weight``,
+        place: state dict saved from an LPIPS network (``net.slice1.0.weight``,
             ``lin0.model.1.weight``, ...), or a folder with torchvision's state dict of a backbone
-            (``features.0.weight``, ...) and one or more of the published files of linear layers, of
-            which the fitting one is taken.
-        name: the name in errors and results.
+            (``features.0.weight``, ...) and one or more published files of linear layers; the one
+            that fits the backbone is used.
+        name: name in errors and results.
         device: "cpu" or "cuda".
 
     Raises:
-        InputError: nothing there, something missing, or more than one that fits.
+        InputError: the place is empty, a file is missing, or several files fit.
     """
     torch_device = device_of(device)
     if place.is_file():
@@ -273,7 +273,7 @@ def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
     used = sorted({path, fitting[0][0]})
     if not all(bool(torch.isfinite(v).all()) for v in [*layers.values(), *fitting[0][1]]):
         raise InputError(f"{name}: weights in {place} are NaN or infinite; fetch the files again")
-    with torch.device("meta"):  # no time spent on random weights that are replaced at once
+    with torch.device("meta"):  # skips random weights, which would be replaced at once
         network = features(backbone.name)
     network.load_state_dict(layers, assign=True)
     about = EncoderInfo(
@@ -299,8 +299,8 @@ _HOW = (
 
 
 def _backbone_tensors(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The backbone's tensors by torchvision's names without ``features.``, whichever way they were
-    saved.
+    """Select the backbone's tensors by torchvision's names without ``features.``, for both ways of
+    saving.
     """
     # lpips numbers the layers inside its slices as torchvision does: net.slice3.6.weight is
     # features.6.weight.

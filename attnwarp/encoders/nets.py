@@ -1,7 +1,7 @@
-"""The networks of the bundled encoders. Small enough for a CPU; the recipes in eval/training/ train
+"""Networks of the bundled encoders, small enough for a CPU; the recipes in eval/training/ train
 them.
 
-Pictures come in as (N, 3, H, W) sRGB in [0, 1]; each network centres them itself.
+Inputs are pictures (N, 3, H, W) sRGB in [0, 1]; each network centres its input.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ class Residual(nn.Module):
         self.second_norm = nn.BatchNorm2d(channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, C, h, w) -> (N, C, h, w)."""
+        """Map (N, C, h, w) -> (N, C, h, w)."""
         y = functional.relu(self.first_norm(self.first(x)))
         return functional.relu(x + self.second_norm(self.second(y)))
 
 
 class Stages(nn.Module):
-    """Convolutional stages: the first at a quarter of the size, each further one at half of the one
-    before.
+    """Convolutional stages: the first at a quarter of the size, each further one at half of the
+    previous size.
 
     Args:
         widths: channels of the stages.
@@ -55,8 +55,8 @@ class Stages(nn.Module):
             self.stages.append(nn.Sequential(*down, *(Residual(width) for _ in range(depth))))
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        """(N, 3, H, W) in [0, 1] -> the output of every stage, (N, C_k, H / 2^(k + 2), W / 2^(k +
-        2)).
+        """Map (N, 3, H, W) in [0, 1] -> the output of every stage, (N, C_k, H / 2^(k + 2),
+        W / 2^(k + 2)).
         """
         x = self.stem(4 * x - 2)
         out = []
@@ -67,8 +67,8 @@ class Stages(nn.Module):
 
 
 class Pool(nn.Module):
-    """Mean and maximum over all places, projected: the mean for ground and light, the maximum for
-    what is in one place.
+    """Mean and maximum over all positions, projected: the mean captures ground and light, the
+    maximum local objects.
     """
 
     def __init__(self, channels: int, dim: int) -> None:
@@ -77,21 +77,21 @@ class Pool(nn.Module):
         self.project = nn.Linear(2 * channels, dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, C, h, w) -> (N, dim)."""
+        """Map (N, C, h, w) -> (N, dim)."""
         return self.project(self.features(x))
 
     def features(self, x: Tensor) -> Tensor:
-        """(N, C, h, w) -> (N, 2 C), what is projected."""
+        """Map (N, C, h, w) -> (N, 2 C), the features before the projection."""
         return self.norm(torch.cat([x.mean((2, 3)), x.amax((2, 3))], dim=1))
 
 
 class Patches(nn.Module):
-    """A vector for each place, from all stages but the first: what is there, in the space of texts.
+    """Vectors of regions, from all stages but the first, in the space of texts.
 
     Args:
-        widths: channels of the stages, each of which has half of the size of the one before.
+        widths: channels of the stages, each of half the size of the previous one.
         dim: number of dimensions of the vectors.
-        hidden: channels in between.
+        hidden: number of intermediate channels.
     """
 
     def __init__(self, widths: Sequence[int], dim: int, hidden: int = 128) -> None:
@@ -100,12 +100,12 @@ class Patches(nn.Module):
         self.norm = nn.BatchNorm2d(hidden)
         self.mix = nn.Conv2d(hidden, hidden, 3, padding=1)
         self.project = nn.Conv2d(hidden, dim, 1)
-        # A place shows what a text says with probability sigmoid(exp(scale) cosine + bias).
+        # A text describes a region with probability sigmoid(exp(scale) cosine + bias).
         self.scale = nn.Parameter(torch.tensor(2.3))
         self.bias = nn.Parameter(torch.tensor(-4.0))
 
     def forward(self, stages: Sequence[Tensor]) -> Tensor:
-        """Outputs of the stages, (N, C_k, h / 2^k, w / 2^k) -> (N, dim, h, w)."""
+        """Map the stages' outputs, (N, C_k, h / 2^k, w / 2^k) -> (N, dim, h, w)."""
         size = stages[0].shape[-2:]
         total = self.inputs[0](stages[0])
         for layer, x in zip(list(self.inputs)[1:], stages[1:], strict=True):
@@ -116,7 +116,7 @@ class Patches(nn.Module):
 
 
 class Block(nn.Module):
-    """A transformer block, normalised first."""
+    """Transformer block with normalisation first."""
 
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
@@ -128,7 +128,7 @@ class Block(nn.Module):
         self.think = nn.Sequential(nn.Linear(dim, 2 * dim), nn.GELU(), nn.Linear(2 * dim, dim))
 
     def forward(self, x: Tensor, absent: Tensor | None = None) -> Tensor:
-        """(N, L, D) -> (N, L, D); what is ``absent``, (N, L) bool, is looked at by nobody."""
+        """Map (N, L, D) -> (N, L, D); no token attends to ``absent`` ones, (N, L) bool."""
         n, length, dim = x.shape
         q, k, v = (
             self.qkv(self.attend_norm(x))
@@ -147,12 +147,12 @@ class Block(nn.Module):
 
 
 class TextTower(nn.Module):
-    """A small transformer over byte-pair tokens; the embedding is read at the last token.
+    """Small transformer over byte-pair tokens; the embedding is read at the last token.
 
     Args:
         vocabulary: number of tokens; token 0 is padding.
         width, depth, heads: width, depth and heads of the transformer.
-        length: longest text in tokens; longer ones are cut, keeping their end token.
+        length: longest text in tokens; longer texts are cut, keeping their end token.
         dim: number of dimensions of the embedding.
     """
 
@@ -168,7 +168,7 @@ class TextTower(nn.Module):
         self.project = nn.Linear(width, dim)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """(N, L) int64, padded with 0 at the end -> (N, dim)."""
+        """Map (N, L) int64, padded with 0 at the end -> (N, dim)."""
         x = self.words(tokens) + self.position[: tokens.shape[1]]
         for block in self.blocks:
             x = block(x, tokens == 0)
@@ -177,7 +177,7 @@ class TextTower(nn.Module):
 
 
 class ClipSmall(nn.Module):
-    """Pictures and texts in one space (Radford et al. 2021), small.
+    """Small encoder of pictures and texts in one space (Radford et al. 2021).
 
     Args:
         vocabulary: vocabulary of the tokenizer.
@@ -192,20 +192,20 @@ class ClipSmall(nn.Module):
         self.vision = Stages((32, 64, 128, 224), (1, 1, 2, 2))
         self.pool = Pool(224, dim)
         self.text = TextTower(vocabulary, 128, 3, 4, self.length, dim)
-        # exp of it multiplies the cosine, as in the paper, which starts at 1 / 0.07.
+        # exp(scale) multiplies the cosine, as in the paper, which starts at 1 / 0.07.
         self.scale = nn.Parameter(torch.tensor(2.66))
 
     def images(self, x: Tensor) -> Tensor:
-        """(N, 3, 112, 112) in [0, 1] -> (N, dim)."""
+        """Map (N, 3, 112, 112) in [0, 1] -> (N, dim)."""
         return self.pool(self.vision(x)[-1])
 
     def texts(self, tokens: Tensor) -> Tensor:
-        """(N, L) tokens -> (N, dim)."""
+        """Map (N, L) tokens -> (N, dim)."""
         return self.text(tokens)
 
 
 class ClipParts(ClipSmall):
-    """:class:`ClipSmall` with a vector for each place of 8 x 8 px in the space of texts.
+    """:class:`ClipSmall` with a vector for each region of 8 x 8 px in the space of texts.
 
     Args:
         vocabulary: vocabulary of the tokenizer.
@@ -217,15 +217,15 @@ class ClipParts(ClipSmall):
         self.patches = Patches((64, 128, 224), dim)
 
     def places(self, x: Tensor) -> Tensor:
-        """(N, 3, H, W) in [0, 1], sides multiples of 32 -> (N, dim, H / 8, W / 8)."""
+        """Map (N, 3, H, W) in [0, 1], sides multiples of 32 -> (N, dim, H / 8, W / 8)."""
         return self.patches(self.vision(x)[1:])
 
 
 class DinoSmall(nn.Module):
-    """Convolutions to a sixteenth of the size, then a transformer with a class token (Caron et al.
-    2021), small.
+    """Small network: convolutions to 1/16 of the size, then a transformer with a class token (Caron
+    et al. 2021).
 
-    The convolutions take the place of the patch embedding: a transformer alone needs far more
+    The convolutions replace the patch embedding, since a transformer alone needs far more
     pictures. The class token starts as mean and maximum of their features.
     """
 
@@ -243,8 +243,8 @@ class DinoSmall(nn.Module):
         self.norm = nn.LayerNorm(dim)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 3, H, W) in [0, 1], sides multiples of 16 -> class token (N, D), patch tokens (N, D,
-        H / 16, W / 16).
+        """Map (N, 3, H, W) in [0, 1], sides multiples of 16 -> class token (N, D), patch tokens
+        (N, D, H / 16, W / 16).
         """
         x = self.stages(x)[-1]
         y = self.embed(x)
@@ -258,12 +258,12 @@ class DinoSmall(nn.Module):
 
 
 class PerceptualSmall(nn.Module):
-    """Differences of features, weighted by channel and averaged over places and stages (Zhang et
-    al. 2018, eq. 1), small.
+    """Small network: differences of features, weighted by channel and averaged over positions and
+    stages (Zhang et al. 2018, eq. 1).
 
-    Features are normalised at each place; weights are kept positive by their exponential. The
-    picture itself, a little blurred, is a first stage of its own, so that differences too faint for
-    the features still count.
+    Features are normalised at each position; weights are kept positive by their exponential. The
+    slightly blurred picture is an additional first stage, so that differences too faint for the
+    features still count.
     """
 
     def __init__(self) -> None:
@@ -282,7 +282,7 @@ class PerceptualSmall(nn.Module):
         self.color_log_weight = nn.Parameter(torch.zeros(3))
 
     def features(self, x: Tensor) -> list[Tensor]:
-        """(N, 3, H, W) in [0, 1] -> (N, C_k, h_k, w_k): full size, then a half of the size before
+        """Map (N, 3, H, W) in [0, 1] -> (N, C_k, h_k, w_k): full size, then half the previous size
         at each stage.
         """
         x = 4 * x - 2
@@ -295,18 +295,18 @@ class PerceptualSmall(nn.Module):
         return out
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        """(N, 3, H, W) twice -> (N,) distances, 0 for equal pictures, symmetric."""
+        """Map two (N, 3, H, W) -> (N,) symmetric distances, 0 for equal pictures."""
         return self.between(self.stack(a), self.stack(b))
 
     def stack(self, x: Tensor) -> list[Tensor]:
-        """Features that are compared of pictures: the pictures averaged over 4 x 4 px, then their
+        """Stack the compared features of pictures: the pictures averaged over 4 x 4 px, then their
         unit features.
         """
         size = 4 if min(x.shape[-2:]) >= 4 else 1
         return [functional.avg_pool2d(x, size), *(_unit(y) for y in self.features(x))]
 
     def between(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
-        """(N,) distances of what :meth:`stack` gave."""
+        """Compute distances, (N,), from the results of :meth:`stack`."""
         weights = [self.color_log_weight, *self.log_weights]
         parts = [
             (x - y).square().mean((2, 3)) @ w.exp() for x, y, w in zip(a, b, weights, strict=True)
@@ -315,5 +315,5 @@ class PerceptualSmall(nn.Module):
 
 
 def _unit(x: Tensor) -> Tensor:
-    """Each place's feature vector to length 1; where it is all but zero it stays so."""
+    """Normalise each position's feature vector to length 1; nearly zero vectors stay so."""
     return x / (x.square().sum(dim=1, keepdim=True) + 1e-2).sqrt()

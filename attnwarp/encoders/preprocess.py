@@ -1,7 +1,7 @@
-"""Preprocessing of pictures for pretrained networks, read from the file beside the weights.
+"""Preprocessing of pictures for pretrained networks, read from a file in the weights' folder.
 
 Resizing uses Pillow's filter, as the reference pipelines do, but on floating values. Those
-pipelines round to 8 bits before and after it, which would turn differences below 1/255 into noise.
+pipelines round to 8 bits before and after it, which turns differences below 1/255 into noise.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 _FILES = ("preprocessor_config.json", "processor_config.json")
 _FAMILIES = ("CLIPImageProcessor", "CLIPFeatureExtractor", "BitImageProcessor")
 _FILTERS = {0: "nearest", 1: "Lanczos", 2: "bilinear", 3: "bicubic", 4: "box", 5: "Hamming"}
-"""Pillow's numbers of its filters, as the file stores them."""
+"""Pillow's filter numbers, as stored in the file."""
 
 _SAMPLED = "bicubic, not antialiased"
 
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """Resize, crop, scale, normalise, in this order; None leaves a step out.
+    """Preprocessing steps: resize, crop, scale, normalise, in this order; None skips a step.
 
     Attributes:
-        resize: side in px that the shorter edge is resized to (the other one rounded down), or
+        resize: side in px of the resized shorter edge (the other edge is rounded down), or
             (height, width).
         resample: Pillow's number of the filter.
         crop: (height, width) in px, cut from the centre; a smaller picture is padded with black.
         scale: factor applied to [0, 1]; 1 for networks that expect [0, 1].
-        mean, std: per channel, after the scaling.
-        antialias: False resizes as torch does by default: a cubic of the nearest 16 pixels, however
-            much a picture shrinks.
+        mean, std: mean and deviation of each channel, after the scaling.
+        antialias: False resizes like torch's default: a cubic over the nearest 16 pixels for any
+            shrinking factor.
     """
 
     resize: int | tuple[int, int] | None
@@ -54,18 +54,18 @@ class Preprocessing:
 
     @property
     def shape(self) -> tuple[int, int] | None:
-        """(height, width) of the output; None if it depends on the picture."""
+        """Output (height, width); None if it depends on the picture."""
         return self.crop or (self.resize if isinstance(self.resize, tuple) else None)
 
     @property
     def seen(self) -> float:
-        """Share of a picture's shorter side that is left by the crop, in (0, 1]."""
+        """Share of a picture's shorter side left by the crop, in (0, 1]."""
         if self.crop is None or not isinstance(self.resize, int):
             return 1.0
         return min(1.0, min(self.crop) / self.resize)
 
     def __call__(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """(H, W, 3) in [0, 1] to (3, h, w), normalised."""
+        """Convert (H, W, 3) in [0, 1] to (3, h, w), normalised."""
         if self.resize is not None:
             size = _target(image, self.resize)
             image = resize(image, size, self.resample) if self.antialias else sampled(image, size)
@@ -93,15 +93,15 @@ class Preprocessing:
 def resize(
     image: npt.NDArray[np.float32], size: tuple[int, int], resample: int = 3
 ) -> npt.NDArray[np.float32]:
-    """(H, W, 3) in [0, 1] to (h, w, 3) with a filter of Pillow's, antialiased when shrinking.
+    """Resize (H, W, 3) in [0, 1] to (h, w, 3) with a Pillow filter, antialiased when shrinking.
 
     Args:
-        image: the picture.
-        size: (h, w) in px.
+        image: picture to resize.
+        size: (h, w) of the result, in px.
         resample: Pillow's number of the filter; 3 is bicubic.
 
     Returns:
-        The picture in [0, 1]: a cubic overshoots at edges, and is clipped there as 8 bits would be.
+        Picture in [0, 1]: overshoots of a cubic at edges are clipped, as with 8 bits.
     """
     from PIL import Image
 
@@ -111,7 +111,7 @@ def resize(
     for c in range(3):
         channel = np.ascontiguousarray(image[..., c])
         # Width, then height, each clipped, as Pillow does in 8 bits. If the aspect ratio changes,
-        # Pillow may take height first; then clipped values differ, and no others.
+        # Pillow may resize height first, which only affects clipped values.
         for shape in ((size[1], image.shape[0]), (size[1], size[0])):
             channel = np.asarray(Image.fromarray(channel).resize(shape, resample)).clip(0, 1)
         channels.append(channel)
@@ -119,11 +119,11 @@ def resize(
 
 
 def sampled(image: npt.NDArray[np.float32], size: tuple[int, int]) -> npt.NDArray[np.float32]:
-    """(H, W, 3) in [0, 1] to (h, w, 3), bicubic without antialiasing, clipped to [0, 1].
+    """Resize (H, W, 3) in [0, 1] to (h, w, 3), bicubic, not antialiased, clipped to [0, 1].
 
     Args:
-        image: the picture.
-        size: (h, w) in px.
+        image: picture to resize.
+        size: (h, w) of the result, in px.
 
     Example:
         >>> half = sampled(np.eye(4, dtype=np.float32)[..., None].repeat(3, axis=2), (2, 2))
@@ -138,7 +138,7 @@ def sampled(image: npt.NDArray[np.float32], size: tuple[int, int]) -> npt.NDArra
 
 
 def center_crop(image: npt.NDArray[np.float32], size: tuple[int, int]) -> npt.NDArray[np.float32]:
-    """The central (h, w) px of (H, W, 3); black where the picture is smaller."""
+    """Crop the central (h, w) px of (H, W, 3); a smaller picture is padded with black."""
     out = np.zeros((*size, image.shape[2]), image.dtype)
     window = []
     for side, target in zip(image.shape[:2], size, strict=True):
@@ -158,15 +158,15 @@ def _target(image: npt.NDArray[np.float32], size: int | tuple[int, int]) -> tupl
 
 
 def read_preprocessing(folder: Path) -> Preprocessing:
-    """Read preprocessor_config.json, or the part of processor_config.json that newer versions
-    write.
+    """Read preprocessor_config.json, or the corresponding part of processor_config.json, written by
+    newer versions.
 
     Missing keys take CLIP's values: shorter edge to 224 px, bicubic, the central 224 x 224 px,
     CLIP's mean and deviation.
 
     Raises:
-        InputError: no such file, not JSON, or an unsupported value; the message names file and
-            key.
+        InputError: the file is missing, not JSON, or has an unsupported value; the message names
+            file and key.
     """
     path = next((folder / name for name in _FILES if (folder / name).is_file()), None)
     if path is None:
@@ -220,7 +220,7 @@ def read_preprocessing(folder: Path) -> Preprocessing:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON file that holds an object. Raises InputError naming the file."""
+    """Read a JSON file with an object; InputError names the file."""
     try:
         value = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
@@ -261,7 +261,7 @@ def _resample(value: Any) -> int:
 
 
 def _three(config: dict[str, Any], key: str, default: tuple[float, ...]) -> tuple[float, ...]:
-    """One number for each channel."""
+    """Read one number for each channel."""
     values = config.get(key, default)
     entries = values if isinstance(values, list | tuple) else [values]
     if len(entries) != 3 or not all(check.is_number(v) for v in entries):

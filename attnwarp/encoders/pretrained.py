@@ -2,8 +2,8 @@
 
 Three mistakes give plausible figures in transformers and are refused here:
 
-- tensors that the file lacks, which transformers fills with random numbers;
-- a tokenizer of another model, with which every text is read at its first token;
+- missing tensors, which transformers fills with random numbers;
+- a tokenizer of another model, whose texts are all read at their first token;
 - a model of another kind.
 """
 
@@ -28,7 +28,7 @@ from attnwarp.encoders.preprocess import Preprocessing, read_json, read_preproce
 from attnwarp.errors import InputError, optional_imports
 
 BATCH = 8
-"""Pictures in a batch: enough to use all cores, few enough to fit in memory beside ViT-L's weights.
+"""Number of pictures in a batch: enough for all cores, few enough to fit next to ViT-L's weights.
 """
 
 _ASK = {
@@ -47,7 +47,7 @@ _FILES = {
 
 
 class _Pictures:
-    """Shared by CLIP and DINOv2: preprocessing and network, batch by batch, in float32."""
+    """Base of CLIP and DINOv2: preprocessing and network, batch by batch, in float32."""
 
     def __init__(
         self, about: EncoderInfo, preprocessing: Preprocessing, device: torch.device
@@ -59,7 +59,7 @@ class _Pictures:
     def _run(
         self, images: Sequence[Image], network: Callable[[torch.Tensor], torch.Tensor]
     ) -> list[npt.NDArray[np.float64]]:
-        """One result per picture. Only neighbours of equal size share a batch."""
+        """Compute one result per picture. Only neighbours of equal size share a batch."""
         if isinstance(images, np.ndarray) and images.ndim == 3:
             raise TypeError(
                 f"images: got one picture of shape {images.shape}, expected a list of pictures"
@@ -80,8 +80,8 @@ class _Pictures:
 class Clip(_Pictures):
     """CLIP; see :class:`attnwarp.encoders.TextImageEncoder`.
 
-    Embeddings are the outputs of the two projections. Texts longer than the network takes (77
-    tokens with the published ones) are cut; ``cut`` counts the dropped tokens.
+    Embeddings are the outputs of the two projections. Texts beyond the network's limit (77 tokens
+    in published networks) are cut; ``cut`` counts the dropped tokens.
     """
 
     def __init__(
@@ -98,12 +98,12 @@ class Clip(_Pictures):
         self._length = int(model.config.text_config.max_position_embeddings)
 
     def images(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
-        """(N, D) float64, not normalised."""
+        """Embed pictures, (N, D) float64, not normalised."""
         rows = self._run(images, lambda x: _pooled(self._model.get_image_features(pixel_values=x)))
         return np.array(rows, dtype=np.float64).reshape(len(rows), self._dim)
 
     def texts(self, texts: Sequence[str]) -> npt.NDArray[np.float64]:
-        """(N, D) float64, not normalised."""
+        """Embed texts, (N, D) float64, not normalised."""
         rows: list[npt.NDArray[np.float64]] = []
         for text in checked_texts(texts):
             # One at a time: prompts are few, and padding could change a row.
@@ -118,7 +118,7 @@ class Clip(_Pictures):
         return np.array(rows, dtype=np.float64).reshape(len(rows), self._dim)
 
     def cut(self, text: str) -> int:
-        """Count of a text's tokens beyond the network's length, which are dropped."""
+        """Count a text's tokens beyond the network's length, which are dropped."""
         return self._ids(text)[1]
 
     @property
@@ -135,8 +135,8 @@ class Clip(_Pictures):
 class Dino(_Pictures):
     """DINOv2, with registers or without; see :class:`attnwarp.encoders.TokenEncoder`.
 
-    The embedding of a picture is the class token, that of a patch its own token, both after the
-    last normalisation.
+    The embedding of a picture is the class token, that of a patch is the patch's token, both after
+    the last normalisation.
     """
 
     def __init__(
@@ -148,16 +148,16 @@ class Dino(_Pictures):
         self._special = 1 + int(getattr(model.config, "num_register_tokens", 0))
 
     def images(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
-        """(N, D) float64, not normalised."""
+        """Embed pictures, (N, D) float64, not normalised."""
         rows = self._run(images, lambda x: self._model(pixel_values=x).last_hidden_state[:, 0])
         return np.array(rows, dtype=np.float64).reshape(len(rows), self._dim)
 
     def tokens(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
-        """(N, h, w, D) float64; 16 x 16 with the published preprocessing of 224 px.
+        """Embed patches, (N, h, w, D) float64; 16 x 16 with the published preprocessing of 224 px.
 
         Raises:
-            ValueError: also where the folder's preprocessing leaves pictures of different shapes
-                different.
+            ValueError: also if the folder's preprocessing gives pictures of different shapes
+                different sizes.
         """
         grids = self._run(images, self._grid)
         if len({grid.shape for grid in grids}) > 1:
@@ -183,17 +183,18 @@ class Dino(_Pictures):
 
 
 def load_clip(folder: Path, *, name: str, device: str = "cpu", whole: bool = False) -> Clip:
-    """CLIP from a folder in the transformers format.
+    """Load CLIP from a folder in the transformers format.
 
     Args:
-        folder: with config.json, model.safetensors (or pytorch_model.bin, or either in parts with
-            its index), preprocessor_config.json, and tokenizer.json or vocab.json with merges.txt.
-        name: the name in errors and results.
+        folder: folder with config.json, model.safetensors (or pytorch_model.bin, or either in parts
+            with its index), preprocessor_config.json, and tokenizer.json or vocab.json with
+            merges.txt.
+        name: name in errors and results.
         device: "cpu" or "cuda".
-        whole: resize the whole picture, without antialiasing and without a crop.
+        whole: True resizes the full picture, without antialiasing and without a crop.
 
     Raises:
-        InputError: a file is missing or invalid; the message says which, and how to get it.
+        InputError: a file is missing or invalid; the message names the file and its source.
         MissingExtraError: transformers is not installed.
     """
     torch_device = device_of(device)
@@ -227,18 +228,18 @@ def load_clip(folder: Path, *, name: str, device: str = "cpu", whole: bool = Fal
 
 
 def load_dinov2(folder: Path, *, name: str, device: str = "cpu", side: int | None = None) -> Dino:
-    """DINOv2 from a folder in the transformers format, with registers or without.
+    """Load DINOv2 from a folder in the transformers format, with or without registers.
 
     Args:
-        folder: with config.json, model.safetensors (or pytorch_model.bin, or either in parts with
-            its index) and preprocessor_config.json.
-        name: the name in errors and results.
+        folder: folder with config.json, model.safetensors (or pytorch_model.bin, or either in parts
+            with its index) and preprocessor_config.json.
+        name: name in errors and results.
         device: "cpu" or "cuda".
-        side: px to which the whole picture is resized, without antialiasing and without a crop;
+        side: px to which the full picture is resized, without antialiasing and without a crop;
             None for the published preprocessing.
 
     Raises:
-        InputError: a file is missing or invalid; the message says which, and how to get it.
+        InputError: a file is missing or invalid; the message names the file and its source.
         MissingExtraError: transformers is not installed.
     """
     torch_device = device_of(device)
@@ -325,9 +326,7 @@ def _load(
             )  # fmt: skip
     except InputError:
         raise
-    except (
-        Exception
-    ) as error:  # transformers raises many kinds for files that do not fit each other
+    except Exception as error:  # transformers raises many kinds of errors for inconsistent files
         raise InputError(
             f"{name}: the weights in {folder} cannot be loaded: {reason_of(error)}; fetch its files"
             " again"
@@ -364,7 +363,7 @@ def _silent() -> Iterator[None]:
 
 
 def _tokenizer(folder: Path, name: str) -> Any:
-    """A ``tokenizers.Tokenizer`` that neither pads nor cuts."""
+    """Load a ``tokenizers.Tokenizer`` that neither pads nor cuts."""
     with optional_imports():
         from tokenizers import Tokenizer
 
@@ -395,7 +394,7 @@ def _tokenizer(folder: Path, name: str) -> Any:
                 " fetch it again"
             )
         try:
-            # By these names: an older version's vocab_file= is ignored and leaves two tokens.
+            # These keywords, since an older version's vocab_file= is ignored and leaves two tokens.
             tokenizer_class: Any = CLIPTokenizer
             tokenizer = tokenizer_class(vocab=read_json(vocabulary_file), merges=pairs)._tokenizer
         except InputError:
@@ -418,7 +417,7 @@ def _fitting_tokenizer(tokenizer: Any, config: Any, folder: Path, name: str) -> 
     """Refuse another model's tokenizer: the network would silently read the wrong token."""
     first, last = tokenizer.encode("a").ids[0], tokenizer.encode("a").ids[-1]
     top = max(tokenizer.get_vocab().values())
-    # Old files hold 2 for any tokenizer; the network then reads at the highest token number.
+    # Old files have 2 for any tokenizer; the network then reads at the highest token number.
     expected = top if config.eos_token_id == 2 else config.eos_token_id
     if first == last or last != expected or top >= config.vocab_size:
         raise InputError(
@@ -429,7 +428,7 @@ def _fitting_tokenizer(tokenizer: Any, config: Any, folder: Path, name: str) -> 
 
 
 def _pooled(output: Any) -> torch.Tensor:
-    """The pooled output: some versions of transformers return it inside an object."""
+    """Return the pooled output, which some versions of transformers wrap in an object."""
     return output if isinstance(output, torch.Tensor) else output.pooler_output
 
 
