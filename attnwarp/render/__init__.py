@@ -1,4 +1,4 @@
-"""Gaussian splats to pictures: one door, several backends. See docs/method/rendering.md."""
+"""Renderer of Gaussian splats with several backends; see docs/method/rendering.md."""
 
 from attnwarp.render.api import Render, normal_from_depth, render
 

@@ -1,12 +1,11 @@
-"""Memory that is used again: fresh pages cost more than what is done with them.
+"""Memory pool of arrays, since fresh pages cost more than the work on them.
 
-A picture of 512 x 512 with 50,000 splats takes 30 MB, and each page of it that the system has to
-find and clear costs a microsecond or two: a quarter of the time that the picture takes. A block
-goes back to the pool when the last array that lies in it is gone, whoever holds it: results that
-the caller keeps are never written again.
+A picture of 512 x 512 with 50,000 splats takes 30 MB, and each page that the system must find and
+clear costs a microsecond or two: a quarter of the picture's time. A block returns to the pool once
+the last array in it is gone, whoever holds it: results kept by the caller are never overwritten.
 
-Each view of a million splats or more takes and returns hundreds of megabytes, so what is held
-follows what was needed of late, and falls again once smaller views have followed.
+Each view of a million splats or more takes and returns hundreds of megabytes, so the held amount
+follows the recent need, and falls again after smaller views.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from typing import Any
 import numpy as np
 
 SMALLEST = 1 << 14
-"""Bytes; what is smaller is left to numpy."""
+"""Smallest pooled size in bytes; numpy allocates smaller arrays."""
 LEAST = 256 << 20
-"""Bytes that may be held for further use after views of any size."""
+"""Bytes that may always be held for reuse, after views of any size."""
 SLACK = 1.25
-"""Most bytes held, in multiples of the most taken at one time. Blocks of different sizes take the
-place of each other within a view, so its blocks sum to up to 1.12 times that (measured, 50,000 to
-3 million splats, with and without gradients)."""
+"""Most bytes held, in multiples of the most taken at one time. Blocks of different sizes replace
+each other within a view, so its blocks sum to up to 1.12 times that (measured, 50,000 to 3 million
+splats, with and without gradients)."""
 WINDOW = 512
-"""Arrays taken before an earlier need begins to be forgotten. A view takes 36 to 86."""
+"""Number of allocations after which an earlier need is forgotten; a view makes 36 to 86."""
 ALIGNMENT = 64
 
 _free: dict[int, list[np.ndarray]] = {}
@@ -59,9 +58,9 @@ class _Lease:
 
 
 def _give(raw: np.ndarray) -> None:
-    # Dictionaries and lists are safe to use from several threads; the sums may be off by a block,
-    # which is no harm. No lock: the garbage collector may come here at any moment, from inside of
-    # this module too.
+    # Dictionaries and lists are thread-safe; the sums may be off by a block, which is harmless.
+    # No lock: the garbage collector may call this at any moment, even from inside this
+    # module.
     global _held, _leased, _low
     _leased -= raw.nbytes
     _low = min(_low, _leased)
@@ -77,13 +76,13 @@ def _most() -> float:
 
 
 def _make_room(size: int) -> None:
-    """Give all unused blocks up if ``size`` more bytes are too many: sizes have changed."""
+    """Release all unused blocks if ``size`` more bytes exceed the limit: sizes have changed."""
     if _held + _leased - _low + size > _most():
         clear()
 
 
 def _count(size: int) -> None:
-    """Count a block that is taken."""
+    """Count an allocated block."""
     global _leased, _low, _need, _taken
     _leased += size
     _taken += 1
@@ -93,21 +92,21 @@ def _count(size: int) -> None:
 
 
 def clear() -> None:
-    """Give all unused blocks back to the system."""
+    """Return all unused blocks to the system."""
     global _held
     _free.clear()
     _held = 0
 
 
 def empty(shape: int | tuple[int, ...], dtype: Any) -> np.ndarray:
-    """An array like ``np.empty``'s, on a 64-byte boundary if it has 16 KiB or more."""
+    """Allocate like ``np.empty``, on a 64-byte boundary for 16 KiB or more."""
     global _held
-    # Not numpy's product, which makes an array of each shape: a picture takes dozens.
+    # Not numpy's product, which allocates an array per shape: a picture has dozens.
     length = math.prod(shape) if isinstance(shape, tuple) else int(shape)
     size = length * np.dtype(dtype).itemsize
     if size < SMALLEST:
         return np.empty(shape, dtype)
-    # Eight sizes between a power of two and the next.
+    # Eight block sizes between consecutive powers of two.
     step = 1 << max(size.bit_length() - 4, 0)
     whole = -(-size // step) * step + ALIGNMENT
     try:
@@ -121,7 +120,7 @@ def empty(shape: int | tuple[int, ...], dtype: Any) -> np.ndarray:
 
 
 def zeros(shape: int | tuple[int, ...], dtype: Any) -> np.ndarray:
-    """An array like ``np.zeros``'s."""
+    """Allocate like ``np.zeros``."""
     result = empty(shape, dtype)
     result.fill(0)
     return result

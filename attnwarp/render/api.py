@@ -1,4 +1,4 @@
-"""The door: check every argument, choose a backend, and name what comes out."""
+"""Public interface: check every argument, choose a backend, and name the outputs."""
 
 from __future__ import annotations
 
@@ -24,37 +24,37 @@ DEPTHS = {"2d": ("intersection", "center"), "3d": ("center", "peak")}
 
 @dataclass(eq=False)
 class Render:
-    """A picture of splats. Every output means the same whatever the kind, the backend and the depth
-    mode.
+    """Rendered picture of splats. Every output has the same meaning for all kinds, backends and
+    depth modes.
 
-    Per pixel, w_i = alpha_i prod_{j<i} (1 - alpha_j) is the share of splat i, z_i its depth there.
+    Per pixel, w_i = alpha_i prod_{j<i} (1 - alpha_j) is the share of splat i, z_i its depth.
 
     Attributes:
         color: (H, W, C) sum w_i c_i + (1 - alpha) background: sRGB colour, or the features passed
             in.
         alpha: (H, W) sum w_i, coverage in [0, 1].
         depth: (H, W) expected depth sum w_i z_i / sum w_i along the optical axis, in scene units;
-            NaN where nothing was drawn. The background takes no part in it.
-        median_depth: (H, W) depth of the last splat drawn while the transmittance before it is
-            above 1/2; NaN where nothing was drawn. Where alpha stays below 1/2 it is the last
+            NaN where nothing was drawn. The background has no influence.
+            an_depth: (H, W) depth of the last splat drawn while the transmittance before it is
+            above 1/2; NaN where nothing was drawn. If alpha stays below 1/2 it is the last
             splat's.
         normal: (H, W, 3) sum w_i n_i in world axes, each n_i turned to face the camera; its length
             is at most alpha.
         distortion_ordered: (H, W) 2 sum_i w_i |sum_{j<i} w_j (z_i - z_j)| in compositing order:
             ``distortion_l1`` where depth grows along that order, less elsewhere, and 0 only where
-            that is 0. Scene units.
+            ``distortion_l1`` is 0. Scene units.
         distortion_l2_ndc: (H, W) sum_{j<i} w_i w_j (m_i - m_j)^2 with m = far / (far - near) (1 -
             near / z) and the planes ``ndc`` (the original 2DGS code). No unit.
-        weight: (N,) sum over pixels of w_i: how much of the picture a splat makes up; 0 means it is
-            not seen.
-        counters: amounts of work. "splats": of the model. "visible": can show in the picture.
+        weight: (N,) sum over pixels of w_i: a splat's contribution to the picture; 0 means
+            invisible.
+        counters: amounts of work. "splats": of the model. "visible": possibly visible splats.
             "tiles", "tile_pairs": splats over tiles, of 16 x 16 pixels on the CPU and 8 x 8 on a
             GPU. "pairs": splats over pixels whose intersection was computed. "composited": those
-            pairs in a 4 x 4 square that the splat draws to. "contributing": those drawn. Backend
+            pairs in a 4 x 4 square that the splat draws to. "contributing": pairs drawn. Backend
             "reference" has "splats", "pairs" and "contributing"; "gpu" has the first four, which
-            it need not wait for.
-        camera: the camera, with the pose that was used.
-        depth_mode, backend: depth mode as requested, and the backend that rendered.
+            need no synchronisation.
+        camera: camera with the pose used.
+        depth_mode, backend: requested depth mode, and the backend that rendered.
 
     Example:
         A disc that faces the camera: its normals point back at it, and beside it nothing is drawn.
@@ -99,30 +99,30 @@ class Render:
 
     @cached_property
     def distortion_l1(self) -> Tensor:
-        """(H, W) sum over ordered pairs of w_i w_j |z_i - z_j| (2DGS paper), in scene units.
+        """Sum over ordered pairs of w_i w_j |z_i - z_j| (2DGS paper), (H, W), in scene units.
 
-        Every pair of splats counts twice, as in the paper's sum over i and j. Made on first use, by
-        a second pass over the splats; differentiable.
+        Every pair of splats counts twice, as in the paper's sum over i and j. Computed on first use
+        by a second pass over the splats; differentiable.
 
         Raises:
-            RuntimeError: the splats were modified in place since they were rendered.
+            RuntimeError: the splats were modified in place after rendering.
         """
         return self._exact()
 
     @cached_property
     def valid(self) -> Tensor:
-        """(H, W) bool: something was drawn, so depth, median_depth and the direction of normal are
-        defined.
+        """Mask of drawn pixels, (H, W) bool, for which depth, median_depth and the direction of
+        normal are defined.
         """
         return ~torch.isnan(self.depth.detach())
 
     @cached_property
     def normal_from_depth(self) -> Tensor:
-        """(H, W, 3) unit normals, in world axes and facing the camera, of the surface that
-        ``depth`` describes.
+        """Unit normals, (H, W, 3), in world axes and facing the camera, of the surface described by
+        ``depth``.
 
         The cross product of central differences of the unprojected points (2DGS); NaN on the
-        image's border and where one of the four neighbours is undefined. Made on first use,
+        image's border and if one of the four neighbours is undefined. Computed on first use,
         differentiable in ``depth`` and the pose.
         """
         return normal_from_depth(self.depth, self.camera, self._pose)
@@ -132,12 +132,13 @@ class Render:
 def normal_from_depth(
     depth: check.Array, camera: Camera, pose: check.Array | None = None
 ) -> Tensor:
-    """(H, W, 3) unit normals in world axes, facing the camera, of a depth map; see :class:`Render`.
+    """Compute unit normals (H, W, 3) in world axes, facing the camera, of a depth map; see
+    :class:`Render`.
 
     Args:
         depth: (H, W) depth along the optical axis, NaN where undefined.
-        camera: its camera.
-        pose: (4, 4) world-to-camera transform in place of the camera's.
+        camera: camera of the depth map.
+        pose: (4, 4) world-to-camera transform that replaces the camera's.
 
     Example:
         >>> import numpy as np, torch
@@ -164,7 +165,7 @@ def normal_from_depth(
         & defined[2:, 1:-1]
         & defined[1:-1, 1:-1]
     )
-    # x right, y down, z forward: d/dy x d/dx points back at the camera for a surface that faces it.
+    # x right, y down, z forward: for a surface that faces the camera, d/dy x d/dx points at it.
     across = torch.linalg.cross(
         points[2:, 1:-1] - points[:-2, 1:-1], points[1:-1, 2:] - points[1:-1, :-2]
     )
@@ -200,31 +201,31 @@ def render(
 
     Args:
         gaussians: N splats of kind "2d" (2DGS) or "3d" (3DGS), float32 or float64.
-        camera: the view; H x W pixels.
+        camera: camera of the view; H x W pixels.
         backend: "cpu" is numba, float32 with a float64 projection. "reference" is brute force in
             float64, for small scenes. "gpu" is NVIDIA Warp, float32 with a float64 projection, on
-            the GPU that the splats lie on; see :mod:`attnwarp.render.gpu`. "auto" is "gpu" where
-            the splats lie on a GPU and "cpu" elsewhere.
-        depth: which z a splat has at a pixel. "2d": "intersection" of ray and disc (default) or
-            "center". "3d": "center" (default) or "peak", where the Gaussian is largest along the
-            ray.
-        background: (C,) colour behind everything; black if left out.
-        features: (N, C) values rendered in place of the spherical harmonics' colour.
-        sh_degree: use only the harmonics up to this degree.
-        near: nothing nearer than this depth is drawn, in scene units. 2D splats are cut per pixel,
-            3D splats as a whole by their centre. Scale it with the scene.
-        antialiased: 3D only: compensate the opacity for the screen filter. Default: what the
-            Gaussians say.
-        pose: (4, 4) world-to-camera transform in place of the camera's; may require gradients.
+            the splats' GPU; see :mod:`attnwarp.render.gpu`. "auto" is "gpu" for splats on a GPU and
+            "cpu" otherwise.
+        depth: definition of a splat's z at a pixel. "2d": "intersection" of ray and disc (default)
+            or "center". "3d": "center" (default) or "peak", where the Gaussian is largest along
+            the ray.
+        background: (C,) colour behind everything; black if omitted.
+        features: (N, C) values rendered instead of the spherical harmonics' colour.
+        sh_degree: highest degree of the harmonics used.
+        near: near-plane depth, in scene units. 2D splats are cut per pixel, 3D splats as a unit by
+            their centre. Scale it with the scene.
+        antialiased: True compensates the opacity of 3D splats for the screen filter. Default: the
+            Gaussians' setting.
+        pose: (4, 4) world-to-camera transform that replaces the camera's; may require gradients.
         ndc: near and far of ``distortion_l2_ndc``, in scene units.
 
     Returns:
-        A :class:`Render`, float32 from "cpu" and "gpu", float64 from "reference".
+        :class:`Render`, float32 from "cpu" and "gpu", float64 from "reference".
 
     Raises:
-        ValueError: an argument out of range or of the wrong shape; the message says which and what
-            was expected. Also backend "gpu" without Warp (:class:`attnwarp.errors.InputError`).
-        TypeError: an argument of another type; the message says which.
+        ValueError: an argument is out of range or has a wrong shape; the message names it and the
+            expectation. Also backend "gpu" without Warp (:class:`attnwarp.errors.InputError`).
+        TypeError: an argument has a wrong type; the message names it.
 
     Example:
         >>> import torch
@@ -266,7 +267,7 @@ def render(
         ndc,
         on_cpu=chosen != "gpu",
     )
-    # A backend is imported when it is first asked for: numba and Warp each take their time.
+    # A backend is imported on first use, since numba and Warp are slow to import.
     if chosen == "cpu":
         from attnwarp.render import cpu
 

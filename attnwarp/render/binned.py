@@ -15,47 +15,47 @@ from attnwarp.render.interface import Inputs
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 
 PIECE = 4096
-"""Splats in one job of what is done splat by splat."""
+"""Number of splats in one job of per-splat work."""
 GROUP, GROUPS = 1024, 8
-"""Splats that are projected and binned by one job: at least so many, and in about so many jobs."""
+"""Least number of splats projected and binned by one job, and approximate number of jobs."""
 WIDEST = 4 * 32767 // layout.TILE * layout.TILE
-"""Pixels: columns of squares are stored in 15 bits."""
+"""Largest width in pixels: columns of squares are stored in 15 bits."""
 RUNS_PER_SPLAT = 3.0
-"""Runs of tiles that a splat is expected to have, to begin with."""
+"""Initial estimate of a splat's number of runs of tiles."""
 NEIGHBOURS = 4
-"""Edge of a block of tiles that are visited together."""
+"""Edge of a block of tiles visited together."""
 FRONT = 512
-"""Splats a tile to begin with in a deep scene: more than most pixels need to become opaque."""
+"""Initial splats per tile in a deep scene: more than most pixels need to become opaque."""
 ENTRIES = 4
 """Entries of tiles' lists held at once, for each pixel and splat; with their weights 12 bytes each.
 """
 
 
 def as_array(tensor: torch.Tensor, dtype: type) -> np.ndarray:
-    """The values of a tensor, contiguous."""
+    """Convert a tensor to a contiguous array."""
     return np.ascontiguousarray(tensor.detach().numpy(), dtype=dtype)
 
 
 def aligned(size: int) -> np.ndarray:
-    """Floats on a 64-byte boundary: a vector that straddles two cache lines costs twice."""
+    """Allocate floats on a 64-byte boundary: a vector across two cache lines costs twice."""
     raw = np.empty(size + 16, np.float32)
     skip = (-raw.ctypes.data & 63) // 4
     return raw[skip : skip + size]
 
 
 def aligned_doubles(size: int) -> np.ndarray:
-    """Float64 numbers on a 64-byte boundary."""
+    """Allocate float64 numbers on a 64-byte boundary."""
     return aligned(2 * size).view(np.float64)
 
 
 def join(parts: list[np.ndarray]) -> np.ndarray:
-    """One array of several."""
+    """Concatenate several arrays."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 @functools.lru_cache(maxsize=64)
 def _visiting_order(across: int, down: int) -> np.ndarray:
-    """All tiles, block by block: neighbours list the same splats, which then are still in the
+    """Order all tiles block by block: neighbours list the same splats, which then are still in the
     cache.
     """
     y, x = np.divmod(np.arange(across * down), across)
@@ -94,18 +94,18 @@ def _splats(inputs: Inputs) -> layout.Splats:
 
 
 class BinnedSplats:
-    """One view's splats, ordered, projected and binned: what the forward pass leaves to the
+    """Ordered, projected and binned splats of one view, passed from the forward pass to the
     backward pass.
 
-    Splats are known by their place in the order of depth; only as many of them are projected as may
-    be seen.
+    Splats are indexed by their position in the depth order; only potentially visible ones are
+    projected.
 
     Attributes:
         view, splats, tiles, table: see :mod:`attnwarp.render._kernels.layout`.
-        order: (M,) int32 splats that can show, front to back.
+        order: (M,) int32 potentially visible splats, front to back.
         background: (C,) float32.
-        projected: how many splats of ``order`` are projected.
-        lists: the lists that the tiles were composited from, filled by the forward pass.
+        projected: number of projected splats of ``order``.
+        lists: lists from which the tiles were composited, filled by the forward pass.
     """
 
     def __init__(self, inputs: Inputs) -> None:
@@ -135,7 +135,7 @@ class BinnedSplats:
         self._changes: list[np.ndarray] = []
 
     def _set_order(self) -> None:
-        """Sort the splats that can show by depth, ties by what they are."""
+        """Sort the potentially visible splats by depth, ties by their parameters."""
         n = len(self.splats.means)
         depth = _pool.empty(n, np.float32)
         pieces = ranges(n, PIECE)
@@ -154,16 +154,16 @@ class BinnedSplats:
             order.break_ties(self.order, depth, content, ties)
 
     def front(self) -> int:
-        """Number of the nearest splats to begin with: all, unless they would make lists far longer
+        """Choose the initial number of nearest splats: all, unless the lists would be far longer
         than needed.
         """
         length, count = self._listed / self.tile_count, len(self.order)
         return count if length < 4 * FRONT else -(-count * FRONT // int(length))
 
     def project(self, count: int, live: np.ndarray) -> None:
-        """Project the nearest ``count`` splats, and find the tiles that they may show in.
+        """Project the nearest ``count`` splats, and find the tiles that they may cover.
 
-        Splats that were not projected before need only be right in the tiles that are ``live``.
+        Newly projected splats need only be right in the tiles that are ``live``.
         """
         wanted = np.zeros((self.tiles.down + 1, self.tiles.across + 1), np.int32)
         wanted[1:, 1:] = live.reshape(self.tiles.down, self.tiles.across).cumsum(0).cumsum(1)
@@ -193,7 +193,7 @@ class BinnedSplats:
         before: np.ndarray,  # (tiles + 1,)
         changes: np.ndarray,  # (tiles + 1,)
     ) -> np.ndarray:
-        """Project a group of splats; returns their runs."""
+        """Project a group of splats and return their runs."""
         outlines = _pool.empty((last - first, layout.OUTLINE_SIZE), np.float32)
         call(
             projection.project,
@@ -227,15 +227,15 @@ class BinnedSplats:
             if used <= room:
                 return target.runs[:used]
             room = used
-            # Only for how much is set aside for the next ones.
+            # Only used to size the next allocations.
             self._runs_per_splat = 1.1 * used / (last - first)
             changes[:] = 0
 
     def bands(self, live: np.ndarray) -> list[np.ndarray]:
-        """The tiles that are ``live``, in parts whose lists together are no longer than the picture
-        and the splats allow.
+        """Split the tiles that are ``live`` into parts whose total list length is bounded by the
+        picture and the splats.
 
-        Memory stays proportional to these, whatever the splats cover.
+        Memory stays proportional to both, independent of the splats' coverage.
         """
         if not self._changes:
             return []
@@ -251,7 +251,7 @@ class BinnedSplats:
         return [live & (band == k) for k in np.unique(band[live])]
 
     def bin(self, live: np.ndarray) -> layout.Lists:
-        """Lists of the projected splats in the tiles that are ``live``."""
+        """Build lists of the projected splats in the tiles that are ``live``."""
         starts, counts = np.zeros((2, self.tile_count), np.int64)
         no_changes = np.zeros((0, self.tile_count + 1), np.int32)
         changes = join(self._changes) if self._changes else no_changes
@@ -269,7 +269,7 @@ class BinnedSplats:
         return layout.Lists(starts, counts, entries)
 
     def pieces(self, counts: np.ndarray) -> list[tuple[int, int]]:
-        """Consecutive tiles, by their place in the order of visits, in pieces of about equal work.
+        """Split the tiles, in visiting order, into consecutive pieces of about equal work.
 
         Args:
             counts: (tiles,) length of each tile's list.

@@ -1,4 +1,4 @@
-"""Every number that decides what a picture of splats is, with its reason. All backends read them
+"""All numbers that define a picture of splats, with their reasons; every backend reads them
 from here.
 """
 
@@ -9,10 +9,10 @@ import math
 from attnwarp.gaussians import SCREEN_FILTER
 
 ALPHA_MIN = 1 / 255
-"""A splat that adds less than one step of an 8-bit image to a pixel is left out there, as in every
+"""Alpha below which a splat is skipped at a pixel: one step of an 8-bit image, as in every
 published renderer.
 
-It is the only footprint cut-off: no box of so many sigmas, so nothing is truncated that would show.
+This is the only footprint cut-off: without a box of some sigmas, nothing visible is truncated.
 """
 
 ALPHA_MAX = 0.99
@@ -24,7 +24,7 @@ TRANSMITTANCE_STOP = 1e-4
 """A ray ends behind the splat that brings its transmittance to or below this (the published value).
 
 That splat is still drawn. The published kernels leave it out, which loses up to 1 % of the light
-and makes two opaque splats in a row (0.01 * 0.01 = 1e-4) a matter of rounding; here what is lost is
+and makes two opaque splats in a row (0.01 * 0.01 = 1e-4) a matter of rounding; here the loss is
 at most 1e-4.
 """
 
@@ -43,20 +43,20 @@ JACOBIAN_MARGIN = 0.3
 """3DGS linearises the projection at x/z clamped to the image's edge plus this times half of the
 field of view.
 
-Beyond it the linearisation grows without bound. The two sides are clamped apart, so an off-centre
-principal point is treated right.
+Beyond it the linearisation grows without bound. The two sides are clamped separately, so an
+off-centre principal point is treated correctly.
 """
 
 EXTENT_SIGMAS = math.sqrt(2 * math.log(255.0))
-"""3.33: where an opaque splat falls to ALPHA_MIN. Depth within a splat is bounded to this many
-sigmas of its extent.
+"""3.33: sigmas at which an opaque splat falls to ALPHA_MIN. Depth within a splat is bounded to this
+many sigmas of its extent.
 """
 
 EDGE_ON = 1e-6
 """Smallest |n . c| / |c| of a 2D splat's plane: closer to edge-on than this, the plane is tilted to
 this angle.
 
-The screen filter draws such a splat anyway; the bound keeps its numbers finite in float32.
+The screen filter still draws such a splat; the bound keeps its numbers finite in float32.
 """
 
 COMPENSATION_MIN = 1e-6

@@ -1,18 +1,18 @@
 """The CPU backend: numba kernels over tiles of 16 x 16 pixels, float32 with a float64 projection.
 
-1. Ordering: front to back. From here on a splat is known by its place in this order.
-2. Projection: each splat's outline, depth and colour as seen by the camera, in float64. In deep
-   scenes of the nearest ones only; the others follow if a tile is not opaque by then, and only
-   those that can show in such a tile.
+1. Ordering: front to back. From here on a splat is indexed by its position in this order.
+2. Projection: each splat's outline, depth and colour as seen by the camera, in float64. Deep scenes
+   start with the nearest splats; the others follow if a tile is not opaque by then, and only
+   those that may cover such a tile.
 3. Binning: the splats of each tile, and of its squares of 4 x 4 pixels; exact outlines, no bounding
    circles. Lists that would be too long together are made for some of the tiles after the others.
 4. Rasterization: composite tile by tile, square by square, until every pixel is opaque.
 5. Backward: the same tiles back to front, a row of gradients for each splat of a tile; each splat's
    rows are summed, and taken to the parameters and the pose.
-6. Exact distortion, for who asks for it: the same tiles front to back once more, in the backward
+6. Exact distortion, on request: the same tiles front to back once more, in the backward
    pass too.
 
-Threads follow ``torch.set_num_threads``; the result has the same bits for any number of them.
+Threads follow ``torch.set_num_threads``; the result has the same bits for any number of threads.
 """
 
 from __future__ import annotations
@@ -51,15 +51,15 @@ MAP_READERS = {
     "alpha": ("depth", "distortion_ordered", "distortion_l2_ndc", "distortion_l1", "background"),
     "depth": ("depth", "distortion_ordered", "distortion_l1"),
 }
-"""Outputs whose gradients read a map that the caller holds, and the background, whose own does."""
+"""Outputs, and the background, whose gradients read a map held by the caller."""
 
 GRADIENT_ROWS = 1 << 16
-"""Rows of gradients held before they are summed: a few megabytes, which stay in the cache."""
+"""Rows of gradients held before summation: a few megabytes, which stay in the cache."""
 
 
 def _as_tensor(array: np.ndarray, shape: torch.Size, dtype: torch.dtype) -> torch.Tensor:
-    """Converted by numpy: torch starts its thread pool for it, which on a busy machine takes longer
-    than a picture.
+    """Convert by numpy, since torch would start its thread pool, which on a busy machine takes
+    longer than a picture.
     """
     wanted = np.float32 if dtype == torch.float32 else np.float64
     return torch.from_numpy(array.astype(wanted, copy=False).reshape(tuple(shape)))
@@ -67,7 +67,7 @@ def _as_tensor(array: np.ndarray, shape: torch.Size, dtype: torch.dtype) -> torc
 
 @dataclass(frozen=True)
 class _Drawn:
-    """State that the forward pass leaves to the backward pass."""
+    """State passed from the forward pass to the backward pass."""
 
     binned: BinnedSplats
     pictures: layout.Pictures
@@ -109,14 +109,14 @@ def _pairs_workspace(room: int) -> distortion.Workspace:
 
 
 def _rooms(lists: layout.Lists) -> np.ndarray:
-    """(tiles,) how many places the splats of each tile need in ``distortion.Workspace``."""
+    """Count the places needed by each tile's splats in ``distortion.Workspace``, (tiles,)."""
     squares = distortion.bits(lists.entries >> layout.PLACE_BITS)
     before = np.concatenate([[0], np.cumsum(squares)])
     return before[lists.starts + lists.counts] - before[lists.starts]
 
 
 def _exact_distortion(drawn: _Drawn) -> torch.Tensor:
-    """(H, W) ``distortion_l1`` of what was drawn with its state."""
+    """Compute ``distortion_l1``, (H, W), from a drawn picture with its state."""
     binned, state = drawn.binned, drawn.pictures.state
     target = _pool.empty(state.shape[1:], np.float32)
     rooms = _rooms(binned.lists)[binned.tiles.order]
@@ -134,7 +134,7 @@ def _exact_distortion(drawn: _Drawn) -> torch.Tensor:
 
 
 def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
-    """The forward pass; ``with_state`` if a backward pass may follow."""
+    """Run the forward pass; ``with_state`` keeps the state for a backward pass."""
     binned = BinnedSplats(inputs)
     tile_count = binned.tile_count
     near, far = inputs.ndc
@@ -147,8 +147,8 @@ def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
     cached: list[np.ndarray] = []
     sums = _pool.zeros(len(binned.order), np.int64)
     count = binned.front()
-    # In deep scenes most tiles are opaque long before the last splat; those that are not start
-    # again with all.
+    # In deep scenes most tiles are opaque long before the last splat; the other tiles start
+    # again with all splats.
     while True:
         binned.project(count, live)
         is_last = count == len(binned.order)
@@ -201,8 +201,8 @@ def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
 
 
 class _Composite(torch.autograd.Function):
-    """The kernels as one differentiable step: the tensors of ``Inputs`` in, those of ``Outputs``
-    out.
+    """All kernels as one differentiable step from the tensors of ``Inputs`` to those of
+    ``Outputs``.
     """
 
     @staticmethod
@@ -217,10 +217,10 @@ class _Composite(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         outputs = tuple(torch.from_numpy(array) for array in drawn.pictures[:-1])
         _, alpha, depth, *_ = outputs
-        # Saved so that torch notices when one of them is changed in place before the backward pass.
+        # Saved so that torch detects an in-place change before the backward pass.
         ctx.save_for_backward(*tensors)
         # Not saved, as most gradients read neither. Detached, they hold no graph, but they share
-        # the caller's memory and its count of changes in place.
+        # the caller's memory and its version counter.
         ctx.maps = {"alpha": alpha.detach(), "depth": depth.detach()}
         placeholder = torch.zeros(1, dtype=torch.float32).expand(inputs.height, inputs.width)
         return *outputs, placeholder, torch.from_numpy(drawn.weight)
@@ -288,13 +288,13 @@ class _Composite(torch.autograd.Function):
 
 
 def _with_sound_maps(drawn: _Drawn, maps: dict[str, torch.Tensor], wanted: set[str]) -> _Drawn:
-    """The drawn picture, with ones for a map that was changed since and that no gradient reads.
+    """Return the drawn picture, with ones for a changed map that no gradient reads.
 
     Zero times a changed value need not be zero.
 
     Args:
-        maps: "alpha" and "depth" as the caller holds them.
-        wanted: names of the outputs that have a gradient, and "background" if it needs one.
+        maps: "alpha" and "depth" as held by the caller.
+        wanted: names of the outputs with a gradient, and "background" if it needs one.
 
     Raises:
         RuntimeError: a gradient reads a map that was changed in place.
@@ -314,10 +314,10 @@ def _with_sound_maps(drawn: _Drawn, maps: dict[str, torch.Tensor], wanted: set[s
 
 
 def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:
-    """(M, columns) gradients in the projected splats, summed over tiles in their order.
+    """Sum gradients of the projected splats over tiles in order, (M, columns).
 
-    One row for each splat of each tile would be more than should be held at once, so groups of
-    tiles take turns.
+    One row for each splat of each tile would take too much memory, so groups of tiles are
+    processed in turn.
     """
     binned = drawn.binned
     n, tile_count = binned.projected, binned.tile_count

@@ -1,8 +1,8 @@
 """Dispatch of a kernel's calls to machine code.
 
-numba works out the types of all arguments at every call, which takes microseconds for each array
-of a structure. A small picture takes milliseconds and dozens of calls with dozens of arrays, so
-that this would be a fifth of its time: here the machine code for such arguments is looked up.
+numba infers the types of all arguments at every call, which takes microseconds for each array of a
+structure. A small picture takes milliseconds and dozens of calls with dozens of arrays, so the
+inference would take a fifth of its time: this module caches the machine code by type.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _machine_code: dict[tuple[Any, ...], Callable[..., Any]] = {}
 
 
 def _type_key(value: Any) -> Any:
-    """Equal for two values only if numba gives them the same type."""
+    """Compute a key that is equal for two values only if numba gives them the same type."""
     kind = type(value)
     if kind is np.ndarray:
         flags = value.flags.num
@@ -40,9 +40,9 @@ def _type_key(value: Any) -> Any:
 
 
 def machine_code(kernel: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
-    """Machine code of ``kernel`` for arguments of such types; it is compiled if need be.
+    """Return the machine code of ``kernel`` for the arguments' types, compiling it if missing.
 
-    Where numba was told to compile nothing, a kernel is a plain function: itself.
+    If numba's compilation is disabled, the kernel is a plain function and is returned.
     """
     if not hasattr(kernel, "typeof_pyval"):
         return kernel
@@ -53,5 +53,5 @@ def machine_code(kernel: Callable[..., Any], arguments: tuple[Any, ...]) -> Call
 
 
 def call(kernel: Callable[..., Any], *arguments: Any) -> Any:
-    """``kernel(*arguments)``."""
+    """Call ``kernel(*arguments)``."""
     return machine_code(kernel, arguments)(*arguments)

@@ -1,5 +1,5 @@
-"""Exact distortion of the backends with kernels: it takes a second pass, and is made when it is
-first read.
+"""Exact distortion of the backends with kernels: it takes a second pass, which runs on first
+use.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class _Exact(torch.autograd.Function):
     """The exact distortion as a differentiable output.
 
     Its gradient goes to a placeholder among the outputs of the first pass, whose backward pass
-    takes it on with those of the other outputs.
+    handles it together with the gradients of the other outputs.
     """
 
     @staticmethod
@@ -37,17 +37,17 @@ def outputs_of(
     of_drawn: Callable[[], Tensor],
     anew: Callable[[], Tensor],
 ) -> Outputs:
-    """Outputs of a backend.
+    """Assemble the outputs of a backend.
 
     Args:
         inputs: drawn inputs.
-        tensors: the pictures, a placeholder for the exact distortion, and the weights.
+        tensors: pictures, a placeholder for the exact distortion, and the weights.
         counters: amounts of work.
-        of_drawn: makes the exact distortion of what the first pass kept.
-        anew: makes it by drawing again.
+        of_drawn: function that computes the exact distortion from the first pass's state.
+        anew: function that computes it by drawing again.
     """
     *pictures, placeholder, weight = tensors
-    # Without gradients nothing is left for a second pass, which most pictures never need.
+    # Without gradients no state is kept for a second pass, which most pictures never need.
     exact = (
         partial(_later, placeholder, of_drawn)
         if placeholder.requires_grad
@@ -58,7 +58,7 @@ def outputs_of(
 
 
 def _later(placeholder: Tensor, make: Callable[[], Tensor]) -> Tensor:
-    # Whoever reads it first may have switched gradients off; others read the same.
+    # The first reader may have disabled gradients, but later readers share the result.
     with torch.enable_grad():
         result: Tensor = _Exact.apply(placeholder, make)
     return result

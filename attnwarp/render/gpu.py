@@ -2,23 +2,23 @@
 reference.
 
 1. Projection: each splat's outline, depth and colour as seen by the camera, in float64.
-2. Ordering: a radix sort by depth; ties are broken by what the splats are.
-3. Binning: an entry for each tile of 8 x 8 pixels that a splat may show in, by exact outlines; a
-   stable radix sort by tile. What is linear in a pixel's position is evaluated in float64 at the
+2. Ordering: a radix sort by depth; ties are broken by the splats' parameters.
+3. Binning: an entry for each tile of 8 x 8 pixels that a splat may cover, by exact outlines; a
+   stable radix sort by tile. Terms linear in a pixel's position are evaluated in float64 at the
    tile's middle.
 4. Compositing, one thread a pixel, until the 32 pixels of a warp are opaque.
 5. Backward: each pixel's splats back to front. A splat's gradients are summed over a warp's
    pixels, then added to its row in float64, and taken to the parameters and the pose.
-6. Exact distortion, for who asks for it: the splats of each pixel are kept, so that each can walk
-   back over those that are out of order.
+6. Exact distortion, on request: the splats of each pixel are kept, so that each can walk back
+   over splats out of order.
 
-The host waits for the device once a picture, for the number of entries and of ties; once more for
-the exact distortion, and where the pose has a gradient. Pictures and weights have the same bits in
-every run. So have gradients, but for the order of sums in float64: 1e-15 of the largest term.
+The host waits for the device once per picture, for the number of entries and of ties; once more for
+the exact distortion, and if the pose has a gradient. Pictures and weights have the same bits in
+every run, gradients up to the order of sums in float64: 1e-15 of the largest term.
 
-Kernels run where the splats lie. For tensors in the host's memory that is Warp's CPU device, on one
-thread: far slower than backend "cpu", with the same results. Tests use it; this backend has never
-run on a GPU.
+Kernels run on the splats' device. For CPU tensors that is Warp's CPU device, on one thread: far
+slower than backend "cpu", with the same results. Tests use this device; the backend has never run
+on a GPU.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ PRECISE = torch.float64
 """Type of the projection and of the sums of gradients."""
 
 MOST_ENTRIES = 2**31 - 1
-"""Entries that a picture may have: their numbers are int32."""
+"""Largest number of entries of a picture: their numbers are int32."""
 
 
 def _cache_folder() -> str | None:
-    """Folder of compiled kernels if Warp's own cannot be written."""
+    """Choose the folder of compiled kernels if Warp's default is not writable."""
     own = os.environ.get("WARP_CACHE_PATH")
     folder = Path(own) if own else Path.home() / ".cache"
     while not folder.exists():
@@ -81,7 +81,7 @@ MODULES = (projection, binning, compositing, backward, projection_backward)
 
 @contextlib.contextmanager
 def _on(device: torch.device) -> Iterator[None]:
-    """Launches go to torch's stream: what torch has queued before comes first."""
+    """Launch on torch's stream, so that work queued by torch runs first."""
     if device.type == "cuda":
         with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
             yield
@@ -90,7 +90,7 @@ def _on(device: torch.device) -> Iterator[None]:
 
 
 def _launch(kernel: Any, count: int, device: torch.device, *arguments: Any) -> None:
-    """Launch a thread for each of ``count``; tensors are handed in as they lie in memory."""
+    """Launch ``count`` threads; tensors are passed without a copy."""
     if count == 0:
         return
     given = [
@@ -102,7 +102,7 @@ def _launch(kernel: Any, count: int, device: torch.device, *arguments: Any) -> N
 
 @dataclass(frozen=True)
 class _Splats:
-    """N splats as kernels take them: all float32, or all float64; values float32."""
+    """N splats in the kernels' format: all float32, or all float64; values float32."""
 
     means: Tensor
     quats: Tensor
@@ -116,13 +116,13 @@ class _Splats:
 
     @property
     def real(self) -> Any:
-        """Their type in kernels."""
+        """Type of the splats in kernels."""
         return wp.float32 if self.means.dtype == torch.float32 else wp.float64
 
 
 @dataclass(frozen=True)
 class _Drawn:
-    """State that the forward pass leaves to the backward pass."""
+    """State passed from the forward pass to the backward pass."""
 
     view: Any
     splats: _Splats
@@ -177,20 +177,20 @@ def _splats(inputs: Inputs) -> _Splats:
 
 
 def _sort(keys: Tensor, values: Tensor, bits: int | None = None) -> None:
-    """Sort ``values`` by ``keys``, stably, in place; both have room for as many again."""
+    """Sort ``values`` by ``keys``, stably, in place; both have double capacity."""
     count = len(keys) // 2
     wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(values), count, 0, bits)
 
 
 def _twice(values: Tensor) -> Tensor:
-    """The values, with room for as many again."""
+    """Copy values to a tensor of double capacity."""
     room = values.new_empty(2 * len(values))
     room[: len(values)] = values
     return room
 
 
 def _by_depth(depths: Tensor) -> tuple[Tensor, Tensor]:
-    """Depths in ascending order, and the splats in it."""
+    """Return depths in ascending order, and the splats in this order."""
     keys = _twice(depths)
     order = _twice(torch.arange(len(depths), dtype=torch.int32, device=depths.device))
     _sort(keys, order)
@@ -198,8 +198,8 @@ def _by_depth(depths: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _with_ties_broken(depths: Tensor, splats: _Splats) -> tuple[Tensor, Tensor]:
-    """Result of ``_by_depth``, with splats of equal depth in the order of what they are: as
-    :func:`attnwarp.render.order.break_ties` has them."""
+    """Return the result of ``_by_depth`` with splats of equal depth ordered by their parameters, as
+    in :func:`attnwarp.render.order.break_ties`."""
     count = len(depths)
     order = _twice(torch.arange(count, dtype=torch.int32, device=depths.device))
     # The least significant key first. Adding 0 takes the sign from zeros.
@@ -217,7 +217,7 @@ def _with_ties_broken(depths: Tensor, splats: _Splats) -> tuple[Tensor, Tensor]:
 
 
 def _draw(inputs: Inputs) -> tuple[_Drawn, tuple[Tensor, ...], Tensor]:
-    """The forward pass: its state, the pictures in the order of PICTURES, and the weights."""
+    """Run the forward pass: return its state, the pictures as in PICTURES, and the weights."""
     with _on(inputs.means.device):
         return _draw_here(inputs)
 
@@ -244,7 +244,7 @@ def _draw_here(inputs: Inputs) -> tuple[_Drawn, tuple[Tensor, ...], Tensor]:
     sorted_depths, order = _by_depth(depths) if n else (depths, counts)
     shown = torch.isfinite(sorted_depths)
     ties = ((sorted_depths[1:] == sorted_depths[:-1]) & shown[1:]).sum()
-    # The only wait for the device.
+    # The only synchronisation with the device.
     total, visible, tied = torch.stack([counts.sum(), shown.sum(), ties]).tolist()
     if total > MOST_ENTRIES:
         raise RuntimeError(
@@ -287,7 +287,7 @@ def _draw_here(inputs: Inputs) -> tuple[_Drawn, tuple[Tensor, ...], Tensor]:
 
 
 def _pair_up(drawn: _Drawn) -> tuple[Tensor, Tensor, Tensor]:
-    """(H, W) ``distortion_l1``; the rows of ``past``, and where each pixel's end."""
+    """Compute ``distortion_l1``, (H, W), the rows of ``past``, and each pixel's last row."""
     hits = drawn.steps[compositing.Plane.hits]
     ends = torch.cumsum(hits.flatten(), 0, dtype=torch.int64).reshape(hits.shape)
     total = int(ends[-1, -1])
@@ -308,8 +308,8 @@ def _pair_up(drawn: _Drawn) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class _Composite(torch.autograd.Function):
-    """The kernels as one differentiable step: the tensors of ``Inputs`` in, those of ``Outputs``
-    out.
+    """All kernels as one differentiable step from the tensors of ``Inputs`` to those of
+    ``Outputs``.
     """
 
     @staticmethod
@@ -321,10 +321,10 @@ class _Composite(torch.autograd.Function):
         ctx.origin = inputs.origin.double().cpu()
         ctx.shapes = [(t.shape, t.dtype) for t in tensors]
         ctx.set_materialize_grads(False)
-        # Saved so that torch notices when one of them is changed in place before the backward pass.
+        # Saved so that torch detects an in-place change before the backward pass.
         ctx.save_for_backward(*tensors)
         if any(ctx.needs_input_grad):
-            # Copies of the two that the backward pass reads: the caller may change its own.
+            # Copies of two outputs read by the backward pass: the caller may change the originals.
             made = dict(zip(PICTURES, pictures, strict=True))
             ctx.drawn, ctx.maps = drawn, {name: made[name].clone() for name in ("alpha", "depth")}
         placeholder = torch.zeros(1, dtype=torch.float32, device=drawn.device).expand(
@@ -348,7 +348,7 @@ class _Composite(torch.autograd.Function):
 def _gradients(
     ctx: Any, drawn: _Drawn, maps: dict[str, Tensor], upstream: dict[str, Tensor | None]
 ) -> list[Tensor | None]:
-    """Gradients in the tensors of ``Inputs`` from those in the outputs."""
+    """Compute gradients of the tensors of ``Inputs`` from those of the outputs."""
     device, view, splats = drawn.device, drawn.view, drawn.splats
     n, channels = len(splats.means), view.channels
     image = tuple(drawn.state.shape[1:])
@@ -399,7 +399,7 @@ def _gradients(
 
 
 def render(inputs: Inputs) -> Outputs:
-    """Render where the splats lie; see :func:`attnwarp.render.render`."""
+    """Render on the splats' device; see :func:`attnwarp.render.render`."""
     kept: list[_Drawn] = []
     tensors = _Composite.apply(
         inputs, kept, inputs.means, inputs.quats, inputs.scales, inputs.opacities, inputs.values,

@@ -20,11 +20,11 @@ C3 = (
 
 
 def basis(direction: torch.Tensor, degree: int) -> torch.Tensor:
-    """Values of the (degree + 1)^2 harmonics.
+    """Compute the values of the (degree + 1)^2 harmonics.
 
     Args:
         direction: (..., 3) unit vectors from the camera to the splat, in world axes.
-        degree: 0 to 3.
+        degree: highest degree, 0 to 3.
 
     Returns:
         (..., (degree + 1)^2).
@@ -55,8 +55,8 @@ def basis(direction: torch.Tensor, degree: int) -> torch.Tensor:
 
 
 def color(sh: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
-    """(N, 3) colours max(0, sum_k sh_k Y_k + 0.5) of (N, K, 3) coefficients seen along (N, 3) unit
-    directions.
+    """Compute colours (N, 3), max(0, sum_k sh_k Y_k + 0.5), of (N, K, 3) coefficients along (N, 3)
+    unit directions.
     """
     degree = round(sh.shape[1] ** 0.5) - 1
     return (torch.einsum("nk,nkc->nc", basis(direction, degree), sh) + 0.5).clamp_min(0)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Inputs:
-    """Inputs of a backend: checked, and free of defaults. N splats, C channels.
+    """Checked inputs of a backend, with defaults resolved. N splats, C channels.
 
     ``values`` is (N, K, 3) spherical harmonics if ``harmonic``, else (N, C) features. ``K`` is (3,
     3) and ``pose`` the (4, 4) world-to-camera transform, both float64; ``pose`` and ``background``
@@ -38,13 +38,13 @@ class Inputs:
 
     @property
     def channels(self) -> int:
-        """Channels of the rendered colour."""
+        """Number of channels of the rendered colour."""
         return 3 if self.harmonic else int(self.values.shape[1])
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """Outputs of a backend; they are those of :class:`attnwarp.render.Render`."""
+    """Outputs of a backend, as in :class:`attnwarp.render.Render`."""
 
     color: Tensor
     alpha: Tensor
@@ -55,11 +55,11 @@ class Outputs:
     distortion_l2_ndc: Tensor
     weight: Tensor
     counters: dict[str, int]
-    exact: Callable[[], Tensor]  # makes distortion_l1
+    exact: Callable[[], Tensor]  # computes distortion_l1
 
     @property
     def distortion_l1(self) -> Tensor:
-        """(H, W), made anew at each use."""
+        """Exact distortion, (H, W), computed at each use."""
         return self.exact()
 
 
@@ -72,7 +72,7 @@ PICTURES = (
     "distortion_ordered",
     "distortion_l2_ndc",
 )
-"""Names of the outputs that are pictures and made at once."""
+"""Names of the picture outputs of the first pass."""
 
 OUTPUTS = (*PICTURES, "distortion_l1", "weight")
 """Names of the differentiable outputs."""

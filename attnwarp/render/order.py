@@ -1,5 +1,5 @@
-"""The order in which splats are composited: front to back by centre depth, and never by their place
-in the input.
+"""Compositing order of splats: front to back by centre depth, independent of their order in the
+input.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ def break_ties(
     content: list[np.ndarray],
     places: npt.NDArray[np.int64] | None = None,
 ) -> None:
-    """Put splats of equal depth into an order that depends on what they are, in place.
+    """Put splats of equal depth into an order that depends on their parameters, in place.
 
-    Depths count as equal when they round to the same float32. In a plane of splats before a rotated
-    camera, depths differ in the last bits of float64 only, which are noise. Splats equal in all
+    Depths count as equal if they round to the same float32. In a plane of splats before a rotated
+    camera, depths differ only in the last bits of float64, which are noise. Splats equal in all
     parameters are interchangeable.
 
     Args:
         order: (M,) indices of splats, sorted by ``depth``; changed in place.
         depth: (N,) float32 depth of each splat.
-        content: arrays of (N,) or (N, k) values that describe a splat, most significant first.
-        places: where in ``order`` a depth equals one beside it, ascending, if that is known.
+        content: arrays of (N,) or (N, k) parameters of a splat, most significant first.
+        places: ascending positions in ``order`` whose depth equals a neighbour's, if known.
     """
     if places is None:
         same = np.flatnonzero(np.diff(depth[order]) == 0)
@@ -32,7 +32,7 @@ def break_ties(
     if not len(places):
         return
     splats = order[places]
-    # Most ties are broken by what comes first: the rest is only looked at if it has to be.
+    # The first parameters break most ties: the others are only compared if necessary.
     for arrays in (content[:1], content):
         keys = [
             depth[splats],
@@ -47,7 +47,7 @@ def break_ties(
 def front_to_back(
     depth: npt.NDArray[np.float32], content: list[np.ndarray]
 ) -> npt.NDArray[np.int64]:
-    """(N,) indices from the nearest to the farthest splat; see :func:`break_ties`."""
+    """Sort splats from the nearest to the farthest, (N,) indices; see :func:`break_ties`."""
     order = np.argsort(depth, kind="stable").astype(np.int64)
     break_ties(order, depth, content)
     return order

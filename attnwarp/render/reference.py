@@ -1,9 +1,9 @@
-"""The definition of every output, by brute force: each splat against each pixel in float64 torch,
-through autograd.
+"""Definition of every output, by brute force: each splat at each pixel in float64 torch, with
+autograd.
 
-No tiles, no boxes, no cut-offs but those of ``constants.py``. Written as the papers write it
-(ray-plane intersection, EWA projection), not as the fast backend computes it, so that agreement
-between the two means something. Small scenes and small images only: memory is splats x pixels.
+No tiles, no boxes, no cut-offs except those of ``constants.py``. The formulas follow the papers
+(ray-plane intersection, EWA projection), not the fast backend, so that agreement of the two is
+meaningful. Only for small scenes and images: memory is splats x pixels.
 
 Notation. c = R m + t is a splat's centre in camera axes, d = K^-1 (x, y, 1) the ray of a pixel with
 d_z = 1, so that a depth z is the point z d. w_i = alpha_i T_i with T_i = prod_{j<i} (1 - alpha_j),
@@ -34,8 +34,8 @@ Tensor = torch.Tensor
 
 @dataclass(frozen=True)
 class Thresholds:
-    """The cut-offs of ``constants.py``. Tests move them a little to bracket what rounding may
-    decide either way.
+    """Cut-offs of ``constants.py``. Tests shift them slightly to bracket decisions that rounding
+    may change.
     """
 
     alpha_min: float = constants.ALPHA_MIN
@@ -44,7 +44,7 @@ class Thresholds:
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """(N, 3, 3) rotations of (N, 4) quaternions wxyz of any length but zero."""
+    """Convert (N, 4) quaternions wxyz of any length but zero to rotations, (N, 3, 3)."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1, eps=0).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -60,8 +60,8 @@ def render(
     """Render by brute force in float64; differentiable in every tensor of ``inputs``.
 
     Args:
-        chunk: splat-pixel pairs held at once; rows of pixels are worked off in groups of about this
-            size.
+        chunk: number of splat-pixel pairs held at once; rows of pixels are processed in groups of
+            about this size.
     """
     limits = thresholds or Thresholds()
     means, quats, scales = inputs.means.double(), inputs.quats.double(), inputs.scales.double()
@@ -72,7 +72,7 @@ def render(
     )
     K, pose, origin = inputs.K.double(), inputs.pose.double(), inputs.origin.double()
     R = pose[:3, :3]
-    # The world's origin is moved to the splats' in float64 before any splat is touched.
+    # The world's origin is moved to the splats' origin in float64 before any other operation.
     centers = means @ R.T + (R @ origin + pose[:3, 3])
     world_axes = rotation_matrices(quats)
     axes = R @ world_axes
@@ -148,8 +148,8 @@ class _Splats:
     limits: Thresholds
 
     def composite(self, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-        """Colour over black, alpha, depth, median, normal, distortions (ordered, l2, l1) per
-        pixel, weight per splat, contributing pairs.
+        """Composite per pixel colour over black, alpha, depth, median, normal, distortions
+        (ordered, l2, l1); also weight per splat, contributing pairs.
         """
         inputs, limits = self.inputs, self.limits
         rays = torch.stack(_unproject(x, y, self.K), dim=-1)
@@ -272,12 +272,12 @@ class _Splats:
 
 
 def _gaps(w: Tensor, z: Tensor) -> Tensor:
-    """sum_{j<i} w_j (z_i - z_j) for each splat i."""
+    """Compute sum_{j<i} w_j (z_i - z_j) for each splat i."""
     return z * _before(w) - _before(w * z)
 
 
 def _before(values: Tensor) -> Tensor:
-    """Sum over the splats in front, exclusive."""
+    """Compute the exclusive sum over the splats in front."""
     return torch.cumsum(values, dim=1) - values
 
 

@@ -1,8 +1,8 @@
 """Threads for kernels that release the GIL.
 
-Python's own threads, not numba's parallel loops. numba's "workqueue" layer aborts when two threads
-enter it at once, its OpenMP layer aborts after a fork, and both multiply the time of compilation.
-These threads may be used from any thread of any process, forked or not.
+These are Python threads, not numba's parallel loops. numba's "workqueue" layer aborts if two
+threads enter it at once, its OpenMP layer aborts after a fork, and both multiply the time of
+compilation. The threads here work from any thread of any process, forked or not.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from attnwarp.render.dispatch import machine_code
 
 _lock = threading.Lock()
 _pools: dict[int, ThreadPoolExecutor] = {}
-"""Pools by the number of threads that was set: a pool for each number of jobs would keep its own
+"""Pools by the configured number of threads: a pool per number of jobs would keep separate
 threads.
 """
 
 
 def _forget() -> None:
-    # A forked child has the pool's bookkeeping but none of its threads.
+    # A forked child inherits the pool's bookkeeping but none of its threads.
     global _lock
     _lock = threading.Lock()
     _pools.clear()
@@ -37,7 +37,7 @@ _chosen: int | None = None
 
 
 def set_thread_count(threads: int | None) -> None:
-    """Use so many threads from now on, whatever torch is set to; None: torch's setting again.
+    """Set the number of threads, independent of torch's setting; None restores torch's setting.
 
     A fit spends the rest of its time in tensor operations too small to gain from torch's threads,
     which then only wait, and wait by spinning.
@@ -49,14 +49,14 @@ def set_thread_count(threads: int | None) -> None:
 
 
 def thread_count() -> int:
-    """Threads to use: those chosen, or else torch's own setting, ``torch.set_num_threads``."""
+    """Return the number of threads: the chosen one, or else ``torch.set_num_threads``'s."""
     return _chosen or max(1, torch.get_num_threads())
 
 
 def run_jobs(work: Callable[..., None], jobs: Sequence[tuple]) -> None:
     """Call work(*job) for every job, on up to :func:`thread_count` threads.
 
-    Jobs must not write to the same place, and each argument has the same type in all of them.
+    Jobs must not write to the same memory, and each argument has the same type in all jobs.
     """
     if jobs:
         work = machine_code(work, jobs[0])
@@ -87,5 +87,5 @@ def run_jobs(work: Callable[..., None], jobs: Sequence[tuple]) -> None:
 
 
 def ranges(length: int, size: int) -> list[tuple[int, int]]:
-    """(begin, end) of consecutive pieces of ``size``; independent of the number of threads."""
+    """Split a range into (begin, end) pieces of ``size``, independent of the number of threads."""
     return [(begin, min(begin + size, length)) for begin in range(0, length, size)]
