@@ -84,7 +84,7 @@ def write_arrays(kind: str, key: str, arrays: Mapping[str, Any]) -> None:
     folder = cache_dir() / kind
     with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
-        # Not durable: half a file would fail its checksum, and a mesh takes less time than a flush.
+        # Not durable: a partial file fails its checksum, and a mesh takes less time than a flush.
         write_atomically(folder / f"{key}.npz", lambda stream: stream.write(data), durable=False)
         _keep_within(limit, len(data))
 

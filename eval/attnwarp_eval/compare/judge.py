@@ -216,7 +216,7 @@ def _has_gates(name: str) -> bool:
 
 
 def _by_key(cells: Iterable[Measured], exact: bool) -> dict[Key, list[Measured]]:
-    """The cells of every key; variants that share a cell each have it, since they may part."""
+    """The cells of every key; shared cells are repeated, since variants may diverge."""
     table: dict[Key, list[Measured]] = {}
     for cell in cells:
         for variant in cell.variants:

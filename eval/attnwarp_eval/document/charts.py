@@ -81,7 +81,7 @@ def drawing(
         )
         yield list(axes.flat)
         figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # names stand about points, which must not move again
+        figure.set_layout_engine("none")  # names surround points, which must not move again
         for each in axes.flat:
             _place_names(each)
         buffer = io.BytesIO()

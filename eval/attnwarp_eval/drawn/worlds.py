@@ -279,7 +279,7 @@ class World:
         rng = np.random.default_rng([self.seed, 4])
         statue = look.statue if statue is None else statue
         shape = body(OBJECTS[self.thing], self.instance, plain=statue)
-        # A body on its side or askew is still the same thing; small turns only, for it must stand.
+        # A body on its side or askew is still the same thing; small turns only: it must stand.
         shape["yaw"] = round(float(rng.uniform(0, 360)), 1)
         shape["scale"] = round(float(rng.uniform(0.85, 1.2)), 3)
         objects = [

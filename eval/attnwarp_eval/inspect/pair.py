@@ -73,7 +73,7 @@ CATEGORIES = (
     "#b2df8a", "#fdbf6f", "#cab2d6", "#ffd92f",
 )  # fmt: skip
 """Colours of rules and of views, in order (ColorBrewer, Paired; its dark green resembles
-``ACCEPTED``, so cyan stands in its place)."""
+``ACCEPTED``, so cyan replaces it)."""
 
 DISAGREEMENT = 0.3
 """Mean absolute difference of sRGB at the bright end of the colours."""
@@ -338,7 +338,7 @@ class Pair:
     def disagreement(self) -> Array:
         """(H, W) mean absolute difference of the target's edit and the source's, warped.
 
-        NaN where the mask rejects, and if a view has not been edited.
+        NaN where the mask rejects, and in views without an edit.
         """
         edited = self._edited(self.views.source.name), self._edited(self.target)
         if edited[0] is None or edited[1] is None:

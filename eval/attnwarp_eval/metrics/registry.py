@@ -28,7 +28,7 @@ class Metric:
         description: one line for a reader of a report.
         version: raised when the figure's numbers change meaning.
         column: head of a column in the table of the probe that measures it, and of its row in ``attnwarp-eval
-            metrics``; one without stands in tables that name it.
+            metrics``; without it, the metric is only in tables that name it.
         pictures: folders of ``attnwarp-eval metrics`` that it is computed from, of "renders", "edited", "originals".
         function: function that computes it from a view's pictures, (H, W, 3) sRGB in [0, 1] in the
             order of ``pictures``, such as "attnwarp_eval.metrics.image:psnr".
@@ -68,7 +68,7 @@ class Metric:
 
 
 class Registry(dict[str, Metric]):
-    """Metrics by name, which also answers to a result's key, whatever region or size stands behind the name."""
+    """Metrics by name; also accepts a result's key, with a region or size after the name."""
 
     def __missing__(self, key: str) -> Metric:
         name = ".".join(key.split(".")[:2])

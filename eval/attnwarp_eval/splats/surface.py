@@ -288,7 +288,7 @@ def sample_surface(
     normals = np.concatenate([normal[flat], outward])
     primitive = np.concatenate([flat_id[flat], sphere_id[cell_sphere[ball]]])
 
-    # Surfaces inside other objects are seen by nobody; splats there would only shine through.
+    # Surfaces inside other objects are invisible; splats there would only shine through.
     free = ~buried(geometry, point, normals, primitive)
     if free.sum() < count:
         raise InputError(
@@ -353,7 +353,7 @@ def _eliminate(points: Array, normals: Array, spacing: Array, count: int) -> npt
     from scipy.spatial import cKDTree
 
     n = len(points)
-    # Radius of the densest packing of discs that stand for spacing^2 each (Yuksel 2015, eq. 2).
+    # Radius of the densest packing of discs that represent spacing^2 each (Yuksel 2015, eq. 2).
     radius = spacing / np.sqrt(2 * np.sqrt(3.0))
     k = min(n, 6 * CANDIDATES)
     distance, near = cKDTree(points).query(points, k=k, workers=-1)

@@ -45,7 +45,7 @@ def plane_depth(camera: Camera, normal: Sequence[float], offset: float) -> Array
 
 
 def sphere(camera: Camera, radius: float = 1.0) -> tuple[Array, Array]:
-    """(H, W) depth and (H, W, 3) outward normals of a sphere at the origin, NaN beside it."""
+    """(H, W) depth and (H, W, 3) outward normals of a sphere at the origin, NaN outside."""
     rays = camera.directions() @ camera.rotation
     length = np.linalg.norm(rays, axis=-1)
     unit = rays / length[..., None]

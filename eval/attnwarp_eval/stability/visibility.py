@@ -142,7 +142,7 @@ def _rays(K: npt.NDArray[np.float64], x: Extended, y: Extended) -> Extended:
 
 
 def _to_world(camera: Camera, points: Extended) -> Extended:
-    """R^T (p - t): exact up to the pose's own deviation from a rotation."""
+    """R^T (p - t): exact up to the pose's deviation from a rotation."""
     return (points - _long(camera.translation)) @ _long(camera.rotation)
 
 

@@ -1,4 +1,4 @@
-"""Contrast of two arms over scenes on a metric's own scale, with the test that decides it."""
+"""Contrast of two arms over scenes on a metric's scale, with the test that decides it."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Contrast:
     def shown(self, level: float = 0.95) -> tuple[float, float, float]:
         """Mean and bounds for display: b / a for ``ratio`` and ``odds``, else b - a.
 
-        0 (or a factor of 1) lies inside exactly if the test at that level cannot tell.
+        The bounds contain 0 (or a factor of 1) exactly if the test at that level can't tell.
         """
         return self._read((self.flips.mean, *self.flips.interval(level)))
 

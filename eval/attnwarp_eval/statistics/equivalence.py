@@ -184,7 +184,7 @@ def equivalence(a: npt.ArrayLike, b: npt.ArrayLike, *, margin: float) -> Equival
     Journal of Pharmacokinetics and Biopharmaceutics 15).
 
     Args:
-        a, b: (n, ...) and (m, ...) independent samples, such as pictures; each counts by its mean.
+        a, b: (n, ...) and (m, ...) independent samples, such as pictures; only means count.
         margin: a share of the mean.
 
     Example:

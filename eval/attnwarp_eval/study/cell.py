@@ -1,4 +1,4 @@
-"""A cell: one scene, one variant, one seed, one probe. Its id is the hash of what it computes."""
+"""A cell: one scene, one variant, one seed, one probe. Its id is the hash of its spec."""
 
 from __future__ import annotations
 

@@ -161,7 +161,7 @@ def run_on_workers(
     settings = {
         **memory,
         "distributed.worker.memory.terminate": False,
-        # dask samples the worker's stack 100 times a second for a dashboard that nobody opens.
+        # dask samples the worker's stack 100 times a second for a dashboard that is not used.
         "distributed.worker.profile.enabled": False,
         "distributed.nanny.pre-spawn-environ.OMP_NUM_THREADS": threads,
         "distributed.nanny.pre-spawn-environ.MKL_NUM_THREADS": threads,

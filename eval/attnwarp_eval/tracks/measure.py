@@ -218,7 +218,7 @@ FIGURES: Mapping[str, Callable[[Mapping[str, Array]], float]] = {
     "flat": lambda p: _median(p["flat"]),
 }
 """Figures of a row: median px, share kept, median px of those, share off by more than :data:`OFF`
-px or without a position, share of those that the mask drops, and the medians of the tracks' own 3D
+px or without a position, share of those that the mask drops, and the medians of the tracks' 3D
 points and of a flat depth."""
 
 

@@ -45,7 +45,7 @@ from attnwarp_eval.user_images.measure import (
 )
 
 LONGEST = 256
-"""Longest side in px of the pictures that all but keypoints are computed on; smaller ones stay."""
+"""Longest side in px of pictures, except for keypoints; smaller ones keep their size."""
 
 PROTOCOL = 2
 """Version; raised when the same pictures would give other figures."""
@@ -251,7 +251,7 @@ def _files(
 
 
 class _Pairs:
-    """Figures of two neighbouring views; what a view has of its own is kept for its second pair."""
+    """Figures of two neighbouring views; a view's results are kept for its second pair."""
 
     def __init__(
         self,

@@ -360,7 +360,7 @@ def _possible(
     encoders: Mapping[Kind, str | None],
     done: Measured,
 ) -> list[Figure]:
-    """The figures that the inputs allow; the others' reasons go to ``done``."""
+    """The figures that the inputs allow; ``done`` gets reasons for missing ones."""
     wanted = []
     for figure in figures():
         absent = [_option(name) for name in figure.needs if getattr(inputs, name) is None]

@@ -466,7 +466,7 @@ def _fit_settings(manifest: Manifest, kind: str) -> Json:
 
 
 def settings_of(loaded: Loaded, row: Row, seed: int, size: int) -> Json:
-    """All settings of a row's method; one of the library takes the manifest's size and encoder."""
+    """All settings of a row's method; the library's use the manifest's size and encoder."""
     shared = {"size": size, "perceptual_encoder": loaded.encoder("perceptual")}
     own = {**row.options, **(shared if row.method in METHODS else {})}
     return EDITING_METHODS[row.method].settings(row.preset, own, seed)

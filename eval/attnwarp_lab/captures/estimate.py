@@ -73,7 +73,7 @@ class Unit:
         return (files + self.rounds * self.state + self._edits(views) * self.picture) / 1e9
 
     def _edits(self, views: int) -> float:
-        """Methods that edit all views, or more than once, edit more of a larger capture."""
+        """Edits of a cell; some methods edit more in a larger capture."""
         return self.edits * views / self.views if self.edits >= self.views else self.edits
 
 

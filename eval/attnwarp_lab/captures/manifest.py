@@ -263,7 +263,7 @@ class Loaded:
         return self.changed(variants=variants, tables=tables, editors=editors)
 
     def with_editors(self, folders: Sequence[str]) -> Loaded:
-        """The variants whose editors are of the kinds of some others, which take their places.
+        """Replace editors by others of their kind; other variants are dropped.
 
         Raises:
             InputError: no such editor, or no variant uses its kind.

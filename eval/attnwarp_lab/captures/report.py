@@ -404,7 +404,7 @@ def _people() -> Section:
 
 
 def _ask_people(results: Results) -> list[Path]:
-    """Write the page that compares the rows of the first table, where there is a pair."""
+    """Write the page that compares the rows of the first table, if there is a pair."""
     from attnwarp_lab.userstudy.material import read_items
     from attnwarp_lab.userstudy.page import Design, build_page
 

@@ -117,7 +117,7 @@ def part_figures(
         picture: (H, W, 3) sRGB in [0, 1], edited.
         answers: (P,) of the source, from :func:`part_answers`.
         visible: (H, W) bool, the source certainly shows the pixel's surface.
-        hidden: (H, W) bool, it falls inside the source image and is certainly not shown there.
+        hidden: (H, W) bool, the surface is inside the source image and certainly hidden.
         before_it: (H, W) part of the surface that the source shows there instead; -1 for none.
 
     Returns:

@@ -40,7 +40,7 @@ def _visible_tokens(visible: float, way: Way) -> float:
 
 
 def _ideal(tokens: int, alpha: float, way: Way) -> float:
-    """Error of the ideal editor's picture, at an alpha-bar, of a part of so many tokens of 64."""
+    """Error of the ideal editor's picture, at an alpha-bar, for a part of some of 64 tokens."""
     random, answers = np.random.default_rng(int(tokens)), 3
     before = random.random((32, 32, 3)).astype(np.float32)
     after = random.random((answers, 32, 32, 3)).astype(np.float32)

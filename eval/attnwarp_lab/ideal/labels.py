@@ -38,7 +38,7 @@ class Layer(Protocol):
 
 
 def carried_labels(layer: Layer, source: Labels) -> Labels:
-    """(h, w) label that each token of a target takes: the one of the largest weight among its taps.
+    """(h, w) label that each token of a target takes: that of the heaviest tap.
 
     Args:
         source: (h', w') part of each token of the source, -1 outside the thing.
@@ -129,7 +129,7 @@ def label_tokens(
 def label_transport(
     carried: Labels, tokens: Labels, pixels: Labels, visible: Mask, unseen: Mask
 ) -> dict[str, float]:
-    """Right, wrong and missing labels among visible tokens, and labels where none belongs.
+    """Right, wrong and missing labels at visible tokens, and labels at other tokens.
 
     A token is visible if more than half of its pixels show its part and the source shows them;
     hidden if more than half show its part and the source does not.

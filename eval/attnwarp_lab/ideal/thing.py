@@ -1,4 +1,4 @@
-"""A thing in parts: its labels and true answers in every view, and the editor that knows them."""
+"""A thing in parts: its labels and true answers in every view, and the editor with them."""
 
 from __future__ import annotations
 

@@ -221,7 +221,7 @@ def _interval(
 
 
 def _logit(p: Array, choices: float) -> Array:
-    """Logits of probabilities, those of 0 and 1 taken for half of one choice of so many.
+    """Logits of probabilities; 0 and 1 are replaced by half a choice out of ``choices``.
 
     Draws without the one person who chose otherwise have 0 or 1. Their logit is infinite, and that
     of the ridge's 1e-6 would make a single other choice of a hundred outweigh the rest.

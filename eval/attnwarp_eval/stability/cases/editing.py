@@ -220,7 +220,7 @@ def _apart(yaw: float, way: Way) -> float:
 
 
 def _latents(size: float, way: Way) -> float:
-    """Distance in px of the layer's positions from where they must be, and finite tokens."""
+    """Distance in px of the layer's positions from exact ones; tokens must be finite."""
     n = int(size)
     K = np.array([[80.0, 0, 32], [0, 80.0, 32], [0, 0, 1]])
     near = np.eye(4)

@@ -178,7 +178,7 @@ def _mask(share: float, way: Way) -> float:
 
 def _near_equal_depth(gap: float, way: Way) -> float:
     """Error of a blend at a = 1 where the source sees a wall before the target's by a share of its
-    depth; the cameras stand side by side.
+    depth; the cameras are side by side.
     """
     K = np.array([[20.0, 0, 8], [0, 20.0, 8], [0, 0, 1]])
     pose = np.eye(4)

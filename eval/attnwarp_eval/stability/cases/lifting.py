@@ -79,14 +79,14 @@ def _around(mask: Mask) -> npt.NDArray[np.bool_]:
 
 
 def _far_off(mine: Mask, true: Mask) -> float:
-    """Pixels marked far from the exact mask, missing in its midst, or far from any mark."""
+    """Pixels marked far from the exact mask, or missing in its interior or far from marks."""
     near = _around(true)
     stray, hole = mine & ~near.any(0), ~mine & near.all(0)
     return float((stray | hole | (true & ~_around(mine).any(0))).sum())
 
 
 def _touching(gap: float, way: Way) -> float:
-    """Pixels far off, of a ball that a wall stands behind, at a gap."""
+    """Pixels far off, of a ball in front of a wall, at a gap."""
     step = 6 / WALL
     scene = _scene(way, (_ball(), 0.04), (_wall(-1 - gap, (3, 3), step), step / 2))
     return _far_off(_lifted(scene, _ball_mask(_view(SOURCE)), way), _ball_mask(_view(TARGET)))

@@ -457,7 +457,7 @@ def _half(magnitude: float, way: Way) -> float:
 
 
 def grid_sampled(result: Correspondence, features: torch.Tensor) -> torch.Tensor:
-    """(C, H, W) float64: features (C, h, w) at the positions, by torch's own sampler."""
+    """(C, H, W) float64: features (C, h, w) at the positions, by torch's sampler."""
     size = torch.tensor([result.source.width, result.source.height])
     grid = torch.nan_to_num(2 * result.xy / size - 1, nan=-2.0)
     return torch.nn.functional.grid_sample(

@@ -143,7 +143,7 @@ class Figure:
     Attributes:
         key, title: key and title of the metric.
         needs: inputs besides the edited pictures.
-        measure: value of a pair, of source and target after the edit; None for a figure of a set.
+        measure: function of a pair and its edited source and target; None for figures of sets.
         encoder: kind of the encoder needed.
         truth: whether the truth is needed.
     """

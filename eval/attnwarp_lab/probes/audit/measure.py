@@ -122,7 +122,7 @@ class AuditProbe(Probe[Seconds]):
     def cells(
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
-        """One for each scene and seed. The next scene gives the pictures of another scene."""
+        """Cells: one for each scene and seed, with the next scene as the other scene."""
         part = study.part(StudyPart)
         identities = encoder_identities(part)
         files = dict(zip(study.scene_names, study.scenes, strict=True))

@@ -103,11 +103,11 @@ class Pairs:
         return self.area(row, [flaw.key(flaw.reference)], self.near)
 
     def counted(self, row: Figure, yaws: Sequence[float], right: Sequence[str] = RIGHT) -> Auroc:
-        """Mean AUROC of the flaws that matter most, against right pairs."""
+        """Mean AUROC of the most important flaws, against right pairs."""
         return self.area(row, [flaw.key(flaw.reference) for flaw in COUNTED], yaws, right)
 
     def lowest(self, row: Figure) -> float:
-        """Lowest AUROC among the flaws that matter most; NaN where one is undefined."""
+        """Lowest AUROC among the most important flaws; NaN if one is undefined."""
         return float(np.min([self.shown(row, flaw).value for flaw in COUNTED]))
 
     def alarms(self, row: Figure, trap: str = VARNISHED) -> float:
@@ -168,7 +168,7 @@ class Pairs:
         return [row for row in usable if math.isfinite(self.counted(row, self.near).value)]
 
     def best(self) -> Figure | None:
-        """Metric without truth with the largest mean AUROC of the flaws that matter most."""
+        """Metric without truth with the largest mean AUROC of the most important flaws."""
         return max(self.known(), key=lambda row: self.counted(row, self.near).value, default=None)
 
 
@@ -196,7 +196,7 @@ class AuditReport(ProbeReport):
 
 
 def area_text(value: Auroc, intervals: bool = True) -> str:
-    """AUROC with its interval, where it has one; a dash where it is undefined.
+    """AUROC with its interval, if any; a dash if undefined.
 
     Example:
         >>> area_text(Auroc(0.951, 0.9, 1.0, 24, 0.0, 0.9))
@@ -224,7 +224,7 @@ def percent(share: float) -> str:
 
 
 def rank_correlation(sizes: Any, values: Any) -> float:
-    """Spearman's of what is defined; 0 for values that never change, NaN for fewer than three.
+    """Spearman's correlation; 0 for values that never change, NaN for fewer than three.
 
     Example:
         >>> round(rank_correlation((0, 1, 2, 3, 4), (1, 2, 3, 5, 4)), 9)  # 1 - 6 * 2 / (5 * 24)

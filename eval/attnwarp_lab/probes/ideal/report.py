@@ -50,7 +50,7 @@ class IdealReport(ProbeReport):
         ]
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """The editor by scene: share of signal, when answers settle, and what it is alone."""
+        """The editor by scene: share of signal, settling of answers, statistics alone."""
         found: dict[tuple[object, ...], list[str]] = {}
         for cell, record in results.finished(self.name):
             ideal, extra = record.spec["editor"]["ideal"], record.extra
