@@ -42,7 +42,7 @@ LONE_SIZE = 0.01
 
 
 def extent_of(cameras: Sequence[Camera], points: Array | None = None) -> float:
-    """Size of a scene in its own units: 1.1 times the largest distance of a camera from their mean
+    """Size of a scene in scene units: 1.1 times the largest distance of a camera from their mean
     (3DGS).
 
     Cameras at one place do not determine the size; it is then the median distance of ``points``

@@ -408,7 +408,7 @@ class _Run:
         return result
 
     def _follow(self, call: tuple[str, int, tuple[int, ...], int] | None) -> None:
-        """Raise RuntimeError unless a call is the plan's next; None stands for the end."""
+        """Raise RuntimeError unless a call is the plan's next; None means the end."""
         planned = next(self.planned, None)
         if call != planned:
             raise RuntimeError(

@@ -218,7 +218,7 @@ class ViewEdits:
 
     def recorded(self, count: int) -> list[RecordedSource]:
         """Return the first ``count`` sources with their features. A process that found their edits
-        finished edits them anew, to the same bytes.
+        finished repeats the edits, with the same bytes.
         """
         while len(self._recorded) < count:
             number = len(self._recorded)

@@ -20,7 +20,7 @@ value.
 
 PLAIN, WRITEABLE = 0x101, 0x400
 """numpy's flags of arrays: C-contiguous and aligned (NPY_ARRAY_CARRAY_RO), writeable. Read as one
-number, since each of them by name is an object of its own."""
+number, since access by name would create an object for each flag."""
 
 _machine_code: dict[tuple[Any, ...], Callable[..., Any]] = {}
 

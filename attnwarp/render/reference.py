@@ -11,7 +11,7 @@ front to back by c_z. Splats whose centre is not beyond the near plane, c_z <= n
 
 2D splats: the ray meets the plane at z = n.c / n.d in the splat's coordinates (u, v); rho = min(u^2
 + v^2, 2 |x - x_c|^2) and alpha = o exp(-rho / 2). The first term holds only where near <= z. Where
-the second decides, z of the plane may lie anywhere: it is bounded to the splat's own extent, c_z +-
+the second decides, z of the plane may lie anywhere: it is bounded to the splat's extent, c_z +-
 3.33 sigma_z, and to near. Since |u, v| <= 3.33 wherever the first decides, the bound changes
 nothing there and z is continuous.
 
@@ -263,7 +263,7 @@ class _Splats:
         alpha = opacity * torch.exp(-0.5 * power)
         if inputs.depth == "center":
             return alpha, depth.expand_as(alpha)
-        # d.P.c and d.P.d in the splat's own axes and scales: P itself spans the scales squared.
+        # d.P.c and d.P.d in the splat's axes and scales: P itself spans the scales squared.
         ray = torch.einsum("pi,nij->pnj", rays, self.axes) / self.scales
         center = torch.einsum("ni,nij->nj", c, self.axes) / self.scales
         along, across = (ray * center).sum(-1), (ray * ray).sum(-1)

@@ -1,8 +1,8 @@
 # mypy: ignore-errors
 """Backward pass of the compositing, one thread a pixel: its splats back to front.
 
-What a splat gets from the pixels of a warp is summed among the threads, and added to the splat's
-row of gradients in float64. The order of those additions is the only one that is not fixed.
+A splat's gradients from the pixels of a warp are summed among the threads, and added to the splat's
+row of gradients in float64. Only the order of those additions is not fixed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def composite_backward(
     depth: wp.array2d(dtype=wp.float32),
     state: wp.array3d(dtype=wp.float32),
     steps: wp.array3d(dtype=wp.int32),
-    ends: wp.array2d(dtype=wp.int64),  # of each pixel's rows of past
+    ends: wp.array2d(dtype=wp.int64),  # end of each pixel's rows of past
     past: wp.array2d(dtype=wp.float32),  # see pair_up; no rows without d_exact
     d_color: wp.array3d(dtype=wp.float32),
     d_alpha: wp.array2d(dtype=wp.float32),
@@ -54,8 +54,8 @@ def composite_backward(
 ):
     """Add the gradients of a pixel in its splats to their rows of ``total``.
 
-    The transmittance before each is recovered by division from what the forward pass left.
-    "behind" are sums over the splats behind the one at hand.
+    The transmittance before each splat is recovered by division from the forward pass's state.
+    "behind" marks sums over the splats behind the current one.
     """
     here = pixel_of(view, wp.tid())
     row, column = here.row, here.column

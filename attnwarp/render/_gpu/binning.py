@@ -1,8 +1,8 @@
 # mypy: ignore-errors
 """Binning: the order of the splats, and the splats of each tile.
 
-Splats are sorted by depth, an entry is written for each tile that one may show in, in that order,
-and a stable sort by tile keeps it within each tile.
+Splats are sorted by depth, an entry is written for each tile that a splat may cover, in depth
+order, and a stable sort by tile keeps this order within each tile.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def break_ties(
     values: wp.array2d(dtype=wp.float32),
     result: wp.array(dtype=wp.int32),
 ):
-    """Order splats of equal depth and mean by what else they are; those that are equal in all are
-    interchangeable and stay as they are."""
+    """Order splats of equal depth and mean by their other parameters; splats equal in all are
+    interchangeable and keep their order."""
     k = wp.tid()
     i = order[k]
     place = k
@@ -87,7 +87,7 @@ def write_entries(
     tiles: wp.array(dtype=wp.int32),
     splats: wp.array(dtype=wp.int32),
 ):
-    """Write an entry for each tile that a splat may show in."""
+    """Write an entry for each tile that a splat may cover."""
     k = wp.tid()
     i = order[k]
     count = counts[i]
@@ -120,7 +120,7 @@ def lay_out(
     bounds: wp.array2d(dtype=wp.int32),  # (tiles, 2) first entry and the one after the last
     terms: wp.array2d(dtype=wp.float32),  # (entries, 5)
 ):
-    """Evaluate what is linear in a pixel's position at the middle of each entry's tile, in float64,
+    """Evaluate terms linear in a pixel's position at the middle of each entry's tile, in float64,
     and find the entries of each tile.
 
     Of 2D splats U, V, W and the offset from the reference point; of 3D splats u, v, l, p and q.

@@ -21,7 +21,7 @@ NAN = f32(float("nan"))
 
 
 class Plane:
-    """Planes of the state that the forward pass leaves."""
+    """Planes of the state saved by the forward pass."""
 
     # float32
     transmittance = 0  # behind all splats
@@ -36,7 +36,7 @@ class Plane:
 class Past:
     """Columns of a splat drawn at a pixel; see :func:`pair_up`.
 
-    ``lean`` and ``spread`` are what the pairs that are out of order change, each by half: in
+    ``lean`` and ``spread`` are half the changes made by pairs out of order in
     sum_j w_j sign(z_i - z_j) and in sum_j w_j |z_i - z_j|.
     """
 
@@ -49,7 +49,7 @@ class Past:
 
 @wp.struct
 class Pixel:
-    """A thread's pixel: its place in the picture, and from its tile's middle."""
+    """Pixel of a thread: its position in the picture, and relative to its tile's middle."""
 
     tile: wp.int32
     column: wp.int32
@@ -61,7 +61,7 @@ class Pixel:
 
 @wp.func
 def pixel_of(view: View, thread: wp.int32) -> Pixel:
-    """The pixel of a thread: a warp's are 8 x 4 pixels of one tile."""
+    """Find the pixel of a thread: a warp covers 8 x 4 pixels of one tile."""
     r = Pixel()
     r.tile = thread / PIXELS
     k = thread % PIXELS
@@ -182,11 +182,11 @@ def pair_up(
     past: wp.array2d(dtype=wp.float32),
     target: wp.array2d(dtype=wp.float32),
 ):
-    """Write the exact distortion of a pixel, and what its pairs out of order change.
+    """Write the exact distortion of a pixel, and the changes by its pairs out of order.
 
-    In compositing order the sum of w_i w_j (z_i - z_j) takes two running sums, and counts a pair
-    that is out of order with the wrong sign. So every splat walks back over those in front of it,
-    no further than the largest depth among them lies behind its own.
+    In compositing order the sum of w_i w_j (z_i - z_j) takes two running sums, but a pair out of
+    order counts with the wrong sign. So every splat walks back over the splats in front of it,
+    until the largest depth among them no longer exceeds its depth.
     """
     here = pixel_of(view, wp.tid())
     if not here.inside:
@@ -230,5 +230,5 @@ def pair_up(
             T -= w
             A += w
             depth_sum += w * z[0]
-    # Not negative: the running sums of equal depths leave what rounding leaves.
+    # Clamped to 0: running sums of equal depths leave a rounding error.
     target[here.row, here.column] = f32(2.0) * wp.max(pairs, f32(0.0))

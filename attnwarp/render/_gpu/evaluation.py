@@ -1,8 +1,8 @@
 # mypy: ignore-errors
-"""One splat at one pixel: where it is drawn, its alpha and its depth.
+"""One splat at one pixel: its coverage, alpha and depth.
 
-Shared by the forward and the backward pass. :mod:`attnwarp.render._kernels.evaluation` says why the
-depth is bounded as it is.
+Shared by the forward and the backward pass. :mod:`attnwarp.render._kernels.evaluation` explains the
+bounds of the depth.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ SMALLEST = f32(1e-30)
 
 @wp.struct
 class Pair:
-    """A splat at a pixel. Depths of a 2D splat are in units of its column ``depth`` unless they are
-    its centre's, which ``depth_from`` takes from its row."""
+    """Splat at a pixel. Depths of a 2D splat are in units of its column ``depth``, except its
+    centre's depth, which ``depth_from`` reads from the splat's row."""
 
     drawn: wp.bool
     alpha: wp.float32  # anything where not drawn
@@ -44,7 +44,7 @@ def evaluate(
     view: View, singles: wp.array2d(dtype=wp.float32), terms: wp.array2d(dtype=wp.float32),
     i: wp.int32, e: wp.int32, x: wp.float32, y: wp.float32,
 ) -> Pair:  # fmt: skip
-    """Splat i, entry e, at a pixel (x, y) from its tile's middle."""
+    """Evaluate splat i, entry e, at a pixel (x, y) relative to its tile's middle."""
     r = Pair()
     rho = FAR
     if view.discs:
@@ -86,7 +86,7 @@ def depth_from(
     view: View, singles: wp.array2d(dtype=wp.float32), i: wp.int32, r: Pair,
     z0: wp.float32, inverse_z0: wp.float32,
 ) -> wp.vec2f:  # fmt: skip
-    """z - z0 and 1 / z - inverse_z0 of a splat."""
+    """Compute z - z0 and 1 / z - inverse_z0 of a splat."""
     if view.by_center:
         return wp.vec2f(
             singles[i, Of.depth_low] - z0, singles[i, Of.inverse_depth_low] - inverse_z0

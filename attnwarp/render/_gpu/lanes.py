@@ -1,8 +1,8 @@
 # mypy: ignore-errors
 """Sums and votes over the 32 threads of a GPU's warp, which are neighbouring pixels.
 
-On Warp's CPU device a thread is alone: a sum is its own value. On a GPU every thread of the warp
-must come to these calls together, so they stand only in branches that all take.
+On Warp's CPU device a thread is alone, so a sum is the thread's value. On a GPU every thread of the
+warp must reach these calls together, so they appear only in branches taken by all.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 COLUMNS = 22
-"""Columns of a splat's row of gradients that every picture has."""
+"""Number of columns of a splat's gradient row common to all pictures."""
 
 Sums = wp.types.vector(length=COLUMNS, dtype=wp.float32)
 
@@ -25,7 +25,7 @@ Sums = wp.types.vector(length=COLUMNS, dtype=wp.float32)
 """
 )
 def any_lane(value: wp.bool) -> wp.bool:
-    """Return True if it is for any thread of the warp."""
+    """Return True if ``value`` is True for any thread of the warp."""
     ...
 
 
@@ -38,7 +38,7 @@ def any_lane(value: wp.bool) -> wp.bool:
 """
 )
 def most_of_lanes(value: wp.int32) -> wp.int32:
-    """Largest value of the warp's threads."""
+    """Return the largest value of the warp's threads."""
     ...
 
 
@@ -52,7 +52,7 @@ def most_of_lanes(value: wp.int32) -> wp.int32:
 """
 )
 def add_whole(value: wp.float32, unit: wp.float64, target: wp.array(dtype=wp.int64), at: wp.int32):
-    """Add the warp's sum, as a whole number of 1 / ``unit``, to ``target``: whole numbers have the
+    """Add the warp's sum, as an integer multiple of 1 / ``unit``, to ``target``: integers have the
     same sum in any order."""
     ...
 
@@ -87,9 +87,9 @@ def add_double(value: wp.float64, target: wp.array(dtype=wp.float64), at: wp.int
     ...
 
 
-# Columns over threads: at each step a thread hands one half of its columns to the thread whose
-# number differs in that bit, and adds what it gets to the other half. In the end thread k holds the
-# sum of column k: 31 exchanges in place of 5 for each column, and one addition to memory for all.
+# Columns over threads: at each step a thread passes one half of its columns to the thread whose
+# number differs in that bit, and adds the received half to the other. In the end thread k has the
+# sum of column k: 31 exchanges instead of 5 per column, and one addition to memory for all.
 @wp.func_native(
     """
 #if defined(__CUDA_ARCH__)

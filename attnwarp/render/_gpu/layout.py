@@ -1,12 +1,12 @@
-"""The data that the GPU kernels share: the view, and the columns of a projected splat."""
+"""Data shared by the GPU kernels: the view, and the columns of a projected splat."""
 
 from __future__ import annotations
 
 import warp as wp
 
 TILE = 8
-"""Edge of a tile in pixels: two warps of 8 x 4. Smaller than the CPU backend's: no tile is loaded
-as a whole, and small ones leave out more of what a splat does not reach.
+"""Edge of a tile in pixels: two warps of 8 x 4. It is smaller than the CPU backend's: no tile is
+loaded as a unit, and small tiles exclude more pixels outside a splat.
 """
 PIXELS = TILE * TILE
 MIDDLE = 3.5
@@ -17,7 +17,7 @@ SINGLES = 32
 TERMS = 5
 NOWHERE = 1e30
 WEIGHT_UNIT = 2.0**36
-"""Weights are summed as whole numbers of 1 / WEIGHT_UNIT."""
+"""Weights are summed as integer multiples of 1 / WEIGHT_UNIT."""
 
 
 class At:
@@ -49,7 +49,7 @@ class At:
 
 
 class Of:
-    """Columns of the float32 table: what says where a splat is drawn, then what it looks like."""
+    """Columns of the float32 table: a splat's outline first, then its appearance."""
 
     u_x = 0
     u_y = 1
@@ -72,7 +72,7 @@ class Of:
     opacity = 11
     depth = 12  # of the centre
     inverse_depth = 13
-    depth_low = 14  # bounds of z at a pixel: the splat's own extent, and near
+    depth_low = 14  # bounds of z at a pixel: the splat's extent, and near
     depth_high = 15
     inverse_depth_low = 16
     normal = 17  # (3) in world axes
