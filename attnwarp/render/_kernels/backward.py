@@ -62,15 +62,15 @@ from attnwarp.render.constants import ALPHA_MAX, GAP_MIN
 
 
 class Slots(NamedTuple):
-    """Slots of a tile's buffer, PIXELS float32 each; square by square, row by row in each.
+    """Slots of a tile's buffer, PIXELS float32 each; square by square, then row by row.
 
-    "d_" is the gradient of the loss in what a pixel sums up; "behind" are sums over the splats
-    behind the one at hand.
+    "d_" is the gradient of the loss in a pixel's sum; "behind" marks sums over the splats
+    behind the current one.
     """
 
-    x: int = 0  # from the tile's middle
+    x: int = 0  # relative to the tile's middle
     y: int = 1
-    transmittance: int = 2  # behind the splat at hand
+    transmittance: int = 2  # behind the current splat
     last_step: int = 3
     median_step: int = 4
     # Relative to the means the first moments vanish, and with them most terms.
@@ -99,16 +99,16 @@ SLOT = Slots()
 
 
 def buffer_floats(channels: int) -> int:
-    """Floats of a tile's buffer."""
+    """Count the floats of a tile's buffer."""
     return (SLOT.d_color + max(3, channels)) * PIXELS
 
 
 class WorkRegions(NamedTuple):
-    """Offsets of parts of the work on a splat, in float32."""
+    """Offsets of the parts of a splat's work buffer, in float32."""
 
     row: int = 0  # see lay_out
     sums: int = ROW  # (24) over the tile, see DiscSums and EllipsoidSums
-    linear: int = ROW + 32  # at the quarter at hand
+    linear: int = ROW + 32  # at the current quarter
 
 
 WORK = WorkRegions()
@@ -155,11 +155,11 @@ DISC_SUM, ELLIPSOID_SUM = DiscSums(), EllipsoidSums()
 
 @inlined
 def _write_disc_row(work, row, rows, dx, dy, line):
-    """A 2D splat's row of gradients from its sums.
+    """Write a 2D splat's row of gradients from its sums.
 
     Args:
-        row: its row of the table, as float64.
-        dx, dy: the tile's middle, from the reference point.
+        row: row of the splat in the table, as float64.
+        dx, dy: middle of the tile, relative to the reference point.
     """
     b = u64(WORK.sums)
     for k in range(3):
@@ -186,7 +186,7 @@ def _write_disc_row(work, row, rows, dx, dy, line):
 
 @inlined
 def _write_ellipsoid_row(work, row, rows, line):
-    """A 3D splat's row of gradients from its sums; ``row`` is its row of the table, as float64."""
+    """Write a 3D splat's row of gradients from its sums; ``row`` is its float64 table row."""
     b = u64(WORK.sums)
     u, v = f64(work[b + u64(ELLIPSOID_SUM.uv)]), f64(work[b + u64(ELLIPSOID_SUM.uv + 1)])
     rows[line, SPLAT.center_x] = row[ELLIPSOID.factor_xx] * u
@@ -202,9 +202,10 @@ def _write_ellipsoid_row(work, row, rows, line):
 
 @inlined
 def _select_drawn(buffer, p, background, scale):
-    """Turn the outputs and gradients of 16 pixels into what their splats need.
+    """Prepare the outputs and gradients of 16 pixels for their splats.
 
-    Selected, not multiplied: where nothing is drawn, depth is NaN, and gradients may be anything.
+    Values are selected, not multiplied: depth is NaN and gradients are arbitrary if nothing is
+        drawn.
     """
     zero = f32(0.0)
     drawn = load(buffer, SLOT.last_step * PIXELS + p) > zero
@@ -236,7 +237,7 @@ def _select_drawn(buffer, p, background, scale):
 
 @inlined
 def _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream):
-    """Outputs and gradients of a whole tile of three channels to its buffer."""
+    """Load outputs and gradients of a complete tile of three channels into its buffer."""
     width, plane = view.width, view.width * view.height
     state = pictures.state
     for k in range(PIXELS // 4):
@@ -265,7 +266,7 @@ def _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream):
 
 @inlined
 def _load_tile(buffer, tile, background, scale, pictures, upstream):
-    """Outputs and gradients of a tile of any size and any number of channels to its buffer."""
+    """Load outputs and gradients of a tile of any size and channel count into its buffer."""
     state = pictures.state
     for r in range(tile.rows):
         for k in range(tile.columns):
@@ -301,13 +302,13 @@ def _load_tile(buffer, tile, background, scale, pictures, upstream):
 def _blame(
     space, s, row, hit, alpha, z, inverse_z, step, d_weight, k, channels, features, out, place
 ):
-    """Gradients of a splat's 16 pixels in its alpha and its z; moves the sums behind it on.
+    """Compute gradients of a splat's 16 pixels in its alpha and z; update the sums behind it.
 
     Args:
-        place: where its pairs out of order begin in ``space.pairs.past``; negative: not wanted.
+        place: start of the splat's pairs out of order in ``space.pairs.past``; negative: unused.
 
     Returns:
-        Its weights; alpha times the gradient in alpha; the gradient in z.
+        The splat's weights; alpha times the gradient in alpha; the gradient in z.
     """
     buffer, work = space.buffer, space.splat
     zero, one, two = f32(0.0), f32(1.0), f32(2.0)
@@ -386,9 +387,9 @@ def _add_disc(work, x, y, nx, ny, z, in_alpha, in_z, by_center, zero_lanes, sums
     """Add a 2D splat's gradients at 16 pixels to ``sums``, in the order of :class:`DiscSums`.
 
     Args:
-        x, y: pixels from the tile's middle.
-        nx, ny: the same from the quarter's.
-        z: scaled, from evaluate.
+        x, y: pixels relative to the tile's middle.
+        nx, ny: pixels relative to the quarter's middle.
+        z: scaled depth from evaluate.
     """
     zero, one, two = f32(0.0), f32(1.0), f32(2.0)
     row, linear = WORK.row, WORK.linear
@@ -406,7 +407,7 @@ def _add_disc(work, x, y, nx, ny, z, in_alpha, in_z, by_center, zero_lanes, sums
     meets = (w <= broadcast(work, row + DISC.w_most)) & (
         (u * u + v * v) * (z * z) <= sx * sx + sy * sy
     )
-    # Selected, not multiplied by 0: what it is multiplied with may be infinite.
+    # Selected, not multiplied by 0, since the other factor may be infinite.
     scale = select(meets, z, zero)
     u, v = u * scale, v * scale
     blame = in_alpha * scale
@@ -436,8 +437,8 @@ def _add_disc(work, x, y, nx, ny, z, in_alpha, in_z, by_center, zero_lanes, sums
 
 @inlined
 def _add_ellipsoid(work, nx, ny, in_alpha, in_z, by_center, sums):
-    """Add a 3D splat's gradients at 16 pixels, (nx, ny) from the quarter's middle, to ``sums``, in
-    the order of :class:`EllipsoidSums`."""
+    """Add a 3D splat's gradients at 16 pixels, (nx, ny) relative to the quarter's middle, to
+    ``sums``, in the order of :class:`EllipsoidSums`."""
     zero = f32(0.0)
     row, linear = WORK.row, WORK.linear
     exponent, u_0, v_0, uu, uv, vv, low, high, l_0, p_0, q_0, lp, lq, pp, pq, qq, s16 = sums
@@ -470,7 +471,7 @@ def _add_ellipsoid(work, nx, ny, in_alpha, in_z, by_center, sums):
 def _splat_backward(
     space, table, view, tile, k, step, squares, d_weight, channels, rows, line, place
 ):
-    """The row of gradients of splat k of the table in a tile, from the squares it may show in;
+    """Compute the row of gradients of table row k in a tile, from the squares the splat may cover;
     ``place`` as in :func:`_blame`, of the first square."""
     buffer, work, moments = space.buffer, space.splat, space.moments
     discs, by_center = view.discs, view.by_center
@@ -558,13 +559,13 @@ def rasterize_backward(
     target,
     space,
 ):
-    """Gradients of the tiles order[first:last], a row of ``target``, ``Rows``, for each entry.
+    """Compute gradients of the tiles order[first:last], a row of ``target``, ``Rows``, per entry.
 
-    None is written for entries without squares, which are nowhere drawn. A row holds the gradient
-    in the first GRADIENTS columns of the splat's row of the table, or what
-    :class:`EllipsoidGradients` says, then in its normal and values.
+    Entries without squares, which are not drawn, get no row. A row holds the gradients of the first
+    GRADIENTS columns of the splat's table row, or those listed in :class:`EllipsoidGradients`, then
+    of its normal and values.
     Splats are visited back to front: the transmittance before each is recovered by division from
-    what the forward pass left. A splat's sums stay in registers while its squares go by.
+    the forward pass's state. A splat's sums stay in registers while its squares go by.
     """
     buffer, entries, channels = space.buffer, lists.entries, background.shape[0]
     scale = f32(ndc_scale)
@@ -635,7 +636,7 @@ def reduce_rows(
             prefetch(total, ahead + 16)
             entry = entries[starts[t] + k]
             i = entry & PLACE
-            # What is nowhere drawn has no row.
+            # A splat that is not drawn has no row.
             if entry > PLACE and low <= i < high:
                 row = row_starts[t] + k
                 for c in range(columns):

@@ -1,7 +1,7 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
-"""Binning: which splats may show in which tiles, down to squares of 4 x 4 pixels.
+"""Binning: assignment of splats to the tiles they may cover, down to squares of 4 x 4 pixels.
 
-By exact outlines; no bounding circles.
+It uses exact outlines, no bounding circles.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from attnwarp.render._kernels.layout import (
 )
 
 PIECES = 64
-"""Pieces of outlines, 16 rows of squares each, that are worked off together."""
+"""Number of pieces of outlines, 16 rows of squares each, processed together."""
 PIECE_SPANS = 48  # int32 of a piece in ``spans``: intervals, then first and last column of squares
 FIRST_COLUMN, LAST_COLUMN = 16, 32
 NO_COLUMNS = 32767.0  # first column of a row without any; its last is -1
 
 
 class Pieces(NamedTuple):
-    """Pieces of outlines that wait, for work."""
+    """Pieces of outlines waiting to be processed."""
 
     outlines: np.ndarray  # (16 PIECES,) float32, the outlines' rows
     spans: np.ndarray  # (PIECE_SPANS PIECES,) int32
@@ -57,11 +57,11 @@ class Pieces(NamedTuple):
 
 @inlined
 def _overlaps(row, x1, x2, y1, y2, cut, w_most):
-    """Return True if a 2D splat of any outline may show in a rectangle, by interval arithmetic.
+    """Return True if a 2D splat of any outline may cover a rectangle, by interval arithmetic.
 
     Args:
         row: (ROW_DOUBLES,) float64 of the table.
-        x1, x2, y1, y2: the rectangle, from the reference point.
+        x1, x2, y1, y2: rectangle, relative to the reference point.
     """
     hx, hy, mx, my = (x2 - x1) / 2, (y2 - y1) / 2, (x1 + x2) / 2, (y1 + y2) / 2
     ux, uy, vx, vy = row[DISC.u_x], row[DISC.u_y], row[DISC.v_x], row[DISC.v_y]
@@ -79,7 +79,7 @@ def _overlaps(row, x1, x2, y1, y2, cut, w_most):
 
 @inlined
 def _runs_by_intervals(k, table, view, tiles, target, used):
-    """The runs of splat k, whose outline is no ellipse; see :func:`find_runs`."""
+    """Find the runs of splat k, whose outline is no ellipse; see :func:`find_runs`."""
     row, singles = table.doubles[k], table.singles[k]
     cut = f64(singles[SINGLE + SPLAT.cut]) * (1 + 1e-6)
     w_most = singles[SINGLE + DISC.w_most]
@@ -111,15 +111,15 @@ def _runs_by_intervals(k, table, view, tiles, target, used):
 
 @inlined
 def _piece_ends(outlines, piece, steps, discs, width):
-    """Leftmost and rightmost pixel of an outline in each of 16 rows of squares.
+    """Find the leftmost and rightmost pixel of an outline in each of 16 rows of squares.
 
     Args:
-        outlines: see :class:`Pieces`; where this one begins, counted flat.
-        steps: Lanes, where the rows begin, in pixels from the first.
-        discs: join the disc of the screen filter to the ellipse.
+        outlines, piece: outlines of :class:`Pieces`, and the flat start of this piece.
+        steps: Lanes, starts of the rows, in pixels from the first.
+        discs: True joins the disc of the screen filter to the ellipse.
     """
     zero, far = f32(0.0), f32(1e9)
-    # From the ellipse's middle; rows that the image ends within are taken whole.
+    # Relative to the ellipse's middle; rows cut by the image's end are taken completely.
     y1 = steps + broadcast(outlines, piece + OUTLINE.row_y)
     y2 = y1 + broadcast(outlines, piece + OUTLINE.row_height)
     top = broadcast(outlines, piece + OUTLINE.top)
@@ -131,7 +131,7 @@ def _piece_ends(outlines, piece, steps, discs, width):
     e1 = maximum(y1 - broadcast(outlines, piece + OUTLINE.middle_y), -top)
     e2 = minimum(y2 - broadcast(outlines, piece + OUTLINE.middle_y), top)
     t1, t2 = e1 * inverse_top, e2 * inverse_top
-    # 5e-7: what 1 - t^2 may be rounded by; at the tips its root is much.
+    # 5e-7 bounds the rounding of 1 - t^2; at the tips its root is large.
     chord1 = approximate_sqrt(maximum(f32(1.0) - t1 * t1, zero) + f32(5e-7)) * half
     chord2 = approximate_sqrt(maximum(f32(1.0) - t2 * t2, zero) + f32(5e-7)) * half
     right = maximum(lean * e1 + chord1, lean * e2 + chord2)
@@ -155,7 +155,7 @@ def _piece_ends(outlines, piece, steps, discs, width):
 
 @inlined
 def _find_columns(pieces, waiting, steps, discs, width):
-    """Columns of squares of the pieces that wait, each row's and each row of tiles', to their
+    """Write the columns of squares of the waiting pieces, per row and per row of tiles, to
     ``spans``."""
     for j in range(waiting):
         left, right = _piece_ends(pieces.outlines, j * 16, steps, discs, width)
@@ -172,10 +172,10 @@ def _find_columns(pieces, waiting, steps, discs, width):
 
 @bare
 def _flush(pieces, waiting, discs, steps, width, tiles, wanted_before, target, used):
-    """Write the runs of the pieces that wait; see :func:`find_runs`.
+    """Write the runs of the waiting pieces; see :func:`find_runs`.
 
-    In steps, each for all pieces: what finds the columns waits for no branch, and the branches (how
-    many rows has a splat) wait for no root or division.
+    The work runs in steps over all pieces: finding columns waits for no branch, and the branches
+    (number of rows of a splat) wait for no root or division.
     """
     _find_columns(pieces, waiting, steps, discs, width)
     spans, rows = pieces.spans, pieces.rows
@@ -213,19 +213,19 @@ def find_runs(
     tiles,
     table,
     outlines,  # (last - first, OUTLINE_SIZE) float32, from project
-    wanted_before,  # (tiles + 1,) int64, how many tiles are wanted before each
+    wanted_before,  # (tiles + 1,) int64, number of wanted tiles before each
     target,
     pieces,
 ):
     """Write the runs of tiles that the splats first..last may show in to ``target``, a ``Runs``.
 
     Exact for ellipses, down to the tiles' squares of 4 x 4 pixels: a square is taken if and only if
-    the outline rho <= cut meets the rectangle of its pixel centres (but for roundings, which only
-    add). Sixteen rows of squares are done at once. The runs of splat k follow those of k - 1. Runs
-    without a wanted tile are left out.
+    the outline rho <= cut meets the rectangle of its pixel centres (up to roundings, which only
+    add). Sixteen rows of squares are processed at once. The runs of splat k follow those of k - 1.
+    Runs without a wanted tile are left out.
 
     Returns:
-        The number of runs. Where it is more than there is room for, nothing written counts.
+        Number of runs. If it exceeds the room, the written runs are invalid.
     """
     discs, counts = view.discs, target.counts
     for k in range(16):
@@ -238,7 +238,7 @@ def find_runs(
         row = int(outlines[outline, u64(OUTLINE.first_row)])
         end = int(outlines[outline, u64(OUTLINE.last_row)])
         if row == NO_ELLIPSE:
-            # In the order of the splats: the pieces that wait come first.
+            # In the order of the splats, so the waiting pieces come first.
             used = _flush(
                 pieces, waiting, discs, steps, view.width, tiles, wanted_before, target, used
             )
@@ -269,8 +269,8 @@ def place_cursors(
     starts,  # (tiles,) int64
     counts,  # (tiles,) int64
 ):
-    """Write the place of each group's entries to ``cursors``, and the tiles' lists, to ``starts``
-    and ``counts``; nothing goes to tiles that are not live.
+    """Write the start of each group's entries to ``cursors``, and the tiles' lists to ``starts``
+    and ``counts``; tiles that are not live get nothing.
     """
     total = 0
     groups, tiles = changes.shape[0], starts.shape[0]
@@ -288,14 +288,14 @@ def place_cursors(
 
 @inlined
 def _row_bits(interval, begin):
-    """A row of a run as one bit for each column of squares from ``begin`` on; up to 58 columns."""
+    """Encode a row of a run as one bit per column of squares from ``begin`` on, up to 58."""
     low, high = (interval & 0xFFFF) - begin, (interval >> 16) - begin
     return ((2 << high) - (1 << low)) if interval >= 0 else 0
 
 
 @inlined
 def _tile_bits(interval, column):
-    """Bits of SIDE columns of squares from ``column`` on, in a row of a run."""
+    """Extract the bits of SIDE columns of squares from ``column`` on, in a row of a run."""
     begin, end = max((interval & 0xFFFF) - column, 0), min((interval >> 16) - column, SIDE - 1)
     return ((2 << end) - (1 << begin)) if end >= begin else 0
 

@@ -27,7 +27,7 @@ FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
 def fingerprint(folder: Path = Path(__file__).parent) -> str:
-    """SHA-256 of all that is compiled: the modules of ``folder``, and two modules beside it."""
+    """Hash all compiled code (SHA-256): the modules of ``folder``, and two of its parent."""
     beside = [folder.parent / name for name in ("constants.py", "harmonics.py")]
     files = [*sorted(folder.glob("*.py")), *beside]
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
@@ -37,15 +37,15 @@ FINGERPRINT = fingerprint()
 
 
 def by_one_process(dispatcher: Any) -> Any:
-    """Let one process at a time compile a kernel that is cached; the others then read it from disk.
+    """Let one process at a time compile a cached kernel; the others then read it from disk.
 
-    Workers that begin together would each spend half a minute on the same kernels.
+    Workers that start together would otherwise each spend half a minute on the same kernels.
     """
     if fcntl is not None and hasattr(dispatcher, "_cache"):
         compile_here = dispatcher.compile
 
         def compile_or_read(signature: Any) -> Any:
-            # numba's lock first: a thread that holds it may come here for a kernel it calls.
+            # numba's lock first: a thread that holds it may compile a called kernel here.
             with global_compiler_lock, _alone(dispatcher):
                 return compile_here(signature)
 
@@ -59,26 +59,26 @@ def _alone(dispatcher: Any) -> Iterator[None]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("w")
-    except OSError:  # no cache either, where nothing can be written
+    except OSError:  # unwritable, so there is no cache either
         yield
         return
     with file:
-        with suppress(OSError):  # where the file system has no locks, each process compiles
+        with suppress(OSError):  # without file locks, each process compiles
             fcntl.flock(file, fcntl.LOCK_EX)  # until it is closed
         yield
 
 
 def _compiled(**options: Any) -> Any:
-    """numba's decorator, with a cache on disk that is discarded when any of the modules changes.
+    """Apply numba's decorator, with a disk cache that is discarded if any module changes.
 
-    numba alone looks at the function's own file only, and would reuse what was inlined from others.
+    numba tracks only the function's file, and would reuse outdated code inlined from other files.
     """
 
     def decorate(function: Any) -> Any:
         dispatcher = numba.njit(
             nogil=True, cache=CACHE, error_model="numpy", fastmath=FAST, **options
         )(function)
-        # There is no cache where numba is told to compile nothing.
+        # There is no cache if numba's compilation is disabled.
         file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if file is not None:
             file._source_stamp = FINGERPRINT
@@ -91,19 +91,19 @@ jit = _compiled()
 
 
 def exact(function: Any) -> Any:
-    """numba's decorator for kernels whose every operation is rounded by itself, in its order.
+    """Apply numba's decorator for kernels whose every operation is rounded separately, in order.
 
-    Without numba's reference counts: two threads that count the same array up and down for every
-    token spend more on that than on the token. Such kernels allocate nothing.
+    numba's reference counts are off: two threads that count the same array up and down for every
+    token spend more on the counting than on the token. Such kernels must not allocate.
     """
     return by_one_process(numba.njit(**_EXACT)(function))
 
 
 def exact_inlined(function: Any) -> Any:
-    """Compile as :func:`exact` does, for functions that kernels call for each pixel: LLVM puts it
-    into its callers.
+    """Compile as :func:`exact` does, for functions called for each pixel: LLVM inlines them into
+    their callers.
 
-    By itself LLVM leaves the larger ones apart, and each call then hands over 50 fields.
+    By default LLVM does not inline the larger ones, and each call then passes 50 fields.
     """
     return by_one_process(numba.njit(forceinline=True, **_EXACT)(function))
 
@@ -117,9 +117,9 @@ def exact_pasted(function: Any) -> Any:
 _EXACT: Any = {"nogil": True, "cache": CACHE, "error_model": "numpy", "_nrt": False}
 
 
-# Without numba's reference counts: LLVM cannot remove those of arrays passed to inlined functions,
-# and two threads that count the same array up and down for every splat spend a third of their time
-# on it. Such kernels allocate nothing.
+# numba's reference counts are off: LLVM cannot remove those of arrays passed to inlined functions,
+# and two threads that count the same array up and down for every splat spend a third of their
+# time on it. Such kernels must not allocate.
 bare = _compiled(_nrt=False)
 inlined = _compiled(inline="always")
 

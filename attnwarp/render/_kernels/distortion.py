@@ -1,10 +1,10 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
 """Exact depth distortion: sum over ordered pairs w_i w_j |z_i - z_j| at each pixel.
 
-Splats are composited in the order of their centres, and the depths at a pixel need not follow it.
-In this order, sum_{j<i} w_i w_j (z_i - z_j) takes two running sums. It counts a pair that is out of
-order with the wrong sign. So every splat walks back over those in front of it, no further than the
-largest depth among them lies behind its own, and adds what such pairs lack.
+Splats are composited in the order of their centres, and the depths at a pixel may differ from it.
+In this order, sum_{j<i} w_i w_j (z_i - z_j) takes two running sums, but a pair out of order counts
+with the wrong sign. So every splat walks back over the splats in front of it, until the largest
+depth among them no longer exceeds its depth, and adds the correction of such pairs.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from attnwarp.render._kernels.layout import (
 from attnwarp.render._kernels.rasterization import prefetch_row, quarter_offset, tile_at
 
 FAR = f32(1e30)
-"""Depth that no splat has."""
+"""Depth beyond that of any splat."""
 
 
 class Slots(NamedTuple):
@@ -71,7 +71,7 @@ BUFFER_FLOATS = len(SLOT) * PIXELS
 class PastColumns(NamedTuple):
     """A splat at the 16 pixels of a square, PAST float32.
 
-    ``lean`` and ``spread`` are what the pairs that are out of order change, each by half: in
+    ``lean`` and ``spread`` are half the changes made by pairs out of order in
     sum_j w_j sign(z_i - z_j) and in sum_j w_j |z_i - z_j|.
     """
 
@@ -99,7 +99,7 @@ WORK_FLOATS = ROW + 16
 
 class Workspace(NamedTuple):
     """Memory of one job; ``room`` is the largest number of a tile's splats, each counted once for
-    every square that it may show in."""
+    every square that it may cover."""
 
     buffer: np.ndarray  # (BUFFER_FLOATS,) float32, see Slots
     splat: np.ndarray  # (WORK_FLOATS,) float32, see WorkRegions
@@ -110,7 +110,7 @@ class Workspace(NamedTuple):
 
 
 def bits(squares):
-    """Number of these squares; each is a bit."""
+    """Count the squares, one bit each."""
     pairs = squares - (squares >> 1 & 0x5555)
     fours = (pairs & 0x3333) + (pairs >> 2 & 0x3333)
     eights = (fours + (fours >> 4)) & 0x0F0F
@@ -122,7 +122,7 @@ count_bits = inlined(bits)
 
 @inlined
 def prepare(space):
-    """Set what all tiles have in common."""
+    """Set the values common to all tiles."""
     buffer = space.buffer
     for p in range(PIXELS):
         buffer[SLOT.x * PIXELS + p] = f32(p // 16 % SIDE * 4 + p % 4) - f32(TILE / 2 - 0.5)
@@ -148,15 +148,15 @@ def _begin(space, tile, state):
 
 @inlined
 def _walk_back(space, k, w, z, lean, spread, differentiate):
-    """Pair a splat with those in front of it whose depth may be larger.
+    """Pair a splat with the splats in front of it whose depth may be larger.
 
     Args:
-        k: the latest of them.
-        w, z: Lanes, of the splat; FAR where it is not drawn.
+        k: index of the latest splat in front.
+        w, z: Lanes of the splat; FAR if not drawn.
         lean, spread: Lanes of zeros.
 
     Returns:
-        Its ``lean`` and ``spread``; those of the others are added to.
+        ``lean`` and ``spread`` of the splat; those of the other splats are updated.
     """
     past = space.past
     while k >= 0:
@@ -216,11 +216,11 @@ def _add(space, q, slot, hit, alpha, scaled, inverse, discs, by_center, differen
 def pair_up(space, table, view, tile, entries, begin, count, state, differentiate):
     """Find the pairs of a tile's splats that are out of order.
 
-    Every splat has a place in ``space.past`` for each square that it may show in: splat by splat
+    Every splat has a place in ``space.past`` for each square that it may cover: splat by splat
     front to back, and quarter by quarter.
 
     Returns:
-        How many places there are.
+        Number of places.
     """
     buffer, work, moments = space.buffer, space.splat, space.moments
     discs, by_center = view.discs, view.by_center
@@ -273,5 +273,5 @@ def distort(first, last, view, tiles, lists, table, state, target, space):
             for k in range(tile.columns):
                 p = u64((r // 4 * SIDE + k // 4) * 16 + r % 4 * 4 + k % 4)
                 once = space.buffer[u64(SLOT.distortion * PIXELS) + p]
-                # Not negative: the running sums of equal depths leave what rounding leaves.
+                # Clamped to 0: running sums of equal depths leave a rounding error.
                 target[u64(tile.top + r), u64(tile.left + k)] = f32(2.0) * max(once, f32(0.0))

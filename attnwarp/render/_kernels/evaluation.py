@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
-"""One splat at the 16 pixels of a square: where it is drawn, its alpha and its depth.
+"""One splat at the 16 pixels of a square: its coverage, alpha and depth.
 
 Shared by the forward and the backward pass. Coefficients are float64 in the table; they are laid
 out once for a tile, in float64 about its middle, and moved to the middle of each quarter of it
@@ -71,7 +71,7 @@ def _gaussian(rho):
 
 @inlined
 def prepare_moments(moments, start):
-    """Set the slopes in ``moments`` that all splats have; see :func:`lay_out`."""
+    """Set the slopes in ``moments`` common to all splats; see :func:`lay_out`."""
     for k in range(MOMENTS):
         moments[u64(start + k)] = 0.0
     moments[u64(start + SLOPE_X + LINEAR.screen_x)] = ROOT2
@@ -83,8 +83,8 @@ def prepare_moments(moments, start):
 def lay_out(work, row, moments, start, table, k, middle_x, middle_y, discs, by_center):
     """Lay out splat k of the table for a tile.
 
-    Its row as float32 goes to ``work`` from ``row`` on; what is linear in the pixel's position to
-    ``moments`` from ``start`` on: its values at the tile's middle, and its slopes.
+    The splat's float32 row goes to ``work`` from ``row`` on; terms linear in the pixel's position
+    go to ``moments`` from ``start`` on: values at the tile's middle, and slopes.
     """
     k, b, m = u64(k), u64(row), u64(start)
     doubles, singles = table.doubles, table.singles
@@ -134,7 +134,7 @@ def move_to_quarter(work, linear, moments, start, dx, dy):
 
 @inlined
 def linear_at(work, term, row, slope, x, y):
-    """A linear term at pixels (x, y): its value at ``term``, its slopes in the row at ``slope``."""
+    """Evaluate a linear term at (x, y): value at ``term``, slopes in the row at ``slope``."""
     return (
         broadcast(work, term)
         + broadcast(work, row + slope) * x
@@ -144,14 +144,14 @@ def linear_at(work, term, row, slope, x, y):
 
 @inlined
 def footprint_terms(work, row, linear, x, y):
-    """u and v of a 3D splat at pixels (x, y); see :class:`EllipsoidColumns`."""
+    """Compute u and v of a 3D splat at pixels (x, y); see :class:`EllipsoidColumns`."""
     u = linear_at(work, linear + LINEAR.u, row, ELLIPSOID.factor_xx, x, y)
     return u, broadcast(work, linear + LINEAR.v) + broadcast(work, row + ELLIPSOID.factor_yy) * y
 
 
 @inlined
 def peak_terms(work, row, linear, x, y):
-    """l, p, q of a 3D splat at pixels (x, y), and 1 / (l^2 + p^2 + q^2); see
+    """Compute l, p, q of a 3D splat at pixels (x, y), and 1 / (l^2 + p^2 + q^2); see
     :class:`EllipsoidColumns`."""
     along = linear_at(work, linear + LINEAR.along, row, ELLIPSOID.peak_x, x, y)
     p = linear_at(work, linear + LINEAR.p, row, ELLIPSOID.peak_xx, x, y)
@@ -162,10 +162,10 @@ def peak_terms(work, row, linear, x, y):
 
 @inlined
 def evaluate(work, row, linear, x, y, screen_x, screen_y, discs, by_center):
-    """A splat at 16 pixels: where it is drawn, its alpha (anything elsewhere), z and 1 / z.
+    """Evaluate a splat at 16 pixels: coverage, alpha (arbitrary if not drawn), z and 1 / z.
 
-    The depths are scaled: of a 2D splat in units of its column ``depth``, unless they are its
-    centre's, which then are not looked at; see :func:`depth_from`.
+    The depths are scaled: of a 2D splat in units of its column ``depth``, except its centre's
+    depth, which is then unused; see :func:`depth_from`.
 
     A 2D splat's W is clamped to the z that it may have, between w_low and w_high, before anything
     is divided by it. That bounds the z of what its filter draws, and changes nothing that its
@@ -177,10 +177,10 @@ def evaluate(work, row, linear, x, y, screen_x, screen_y, discs, by_center):
     for.
 
     Args:
-        row: row of ``work``, where the splat's row begins; see :func:`lay_out`.
-        linear: where its linear terms begin; see :func:`move_to_quarter`.
-        x, y: Lanes, pixels from the middle of the quarter.
-        screen_x, screen_y: the same times the root of 2.
+        row: start of the splat's row in ``work``; see :func:`lay_out`.
+        linear: start of the splat's linear terms; see :func:`move_to_quarter`.
+        x, y: Lanes, pixels relative to the quarter's middle.
+        screen_x, screen_y: x and y times the root of 2.
     """
     if discs:
         w = linear_at(work, linear + LINEAR.w, row, DISC.w_x, x, y)
@@ -212,7 +212,7 @@ def evaluate(work, row, linear, x, y, screen_x, screen_y, discs, by_center):
 
 @inlined
 def depth_from(work, row, z, inverse_z, discs, by_center, z0, inverse_z0):
-    """z - z0 and 1 / z - inverse_z0 of a splat, from the scaled depths of :func:`evaluate`."""
+    """Compute z - z0 and 1 / z - inverse_z0 from the scaled depths of :func:`evaluate`."""
     if discs:
         if by_center:
             return (
