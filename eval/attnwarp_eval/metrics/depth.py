@@ -43,7 +43,7 @@ def depth_error(
         raise ValueError("normal, true_normal: got one of them, expected both or neither")
     angle = None
     if normal is not None:
-        # Imported here: torch takes a second, which listing metrics' names needs not.
+        # Imported here: torch takes a second, too long for a list of metrics' names.
         import torch
 
         from attnwarp.warp import angle_between

@@ -79,7 +79,7 @@ class Workplace(ABC):
 
     @abstractmethod
     def receive(self, cell: Cell, result: Any) -> Failure | None:
-        """Store the record of a worker's result."""
+        """Take a worker's result; the record of a finished cell is then on disk."""
 
     @abstractmethod
     def forget(self, worker: str) -> None:
