@@ -45,13 +45,13 @@ class WarpSettings(Settings):
             (:func:`attnwarp.warp.depth.depth_slope`).
         photometric: largest mean over channels of abs(warped source image - target image), sRGB in
             [0, 1], on the images before the edit; None disables the test.
-            ent: True restricts the mask to the target's segment, if given.
-            al_test: test on the pixels' normals: "facing" keeps surface seen from the same side by
+        segment: True restricts the mask to the target's segment, if given.
+        normal_test: test on the pixels' normals: "facing" keeps surface seen from the same side by
             source and target; "source_incidence" surface that the source sees within
             ``normal_angle`` of the normal; "camera_frame" reproduces the published code, which
             flips camera-space normals to each camera and compares them although the two frames
             differ.
-            sian_filter: the same tests on Gaussians, before the target's depth is rendered, and
+        gaussian_filter: the same tests on Gaussians, before the target's depth is rendered, and
             "printed": the rule as printed in the paper, which drops Gaussians whose normals are
             within the angle.
             al_angle: limit in degrees, for every test with an angle.
