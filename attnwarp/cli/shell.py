@@ -156,7 +156,7 @@ COMMANDS = {
     "attnwarp": ("fit", "edit", "render", "convert", "undistort", "edit-image"),
     "attnwarp-eval": (
         "run", "report", "verdicts", "verify", "studies", "captures", "compare", "stability",
-        "metrics", "encoders", "doctor", "scenes", "userstudy", "cache",
+        "metrics", "tracks", "encoders", "doctor", "scenes", "userstudy", "cache",
     ),
 }  # fmt: skip
 """Commands available in only one of the two programs."""
