@@ -42,7 +42,7 @@ class FitSettings(Settings):
         background: colour behind the splats and behind transparent pixels of the images: "black",
             "white" or "random". Random draws a new colour each iteration, so that no colour can
             imitate transparency. "auto" is random for images with transparency, else black.
-            ify: True clones, splits and prunes splats.
+        densify: True clones, splits and prunes splats.
         densify_from: first iteration at which splats are added.
         densify_every: number of iterations between two refinements.
         densify_until: share of the iterations after which splats are neither added nor removed.

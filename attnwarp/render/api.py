@@ -35,7 +35,7 @@ class Render:
         alpha: (H, W) sum w_i, coverage in [0, 1].
         depth: (H, W) expected depth sum w_i z_i / sum w_i along the optical axis, in scene units;
             NaN where nothing was drawn. The background has no influence.
-            an_depth: (H, W) depth of the last splat drawn while the transmittance before it is
+        median_depth: (H, W) depth of the last splat drawn while the transmittance before it is
             above 1/2; NaN where nothing was drawn. If alpha stays below 1/2 it is the last
             splat's.
         normal: (H, W, 3) sum w_i n_i in world axes, each n_i turned to face the camera; its length

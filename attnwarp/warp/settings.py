@@ -54,14 +54,14 @@ class WarpSettings(Settings):
         gaussian_filter: the same tests on Gaussians, before the target's depth is rendered, and
             "printed": the rule as printed in the paper, which drops Gaussians whose normals are
             within the angle.
-            al_angle: limit in degrees, for every test with an angle.
-            h: point where a ray meets a splat: "intersection" (the plane of a 2D splat, the
+        normal_angle: limit in degrees, for every test with an angle.
+        depth: point where a ray meets a splat: "intersection" (the plane of a 2D splat, the
             density's peak along the ray for a 3D one) or "center" (the z of the splat's centre, as
             in gsplat).
-            h_statistic: "expected" or "median" depth along the ray.
-            fined_depth: value of pixels without rendered depth: "none", or the view's largest depth
+        depth_statistic: "expected" or "median" depth along the ray.
+        undefined_depth: value of pixels without rendered depth: "none", or the view's largest depth
             ("farthest").
-            h_interpolation: interpolation of depth at the centres of a feature grid, see
+        depth_interpolation: interpolation of depth at the centres of a feature grid, see
             :func:`attnwarp.warp.resize_depth`.
         depth_spread: relative difference above which taps are not blended; None blends across
             edges.
