@@ -233,7 +233,7 @@ def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Da
             names, beginning after the dataset's first, which edits take as their source; 0 holds
             out none.
 
-        rns:
+    Returns:
         The part to fit on, and the held-out part or None. A fitted view is never held out: neither
         under another name or by a link, nor as a copy, nor at the same pose.
 

@@ -177,7 +177,7 @@ def with_images(
         finder: file finder in the root folder of the images' names.
         elsewhere: hint on naming another folder of images, if possible.
 
-        rns:
+    Returns:
         Cameras (resized to their images if ``resize_cameras``), and paths, None for missing
         images.
 

@@ -304,7 +304,7 @@ def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uin
         colors: (P, 3) uint8 from ``red green blue``, or from another triple of :data:`COLORS` with
             a warning; None if the file has no colours.
 
-        es:
+    Raises:
         FileNotFoundError: the file does not exist.
         FileFormatError: the file is not a PLY, is truncated, lacks ``x y z``, or has a non-finite
             value or colours that are not uchar.

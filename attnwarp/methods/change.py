@@ -73,7 +73,7 @@ def mean_change(pictures: Iterable[tuple[Bytes, Bytes, Mask | None]]) -> float |
         pictures: (h, w, 3) uint8 of a view before, after, and (h, w) bool of the counted pixels,
             None for all.
 
-        rns:
+    Returns:
         dE00; None if no pixel counts.
 
     Example:

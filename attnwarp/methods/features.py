@@ -102,7 +102,7 @@ class Features:
             stages: numbers of the stages that edit views, from 0.
             further: True if there are several sources.
 
-            es:
+        Raises:
             ValueError: a batch uses none of the recorded branches, or cannot record all branches
                 named by the settings.
         """
