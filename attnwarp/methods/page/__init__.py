@@ -429,7 +429,7 @@ def _data(pixels: Bytes, quality: int = QUALITY, exact: int = EXACT) -> str:
 
 
 def _figure(text: str, picture: Bytes | None, id_: str = "") -> str:
-    """Write a captioned picture, or a placeholder."""
+    """Write a captioned picture; an empty cell without one."""
     if picture is None:
         return "<span></span>"
     name = f' id="{id_}"' if id_ else ""

@@ -16,7 +16,7 @@ from attnwarp.reporting import SILENT, Reporter
 from attnwarp.warp import PRESETS, Surface, WarpedView, render_surface, warp_view
 from attnwarp.warp.depth import blend_depth, valid_depth
 from attnwarp_eval.tracks.find import Array, Mask, Tracks, world_points
-from attnwarp_eval.truth import VISIBLE, Geometry, two_view
+from attnwarp_eval.truth import AMBIGUOUS, VISIBLE, Geometry, two_view
 
 OFF = 2.0
 """Error in px beyond which a position is wrong."""
@@ -178,7 +178,7 @@ def _truth(geometry: Geometry, view: WarpedView, at: Array, depth: Array) -> Tru
     )
     exact = two_view(geometry, source, target)
     sees, mask = exact.label == VISIBLE, view.mask.numpy()
-    hidden = exact.hits.valid & ~sees & (exact.label != 3)
+    hidden = exact.hits.valid & ~sees & (exact.label != AMBIGUOUS)
     everywhere = np.linalg.norm(view.correspondence.xy.numpy() - exact.xy, axis=-1)
     return Truth(
         np.linalg.norm(source.project(target.unproject(at, depth))[0] - true, axis=1),
