@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -59,28 +59,22 @@ def tracks(
     """
     from rich.console import Console
 
-    with clear_errors(), reporter(title=out.name) as report:
+    with clear_errors(strict=False), reporter(title=out.name) as report:
+        from attnwarp import check
         from attnwarp.errors import InputError
         from attnwarp.fit import load_views
-        from attnwarp.methods.scene import near_of
         from attnwarp.warp import PRESETS
         from attnwarp_eval.document.write import terminal
-        from attnwarp_eval.tracks import find, measure
+        from attnwarp_eval.tracks import find
         from attnwarp_eval.tracks import report as written
 
         presets = preset or ["paper", "corrected"]
-        if unknown := [name for name in presets if name not in PRESETS]:
-            raise InputError(f"--preset: got {unknown[0]!r}, expected one of {', '.join(PRESETS)}")
+        for name in presets:
+            check.one_of(name, list(PRESETS), "--preset")
         if not ply and halve is None:
-            raise InputError(
-                "--ply: expected splats to judge, or --halve FOLDER to make a fit's data"
-            )
-        try:
-            dataset = read_views(data, reading)
-        except (FileNotFoundError, ValueError) as error:
-            raise InputError(str(error)) from None
-        there = [k for k, path in enumerate(dataset.image_paths) if path is not None]
-        dataset = dataset.select(there)
+            raise InputError("--ply: expected splats to judge, or --halve FOLDER to prepare a fit")
+        dataset = read_views(data, reading)
+        dataset = dataset.select([k for k, path in enumerate(dataset.image_paths) if path])
         found = find.find_tracks(data, dataset, out / find.FILE, model=model, report=report)
         if halve is not None:
             count = find.halve(dataset, found, halve)
@@ -88,58 +82,15 @@ def tracks(
                 f"{halve}: {count} of {len(found.started)} points to begin from; attnwarp fit"
                 f" {halve} --out FIT, then attnwarp-eval tracks {halve} --ply FIT/splats.ply"
             )
-        geometry = None
-        if truth is not None:
-            from attnwarp_eval.scene.file import load_scene
-            from attnwarp_eval.truth import Geometry
-
-            geometry = Geometry(load_scene(truth))
-        rows, pictures, notes = [], {}, []
-        views = load_views(dataset, max_size=max_size)
-        cameras = list(views.cameras)
-        scaled = found.resized(dataset.cameras, cameras)
-        for path in ply or ():
-            splats = read_splats(path, None, None)
-            label = path.parent.name or path.stem
-            held = [
-                (path.parent / "held_out" / f"{Path(camera.name).stem}.png").is_file()
-                for camera in cameras
-            ]
-            for name in presets:
-                pairs = measure.measure(
-                    splats, cameras, scaled, name, apart=apart or (1, 3, 6), held_out=held,
-                    geometry=geometry, near=near_of(cameras, splats), report=report,
-                )  # fmt: skip
-                if not pairs:
-                    raise InputError(
-                        f"--apart: no pair of views has {measure.LEAST} points in common; take"
-                        " nearer ones"
-                    )
-                rows += written.rows_of(label, name, pairs)
-                middle = pairs[len(pairs) // 2].target
-                image = out / "pictures" / f"{label}-{name}.png"
-                written.draw(pairs, scaled, _shown(views.images[middle]), middle, image)
-                pictures[f"{label}, {name}: {cameras[middle].name}"] = image
-        if not rows:
+        if not ply:
             return
-        judged = int((~found.started).sum())
-        notes.append(
-            f"{judged} points in {len(cameras)} pictures, measured at"
-            f" {cameras[0].width} x {cameras[0].height} px."
-        )
-        if not found.started.any():
-            notes.append(
-                "The fit may have begun from these points; --halve keeps half of them from it."
+        views = load_views(dataset, max_size=max_size)
+        page = written.Page(out, views, found.resized(dataset.cameras, views.cameras))
+        for path in ply:
+            page.add(
+                path, read_splats(path, None, None), presets, apart or (1, 3, 6), truth, report
             )
-        inputs = {"data": str(data), "ply": [str(path) for path in ply or ()], "truth": truth}
-        paths = written.write(rows, pictures, inputs, notes, out)
-    Console().print(terminal(written.short_table(rows)))
+        paths = page.write({"data": str(data), "ply": [str(path) for path in ply], "truth": truth})
+    Console().print(terminal(written.short_table(page.rows)))
     for path in paths:
         typer.echo(path)
-
-
-def _shown(image: Any) -> Any:
-    """(H, W, C) values in [0, 1]."""
-    import numpy as np
-
-    return image / np.iinfo(image.dtype).max if image.dtype.kind == "u" else image

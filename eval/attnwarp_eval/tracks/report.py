@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from attnwarp.errors import InputError
+from attnwarp.fit import Views
+from attnwarp.gaussians import Gaussians
 from attnwarp.io.picture import encode_picture
+from attnwarp.methods.scene import near_of
+from attnwarp.reporting import SILENT, Reporter
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.cost import environment
 from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.files import write_atomic
+from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.tracks.find import Tracks
-from attnwarp_eval.tracks.measure import OFF, Figure, Pair, summarise
+from attnwarp_eval.tracks.measure import LEAST, OFF, Figure, Pair, measure, summarise
+from attnwarp_eval.truth import Geometry
 
 FORMAT = 1
 """Version of tracks.json."""
@@ -37,6 +44,8 @@ BLIND = (
     " the splats were fitted to."
 )
 
+COLORS = "Green within 1 px, yellow within 2, red beyond; a ring where the mask drops the point."
+
 COLUMNS = ["splats", "preset", "apart", "pairs", "points", "angle"]
 
 NAMES = {
@@ -44,6 +53,13 @@ NAMES = {
     "dropped_off": "off, dropped", "floor": "floor, px", "flat": "flat, px",
 }  # fmt: skip
 """Columns of the :data:`attnwarp_eval.tracks.measure.FIGURES`."""
+
+EXACT = {
+    "median": "error, px", "off": "off", "dropped_off": "off, dropped",
+    "visible": "of points visible", "median_everywhere": "error of all visible pixels",
+    "kept_everywhere": "kept of all visible", "hidden_accepted": "hidden accepted",
+}  # fmt: skip
+"""Columns of :attr:`Row.truth`."""
 
 
 @dataclass(frozen=True)
@@ -110,95 +126,19 @@ def _truth_of(pairs: Sequence[Pair]) -> dict[str, float]:
     }
 
 
-def write(
-    rows: Sequence[Row],
-    pictures: Mapping[str, Path],
-    inputs: Mapping[str, Any],
-    notes: Sequence[str],
-    folder: Path,
-) -> list[Path]:
-    """Write tracks.json and the page; return their paths, the page at the end.
-
-    Args:
-        rows: figures.
-        pictures: captions and files below ``folder``, see :func:`draw`.
-        inputs: names and values of the command's inputs.
-        notes: sentences about this capture.
-        folder: output folder.
-    """
-    data = {
-        "format": FORMAT,
-        "inputs": dict(inputs),
-        "rows": [without_nan(asdict(row)) for row in rows],
-        "notes": list(notes),
-        "environment": environment(),
-    }
-    text = json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    write_atomic(folder / "tracks.json", text.encode())
-    return [
-        folder / "tracks.json",
-        *write_files(document(rows, pictures, notes, folder), folder, "tracks"),
-    ]
-
-
-def document(
-    rows: Sequence[Row], pictures: Mapping[str, Path], notes: Sequence[str], folder: Path
-) -> Report:
-    """Report of the figures."""
-    sections = [Section("Figures", tables=[table(rows)])]
-    exact = [row for row in rows if row.truth]
-    if exact:
-        names = {
-            "median": "error, px", "off": "off", "dropped_off": "dropped of off",
-            "visible": "of points visible", "median_everywhere": "error of all visible pixels",
-            "kept_everywhere": "kept of all visible", "hidden_accepted": "hidden accepted",
-        }  # fmt: skip
-        cells = [[*_first(row), *(_plain(row.truth[name]) for name in names)] for row in exact]
-        sections.append(
-            Section(
-                "What exact geometry says",
-                ["The same points against exact geometry, then every pixel."],
-                [Table([*COLUMNS, *names.values()], cells)],
-            )
-        )
-    if pictures:
-        shown = [
-            Picture(path.relative_to(folder).as_posix(), text) for text, path in pictures.items()
-        ]
-        sections.append(
-            Section(
-                "Points of a pair",
-                [
-                    "Green within 1 px, yellow within 2, red beyond; a ring where the mask drops"
-                    " the point."
-                ],
-                gallery=Gallery([("", shown)]),
-            )
-        )
-    sections.append(Section("How to read this", [READING, BLIND]))
-    return Report("Warps against tracks", [" ".join(notes)] if notes else [], sections)
-
-
 def table(rows: Iterable[Row]) -> Table:
     """The figures as a table, with their intervals."""
-    return Table(
-        [*COLUMNS, *NAMES.values()],
-        [[*_first(row), *(str(row.figures[name]) for name in NAMES)] for row in rows],
-    )
+    cells = [[*_first(row), *(str(row.figures[name]) for name in NAMES)] for row in rows]
+    return Table([*COLUMNS, *NAMES.values()], cells)
 
 
 def short_table(rows: Iterable[Row]) -> Table:
-    """The figures without intervals, for a terminal."""
-    return Table(
-        ["splats", "preset", "apart", "points", *NAMES.values()],
-        [
-            [
-                *(_first(row)[i] for i in (0, 1, 2, 4)),
-                *(_plain(row.figures[name].value) for name in NAMES),
-            ]
-            for row in rows
-        ],
-    )
+    """Figures for a terminal of 80 columns, without intervals."""
+    shown = ("median", "kept", "median_kept", "dropped_off")
+    cells = [
+        [*_first(row)[:3], *(_plain(row.figures[name].value) for name in shown)] for row in rows
+    ]
+    return Table([*COLUMNS[:3], *(NAMES[name] for name in shown)], cells)
 
 
 def _first(row: Row) -> list[str]:
@@ -210,25 +150,127 @@ def _plain(value: float) -> str:
     return "" if np.isnan(value) else f"{value:.2f}"
 
 
-def draw(
-    pairs: Sequence[Pair], tracks: Tracks, image: np.ndarray[Any, Any], target: int, path: Path
-) -> None:
-    """Draw the target's picture with its points, coloured by their error.
+class Page:
+    """Report of splats fitted to one capture, written as tracks.json, as a page, and as a picture
+    for each splats and preset.
 
     Args:
-        pairs: pairs of the target; the first is drawn.
+        folder: output folder.
+        views: the capture's cameras and pictures, of the size to measure at.
+        tracks: in px of these cameras.
+    """
+
+    def __init__(self, folder: Path, views: Views, tracks: Tracks) -> None:
+        self.folder, self.views, self.tracks = folder, views, tracks
+        self.rows: list[Row] = []
+        self.pictures: dict[str, Path] = {}
+
+    def add(
+        self,
+        path: Path,
+        splats: Gaussians,
+        presets: Sequence[str],
+        apart: Sequence[int],
+        truth: str | None = None,
+        report: Reporter = SILENT,
+    ) -> None:
+        """Measure splats, and draw a target picture for each preset.
+
+        Args:
+            path: path of the splats. Its folder names them; views of the folder's ``held_out`` were
+                held out of the fit.
+            splats: the splats.
+            presets: names of the warp's settings.
+            apart: distances between the views of a pair.
+            truth: name of the scene that the capture is an export of.
+            report: receiver of progress.
+
+        Raises:
+            InputError: no pair of views has enough points in common.
+        """
+        cameras = list(self.views.cameras)
+        label = path.parent.name or path.stem
+        held = [
+            (path.parent / "held_out" / f"{Path(camera.name).stem}.png").is_file()
+            for camera in cameras
+        ]
+        geometry = None if truth is None else Geometry(load_scene(truth))
+        for name in presets:
+            pairs = measure(
+                splats, cameras, self.tracks, name, apart=apart, held_out=held,
+                geometry=geometry, near=near_of(cameras, splats), report=report,
+            )  # fmt: skip
+            if not pairs:
+                raise InputError(
+                    f"--apart: no pair of views has {LEAST} points in common; take nearer ones"
+                )
+            self.rows += rows_of(label, name, pairs)
+            pair = pairs[len(pairs) // 2]
+            image = self.folder / "pictures" / f"{label}-{name}.png"
+            shown = self.views.target(pair.target, np.zeros(3)).numpy()
+            draw(pair, self.tracks, shown, image)
+            self.pictures[f"{label}, {name}: {cameras[pair.target].name}"] = image
+
+    def write(self, inputs: Mapping[str, Any]) -> list[Path]:
+        """Write tracks.json and the page; return their paths, the page at the end.
+
+        Args:
+            inputs: names and values of the command's inputs.
+        """
+        started, camera = self.tracks.started, self.views.cameras[0]
+        notes = [
+            f"{int((~started).sum())} points in {len(self.views.cameras)} pictures, measured at"
+            f" {camera.width} x {camera.height} px."
+        ]
+        if not started.any():
+            notes.append(
+                "The fit may have begun from these points; --halve keeps half of them from it."
+            )
+        data = {
+            "format": FORMAT,
+            "inputs": dict(inputs),
+            "rows": [without_nan(asdict(row)) for row in self.rows],
+            "notes": notes,
+            "environment": environment(),
+        }
+        text = json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        write_atomic(self.folder / "tracks.json", text.encode())
+        page = Report("Warps against tracks", [" ".join(notes)], list(self._sections()))
+        return [self.folder / "tracks.json", *write_files(page, self.folder, "tracks")]
+
+    def _sections(self) -> Iterator[Section]:
+        yield Section("Figures", tables=[table(self.rows)])
+        exact = [row for row in self.rows if row.truth]
+        if exact:
+            cells = [[*_first(row), *(_plain(row.truth[name]) for name in EXACT)] for row in exact]
+            yield Section(
+                "What exact geometry says",
+                ["The same points against exact geometry, then every pixel."],
+                [Table([*COLUMNS, *EXACT.values()], cells)],
+            )
+        shown = [
+            Picture(path.relative_to(self.folder).as_posix(), text)
+            for text, path in self.pictures.items()
+        ]
+        yield Section("Points of a pair", [COLORS], gallery=Gallery([("", shown)]))
+        yield Section("How to read this", [READING, BLIND])
+
+
+def draw(pair: Pair, tracks: Tracks, image: np.ndarray[Any, Any], path: Path) -> None:
+    """Draw the target's picture with the points of a pair, coloured by their error.
+
+    Args:
+        pair: a pair with the target.
         tracks: in px of the target's camera.
-        image: (H, W, 3) float sRGB in [0, 1] of the target.
-        target: index of the target's camera.
+        image: (H, W, 3) sRGB in [0, 1] of the target.
         path: path of the PNG.
     """
     import cv2
 
-    pair = next(pair for pair in pairs if pair.target == target)
     scale = max(1, round(512 / max(image.shape[:2])))
-    large = np.repeat(np.repeat(image[..., :3], scale, axis=0), scale, axis=1)
+    large = np.repeat(np.repeat(image, scale, axis=0), scale, axis=1)
     canvas = np.ascontiguousarray(np.round(255 * large).astype(np.uint8))
-    _, at = tracks.shared(pair.source, target)
+    _, at = tracks.shared(pair.source, pair.target)
     for xy, error, kept in zip(tracks.xy[at], pair.error, pair.kept, strict=True):
         color = (40, 200, 60) if error <= 1 else (250, 210, 30) if error <= OFF else (235, 40, 40)
         center = tuple(int(v) for v in np.round(xy * scale))

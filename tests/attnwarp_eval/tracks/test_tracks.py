@@ -3,6 +3,7 @@ of a corner of three walls.
 """
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -114,7 +115,12 @@ def test_figures_are_those_of_a_loop_over_the_points():
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-0.8, 0.8, (30, 2)), np.zeros(30)])
     planted = {k: (rng.normal(0, 2), rng.normal(0, 2)) for k in range(30)}
-    pairs = measure(disc((0, 0, 0), FLAT, 30), CAMERAS, tracks_of(points, planted), "corrected")
+    pairs = [
+        replace(pair, kept=rng.random(30) < 0.7)
+        for pair in measure(
+            disc((0, 0, 0), FLAT, 30), CAMERAS, tracks_of(points, planted), "corrected"
+        )
+    ]
     found = summarise(pairs)
     errors = sorted(float(e) for pair in pairs for e in pair.error)
     middle = (errors[len(errors) // 2] + errors[(len(errors) - 1) // 2]) / 2
@@ -122,7 +128,14 @@ def test_figures_are_those_of_a_loop_over_the_points():
     off = sum(error > OFF for error in errors)
     assert 0 < off < len(errors)
     assert found["off"].value == pytest.approx(off / len(errors))
-    assert found["kept"].value == 1 and found["dropped_off"].value == 0
+    kept = off_and_dropped = 0
+    for pair in pairs:
+        for error, keeps in zip(pair.error, pair.kept, strict=True):
+            kept += keeps
+            off_and_dropped += error > OFF and not keeps
+    assert found["kept"].value == pytest.approx(kept / len(errors))
+    assert 0 < off_and_dropped < off
+    assert found["dropped_off"].value == pytest.approx(off_and_dropped / off)
     for figure in found.values():
         assert figure.low <= figure.value <= figure.high
 
