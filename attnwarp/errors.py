@@ -46,7 +46,7 @@ EXTRAS = {
         ("accelerate", "warp"),
         "splats are rendered on the processor, and --low-memory is refused",
     ),
-    "colmap": Extra(("pycolmap",), "no reconstruction of edited pictures by COLMAP"),
+    "colmap": Extra(("pycolmap",), "no poses of photographs, no tracks, no figures by COLMAP"),
 }  # fmt: skip
 """All extras, by their names in pyproject.toml."""
 

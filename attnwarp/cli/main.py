@@ -11,6 +11,7 @@ from attnwarp.cli.edit_image import edit_image
 from attnwarp.cli.fit import fit
 from attnwarp.cli.inspect import inspect
 from attnwarp.cli.options import program_options
+from attnwarp.cli.poses import poses
 from attnwarp.cli.render import render
 
 app = typer.Typer(
@@ -30,6 +31,7 @@ app = typer.Typer(
 )
 
 app.callback()(program_options)
+app.command()(poses)
 app.command()(fit)
 app.command()(edit)
 app.command()(render)

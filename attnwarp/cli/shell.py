@@ -153,7 +153,7 @@ def check_out(out: Path) -> None:
 
 
 COMMANDS = {
-    "attnwarp": ("fit", "edit", "render", "convert", "undistort", "edit-image"),
+    "attnwarp": ("poses", "fit", "edit", "render", "convert", "undistort", "edit-image"),
     "attnwarp-eval": (
         "run", "report", "verdicts", "verify", "studies", "captures", "compare", "stability",
         "metrics", "tracks", "encoders", "doctor", "scenes", "userstudy", "cache",

@@ -520,7 +520,7 @@ def test_a_misspelt_scene_and_a_command_of_the_other_program_are_named(data, tmp
     assert "baer: no such file or folder; did you mean 'bear'?" in done.stderr
     (tmp_path / "photos").mkdir()
     done = in_process("fit", tmp_path / "photos", "--out", tmp_path / "out")
-    assert "photographs get poses first, as in docs/start/own-photographs.md" in done.stderr
+    assert "photographs get poses first, by attnwarp poses" in done.stderr
     programs = {"attnwarp": app, "attnwarp-eval": attnwarp_eval.cli.main.app}
     names = {name: {*get_command(program).commands} for name, program in programs.items()}
     for name, other in (tuple(names), tuple(reversed(names))):

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from attnwarp import sfm
 from attnwarp.camera import Camera
-from attnwarp_eval import _colmap
 from attnwarp_eval.metrics._pictures import picture
 from attnwarp_eval.metrics.arrays import share
 
@@ -98,9 +98,9 @@ def reconstruct(images: Sequence[Any], cameras: Sequence[Camera]) -> Reconstruct
     ]
     with tempfile.TemporaryDirectory(prefix="attnwarp-colmap-") as name:
         folder = Path(name)
-        _colmap.write_pictures(
+        sfm.write_pictures(
             folder, [np.round(255 * one).astype(np.uint8) for one in pictures], cameras
         )
-        _colmap.run("reconstruct", folder)
+        sfm.run("reconstruct", folder)
         found = json.loads((folder / "result.json").read_text())
     return Reconstruction(len(pictures), **(found or {}))

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp import sfm
 from attnwarp.camera import Camera
 from attnwarp.errors import InputError
 from attnwarp.io import Dataset, write_transforms
 from attnwarp.io.colmap import find_model
 from attnwarp.io.images import read_image
 from attnwarp.reporting import SILENT, Reporter
-from attnwarp_eval import _colmap
 from attnwarp_eval.files import write_atomic
 
 Array = npt.NDArray[np.float64]
@@ -209,27 +209,28 @@ def _made(dataset: Dataset, model: Path | None, report: Reporter) -> Tracks:
     with tempfile.TemporaryDirectory(prefix="attnwarp-colmap-") as name:
         folder = Path(name)
         if model is not None:
-            _colmap.run("read", folder, model.resolve())
+            sfm.run("read", folder, model.resolve())
         else:
             pairs = len(dataset) * (len(dataset) - 1) // 2
             report.log(f"matching {len(dataset)} pictures, {pairs} pairs, by pycolmap")
             paths = [path for path in dataset.image_paths if path is not None]
             images = [_eight_bits(path) for path in paths]
-            names = _colmap.write_pictures(folder, images, dataset.cameras)
+            names = sfm.write_pictures(folder, images, dataset.cameras)
             poses = {
                 name: camera.world_to_camera[:3].tolist()
                 for name, camera in zip(names, dataset.cameras, strict=True)
             }
             (folder / "poses.json").write_text(json.dumps(poses))
-            _colmap.run("triangulate", folder)
+            sfm.run("triangulate", folder, report=report)
         with np.load(folder / "tracks.npz") as arrays:
             found = [str(name) for name in arrays["names"]]
             image, point, places = (arrays[name] for name in ("image", "point", "xy"))
     if model is None:
         order = {name: int(Path(name).stem) for name in found}
     else:
-        known = {Path(camera.name).name: k for k, camera in enumerate(dataset.cameras)}
-        order = {name: known[Path(name).name] for name in found if Path(name).name in known}
+        # By stem, as undistorted pictures are PNG.
+        known = {Path(camera.name).stem: k for k, camera in enumerate(dataset.cameras)}
+        order = {name: known[Path(name).stem] for name in found if Path(name).stem in known}
         if not order:
             raise InputError(
                 f"{model}: none of its {len(found)} pictures, {', '.join(found[:2])} first, is one"

@@ -22,7 +22,7 @@ pytest.importorskip("pycolmap")  # in this process it is never used: it breaks o
 
 BY_HAND = """
 import json, numpy as np, pycolmap
-from attnwarp_eval._colmap import summary
+from attnwarp.sfm import summary
 pycolmap.set_random_seed(3)
 made = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(
     num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=7, num_points3D=50))
@@ -98,6 +98,6 @@ def test_a_failure_is_counted(cameras):
 def test_what_cannot_be_reconstructed_is_refused(cameras, monkeypatch):
     with pytest.raises(ValueError, match="got 1 pictures and 6 cameras"):
         metrics.reconstruct([np.zeros((256, 256, 3))], cameras)
-    monkeypatch.setattr("attnwarp_eval._colmap.find_spec", lambda name: None)
+    monkeypatch.setattr("attnwarp.sfm.find_spec", lambda name: None)
     with pytest.raises(InputError, match="needs the package pycolmap"):
         metrics.reconstruct([np.zeros((256, 256, 3))] * 2, cameras[:2])

@@ -1,9 +1,10 @@
-"""The only module that imports pycolmap: a separate program, ``python -m attnwarp_eval._colmap
-TASK FOLDER [MODEL]``, which :func:`run` starts.
+"""Structure from motion. The only module that imports pycolmap: a separate program, ``python -m
+attnwarp.sfm TASK FOLDER [PATH]``, which :func:`run` starts.
 
 In one process with other packages pycolmap corrupts memory: its compression library replaces
 theirs.
 
+- ``photographs`` finds cameras, poses and points of the pictures of a folder, by COLMAP's defaults.
 - ``reconstruct`` finds poses and points, and writes their figures to ``result.json``.
 - ``triangulate`` finds points for the poses of ``poses.json``, and writes ``tracks.npz``.
 - ``read`` writes ``tracks.npz`` from a sparse model.
@@ -12,6 +13,7 @@ theirs.
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -24,6 +26,7 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp.errors import InputError, MissingExtraError
+from attnwarp.reporting import SILENT, Reporter
 
 SEED = 0
 """Seed of RANSAC; with one thread the same pictures give the same reconstruction."""
@@ -53,23 +56,47 @@ def write_pictures(
     return names
 
 
-def run(task: str, *paths: Path) -> None:
+STEPS = {
+    "features": r"Processed file \[(\d+)/(\d+)\]",
+    "matches": r"Processing block \[(\d+)/(\d+), (\d+)/(\d+)\]",
+    "poses": r"num_reg_frames=(\d+)",
+}
+"""Lines of COLMAP's log that tell how far it is."""
+
+
+def run(task: str, *paths: Path, report: Reporter = SILENT) -> None:
     """Run a task of this program.
+
+    Args:
+        task: name of the task.
+        paths: its folder, and its further path if it has one.
+        report: receiver of progress.
 
     Raises:
         InputError: the package pycolmap stopped, or is missing (MissingExtraError).
     """
     if find_spec("pycolmap") is None:
         raise MissingExtraError("pycolmap", "colmap")
-    done = subprocess.run(
-        [sys.executable, "-m", "attnwarp_eval._colmap", task, *map(str, paths)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        last = (done.stderr.strip() or "nothing").splitlines()[-1]
-        raise InputError(f"{task}: pycolmap stopped with exit status {done.returncode}: {last}")
+    command = [sys.executable, "-m", "attnwarp.sfm", task, *map(str, paths)]
+    last = "nothing"
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, errors="replace") as process:
+        assert process.stderr is not None
+        try:
+            for line in process.stderr:
+                last = line.strip() or last
+                for name, pattern in STEPS.items():
+                    if found := re.search(pattern, line):
+                        report.step(*_count(*map(int, found.groups())), name)
+        except BaseException:
+            process.kill()
+            raise
+    if process.returncode:
+        raise InputError(f"{task}: pycolmap stopped with exit status {process.returncode}: {last}")
+
+
+def _count(row: int, rows: int = 0, column: int = 0, columns: int = 0) -> tuple[int, int]:
+    """Finished and total steps of a line: of pictures, or of blocks when one begins."""
+    return ((row - 1) * columns + column - 1, rows * columns) if columns else (row, rows)
 
 
 def summary(reconstruction: Any) -> dict[str, float]:
@@ -120,6 +147,38 @@ def options() -> Any:
     return pycolmap.IncrementalPipelineOptions(
         num_threads=1, random_seed=SEED, ba_refine_focal_length=False, ba_refine_extra_params=False
     )
+
+
+def photographs(folder: Path, names: Path) -> None:
+    """Write the largest model of photographs, ``sparse/0``, and its figures, ``result.json``; null
+    without a model.
+
+    Features and matches that ``database.db`` has are not computed again.
+
+    Args:
+        folder: folder for the database and the models.
+        names: JSON file of the pictures' folder, their names in it, whether one camera took all,
+            and the files' times.
+    """
+    import pycolmap
+
+    images, listed, alike, _ = json.loads(names.read_text())
+    database = folder / "database.db"
+    pycolmap.extract_features(
+        database,
+        images,
+        image_names=listed,
+        camera_mode=pycolmap.CameraMode.SINGLE if alike else pycolmap.CameraMode.PER_IMAGE,
+    )
+    # Smaller blocks than the default, whose log tells of progress only every 50 pictures.
+    pairs = pycolmap.ExhaustivePairingOptions(block_size=10)
+    pycolmap.match_exhaustive(database, pairing_options=pairs)
+    found = pycolmap.incremental_mapping(database, images, folder / "models")
+    largest = max(found.values(), key=lambda one: one.num_reg_images(), default=None)
+    if largest is not None:
+        (folder / "sparse" / "0").mkdir(parents=True, exist_ok=True)
+        largest.write(folder / "sparse" / "0")
+    (folder / "result.json").write_text(json.dumps(None if largest is None else summary(largest)))
 
 
 def reconstruct(folder: Path) -> None:
@@ -192,10 +251,8 @@ def write_tracks(reconstruction: Any, folder: Path) -> None:
 
 def main(task: str, *paths: str) -> None:
     """Run ``task`` in the first folder of ``paths``."""
-    import pycolmap
-
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     tasks: dict[str, Callable[..., None]] = {
+        "photographs": photographs,
         "reconstruct": reconstruct,
         "triangulate": triangulate,
         "read": read,
