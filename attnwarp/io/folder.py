@@ -98,8 +98,8 @@ def read_dataset(
         else:
             raise FileNotFoundError(
                 f"{path}: neither a transforms.json nor a COLMAP model (cameras.bin or cameras.txt,"
-                " here, in sparse/0 or in sparse) is there; photographs get poses first, by attnwarp"
-                " poses"
+                " here, in sparse/0 or in sparse) is there; photographs get poses first, by"
+                " attnwarp poses"
             )
     if format == "blendedmvs":
         if scale > 1 or images is not None:
