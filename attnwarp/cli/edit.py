@@ -221,7 +221,7 @@ def edit(
         from attnwarp import check, methods
         from attnwarp.editing.segment import check_marks
         from attnwarp.io.file import existing_file
-        from attnwarp.methods.change import say_change, say_little
+        from attnwarp.methods.change import say_change, say_drift, say_little
         from attnwarp.methods.command import (
             FitPlan,
             check_asked,
@@ -275,6 +275,9 @@ def edit(
         typer.echo(say_change(result.change, edit_options.marks.option != ""))
         if little := say_little(result.change):
             warnings.warn(little, InputWarning, stacklevel=1)
+        moved, warned = say_drift(result.drift)
+        if warned:
+            warnings.warn(moved, InputWarning, stacklevel=1)
         views = len(result.edited)
         carried = ""
         if getattr(settings, "a0", 0) > 0 and views > 1:

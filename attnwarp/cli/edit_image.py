@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
@@ -122,6 +123,7 @@ def edit_image(
 
     from attnwarp import check
     from attnwarp.devices import choose, type_of
+    from attnwarp.drift import drift
     from attnwarp.editing.editor import edit
     from attnwarp.editing.segment import load_segmenter
     from attnwarp.editing.small import load_editor, thread_count
@@ -174,6 +176,9 @@ def edit_image(
     if sheet is not None:
         _write(sheet, _sheet(tiles))
     typer.echo(out)
+    moved = drift(image, np.clip(edited, 0, 1), None if share is None else share[..., 0] == 0)
+    if moved is not None and moved.seen:
+        warnings.warn(f"the edit moved the picture: {moved}", InputWarning, stacklevel=1)
 
 
 def _read(path: Path) -> Image:
@@ -205,8 +210,6 @@ def _fit(image: Image, longest: int, multiple: int) -> Image:
 
 def _tell_stretch(before: Sequence[int], after: Sequence[int], multiple: int) -> None:
     """Warn if rounding the sides to multiples clearly changes a picture's aspect ratio."""
-    import warnings
-
     h, w = before[:2]
     stretch = (after[1] / after[0]) / (w / h)
     if abs(math.log(stretch)) > math.log(1 + MOST_STRETCH):

@@ -9,13 +9,13 @@ views/NAME.png        last edit of each view
 renders/before/ after/  renders of the scene from every view
 sheet.png             renders before, edits and renders after, side by side
 cut.json              budget limit that ended the run, and its round; absent if no limit did
-edited.ply  result.json  times.json  the edited splats; change, counters, Edit PSNR; seconds by part
+edited.ply, result.json, times.json: splats; change, drift, counters, Edit PSNR; seconds by part
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -33,7 +33,7 @@ from attnwarp.fit import compile_kernels
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
 from attnwarp.io.names import file_stems
-from attnwarp.methods.change import Change, change_of
+from attnwarp.methods.change import Change, change_of, drift_of
 from attnwarp.methods.pictures import (
     Bytes,
     Image,
@@ -149,6 +149,8 @@ class Result:
             run.
         change: dE00 inside the mask: of the "scene", from renders before to renders after, and of
             the "source view", or of the "edited views" by a method without a source.
+        drift: "view" and "drift": how the edit of the source, or of the view that moved most,
+            shifts, scales and turns the picture, see :class:`attnwarp.drift.Drift`.
 
     Example:
         >>> import numpy as np, torch
@@ -170,6 +172,7 @@ class Result:
     seconds: dict[str, float]
     cut: str | None = None
     change: Change = field(default_factory=dict)
+    drift: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -573,7 +576,9 @@ class _Run:
                         self.folder.write_picture(path, to_bytes(picture))
             self.folder.write_picture("sheet.png", self._sheet())
             psnr = self._edit_psnr(final)
-            change = change_of(self.work, self.names, self.method.about.get("source"), edited)
+            source = self.method.about.get("source")
+            change = change_of(self.work, self.names, source, edited)
+            drift = drift_of(self.work, self.names, source, edited)
         records = {
             view: self.folder.record(self._picture(number, view))
             for view, number in self.latest.items()
@@ -590,10 +595,19 @@ class _Run:
         tuned = {self.names[view]: n for view, n in sorted(self.tuning.visits.items())}
         limit = None if cut is None else cut["limit"]
         about = {"edit_psnr": psnr, "counters": counters, "tuned": tuned, "cut": limit}
-        self.folder.write_json("result.json", {"change": change, **about})
+        self.folder.write_json("result.json", {"change": change, "drift": drift, **about})
         self.seconds.write()
         return Result(
-            self.name, final, edited, self.rounds, psnr, counters, self.seconds.parts, limit, change
+            self.name,
+            final,
+            edited,
+            self.rounds,
+            psnr,
+            counters,
+            self.seconds.parts,
+            limit,
+            change,
+            drift,
         )
 
     def _edit_psnr(self, final: Gaussians) -> dict[str, Any]:

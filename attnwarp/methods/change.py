@@ -1,12 +1,15 @@
-"""Measured change of an edit, and advice if the change is negligible."""
+"""Measured change and drift of an edit, and advice if the change is negligible."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
 from attnwarp.colors import ciede2000, to_lab
+from attnwarp.drift import Drift, drift
 from attnwarp.methods.pictures import Bytes, Mask, Size, resized, to_bytes
 from attnwarp.methods.work import Work
 
@@ -16,6 +19,9 @@ from about 1; rounding, tuning and an unchanged source account for up to 2."""
 
 MOST_PIXELS = 20_000
 """Compared pixels per view, evenly spread; more pixels would change no displayed digit."""
+
+MOST_DRIFTS = 4
+"""Edited views, evenly spread, whose drift is measured if no view is the source."""
 
 Change = Mapping[str, float | None]
 """Mean CIEDE2000 of "scene" and of "source view", or of "edited views" for a method without a
@@ -64,6 +70,55 @@ def change_of(
         "scene": rendered(views) if scene is None else scene,
         "source view" if source else "edited views": mean_change(map(edit, edits)),
     }
+
+
+def drift_of(
+    work: Work, names: Sequence[str], source: str | None, edited: Mapping[int, Bytes]
+) -> dict[str, Any]:
+    """Measure how far an editor moved what lies outside the mask, before composition.
+
+    Args:
+        work, names, edited: see :func:`change_of`.
+        source: name of the source view; None to measure a few views and return the largest drift.
+
+    Returns:
+        "view", and the attributes of a :class:`attnwarp.drift.Drift` as "drift", None if it can't
+        be told.
+    """
+    chosen = [view for view in edited if names[view] == source]
+    chosen = chosen or list(edited)[:: 1 + len(edited) // MOST_DRIFTS]
+    found: list[tuple[str, Drift | None]] = []
+    for view in chosen:
+        pixels, segments = edited[view], work.scene.segments
+        before = to_bytes(resized(work.scene.picture(view), pixels.shape[:2]))
+        left = None
+        if segments is not None:
+            touched = np.asarray(segments[view] > 0, np.float32)[..., None].repeat(3, 2)
+            left = resized(touched, pixels.shape[:2])[..., 0] == 0
+        found.append((names[view], drift(before, pixels, left)))
+    view_name, most = max(found, key=lambda f: f[1].largest if f[1] else -1, default=(None, None))
+    return {"view": view_name, "drift": asdict(most) if most else None}
+
+
+def say_drift(of: Mapping[str, Any]) -> tuple[str, bool]:
+    """Write a line about the drift of an edit, and whether it warns.
+
+    Args:
+        of: see :func:`drift_of`.
+
+    Example:
+        >>> say_drift({"view": "bear", "drift": None})
+        ("whether the edit of bear moved the picture can't be told", False)
+    """
+    if of["drift"] is None:
+        return f"whether the edit of {of['view']} moved the picture can't be told", False
+    moved = Drift(**of["drift"])
+    if not moved.seen:
+        return f"the edit of {of['view']} left the picture in place ({moved})", False
+    return (
+        f"the edit of {of['view']} moved the picture, corners by {moved.largest:.1f} px ({moved});"
+        " warps assume that it stays: try another seed or editor"
+    ), True
 
 
 def mean_change(pictures: Iterable[tuple[Bytes, Bytes, Mask | None]]) -> float | None:

@@ -25,7 +25,7 @@ from attnwarp.io.images import encode_png
 from attnwarp.io.names import file_stems
 from attnwarp.io.splat import RECORD
 from attnwarp.methods.base import VIEWER_PLY, edit_file
-from attnwarp.methods.change import say_change, say_little
+from attnwarp.methods.change import say_change, say_drift, say_little
 from attnwarp.methods.page.measured import CONTROL, disagreement, edited_alone, spill
 from attnwarp.methods.page.orbit import focus_of, orbit, renders, up_of, write_film
 from attnwarp.methods.pictures import SOURCE_COLORS, Bytes, resized, to_bytes
@@ -147,10 +147,13 @@ class _Page:
         ended = f", cut short by its {cut.replace('_', ' ')}" if cut else ""
         change = self.result["change"]
         said, little = say_change(change, self.segments is not None), say_little(change)
+        moved, warned = say_drift(self.result["drift"])
+        notes = (little, note, moved if warned else "")
         lines = [
             f"<h1>{escape(self.manifest['instruction'])}</h1>",
             f"<p><b>{said[0].upper()}{said[1:]}.</b></p>",
-            *(f"<p><b>Warning:</b> {escape(text)}.</p>" for text in (little, note) if text),
+            *(f"<p><b>Warning:</b> {escape(text)}.</p>" for text in notes if text),
+            *([] if warned else [f"<p>{escape(moved[0].upper() + moved[1:])}.</p>"]),
             f"<p>Edited by the method <code>{escape(method)}</code>: {len(self.edited)} of"
             f" {len(self.names)} views were edited, and the splats were tuned on them{ended}."
             " The edited scene is <code>edited.ply</code> in this folder"

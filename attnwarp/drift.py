@@ -1,0 +1,377 @@
+"""Drift of an edit: shift, scale and turn of what it should have left in place.
+
+Every warp along depth assumes that an edited picture lies where its original lay. Tiles of both
+pictures are aligned by Lucas-Kanade with a gain and an offset of each tile, so that changes of
+colour, light and blur do not count; the similarity that most tiles share is the drift. Repainted
+tiles disagree and drop out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy import fft
+from scipy.special import stdtrit
+
+Floats = npt.NDArray[Any]
+
+SEARCHED = 0.24, 0.105
+"""Largest searched log scale and turn in radians."""
+
+LONGEST = 512
+"""Longest side in px at which tiles are aligned; larger pictures are reduced."""
+
+AGREEING = 0.35
+"""Least share of textured tiles, weighted by their agreement, that must share one similarity.
+Unrelated pictures and neighbouring views of a capture reach 0.25 at most."""
+
+FLOOR = np.array([0.03, 0.03, 3e-4, 3.5e-4])
+"""Half widths (px at the working size, twice; log scale; radians) below which resampling and
+rounding to 8 bits dominate, added in quadrature."""
+
+WIDENING = 1.5
+"""Factor on the half widths of the sandwich estimate, which neglects that residuals correlate
+beyond a cell and that tiles are selected."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Similarity from a picture to its edit, about the picture's middle.
+
+    Attributes:
+        right, down: shift of the middle, px of the picture.
+        scale: percent; 2 means that the edit shows everything 2 % larger.
+        turn: degrees, clockwise as displayed.
+        half_widths: 99 % half widths of right, down, scale and turn, in their units.
+        largest: displacement of the corner that moves most, px.
+    """
+
+    right: float
+    down: float
+    scale: float
+    turn: float
+    half_widths: tuple[float, float, float, float]
+    largest: float
+
+    @property
+    def seen(self) -> bool:
+        """True if a corner moves by 1 px and more, and a value exceeds its half width."""
+        values = (self.right, self.down, self.scale, self.turn)
+        beyond = (abs(v) > half for v, half in zip(values, self.half_widths, strict=True))
+        return self.largest >= 1 and any(beyond)
+
+    def __str__(self) -> str:
+        values = (self.right, self.down, self.scale, self.turn)
+        names = ("px right", "px down", "% larger", "degrees clockwise")
+        return ", ".join(
+            f"{value + 0.0:.2f} ± {half:.2f} {name}"
+            for value, half, name in zip(values, self.half_widths, names, strict=True)
+        )
+
+
+def drift(
+    before: npt.NDArray[Any], after: npt.NDArray[Any], left: npt.NDArray[np.bool_] | None = None
+) -> Drift | None:
+    """Measure the drift between a picture and its edit.
+
+    Args:
+        before: (h, w, 3) the picture, uint8 or floating in [0, 1].
+        after: (h, w, 3) its edit.
+        left: (h, w) True where the edit should leave the picture as it is; None for everywhere.
+
+    Returns:
+        The drift; None if too little is textured or left alone to tell.
+
+    Raises:
+        ValueError: the pictures or the mask have other shapes.
+
+    Example:
+        >>> import cv2
+        >>> noise = np.random.default_rng(0).random((128, 128, 3), np.float32)
+        >>> before = cv2.GaussianBlur(noise, (0, 0), 2)
+        >>> moved = drift(before, np.roll(before, 3, axis=1) * 0.5)
+        >>> round(moved.right, 1), abs(round(moved.down, 1)), abs(round(moved.scale, 1))
+        (3.0, 0.0, 0.0)
+        >>> drift(before, np.zeros_like(before)) is None
+        True
+    """
+    size = before.shape[:2]
+    mask = np.ones(size, bool) if left is None else np.asarray(left, bool)
+    if before.shape != after.shape or mask.shape != size:
+        raise ValueError(
+            f"drift: got {before.shape}, {after.shape}, mask {mask.shape}; expected one size"
+        )
+    pictures = _gray(before), _gray(after)
+    longest = max(size)
+    sides = [side for side in (64, 128, 256) if side < longest] + [min(longest, LONGEST)]
+    levels = [_Level.of(pictures[0], pictures[1], mask, side) for side in sides]
+    draw = np.random.default_rng(0)
+    found = _aligned(levels[:2], np.zeros(4), draw)
+    if found is None or found.agreeing < 2 * AGREEING:
+        tried = [_aligned(levels[:2], start, draw) for start in _search(levels[0])]
+        found = max((f for f in [found, *tried] if f), key=lambda f: f.agreeing, default=None)
+    if found is not None and levels[2:]:
+        found = _aligned(levels[2:], found.motion, draw)
+    if found is None or found.agreeing < AGREEING:
+        return None
+    half = found.half_widths()
+    return None if half is None else _drift(found.motion, half, longest, size)
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """Both pictures at one size, smoothed so that cubic resampling is exact to 0.01 px."""
+
+    before: Floats
+    after: Floats
+    left: npt.NDArray[np.bool_]
+    middle: Floats
+    side: int
+
+    @classmethod
+    def of(cls, before: Floats, after: Floats, left: npt.NDArray[np.bool_], side: int) -> _Level:
+        h, w = (max(16, round(n * side / max(before.shape))) for n in before.shape)
+        one, two, mask = (
+            cv2.resize(p.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA)
+            for p in (before, after, left)
+        )
+        one, two = (cv2.GaussianBlur(p, (0, 0), 1.0) for p in (one, two))
+        return cls(one, two, mask > 0.95, np.array([w - 1, h - 1]) / 2, side)
+
+    def affine(self, motion: Floats) -> Floats:
+        """Return the (2, 3) map from px of the picture to px of the edit."""
+        turned = _linear(motion)
+        return np.c_[turned, self.middle + motion[:2] * self.side - turned @ self.middle]
+
+    def moved_back(self, motion: Floats) -> tuple[Floats, npt.NDArray[np.bool_]]:
+        """Resample the edit to the picture, and mark pixels that the edit shows."""
+        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        h, w = self.after.shape
+        back = cv2.warpAffine(
+            self.after, self.affine(motion), (w, h), flags=flags, borderMode=cv2.BORDER_REFLECT
+        )
+        y, x = np.mgrid[:h, :w].reshape(2, -1)
+        at = self.affine(motion) @ np.stack([x, y, np.ones_like(x)])
+        shown = (at >= 3).all(0) & (at <= np.array([[w - 4], [h - 4]])).all(0)
+        return np.asarray(back), np.asarray(shown.reshape(h, w))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Similarity that most tiles share."""
+
+    motion: Floats
+    agreeing: float
+    used: npt.NDArray[np.bool_]
+    scores: Floats
+    """(tiles, 4) weighted gradients of the fit."""
+    normal: Floats
+    cells: npt.NDArray[np.intp]
+
+    def half_widths(self) -> Floats | None:
+        """Return 99 % half widths from the scatter between cells; None for too few cells.
+
+        The cluster-robust sandwich of Liang and Zeger (1986): residuals may correlate within
+        cells of a sixth of the picture.
+        """
+        cells = np.unique(self.cells[self.used])
+        if len(cells) < 6 or self.used.sum() < 10:
+            return None
+        sums = np.stack([self.scores[self.used & (self.cells == cell)].sum(0) for cell in cells])
+        inverse = np.linalg.inv(self.normal)
+        free = len(cells) - 4
+        covariance = inverse @ (sums.T @ sums) @ inverse * len(cells) / free
+        return np.asarray(WIDENING * stdtrit(free, 0.995) * np.sqrt(np.diag(covariance)))
+
+
+def _drift(motion: Floats, half: Floats, longest: int, size: tuple[int, ...]) -> Drift:
+    working = min(longest, LONGEST)
+    wide = np.hypot(half, FLOOR / [working, working, 1, 1])
+    scale = float(np.exp(motion[2]))
+    units = np.array([longest, longest, 100 * scale, np.degrees(1)])
+    corners = np.array([[x, y] for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * size[1::-1]
+    moved = corners @ (_linear(motion) - np.eye(2)).T + motion[:2] * longest
+    right, down, _, turn = (float(v) for v in motion * units)
+    return Drift(
+        right, down, 100 * (scale - 1), turn,
+        cast("tuple[float, float, float, float]", tuple(float(v) for v in wide * units)),
+        float(np.linalg.norm(moved, axis=1).max()),
+    )  # fmt: skip
+
+
+def _linear(motion: Floats) -> Floats:
+    cos, sin = np.cos(motion[3]), np.sin(motion[3])
+    return np.asarray(np.exp(motion[2]) * np.array([[cos, -sin], [sin, cos]]))
+
+
+def _gray(picture: npt.NDArray[Any]) -> Floats:
+    scale = 255.0 if picture.dtype == np.uint8 else 1.0
+    gray = picture.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
+    return np.asarray(gray / np.float32(scale))
+
+
+def _aligned(levels: Sequence[_Level], motion: Floats, draw: np.random.Generator) -> _Fit | None:
+    """Refine a motion through levels, from coarse to fine; None if too few tiles agree."""
+    fit = None
+    for level in levels:
+        for step in range(8):
+            fit = _step(level, motion, 1.0 if step > 2 else 2.0, draw)
+            if fit is None:
+                return None
+            moved = np.abs(fit.motion - motion).max() * level.side
+            motion = fit.motion
+            if step > 2 and moved < 1e-3:
+                break
+    return fit
+
+
+def _step(level: _Level, motion: Floats, radius: float, draw: np.random.Generator) -> _Fit | None:
+    back, shown = level.moved_back(motion)
+    tile = max(8, level.side // 16)
+    shift, variance, textured, good, at, cells = _tiles(
+        level.before, back, level.left & shown, tile
+    )
+    if good.sum() < 4:
+        return None
+    x, y = ((at - level.middle) / level.side).T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    design = np.stack([np.stack([one, zero, x, -y], -1), np.stack([zero, one, y, x], -1)], 1)
+    shift, radius = shift / level.side, radius / level.side
+    change = _consensus(design[good], shift[good], radius, draw)
+    inverse = np.linalg.inv(variance / level.side**2 + 0.01 * radius**2 * np.eye(2))
+    for _ in range(10):
+        residual = shift - design @ change
+        weight = np.clip(1 - (residual**2).sum(-1) / radius**2, 0, None) ** 2 * good
+        if (weight > 0).sum() < 4:
+            return None
+        weighted = np.einsum("tki,tkl,t->til", design, inverse, weight)
+        normal = np.einsum("til,tlj->ij", weighted, design)
+        change = np.linalg.solve(normal, np.einsum("til,tl->i", weighted, shift))
+    scores = np.einsum("til,tl->ti", weighted, shift - design @ change)
+    linear = _linear(motion)
+    total = np.r_[motion[:2] + linear @ change[:2], motion[2:]]
+    grown = linear @ np.array([[1 + change[2], -change[3]], [change[3], 1 + change[2]]])
+    total[2:] = np.log(np.hypot(*grown[:, 0])), np.arctan2(grown[1, 0], grown[0, 0])
+    return _Fit(
+        total, float(weight.sum() / max(textured.sum(), 1)), weight > 0, scores, normal, cells
+    )
+
+
+def _consensus(design: Floats, shift: Floats, radius: float, draw: np.random.Generator) -> Floats:
+    """Return the similarity of two tiles that most tiles share (RANSAC with truncated squares)."""
+    pairs = draw.integers(0, len(shift), (300, 2))
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    systems = design[pairs].reshape(-1, 4, 4)
+    solved = np.einsum("nij,nj->ni", np.linalg.pinv(systems), shift[pairs].reshape(-1, 4))
+    residual = shift[None] - np.einsum("tki,ni->ntk", design, solved)
+    loss = np.minimum((residual**2).sum(-1) / radius**2, 1).sum(1)
+    return np.asarray(solved[np.argmin(loss)])
+
+
+def _tiles(before: Floats, back: Floats, valid: npt.NDArray[np.bool_], tile: int) -> Any:
+    """Align tiles by one Gauss-Newton step with a gain and an offset of each tile.
+
+    The gradient is the mean of both pictures', so that noise in one does not shorten the step
+    (Malis 2004, efficient second-order minimisation).
+
+    Returns:
+        (tiles, 2) shifts in px, (tiles, 2, 2) their variances, (tiles,) textured, (tiles,) aligned,
+        (tiles, 2) middles, (tiles,) numbers of cells.
+    """
+    h, w = before.shape
+    rows, columns = h // tile, w // tile
+    top, start = (h - rows * tile) // 2, (w - columns * tile) // 2
+
+    def cut(picture: Floats) -> Floats:
+        inner = picture[top : top + rows * tile, start : start + columns * tile]
+        parts = inner.reshape(rows, tile, columns, tile).swapaxes(1, 2)
+        return np.asarray(parts.reshape(rows * columns, -1), dtype=np.float64)
+
+    share = cut(valid)
+    count = share.sum(1)
+
+    def centred(values: Floats) -> Floats:
+        mean = (values * share).sum(1) / np.maximum(count, 1)
+        return np.asarray((values - mean[:, None]) * share)
+
+    one, two = centred(cut(before)), centred(cut(back))
+    squares, others = (one**2).sum(1), (two**2).sum(1)
+    product = (one * two).sum(1)
+    gain = np.sign(product) * np.sqrt(squares / np.maximum(others, 1e-9))
+    slopes = [
+        centred(
+            (
+                cut(np.gradient(before, axis=axis))
+                + gain[:, None] * cut(np.gradient(back, axis=axis))
+            )
+            / 2
+        )
+        for axis in (1, 0)
+    ]
+    jacobian = np.stack([*slopes, two], -1)
+    error = one - gain[:, None] * two
+    normal = np.einsum("tpi,tpj->tij", jacobian, jacobian) + 1e-9 * np.eye(3)
+    inverse = np.linalg.inv(normal)
+    step = np.einsum("tij,tpj,tp->ti", inverse, jacobian, error, optimize=True)
+    rest = error - np.einsum("tpi,ti->tp", jacobian, step)
+    # The blur of 1 px makes about four neighbouring residuals one.
+    noise = 4 * (rest**2).sum(1) / np.maximum(count - 5, 1)
+    textured = (count >= 0.6 * tile**2) & (squares > 2e-5 * count)
+    good = textured & (others > 2e-5 * count) & (np.linalg.norm(step[:, :2], axis=1) < 6)
+    good &= np.abs(product) > 0.3 * np.sqrt(squares * others)
+    good &= np.linalg.det(normal[:, :2, :2]) > 1e-12
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    at = np.stack([column, row], -1) * tile + (tile - 1) / 2 + [start, top]
+    cells = (row * 6 // rows) * 6 + column * 6 // columns
+    return step[:, :2], inverse[:, :2, :2] * noise[:, None, None], textured, good, at, cells
+
+
+def _search(level: _Level, best: int = 4) -> list[Floats]:
+    """Return the most likely motions by masked normalised correlation (Padfield 2012)."""
+    before, left = _normalised(level.before, level.left), level.left.astype(np.float32)
+    shape = tuple(fft.next_fast_len(2 * n) for n in before.shape)
+
+    def transform(picture: Floats) -> Any:
+        return fft.rfft2(picture, shape)
+
+    one, squares, ones = (np.conj(transform(p)) for p in (before, before**2, left))
+    found = []
+    for scale in np.arange(-SEARCHED[0], SEARCHED[0] + 1e-9, 0.04):
+        for turn in np.arange(-SEARCHED[1], SEARCHED[1] + 1e-9, 0.03):
+            motion = np.array([0, 0, scale, turn])
+            back, shown = level.moved_back(motion)
+            after = _normalised(back, shown)
+            other, its_squares, its_ones = (transform(p) for p in (after, after**2, shown))
+            product, energy, its_energy, count = (
+                fft.irfft2(p, shape)
+                for p in (one * other, squares * its_ones, ones * its_squares, ones * its_ones)
+            )
+            near = np.abs(product) / np.sqrt(np.maximum(energy * its_energy, 1e-6))
+            score = np.where(count > left.sum() / 4, near * np.sqrt(np.maximum(count, 0)), 0)
+            where = np.unravel_index(np.argmax(score), score.shape)
+            down, right = ((k + n // 2) % n - n // 2 for k, n in zip(where, shape, strict=True))
+            motion[:2] = _linear(motion) @ [right, down] / level.side
+            found.append((score[where], motion))
+    kept: list[Floats] = []
+    for _, motion in sorted(found, key=lambda item: -item[0]):
+        apart = [np.abs(motion - other) > [0.03, 0.03, 0.06, 0.05] for other in kept]
+        if all(a.any() for a in apart):
+            kept.append(motion)
+    return kept[:best]
+
+
+def _normalised(picture: Floats, mask: npt.NDArray[np.bool_]) -> Floats:
+    """Subtract the local mean and divide by the local deviation of marked pixels."""
+    share = mask.astype(np.float32)
+
+    def blur(values: Floats) -> Floats:
+        return np.asarray(cv2.GaussianBlur(values.astype(np.float32), (0, 0), 4))
+
+    count = blur(share) + 1e-6
+    centred = (picture - blur(picture * share) / count) * share
+    return np.asarray(centred / np.sqrt(blur(centred**2) / count + 1e-4))
