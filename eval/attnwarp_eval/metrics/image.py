@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.drift import drift
 from attnwarp_eval.colors import to_linear
 from attnwarp_eval.metrics._pictures import pair
 from attnwarp_eval.metrics.arrays import Array, Mask, mean, share
@@ -391,3 +392,19 @@ def _halved(value: Any) -> Any:
     """(H, W, ...) as (H // 2, 2, W // 2, 2, ...): its 2 x 2 blocks."""
     height, width = (side // 2 for side in value.shape[:2])
     return value[: 2 * height, : 2 * width].reshape(height, 2, width, 2, *value.shape[2:])
+
+
+def edit_drift(original: npt.NDArray[Any], edited: npt.NDArray[Any]) -> float:
+    """Displacement in px of the corner that an edit moves most; NaN if it can't be told.
+
+    Args:
+        original, edited: (H, W, 3) in [0, 1], see :func:`attnwarp.drift.drift`.
+
+    Example:
+        >>> from attnwarp_eval.metrics.image import edit_drift
+        >>> flat = np.zeros((64, 64, 3))
+        >>> edit_drift(flat, flat)
+        nan
+    """
+    found = drift(original, edited)
+    return math.nan if found is None else found.largest

@@ -172,6 +172,10 @@ _SPECS = (
     Metric("edit.psnr", "dB", "higher", 1e-2, 1e-3, "Edit PSNR of one view, whose name stands behind"),
     Metric("edit.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of one view, whose name stands behind", squared=True),
     Metric("edit.views", "views", "none", 0, 0, "edited views that were compared"),
+    Metric(
+        "edit.drift", "px", "lower", 1e-2, 1e-2, "displacement of the corner that the edit moves most, by what it leaves alone",
+        column="Drift of the edit", pictures=("originals", "edited"), function="attnwarp_eval.metrics.image:edit_drift",
+    ),
     Metric("edit.views_identical", "views", "none", 0, 0, "of them, views whose pictures are equal (PSNR infinite)"),
     Metric("edit.views_undefined", "views", "none", 0, 0, "of them, views with nothing to measure"),
     *(
