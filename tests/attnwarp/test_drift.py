@@ -41,8 +41,8 @@ class Formula:
         return values.reshape(size, size, 3)
 
 
-def tried(number: int, size: int = 256) -> tuple[np.ndarray, np.ndarray]:
-    """Draw a drift and an edit, and return errors and half widths."""
+def tried(number: int, size: int = 256) -> tuple[np.ndarray, np.ndarray] | None:
+    """Draw a drift and an edit, and return errors and half widths; None if it isn't told."""
     draw = np.random.default_rng(number)
     formula = Formula(number)
     sign = draw.choice([-1, 1], 4)
@@ -65,7 +65,8 @@ def tried(number: int, size: int = 256) -> tuple[np.ndarray, np.ndarray]:
     after = after + draw.normal(size=after.shape) * draw.choice([0, 0.02, 0.06])
     one, two = (np.clip(255 * p + 0.5, 0, 255).astype(np.uint8) for p in (before, after))
     got = drift(one, two, left)
-    assert got is not None
+    if got is None:
+        return None
     values = np.array([got.right, got.down, got.scale, got.turn])
     return values - motion, np.array(got.half_widths)
 
@@ -74,7 +75,9 @@ def tried(number: int, size: int = 256) -> tuple[np.ndarray, np.ndarray]:
     "tries", [6, pytest.param(1000, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])]
 )
 def test_known_drifts_are_found_under_changes_of_colour_blur_noise_and_repaint(tries: int) -> None:
-    errors, half = map(np.abs, map(np.array, zip(*map(tried, range(tries)), strict=True)))
+    told = [values for values in map(tried, range(tries)) if values is not None]
+    assert len(told) >= 0.95 * tries
+    errors, half = map(np.abs, map(np.array, zip(*told, strict=True)))
     assert (np.median(errors, axis=0) <= ASKED).all()
     assert (errors <= 3 * half).all()
     assert (errors > half).mean() <= max(0.01, 1 / errors.size)
