@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp import check
+from attnwarp.methods.sight import near_edges
 from attnwarp_eval.metrics.arrays import share
 
 Labels = npt.NDArray[np.int16]
@@ -126,8 +128,38 @@ def label_tokens(
     }
 
 
+def edge_distance(depth: npt.NDArray[Any], size: tuple[int, int]) -> npt.NDArray[np.float64]:
+    """(h, w) distance of each token to the nearest depth edge, in tokens; infinite without one.
+
+    A pixel at an edge, see :func:`attnwarp.methods.sight.near_edges`, has distance 0; a token has
+    the distance of its nearest pixel.
+
+    Args:
+        depth: (H, W) true depth of the target; NaN without a surface.
+        size: (h, w) of the grid; divisors of H and W.
+
+    Example:
+        >>> import numpy as np
+        >>> step = np.where(np.arange(16) < 4, 2.0, 4.0) * np.ones((4, 1))
+        >>> edge_distance(step, (1, 4)).tolist()
+        [[0.0, 0.0, 1.0, 2.0]]
+    """
+    (H, W), (h, w) = depth.shape, size
+    away = (~near_edges(depth, 1).numpy()).astype(np.uint8)
+    if away.all():
+        return np.full(size, np.inf)
+    px = cv2.distanceTransform(away, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    nearest = px.reshape(h, H // h, w, W // w).min(axis=(1, 3))
+    return np.asarray(nearest / (H // h), dtype=np.float64)
+
+
 def label_transport(
-    carried: Labels, tokens: Labels, pixels: Labels, visible: Mask, unseen: Mask
+    carried: Labels,
+    tokens: Labels,
+    pixels: Labels,
+    visible: Mask,
+    unseen: Mask,
+    among: Mask | None = None,
 ) -> dict[str, float]:
     """Right, wrong and missing labels at visible tokens, and labels at other tokens.
 
@@ -140,6 +172,7 @@ def label_transport(
         pixels: (H, W) true part of each pixel.
         visible: (H, W) bool, the source certainly shows the pixel's surface.
         unseen: (H, W) bool, the source certainly does not show the pixel's surface.
+        among: (h, w) bool of the counted tokens; None for all.
 
     Returns:
         ``labels.right``, ``labels.wrong`` and ``labels.none`` of visible tokens, which sum to 1;
@@ -161,7 +194,9 @@ def label_transport(
         (1.0, 1.0)
     """
     kinds = label_tokens(carried, tokens, pixels, visible, unseen)
-    counts = {name: int(kind.sum()) for name, kind in kinds.items()}
+    counts = {
+        name: int((kind if among is None else kind & among).sum()) for name, kind in kinds.items()
+    }
     figures: dict[str, float] = {
         **{name: share(counts[name], counts["visible"]) for name in ("right", "wrong", "none")},
         "painted_hidden": share(counts["painted_hidden"], counts["hidden"]),

@@ -9,7 +9,7 @@ import torch
 from attnwarp.warp import preset
 from attnwarp_eval.study.shared.warps import warp_truth
 from attnwarp_eval.world import world
-from attnwarp_lab.ideal.labels import NONE, carried_labels, label_transport
+from attnwarp_lab.ideal.labels import NONE, carried_labels, edge_distance, label_transport
 from attnwarp_lab.ideal.parts import token_parts
 from attnwarp_lab.ideal.thing import labels_of
 
@@ -117,3 +117,34 @@ def test_a_position_without_a_tap_takes_what_stands_outside():
             return torch.zeros(len(features), 1, 1)
 
     assert carried_labels(Layer(), np.array([[0]], np.int16)).tolist() == [[-1]]
+
+
+def test_distances_are_those_to_the_nearest_edge_pixel_of_any_token():
+    depth = np.full((16, 16), 3.0)
+    depth[5:9, 2:6] = 1.5  # a box before a wall
+    step = np.zeros((16, 16), bool)  # pixels on either side of its outline
+    step[4:10, 1:7] = True
+    step[6:8, 3:5] = False
+    step[[4, 4, 9, 9], [1, 6, 1, 6]] = False  # diagonal neighbours touch no step along an axis
+    got = edge_distance(depth, (4, 4))
+    rows, columns = np.nonzero(step)
+    for row, column in np.ndindex(4, 4):
+        y, x = np.mgrid[4 * row : 4 * row + 4, 4 * column : 4 * column + 4]
+        px = np.hypot(y[..., None] - rows, x[..., None] - columns).min()
+        assert got[row, column] == pytest.approx(px / 4, abs=1e-6)
+    assert np.isinf(edge_distance(np.full((8, 8), 2.0), (2, 2))).all()
+
+
+def test_counts_by_distance_add_up_to_all(labels):
+    of = world("spheres", 64)
+    pair = of.pair("yaw045", 64)
+    layer = warp_truth(of, pair, bounds_only()).at((16, 16))
+    source, target = (token_parts(labels[name], (16, 16)) for name in ("source", "yaw045"))
+    args = carried_labels(layer, source), target, labels["yaw045"], pair.visible, pair.unseen
+    near = edge_distance(pair.hits.depth, (16, 16)) < 1
+    whole, one, two = (label_transport(*args, among=of) for of in (None, near, ~near))
+    for kind, total in (("right", "visible"), ("painted_hidden", "hidden")):
+        shares = [np.nan_to_num(f[f"labels.{kind}"]) for f in (whole, one, two)]
+        counts = [s * f[f"labels.{total}"] for s, f in zip(shares, (whole, one, two), strict=True)]
+        assert counts[0] == pytest.approx(counts[1] + counts[2])
+    assert one["labels.wrong"] > two["labels.wrong"]  # without a mask, edges go wrong

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field
 
 from attnwarp.warp import WarpedView
@@ -20,10 +21,13 @@ from attnwarp_eval.two_view import TwoView
 from attnwarp_eval.world import World
 from attnwarp_lab.ideal.editor import FACTOR
 from attnwarp_lab.ideal.labels import Labels as LabelMap
-from attnwarp_lab.ideal.labels import carried_labels, label_transport
+from attnwarp_lab.ideal.labels import carried_labels, edge_distance, label_transport
 from attnwarp_lab.ideal.parts import token_parts
 from attnwarp_lab.ideal.thing import labels_of
 from attnwarp_lab.probes.labels.inspected import Parts
+
+FAR = 4
+"""Distance to a depth edge, in tokens, from which tokens are counted together."""
 
 GRIDS = (8, 16, 32, 64)
 """Default sides of the token grids."""
@@ -119,26 +123,40 @@ class LabelTransport(WarpProbe):
             for count in spec["parts"]:
                 for grid in grids:
                     pair = labels[count][names[0]], labels[count][name]
-                    one = _figures(work, truth, view, pair, grid)
-                    if (count, grid) == (spec["parts"][0], near):
-                        figures |= one
+                    first = (count, grid) == (spec["parts"][0], near)
+                    one, by_distance = _figures(work, truth, view, pair, grid, first)
+                    if first:
+                        figures |= one | by_distance
                     figures |= {f"{key}.{grid}.{count}": value for key, value in one.items()}
             work.add(name, figures)
         return NoExtra()
 
 
 def _figures(
-    work: Work, truth: TwoView, view: WarpedView, labels: tuple[LabelMap, LabelMap], grid: int
-) -> dict[str, float]:
-    """Figures of the part labels carried by a warp.
+    work: Work,
+    truth: TwoView,
+    view: WarpedView,
+    labels: tuple[LabelMap, LabelMap],
+    grid: int,
+    distances: bool,
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Figures of the part labels carried by a warp, of all tokens and by distance to depth edges.
 
     Args:
         truth: truth of the pair, (H, W).
         labels: (H, W) part of each pixel of the source and of the target.
         grid: side of the token grid, a divisor of the image's.
+        distances: False leaves the figures by distance out.
     """
     source, target = (token_parts(of, (grid, grid)) for of in labels)
     with work.meter.stage("carry"):
         carried = carried_labels(view.at((grid, grid)), source)
     with work.meter.stage("checks"):
-        return label_transport(carried, target, labels[1], truth.visible, truth.unseen)
+        of = carried, target, labels[1], truth.visible, truth.unseen
+        by_distance: dict[str, float] = {}
+        if distances:
+            far = np.minimum(edge_distance(truth.hits.depth, (grid, grid)), FAR).astype(int)
+            for tokens in range(FAR + 1):
+                one = label_transport(*of, among=far == tokens)
+                by_distance |= {f"{key}.edge{tokens}": value for key, value in one.items()}
+        return label_transport(*of), by_distance
