@@ -208,14 +208,15 @@ class AttentionWarping(Method):
             ExitStack() as stack,
         ):
             start = views.start([view], work.frozen, by_hand=number == 0)
+            views.attend(stack, [view], sights)
             self._inject(stack, before, sights)
-            recording = None
+            tokens, recording = views.keeping(stack, number), None
             if views.features.layers:
                 # Record after the injection: the next source gets the features this source used.
                 plan = views.features.plan(view, views.latent_size(view), further=number > 0)
                 recording = stack.enter_context(record(work.editor, plan))
             pictures, estimates = views.denoise(start, sights, step)
-        views.keep(number, RecordedSource(pictures[0], recording, estimates, sights[0]))
+        views.keep(number, RecordedSource(pictures[0], recording, estimates, sights[0], tokens))
         return [views.result(view, pictures[0], sights[0], number)]
 
     def edit_targets(
@@ -228,6 +229,7 @@ class AttentionWarping(Method):
             sights = [views.sight(count, view, model) for view in batch]
         with work.guided(self.settings.guidance(stage)), ExitStack() as stack:
             start = views.start(batch, model, stage=stage)
+            views.attend(stack, batch, sights)
             self._inject(stack, recorded, sights)
             pictures, _ = views.denoise(start, sights, step)
         return [

@@ -61,12 +61,13 @@ class Features:
             size,
             self._kept(branches),
             s.steps,
-            dtype=self._stored(),
+            dtype=self.stored,
             store=self.store / str(view) if isinstance(self.store, Path) else self.store,  # type: ignore[arg-type]
             chosen=s.feature_range(),
         )
 
-    def _stored(self) -> torch.dtype:
+    @property
+    def stored(self) -> torch.dtype:
         """Precision of recorded features; at most the editor's precision, which is lossless."""
         own, chosen = self.editor.network.dtype, getattr(torch, self.settings.feature_type)
         return own if own.itemsize < chosen.itemsize else chosen

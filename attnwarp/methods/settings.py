@@ -156,6 +156,8 @@ class AttentionWarpingSettings(MethodSettings):
             takes the source that sees it best (:mod:`attnwarp.methods.sight`).
         confidence: True weighs the features by how well the source sees the surface (foreshortening
             and the margin of depth agreement), False by the mask alone.
+        unseen: editing of marked pixels that no warp reaches: "free", as the editor chooses, or
+            "attend", with attention to the first source's edit (:mod:`attnwarp.methods.unseen`).
         estimate: weight at the first step of the source's warped estimate of the clean latents in
             the target's estimate. The weight falls to 0 at ``estimate_until``; 0 disables it.
         estimate_until: share of the steps after which the source's estimate is unused.
@@ -224,6 +226,7 @@ class AttentionWarpingSettings(MethodSettings):
     outside: Literal["border", "zeros"] = "border"
     sources: Count = 1
     confidence: bool = False
+    unseen: Literal["free", "attend"] = "free"
     estimate: Share = 0.0
     estimate_until: Weight = 0.5
     estimate_in: Literal["latents", "picture"] = "latents"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from numbers import Integral
 from typing import Any
@@ -36,6 +37,7 @@ from attnwarp.methods.pictures import (
 from attnwarp.methods.scene import checked_image, to_float
 from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.methods.sight import Sight, Size
+from attnwarp.methods.unseen import SourceTokens, attending, check_network, kept_tokens, unseen_of
 from attnwarp.methods.work import Guide, Work
 from attnwarp.workdir import MANIFEST
 
@@ -52,12 +54,14 @@ class RecordedSource:
         recording: features of the source; None if their weight is 0.
         estimates: (C, h, w) clean latents predicted at each step.
         sight: visibility of this source from the earlier ones; None for the first.
+        tokens: inputs of the first source's self-attention, if unseen tokens attend to them.
     """
 
     picture: Image
     recording: Recording | None
     estimates: list[Tensor] = field(default_factory=list)
     sight: Sight | None = None
+    tokens: SourceTokens | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +159,41 @@ class ViewEdits:
         names = [self.names[view] for view in self.sources]
         self.about = {"source": names[0], "sources": names}
         self.inputs = {"source_picture": None if self.by_hand is None else digest(self.by_hand)}
+        if self.attends:
+            check_network(work.editor.network)
+
+    @property
+    def attends(self) -> bool:
+        """True if marked tokens that no warp reaches attend to the first source."""
+        marked = self.work.scene.segments is not None
+        return self.settings.unseen == "attend" and marked and bool(self.features.layers)
+
+    def keeping(self, stack: ExitStack, number: int) -> SourceTokens | None:
+        """Keep the first source's tokens for views to attend to, until the stack is left."""
+        if number or not self.attends:
+            return None
+        dtype = self.features.stored
+        kept = kept_tokens(self.work.editor.network, self.features.layers, dtype)
+        return stack.enter_context(kept)
+
+    def attend(
+        self, stack: ExitStack, views: Sequence[int], sights: Sequence[Sight | None]
+    ) -> None:
+        """Let unseen tokens of views attend to the first source, until the stack is left."""
+        tokens = self._recorded[0].tokens if self._recorded else None
+        segments = self.work.scene.segments
+        if tokens is None or segments is None:
+            return
+        unseen = [
+            unseen_of(sight, segments[view])
+            for view, sight in zip(views, sights, strict=True)
+            if sight is not None
+        ]
+        layers, size = self.features.layers, self.latent_size(views[0])
+        passes = self.settings.feature_range()
+        stack.enter_context(
+            attending(self.work.editor.network, layers, size, tokens, unseen, passes)
+        )
 
     def _checked_by_hand(self, picture: npt.NDArray[Any], source: int) -> Image:
         """Check an edit made elsewhere and resize it to the source's edit."""

@@ -1,0 +1,137 @@
+"""Attention to the source's edit where no warp reaches the marked thing.
+
+A back that the source does not see gets no features, so the editor chooses its look anew in each
+view. There a view can attend to the keys and values of the source's edit at the same step, as
+GaussCtrl's alignment does everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from attnwarp.editing.layers import Layer
+from attnwarp.editing.schedule import Size
+from attnwarp.methods.attention import Attend, self_attention
+from attnwarp.methods.sight import Sight, averaged
+
+Unseen = Callable[[Size], Tensor]
+"""Function of a grid's (h, w) that returns the share of each token that attends to the source."""
+
+
+def unseen_of(sight: Sight, segment: npt.NDArray[Any]) -> Unseen:
+    """Mark the tokens of a target that no warp reaches, inside its segment.
+
+    Args:
+        sight: visibility of the target from its sources.
+        segment: (H, W) marked part of the target, in [0, 1].
+    """
+
+    def share(size: Size) -> Tensor:
+        reached = torch.stack([sight.mask_at(k, size) for k in range(len(sight.views))]).any(dim=0)
+        return averaged(torch.as_tensor(segment), size) * ~reached
+
+    return share
+
+
+@dataclass(eq=False)
+class SourceTokens:
+    """Inputs of self-attention during a source's edit.
+
+    Attributes:
+        by_pass: (branches, L, C) tokens by the layer's name, one entry for each pass.
+    """
+
+    by_pass: dict[str, list[Tensor]] = field(default_factory=dict)
+
+
+@contextmanager
+def kept_tokens(
+    network: Any, layers: Sequence[Layer], dtype: torch.dtype
+) -> Iterator[SourceTokens]:
+    """Keep the inputs of a network's self-attention while the block runs; outputs are unchanged.
+
+    Args:
+        network: a diffusers UNet that denoises one view.
+        layers: layers to keep; those of cross-attention are ignored.
+        dtype: precision of the kept tokens.
+
+    Raises:
+        ValueError: the network has no self-attention of diffusers.
+    """
+    check_network(network)
+    names = {layer.name for layer in layers}
+    kept = SourceTokens()
+
+    def rule(name: str, tokens: Tensor, attend: Attend) -> Tensor:
+        if name in names:
+            kept.by_pass.setdefault(name, []).append(tokens.detach().to(dtype))
+        return attend(tokens, None)
+
+    with self_attention(network, rule):
+        yield kept
+
+
+@contextmanager
+def attending(
+    network: Any,
+    layers: Sequence[Layer],
+    latent_size: Size,
+    kept: SourceTokens,
+    unseen: Sequence[Unseen],
+    passes: range,
+) -> Iterator[None]:
+    """Let unseen tokens of views attend to the source's tokens while the block runs.
+
+    A token's output is (1 - u) attn(q, k, v) + u attn(q, k_source, v_source), with its share u.
+
+    Args:
+        network: the network that the tokens were kept from.
+        layers: layers that attend, as in :func:`kept_tokens`.
+        latent_size: (h, w) of the views' latents.
+        kept: tokens of the source's edit.
+        unseen: shares of each view of the batch.
+        passes: numbers of the passes in which tokens attend, from 0.
+    """
+    sizes = {layer.name: layer.size(latent_size) for layer in layers if layer.name in kept.by_pass}
+    shares = {
+        size: torch.stack([of(size).reshape(-1, 1) for of in unseen]) for size in {*sizes.values()}
+    }
+    done = dict.fromkeys(sizes, 0)
+
+    def rule(name: str, tokens: Tensor, attend: Attend) -> Tensor:
+        own = attend(tokens, None)
+        if name not in sizes:
+            return own
+        number, done[name] = done[name], done[name] + 1
+        share = shares[sizes[name]].to(own)
+        if number not in passes or not share.any():
+            return own
+        source = kept.by_pass[name][number].to(tokens)
+        branches, views = len(source), len(unseen)
+        if len(tokens) != branches * views:
+            raise ValueError(
+                f"unseen: the source has {branches} guidance branches and the views"
+                f" {len(tokens) / views:g}; give both one text guidance"
+            )
+        others = source[:, None].expand(-1, views, -1, -1).flatten(0, 1)
+        return torch.lerp(own, attend(tokens, others), share.repeat(branches, 1, 1))
+
+    with self_attention(network, rule):
+        yield
+
+
+def check_network(network: Any) -> None:
+    """Raise ValueError unless a network has self-attention of diffusers."""
+    names = getattr(network, "attn_processors", {})
+    if not any(name.endswith(".attn1.processor") for name in names):
+        raise ValueError(
+            "unseen: this editor has no self-attention that could attend to the source; set unseen"
+            " to 'free'"
+        )
