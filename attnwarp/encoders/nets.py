@@ -7,6 +7,7 @@ Inputs are pictures (N, 3, H, W) sRGB in [0, 1]; each network centres its input.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import nn
@@ -303,17 +304,31 @@ class PerceptualSmall(nn.Module):
         unit features.
         """
         size = 4 if min(x.shape[-2:]) >= 4 else 1
-        return [functional.avg_pool2d(x, size), *(_unit(y) for y in self.features(x))]
+        return [functional.avg_pool2d(x, size), *(_Unit.apply(y) for y in self.features(x))]
 
     def between(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
         """Compute distances, (N,), from the results of :meth:`stack`."""
         weights = [self.color_log_weight, *self.log_weights]
         parts = [
-            (x - y).square().mean((2, 3)) @ w.exp() for x, y, w in zip(a, b, weights, strict=True)
+            functional.mse_loss(x, y, reduction="none").mean((2, 3)) @ w.exp()
+            for x, y, w in zip(a, b, weights, strict=True)
         ]
         return torch.stack(parts).sum(dim=0)
 
 
-def _unit(x: Tensor) -> Tensor:
-    """Normalise each position's feature vector to length 1; nearly zero vectors stay so."""
-    return x / (x.square().sum(dim=1, keepdim=True) + 1e-2).sqrt()
+class _Unit(torch.autograd.Function):
+    """Normalise each position's feature vector to length 1; nearly zero vectors stay so. This
+    gradient passes over the features half as often as autograd's."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        scale = (x.square().sum(dim=1, keepdim=True) + 1e-2).rsqrt()
+        unit = x * scale
+        ctx.save_for_backward(unit, scale)
+        return unit
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        (gradient,), (unit, scale) = gradients, ctx.saved_tensors
+        along = (unit * gradient).sum(dim=1, keepdim=True)
+        return torch.addcmul(gradient, unit, along, value=-1).mul_(scale)

@@ -8,6 +8,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from attnwarp.encoders import load_encoder
 from attnwarp.encoders.base import (
@@ -17,6 +18,7 @@ from attnwarp.encoders.base import (
     TokenEncoder,
 )
 from attnwarp.encoders.bundled import WEIGHTS, load
+from attnwarp.encoders.nets import _Unit
 from attnwarp.errors import InputError
 from attnwarp_eval.drawn.assemblies import KINDS
 from training.assess import figures as assess
@@ -218,6 +220,13 @@ def test_a_thing_is_found_from_another_side_more_often_than_by_its_colours(dino)
     assert np.mean(ours) > 0.85
     assert np.mean(ours) > np.mean(colours) + 0.2
     assert np.mean(ours) > np.mean(pixels) + 0.5
+
+
+def test_the_gradient_of_unit_features_is_that_of_differences():
+    """Oracle: finite differences in float64, over a vector of zeros too."""
+    features = torch.randn(1, 3, 2, 2, dtype=torch.float64)
+    features[0, :, 0, 0] = 0
+    assert torch.autograd.gradcheck(_Unit.apply, features.requires_grad_())
 
 
 def test_the_distance_is_zero_for_equal_pictures_symmetric_and_grows_with_blur(perceptual, worlds):
