@@ -14,6 +14,8 @@ ROOT = Path(__file__).parent
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# As in the commands' own entry: idle threads of OpenMP sleep rather than spin.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 _WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if _WORKERS > 1:
     # Read by torch when it is first imported, and by every child process: workers share the cores

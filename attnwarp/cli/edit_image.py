@@ -28,6 +28,7 @@ from attnwarp.cli.options import (
 )
 from attnwarp.editing.small import bundled, check_words, guide_of
 from attnwarp.errors import InputWarning
+from attnwarp.process import core_count
 from attnwarp.reporting import reporter
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ def edit_image(
     from attnwarp.drift import drift
     from attnwarp.editing.editor import edit
     from attnwarp.editing.segment import load_segmenter
-    from attnwarp.editing.small import load_editor, thread_count
+    from attnwarp.editing.small import load_editor
     from attnwarp.methods.pictures import enlarged_change
 
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
@@ -136,7 +137,7 @@ def edit_image(
         editor, device=device, dtype=type_of(dtype, device), low_memory=low_memory, **given
     )
     model.check_text(instruction)
-    torch.set_num_threads(thread_count(model, threads))
+    torch.set_num_threads(threads or core_count())
     longest = size or model.own_size
     whole, image = image, _fit(image, longest, model.side_multiple)
     h, w = image.shape[:2]

@@ -23,7 +23,7 @@ from attnwarp.cli.options import (
     Kind,
     MaxSizeOption,
     Reading,
-    RenderThreadsOption,
+    ThreadsOption,
     options_of,
 )
 from attnwarp.cli.shell import STOPPED, assignments, check_out, clear_errors, use_threads, warn
@@ -94,7 +94,7 @@ def fit(
         float, typer.Option(min=0, help="Seconds between two checkpoints.")
     ] = 30.0,
     device: DeviceOption = "auto",
-    threads: RenderThreadsOption = None,
+    threads: ThreadsOption = None,
     restart: Annotated[
         bool, typer.Option("--restart", help="Begin again, over the fit in --out.")
     ] = False,

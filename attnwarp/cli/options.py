@@ -127,7 +127,7 @@ ThreadsOption = Annotated[
     typer.Option(
         min=1,
         metavar="N",
-        help="CPU threads; one for a small editor, else all cores.",
+        help="CPU threads; all cores if left out.",
         rich_help_panel=MACHINE,
     ),
 ]
@@ -170,14 +170,6 @@ MaxSizeOption = Annotated[
         metavar="N",
         help="Shrink larger images to this many px.",
         rich_help_panel=READING,
-    ),
-]
-
-
-RenderThreadsOption = Annotated[
-    int | None,
-    typer.Option(
-        min=1, metavar="N", help="CPU threads; all cores if left out.", rich_help_panel=MACHINE
     ),
 ]
 

@@ -14,9 +14,9 @@ from attnwarp.cli.files import UNSEEN, check_inputs_stay, read_splats, read_view
 from attnwarp.cli.options import (
     AntialiasedOption,
     Reading,
-    RenderThreadsOption,
     ScreenFilterOption,
     SplatKindOption,
+    ThreadsOption,
     options_of,
 )
 from attnwarp.cli.shell import check_out, clear_errors, use_threads
@@ -44,7 +44,7 @@ def render(
     depth: Annotated[
         bool, typer.Option("--depth", help="Also NAME.depth.npy: median depth, NaN where none.")
     ] = False,
-    threads: RenderThreadsOption = None,
+    threads: ThreadsOption = None,
     normal: Annotated[
         bool, typer.Option("--normal", help="Also NAME.normal.png: (n + 1) / 2 in world axes.")
     ] = False,

@@ -25,8 +25,8 @@ SUMS = "sha256.json"
 """File in a bundled editor's folder with the SHA-256 of its other files."""
 
 ONE_THREAD_PARAMETERS = 50_000_000
-"""Parameters below which a UNet runs on one thread. The bundled UNets, of 3 million, took 20 times
-the CPU time on two threads of a busy machine, with different bits."""
+"""Parameters below which a measured UNet runs on one thread: two give the bundled UNets, of 3
+million, other bits."""
 
 TEXT_GUIDANCE, IMAGE_GUIDANCE = 1.5, 1.0
 """Guidance weights of bundled editors. Higher text guidance favours a few colours, and
@@ -75,16 +75,14 @@ def write_sums(folder: Path) -> None:
     (folder / SUMS).write_text(json.dumps(sums, indent=1) + "\n")
 
 
-def thread_count(editor: Any, asked: int | None = None) -> int:
-    """Number of torch threads for an editor: the requested number, else one for a small UNet and
-    all cores for a large one.
+def thread_count(editor: Any) -> int:
+    """Number of torch threads for a measured editor: one for a small UNet, so that figures depend
+    on no machine's cores, and all cores for a large one.
 
     Example:
         >>> thread_count(load_editor("small-plain"))
         1
     """
-    if asked is not None:
-        return asked
     small = sum(p.numel() for p in editor.network.parameters()) < ONE_THREAD_PARAMETERS
     return 1 if small else core_count()
 
