@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from attnwarp.cli.bundled_scene import SIZE, capture, exact_masks, scenes, view_names
+from attnwarp.cli.bundled_scene import SIZE, bundled, capture, exact_masks
 from attnwarp.cli.files import (
     check_inputs_stay,
     check_seen,
@@ -185,7 +185,7 @@ def edit(
 ) -> None:
     """Edit a scene: one view by an instruction, the others along with it, the splats on all.
 
-    DATA may be a bundled scene's name, such as bear: its pictures and exact masks are rendered.
+    DATA may be a bundled scene: bear, dinosaur, fence or spheres, edited inside an exact mask.
     """
     if out is None:
         out = Path(
@@ -203,8 +203,8 @@ def edit(
         flags = {name: f"--{name.replace('_', '-')}" for name in options}
         if alone:
             changes["a0"], flags["a0"] = 0.0, "--each-view-alone"
-        bundled = str(data) in scenes() and not data.exists()
-        if bundled:
+        scene = str(data) if str(data) in bundled() and not data.exists() else None
+        if scene:
             changes.setdefault("size", SIZE)
         changes |= assignments(change or [], flags)
         _check_splat_options(
@@ -219,7 +219,6 @@ def edit(
         guide_of(editor)  # refuses an unknown editor
         check_words(editor, instruction, anyway=anyway)
         from attnwarp import check, methods
-        from attnwarp.editing.segment import check_marks
         from attnwarp.io.file import existing_file
         from attnwarp.methods.change import say_change, say_drift, say_little
         from attnwarp.methods.command import (
@@ -227,7 +226,6 @@ def edit(
             check_asked,
             check_marked,
             edit_dataset,
-            number_of,
             view_of,
         )
         from attnwarp.methods.marks import Marks
@@ -246,11 +244,12 @@ def edit(
         for path in files:
             existing_file(path)
         check_asked(method, instruction, settings, budget, out, edit_options)
-        if bundled:
-            if editing.source is not None:
-                number_of(view_names(), editing.source)
-            check_marks(SIZE, SIZE, box=edit_options.marks.box, at=edit_options.marks.at)
-            data = capture(str(data), out / "scene", report)
+        origin = ""
+        if scene:
+            data = out / "scene"
+            origin = capture(scene, data, report)
+            if (ply, fit_iterations, max_splats, kind) == (None,) * 4:
+                ply = data / "splats.ply"
             if editing.masks is None and not edit_options.marks.of_source:
                 marks = Marks(exact_masks(data, instruction, report))
                 edit_options = replace(edit_options, marks=marks)
@@ -270,7 +269,7 @@ def edit(
                 (kind or Kind.two).value[:2],
                 max_splats or FIT_SPLATS,
             ),
-            note=note, budget=budget, report=report, **own,
+            note=note, origin=origin, budget=budget, report=report, **own,
         )  # fmt: skip
         typer.echo(say_change(result.change, edit_options.marks.option != ""))
         if little := say_little(result.change):

@@ -16,7 +16,7 @@ from attnwarp.camera import Camera
 from attnwarp.devices import choose, device_of, peak_memory, type_of
 from attnwarp.editing.memory import weight_bytes
 from attnwarp.editing.segment import check_marks, segmenter_folders
-from attnwarp.editing.small import bundled, load_editor, thread_count
+from attnwarp.editing.small import bundled, load_editor
 from attnwarp.errors import InputError, suggest
 from attnwarp.fit import (
     FitSettings,
@@ -50,7 +50,7 @@ from attnwarp.methods.scene import images_of
 from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.methods.tuning import perceptual_net
 from attnwarp.methods.view_edits import check_editor
-from attnwarp.process import asked_to_stop
+from attnwarp.process import asked_to_stop, core_count
 from attnwarp.reporting import Reporter
 from attnwarp.workdir import FORMAT, Budget
 
@@ -89,7 +89,7 @@ class EditOptions:
         device: device of the editor and the splats, "auto", "cpu" or "cuda".
         dtype: dtype of the editor; see :func:`attnwarp.devices.type_of`.
         low_memory: see :func:`attnwarp.editing.memory.save_memory`.
-        threads: threads of the editor; see :func:`attnwarp.editing.small.thread_count`.
+        threads: torch threads; None takes all cores.
         control: True also edits each of the page's views alone; None does so with a bundled editor.
         turntable: file of the turntable film, GIF or MP4.
     """
@@ -119,6 +119,7 @@ def edit_dataset(
     fit_plan: FitPlan | None = None,
     source_picture: Path | None = None,
     note: str = "",
+    origin: str = "",
     report: Reporter,
     **own: Any,
 ) -> tuple[Result, Path]:
@@ -136,6 +137,7 @@ def edit_dataset(
         fit_plan: plan of the fit, if splats are None.
         source_picture: file of the source view edited elsewhere, for attention warping.
         note: warning about the inputs, for the page.
+        origin: sentence on the origin of the inputs, for the page.
         report: receiver of progress.
         own: additional options of the method, such as "budget".
 
@@ -169,7 +171,7 @@ def edit_dataset(
             Features(editor, settings, "cpu")
         perceptual_net(settings)
         splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, device, report)
-    torch.set_num_threads(thread_count(editor, options.threads))
+    torch.set_num_threads(options.threads or core_count())
     splats = splats.to(device=device)
     compile_kernels(splats.kind, report, device)
     result = METHODS[method](
@@ -193,7 +195,7 @@ def edit_dataset(
     control = editor_name in bundled() if options.control is None else options.control
     page = show_edit(
         workdir_of(out), splats, views.cameras, images, turntable=options.turntable, report=report,
-        editor=editor if control else None, note=note,
+        editor=editor if control else None, note=note, origin=origin,
     )  # fmt: skip
     return result, page
 

@@ -24,13 +24,11 @@ from typer.testing import CliRunner
 
 import attnwarp_eval.cli.main
 from attnwarp import Camera, Gaussians, reporting
-from attnwarp.cli.bundled_scene import VIEWS, view_names
 from attnwarp.cli.main import app
 from attnwarp.cli.shell import COMMANDS, clear_errors
 from attnwarp.io import Dataset, read_dataset, read_ply, write_ply, write_transforms
 from attnwarp.render import render
 from attnwarp.render.threads import set_thread_count
-from attnwarp_eval.splats.export import orbit_name
 
 ATTNWARP = [sys.executable, "-m", "attnwarp"]
 
@@ -95,7 +93,6 @@ def test_help_of_every_command_imports_nothing_heavy():
     code = """
 from typer.main import get_command
 from typer.testing import CliRunner
-from attnwarp.cli.bundled_scene import VIEWS, view_names
 from attnwarp.cli.main import app
 names = sorted(get_command(app).commands)
 assert {"fit", "render", "edit", "edit-image", "convert"} <= set(names)
@@ -132,7 +129,6 @@ def test_mistyped_words_are_answered_before_anything_heavy_is_imported(tmp_path)
     }
     code = f"""
 from typer.testing import CliRunner
-from attnwarp.cli.bundled_scene import VIEWS, view_names
 from attnwarp.cli.main import app
 for message, calls in {wrong!r}.items():
     for call in calls:
@@ -459,7 +455,7 @@ def test_a_disk_without_room_ends_in_one_clear_line(data, tmp_path, command):
 def test_a_bundled_scene_is_edited_by_its_name_inside_an_exact_mask(tmp_path, monkeypatch):
     """Oracle: outside the exported mask of the ball, edited views are the pictures before."""
     monkeypatch.chdir(tmp_path)
-    quick = ["--stages", 1, "--steps", 2, "--iterations", 1, "--fit-iterations", 1]
+    quick = ["--stages", 1, "--steps", 2, "--iterations", 1]
     words = "make the beach ball red"
     done = in_process("edit", "spheres", "--instruction", words, *quick)
     assert done.exit_code == 0, done.stderr
@@ -478,6 +474,7 @@ def test_a_bundled_scene_is_edited_by_its_name_inside_an_exact_mask(tmp_path, mo
             outside.append(change[~near].max())
             inside.extend(change[mask > 0].ravel())
     assert max(outside) <= 1 < np.mean(inside)
+    assert "attnwarp fit more --out fit" in (out / "index.html").read_text()
 
 
 @pytest.mark.parametrize(
@@ -502,16 +499,12 @@ def test_a_bundled_scene_is_edited_by_its_name_inside_an_exact_mask(tmp_path, mo
         ),
     ],
 )
-def test_what_cannot_be_used_is_refused_before_a_bundled_scene_is_rendered(more, message, tmp_path):
+def test_what_cannot_be_used_is_refused_before_a_bundled_scene_is_edited(more, message, tmp_path):
     done = in_process(
         "edit", "bear", "--instruction", "make it red", "--out", tmp_path / "out", *more
     )
     assert done.exit_code == 2 and message in done.stderr
-    assert not (tmp_path / "out").exists()
-
-
-def test_views_of_a_bundled_scene_have_the_names_that_an_export_gives_them():
-    assert view_names() == [f"images/{orbit_name(k, VIEWS)}.png" for k in range(VIEWS)]
+    assert {*tmp_path.glob("out/*")} <= {tmp_path / "out" / "scene"}
 
 
 @pytest.mark.door

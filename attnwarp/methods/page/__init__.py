@@ -62,6 +62,7 @@ def show_edit(
     editor: Editor | None = None,
     turntable: Path | None = None,
     note: str = "",
+    origin: str = "",
     report: Reporter = SILENT,
 ) -> Path:
     """Write the page of a finished edit, ``index.html``, from its folder's files.
@@ -74,6 +75,7 @@ def show_edit(
         editor: editor of the control, which edits the page's views alone; None for no control.
         turntable: file of the orbit's film, GIF or MP4; None for no film.
         note: warning at the top of the page.
+        origin: sentence on the origin of the inputs, without its full stop.
         report: receiver of the control's progress, view by view.
 
     Returns:
@@ -88,7 +90,7 @@ def show_edit(
     turns = [renders(model, page.turn) for model in (before, page.after)]
     if turntable is not None:
         write_film(turntable, *turns)
-    parts = [page.head(note), page.scene(), page.views(), page.agreement(), page.outside()]
+    parts = [page.head(note, origin), page.scene(), page.views(), page.agreement(), page.outside()]
     parts += [page.orbit(turns), page.costs()]
     text = Template(_file("page.html")).substitute(
         title=escape(f"{page.manifest['instruction']} - attnwarp"),
@@ -140,8 +142,8 @@ class _Page:
         method, noise = self.manifest["method"], self.manifest["settings"]["noise"]
         return bool(method == "by_view" and noise == "fresh")
 
-    def head(self, note: str) -> str:
-        """Write the instruction, a summary of the run, and warnings."""
+    def head(self, note: str, origin: str) -> str:
+        """Write the instruction, a summary of the run, warnings, and the origin of the inputs."""
         method = self.manifest["method"]
         cut = self.result["cut"]
         ended = f", cut short by its {cut.replace('_', ' ')}" if cut else ""
@@ -163,6 +165,7 @@ class _Page:
                 else ""
             )
             + ".</p>",
+            *(f"<p>{escape(text)}.</p>" for text in (origin,) if text),
         ]
         return "\n".join(lines)
 
