@@ -8,6 +8,7 @@ import difflib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 V = TypeVar("V")
@@ -52,13 +53,16 @@ EXTRAS = {
 
 
 def install_command(*extras: str) -> str:
-    """Write the command that installs extras; it needs a checkout, as the package is unpublished.
+    """Write the command that installs extras, into a checkout or next to an installed wheel.
 
     Example:
         >>> print(install_command("edit", "eval"))
         in the checkout: pip install -c constraints.txt -e '.[edit,eval]'
     """
-    return f"in the checkout: pip install -c constraints.txt -e '.[{','.join(extras)}]'"
+    names = ",".join(extras)
+    if (Path(__file__).parents[1] / "pyproject.toml").is_file():
+        return f"in the checkout: pip install -c constraints.txt -e '.[{names}]'"
+    return f"pip install 'attnwarp[{names}]'"
 
 
 class InputError(ValueError):

@@ -49,14 +49,16 @@ def environment(wheel, tmp_path_factory):
     """The library alone, without any extra; its folder of programs."""
     folder = tmp_path_factory.mktemp("environment")
     run(sys.executable, "-m", "venv", folder, cwd=folder, check=True)
+    pip = ("-m", "pip", "install", "--quiet", "uv==0.13.9")
+    run(folder / "bin" / "python", *pip, cwd=folder, check=True)
     install(folder / "bin", "torch==2.13.0")
     install(folder / "bin", str(wheel))
     return folder / "bin"
 
 
 def install(programs, *what):
-    pip = (programs / "python", "-m", "pip", "install", "--quiet", "-c", ROOT / "constraints.txt")
-    done = run(*pip, *what, cwd=programs)
+    uv = (programs / "python", ROOT / "scripts/uv_install.py", "-c", ROOT / "constraints.txt")
+    done = run(*uv, *what, cwd=programs)
     assert done.returncode == 0, done.stderr
 
 
@@ -111,15 +113,23 @@ def test_the_library_alone_works_and_names_the_extra_that_is_missing(environment
     assert Path(place).is_relative_to(environment.parent)
     assert shape == "(1, 192)"
     assert len(missing) == 2
-    assert all("pip install -c constraints.txt -e '.[edit]'" in line for line in missing)
+    assert all("pip install 'attnwarp[edit]'" in line for line in missing)
     for program in ("attnwarp", "attnwarp-eval"):
         assert "Usage" in run(environment / program, "--help", cwd=tmp_path, check=True).stdout
     done = run(environment / "attnwarp-eval", "scenes", "list", cwd=tmp_path)
     assert done.returncode == 2
-    assert (
-        done.stderr.count("\n") == 1
-        and "pip install -c constraints.txt -e '.[eval]'" in done.stderr
-    )
+    assert done.stderr.count("\n") == 1 and "pip install 'attnwarp[eval]'" in done.stderr
+
+
+def test_a_bundled_scene_is_edited_without_what_renders_it(environment, wheel, tmp_path):
+    install(environment, f"attnwarp[edit] @ {wheel.as_uri()}")
+    for package in ("mitsuba", "open3d"):
+        assert not [*environment.parent.glob(f"lib/*/site-packages/{package}")]
+    few = ("--stages", "1", "--views-per-stage", "1", "--steps", "1", "--iterations", "1")
+    words = ("--instruction", "make the bear red", "--out", tmp_path / "out")
+    done = run(environment / "attnwarp", "edit", "bear", *words, *few, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "index.html").is_file()
 
 
 def test_the_instrument_has_its_scenes_studies_and_weights(environment, wheel, tmp_path):
