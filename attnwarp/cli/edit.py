@@ -68,8 +68,8 @@ def edit(
         str,
         typer.Option(
             metavar="NAME",
-            help="attention_warping, or by_view, igs2gs, dge, gaussctrl; see"
-            " docs/method/baselines.md.",
+            help="attention_warping, or by_view, igs2gs, dge, gaussctrl, corresponding, fused,"
+            " warped_reference; see docs/method/baselines.md.",
             show_default=False,
             rich_help_panel=METHOD,
         ),

@@ -13,19 +13,25 @@ from attnwarp.errors import Named
 from attnwarp.methods.attention_warping import attention_warping
 from attnwarp.methods.base import Options, Result, Round
 from attnwarp.methods.by_view import by_view
+from attnwarp.methods.corresponding import corresponding
 from attnwarp.methods.dge import dge
+from attnwarp.methods.fused import fused
 from attnwarp.methods.gaussctrl import gaussctrl
 from attnwarp.methods.igs2gs import igs2gs
 from attnwarp.methods.settings import (
     PRESETS,
     AttentionWarpingSettings,
     ByViewSettings,
+    CorrespondingSettings,
     DGESettings,
+    FusedSettings,
     GaussCtrlSettings,
     IGS2GSSettings,
     MethodSettings,
+    WarpedReferenceSettings,
     preset,
 )
+from attnwarp.methods.warped_reference import warped_reference
 from attnwarp.workdir import Budget
 
 METHODS: Named[Callable[..., Result]] = Named(
@@ -39,17 +45,23 @@ __all__ = [
     "AttentionWarpingSettings",
     "Budget",
     "ByViewSettings",
+    "CorrespondingSettings",
     "DGESettings",
+    "FusedSettings",
     "GaussCtrlSettings",
     "IGS2GSSettings",
     "MethodSettings",
     "Options",
     "Result",
     "Round",
+    "WarpedReferenceSettings",
     "attention_warping",
     "by_view",
+    "corresponding",
     "dge",
+    "fused",
     "gaussctrl",
     "igs2gs",
     "preset",
+    "warped_reference",
 ]

@@ -454,6 +454,98 @@ class GaussCtrlSettings(MethodSettings):
     batch: Count = 5
 
 
+@dataclass(frozen=True)
+class CarriedSettings(ByViewSettings):
+    """Settings shared by the methods that carry edits along warps of their own.
+
+    Args:
+        warp: correspondences and masks, :class:`attnwarp.warp.WarpSettings`.
+    """
+
+    warp: WarpSettings = WARPS["corrected"]
+
+
+@dataclass(frozen=True)
+class CorrespondingSettings(CarriedSettings):
+    """Settings of :func:`attnwarp.methods.corresponding`.
+
+    Args:
+        self_share: weight of a view's own keys in its self-attention; the rest is attention to the
+            source view, which then is in every batch. Below 1 the editor must be Stable
+            Diffusion's.
+        batch: number of views per network pass, whose tokens are mixed.
+
+    Example:
+        >>> from attnwarp.methods import preset
+        >>> preset("corresponding", "released").self_share
+        0.7
+    """
+
+    batch: Count = 40
+    self_share: Share = 1.0
+
+
+@dataclass(frozen=True)
+class WarpedReferenceSettings(CarriedSettings):
+    """Settings of :func:`attnwarp.methods.warped_reference`.
+
+    Args:
+        start: (lowest, highest) range of the timestep to which start pictures are noised; one is
+            drawn for all views. The source starts from pure noise.
+
+    Example:
+        >>> from attnwarp.methods import WarpedReferenceSettings
+        >>> WarpedReferenceSettings(start=None)
+        Traceback (most recent call last):
+        ValueError: start: got None, but views begin at pictures; give [lowest, highest]
+    """
+
+    start: tuple[int, int] | None = (700, 700)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _needs_start(self.start)
+
+
+@dataclass(frozen=True)
+class FusedSettings(CarriedSettings):
+    """Settings of :func:`attnwarp.methods.fused`.
+
+    Args:
+        start: (lowest, highest) range of the starting timestep, drawn for each edit.
+        grid: grid of the steps below the start, :data:`attnwarp.editing.schedule.Grid`.
+        batch: unused; views are edited one at a time.
+        nearest: number of other views that are fused.
+        fusion_share: s_M / (s_S + s_M), the part of the image guidance that leads to the fusion.
+        occlusion: True lets the nearest of a view's pixels that fall into one win, False the last.
+        holes: picture where no view's pixels fall, the "original" or "black".
+        perceptual_scaled: False feeds the perceptual loss pictures in [0, 1] as if they were in
+            [-1, 1].
+
+    Example:
+        >>> from attnwarp.methods import preset
+        >>> preset("fused", "released").holes
+        'black'
+    """
+
+    start: tuple[int, int] | None = (700, 980)
+    grid: Grid = "even"
+    nearest: Count = 5
+    fusion_share: Share = 2 / 3
+    occlusion: bool = True
+    holes: Literal["original", "black"] = "original"
+    perceptual_scaled: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _needs_start(self.start)
+
+
+def _needs_start(start: tuple[int, int] | None) -> None:
+    if start is None:
+        raise ValueError("start: got None, but views begin at pictures; give [lowest, highest]")
+
+
 _STABLE_DIFFUSION: dict[str, Any] = {
     "suffix": ", best quality, extremely detailed",
     "negative_prompt": (
@@ -464,6 +556,11 @@ _STABLE_DIFFUSION: dict[str, Any] = {
 }
 
 _IGS2GS = IGS2GSSettings(text_guidance=12.5, image_guidance=1.5, grid="scheduler")
+
+_FUSED = FusedSettings(
+    text_guidance=7.5, image_guidance=1.5, grid="scheduler", iterations=1000, normal=0.0,
+    distortion=0.0, color_rate=1.0,
+)  # fmt: skip
 
 _RELEASED = AttentionWarpingSettings(
     views_per_stage=MOST_VIEWS,
@@ -531,6 +628,16 @@ PRESETS: Named[Named[MethodSettings]] = Named({
         "released": GaussCtrlSettings(control_share=0.0, source_prompt=None, **_STABLE_DIFFUSION),
         "random": GaussCtrlSettings(latents="random", **_STABLE_DIFFUSION),
     }),
+    "corresponding": Named({
+        "default": CorrespondingSettings(),
+        "released": CorrespondingSettings(self_share=0.7, text_guidance=6.0, iterations=1000),
+    }),
+    "fused": Named({
+        "default": FusedSettings(),
+        "paper": _FUSED,
+        "released": replace(_FUSED, occlusion=False, holes="black", perceptual_scaled=False),
+    }),
+    "warped_reference": Named({"default": WarpedReferenceSettings()}),
 })  # fmt: skip
 """Settings by the method's name and the preset's name; a method's first preset is its default.
 

@@ -142,22 +142,28 @@ class DistanceToViews:
     Args:
         perceptual: the distance.
         kept_bytes: limit on the bytes of kept features.
+        scaled: False feeds pictures in [0, 1] as if they were in [-1, 1].
     """
 
-    def __init__(self, perceptual: PerceptualLoss, kept_bytes: int = FEATURE_BYTES) -> None:
-        self._perceptual, self._bytes = perceptual, kept_bytes
+    def __init__(
+        self, perceptual: PerceptualLoss, kept_bytes: int = FEATURE_BYTES, scaled: bool = True
+    ) -> None:
+        self._perceptual, self._bytes, self._scaled = perceptual, kept_bytes, scaled
         self._kept: WeakKeyDictionary[TrainingView, list[Tensor]] = WeakKeyDictionary()
 
     def __call__(self, image: Tensor, view: TrainingView) -> Tensor:
         """Compute the distance () of a render (H, W, 3), differentiable, to a view's picture."""
         target = self._of(view, image.device)
-        return self._perceptual.between(self._perceptual.features(image), target)
+        return self._perceptual.between(self._features(image), target)
+
+    def _features(self, image: Tensor) -> list[Tensor]:
+        return self._perceptual.features(image if self._scaled else (image + 1) / 2)
 
     def _of(self, view: TrainingView, device: torch.device) -> list[Tensor]:
         if view in self._kept:
             return self._kept[view]
         with torch.no_grad():
-            features = self._perceptual.features(view.on(device))
+            features = self._features(view.on(device))
         held = sum(x.nbytes for kept in self._kept.values() for x in kept)
         if held + sum(x.nbytes for x in features) <= self._bytes:
             self._kept[view] = features
@@ -226,7 +232,8 @@ class Tuning:
             self._smallest.append((name, net.smallest, "perceptual"))
         if settings.ssim and settings.iterations:
             self._smallest.append(("SSIM", losses.SSIM_WINDOW, "ssim"))
-        self.perceptual = None if net is None else DistanceToViews(net)
+        scaled = getattr(settings, "perceptual_scaled", True)
+        self.perceptual = None if net is None else DistanceToViews(net, scaled=scaled)
         self.weights = {} if net is None else {"perceptual": net.about.weights_sha256}
 
     def check_sizes(self, cameras: Sequence[Camera]) -> None:

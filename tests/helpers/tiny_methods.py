@@ -13,9 +13,12 @@ from attnwarp.methods import (
     METHODS,
     AttentionWarpingSettings,
     ByViewSettings,
+    CorrespondingSettings,
     DGESettings,
+    FusedSettings,
     GaussCtrlSettings,
     IGS2GSSettings,
+    WarpedReferenceSettings,
 )
 
 QUICK = {
@@ -26,6 +29,9 @@ QUICK = {
     "igs2gs": IGS2GSSettings(steps=2, iterations=5, every=3),
     "dge": DGESettings(steps=2, iterations=4, every=2, batch=2, views=2, perceptual=0.0),
     "gaussctrl": GaussCtrlSettings(steps=2, iterations=3, references=2, batch=2),
+    "corresponding": CorrespondingSettings(steps=2, iterations=3, perceptual=0.0, batch=2),
+    "fused": FusedSettings(steps=2, iterations=3, perceptual=0.0),
+    "warped_reference": WarpedReferenceSettings(steps=2, iterations=3, perceptual=0.0, batch=2),
 }
 
 

@@ -36,7 +36,7 @@ SCHEDULE_TOLERANCE = 1e-5
 PROBE_TOLERANCE = 1e-3
 """Relative difference of probe values that devices and precisions cause."""
 
-GUIDES = {"igs2gs": "picture", "dge": "picture", "gaussctrl": "depth"}
+GUIDES = {"igs2gs": "picture", "dge": "picture", "fused": "picture", "gaussctrl": "depth"}
 """Kinds of editors that methods take; the others take both."""
 
 PROBE_WORDS, PROBE_PIXELS = "a photo of a bear", 128

@@ -39,8 +39,8 @@ from attnwarp_lab.ideal.thing import Thing, in_front
 
 Image = npt.NDArray[np.float32]
 
-UNABLE = ("dge", "gaussctrl")
-"""Methods that change the computation of attention, which the ideal editor does not support."""
+UNABLE = ("dge", "gaussctrl", "fused")
+"""Methods that need an editor's attention or guidance, neither of which the ideal editor has."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class IdealProbe(MethodProbe[IdealResult]):
             if own.method in UNABLE:
                 raise ValueError(
                     f"probes.{self.name}: method {own.method!r} of {name!r} changes attention"
-                    " itself, which the ideal editor has none of; leave it out"
+                    " or guidance, which the ideal editor has none of; leave it out"
                 )
 
     def cells(

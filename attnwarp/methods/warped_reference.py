@@ -1,0 +1,135 @@
+"""Warped reference: the source's edit, warped into each view, is the picture that the view's edit
+starts from. In small the projection and refinement of GeM-NR (Bengtson et al. 2026).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import groupby
+from typing import Any, Unpack
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp.camera import Camera
+from attnwarp.editing.editor import Editor, edit
+from attnwarp.gaussians import Gaussians
+from attnwarp.methods.base import Loop, Options, Result, ViewEdit, run
+from attnwarp.methods.by_warps import ByWarps, checked_source
+from attnwarp.methods.geometry import Warps
+from attnwarp.methods.pictures import Image
+from attnwarp.methods.settings import WarpedReferenceSettings
+from attnwarp.methods.work import Work, chunks
+
+
+def warped_reference(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    images: Sequence[npt.NDArray[Any]] | None,
+    editor: Editor,
+    instruction: str,
+    settings: WarpedReferenceSettings | None = None,
+    *,
+    source: int = 0,
+    warps: Warps | None = None,
+    **options: Unpack[Options],
+) -> Result:
+    """Edit a source view, then each other view from the source's warped edit, and tune the splats.
+
+    A view starts from M S_warp + (1 - M) I: S_warp is the source's edit warped along the splats'
+    depth, M the warp's mask, I the view's picture, which also guides the edit. The start is noised
+    to a timestep T and denoised.
+
+    The paper also aligns the depth of edits that change the geometry, and refines by an editor that
+    takes two pictures.
+
+    Args:
+        gaussians, cameras, images, editor, instruction, options: see :func:`by_view`.
+        settings: :class:`WarpedReferenceSettings`; the defaults if omitted.
+        source, warps: see :func:`attention_warping`.
+
+    Raises:
+        ValueError, InputError, RuntimeError: see :func:`by_view`.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.methods import WarpedReferenceSettings, warped_reference
+        >>> from attnwarp.editing.small import load_editor
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = dict(width=32, height=32, fov_y=40, up=(0, 1, 0))
+        >>> cameras = [Camera.look_at((x, 0, 3), (0, 0, 0), **view) for x in (0, 1)]
+        >>> quick = WarpedReferenceSettings(steps=1, iterations=1)
+        >>> result = warped_reference(disc, cameras, None, load_editor("small-plain"), "red", quick)
+        >>> list(result.edited)  # the source, then the other view
+        [0, 1]
+    """
+    return run(
+        "warped_reference", partial(WarpedReference, source=source, warps=warps),
+        WarpedReferenceSettings,
+        gaussians, cameras, images, editor, instruction, settings, **options,
+    )  # fmt: skip
+
+
+class WarpedReference(ByWarps):
+    """Method that edits views from the source's warped edit."""
+
+    def __init__(
+        self, work: Work, settings: WarpedReferenceSettings, source: int, warps: Warps | None
+    ) -> None:
+        assert settings.start is not None
+        work.starts_at(settings.start[0], "start")
+        self.settings, self.source = settings, checked_source(source, work)
+        self.others = [view for view in range(len(work.sizes)) if view != self.source]
+        super().__init__(work, settings, warps, [self.source], self.others)
+        self.about = {"source": self.names[self.source]}
+
+    def run(self, loop: Loop) -> None:
+        """Edit the source, then the other views batch by batch, then tune."""
+        work, s = self.work, self.settings
+        rows = s.steps * work.branches()
+        loop.edit(0, [self.source], partial(self.edit, [self.source]), rows=rows)
+        for _, same in groupby(self.others, key=lambda view: work.sizes[view]):
+            for batch in chunks(list(same), s.batch):
+                loop.edit(0, batch, partial(self.edit, batch), rows=len(batch) * rows)
+        loop.tune(0, range(len(work.sizes)), s.iterations)
+
+    def edit(
+        self, batch: Sequence[int], model: Gaussians, step: Callable[[], None]
+    ) -> list[ViewEdit]:
+        """Edit the source from pure noise, or other views from its edit."""
+        work, s = self.work, self.settings
+        pictures: list[Image] | None = None
+        start, shares = None, [0.0]
+        if self.source not in batch:
+            assert s.start is not None
+            start = work.timestep(0, self.source, s.start)
+            pictures, shares = map(list, zip(*map(self.begin, batch), strict=True))
+        with work.guided(s.text_guidance):
+            result = edit(
+                work.editor,
+                [work.guide(view, work.frozen) for view in batch],
+                work.instruction,
+                steps=s.steps,
+                start=start,
+                pictures=pictures,
+                noise=work.noise(0, batch),
+                on_step=lambda *_: step(),
+                regions=work.regions(batch),
+            )
+        return [
+            ViewEdit(picture, {"start": start, "warped": share})
+            for picture, share in zip(result.images, shares, strict=True)
+        ]
+
+    def begin(self, view: int) -> tuple[Image, float]:
+        """Compose the picture (h, w, 3) that a view starts from, and the warped share of it."""
+        warp, before = self.of_edits(self.source, view), self.work.picture(view)
+        edited = torch.from_numpy(self.kept(0, self.source)).permute(2, 0, 1)
+        warped = warp.warp(edited).permute(1, 2, 0).numpy()
+        mask = warp.mask.numpy()
+        picture = np.where(mask[..., None], warped, before).astype(np.float32)
+        return picture, float(mask.mean())
