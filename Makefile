@@ -21,10 +21,10 @@ test test-all: export ATTNWARP_MITSUBA ?= scalar_rgb
 
 .PHONY: demo test test-all gate baseline bench docs lint checks kernels kernels-float64 collected measured venv clean
 
-## the main job: scenes -> truth -> splats -> warps and masks -> runs/demo/report.html
+## an edit carried, what the mask is for, accuracy against time: runs/demo/report.html
 demo:
 	@scripts/venv.sh edit,eval
-	$(BIN)/attnwarp-eval run quick --jobs $(JOBS) --out $(RUN)
+	$(BIN)/attnwarp-eval run demo --jobs $(JOBS) --out $(RUN)
 
 ## lint, types, layers, the gate, and the tests that fit in a coffee break (CONTRIBUTING.md)
 test: checks

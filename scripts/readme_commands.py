@@ -2,7 +2,7 @@
 
     python scripts/readme_commands.py BIN [RUN]
 
-BIN is the environment's folder of commands, RUN a finished run of the study `quick`. What ends soon
+BIN is the environment's folder of commands, RUN a finished run of the study `demo`. What ends soon
 runs as it stands; of the rest the options are read (``--help``). Every command has to end with 0,
 or with one line that names the extra it lacks. This needs the standard library alone.
 """
