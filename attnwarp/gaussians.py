@@ -49,6 +49,8 @@ class Gaussians:
         screen_filter: variance in square pixels added to a projected 3D splat: 0.3 in 3DGS, 0.1 in
             Mip-Splatting. A model must be drawn with the filter it was fitted with. 2D splats use
             a separate filter.
+        far: distance from the camera, in scene units, beyond which a splat belongs to the sky:
+            it is drawn behind all others and counts in colour alone.
 
     Raises:
         ValueError: a wrong shape, a non-finite value, a zero quaternion, a scale that is not
@@ -80,6 +82,7 @@ class Gaussians:
     origin: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     antialiased: bool = False
     screen_filter: float = SCREEN_FILTER
+    far: float = math.inf
 
     def __post_init__(self) -> None:
         check.one_of(self.kind, ("2d", "3d"), "kind")
@@ -103,6 +106,8 @@ class Gaussians:
             check.finite(tensor, name)
         low, high = LEAST_FILTER, LARGEST_FILTER
         self.screen_filter = float(check.number(self.screen_filter, low, high, "screen_filter"))
+        if not self.far > 0:
+            raise ValueError(f"far: got {self.far}, expected a positive distance in scene units")
         self.origin = np.array(self.origin, dtype=np.float64)
         check.shape(self.origin, (3,), "origin")
         check.finite(self.origin, "origin")
@@ -214,7 +219,8 @@ class Gaussians:
         """Hash the splats (SHA-256), as hexadecimal digits."""
         names = ("means", "quats", "scales", "opacities", "sh")
         arrays = [getattr(self, name).detach().cpu().numpy() for name in names]
-        return digest(self.kind, self.antialiased, self.screen_filter, self.origin, *arrays)
+        far = () if math.isinf(self.far) else (self.far,)
+        return digest(self.kind, self.antialiased, self.screen_filter, self.origin, *arrays, *far)
 
     def detach(self) -> Gaussians:
         """Detach the splats from autograd."""

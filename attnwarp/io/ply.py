@@ -10,6 +10,7 @@ programs that write them.
 from __future__ import annotations
 
 import io
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -192,6 +193,7 @@ def read_ply(
         origin=header.origin + offset,
         antialiased=antialiased,
         screen_filter=width,
+        far=header.far,
     )
 
 
@@ -289,6 +291,8 @@ def write_ply(
         comments += [f"SplatRenderMode: {'mip' if g.antialiased else 'default'}"]
         if g.screen_filter != SCREEN_FILTER:
             comments += [f"attnwarp screen_filter {g.screen_filter!r}"]
+    if np.isfinite(g.far):
+        comments += [f"attnwarp far {g.far!r}"]
     data = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments)
     write_atomically(path, data.write, follow_link=True)
 
@@ -581,6 +585,7 @@ class _Header:
         self.flags: dict[bool, str] = {}
         self.origin: Array = np.zeros(3)
         self.screen_filter: float | None = None
+        self.far = math.inf
 
     def width(self, default: float, given: float | None) -> float:
         """Choose the screen filter, px^2: the given one, the file's, or the default."""
@@ -627,6 +632,15 @@ def _read_comments(path: Path, comments: list[str]) -> _Header:
                         f"got {comment!r}, expected px^2 in [{LEAST_FILTER:g}, {LARGEST_FILTER:g}]",
                         field="screen_filter",
                     ) from None
+            case ["attnwarp", "far", number]:
+                try:
+                    header.far = float(number)
+                except ValueError:
+                    header.far = math.nan
+                if not header.far > 0:
+                    raise FileFormatError(
+                        path, f"got {comment!r}, expected a positive distance", field="far"
+                    )
             # Some files have no space between colon and tag.
             case ["splatrendermode:" | "splatrendermode", mode] if mode in (
                 "mip",

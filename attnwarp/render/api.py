@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,7 +36,8 @@ class Render:
             in.
         alpha: (H, W) sum w_i, coverage in [0, 1].
         depth: (H, W) expected depth sum w_i z_i / sum w_i along the optical axis, in scene units;
-            NaN where nothing was drawn. The background has no influence.
+            NaN where nothing was drawn. Background and sky (``Gaussians.far``) have no
+            influence, here and in every output but ``color`` and ``weight``.
         median_depth: (H, W) depth of the last splat drawn while the transmittance before it is
             above 1/2; NaN where nothing was drawn. If alpha stays below 1/2 it is the last
             splat's.
@@ -46,7 +49,7 @@ class Render:
         distortion_l2_ndc: (H, W) sum_{j<i} w_i w_j (m_i - m_j)^2 with m = far / (far - near) (1 -
             near / z) and the planes ``ndc`` (the original 2DGS code). No unit.
         weight: (N,) sum over pixels of w_i: a splat's contribution to the picture; 0 means
-            invisible.
+            invisible. A sky splat's is that without the scene before it.
         counters: amounts of work. "splats": of the model. "visible": possibly visible splats.
             "tiles", "tile_pairs": splats over tiles, of 16 x 16 pixels on the CPU and 8 x 8 on a
             GPU. "pairs": splats over pixels whose intersection was computed. "composited": those
@@ -210,7 +213,8 @@ def render(
             or "center". "3d": "center" (default) or "peak", where the Gaussian is largest along
             the ray.
         background: (C,) colour behind everything; black if omitted.
-        features: (N, C) values rendered instead of the spherical harmonics' colour.
+        features: (N, C) values rendered instead of the spherical harmonics' colour; the sky has
+            none.
         sh_degree: highest degree of the harmonics used.
         near: near-plane depth, in scene units. 2D splats are cut per pixel, 3D splats as a unit by
             their centre. Scale it with the scene.
@@ -253,6 +257,12 @@ def render(
     check.instance(gaussians, Gaussians, "gaussians", "attnwarp.Gaussians")
     check.instance(camera, Camera, "camera", "attnwarp.Camera")
     check.one_of(backend, BACKENDS, "backend")
+    if math.isfinite(gaussians.far):
+        given = dict(
+            backend=backend, depth=depth, background=background, features=features,
+            sh_degree=sh_degree, near=near, antialiased=antialiased, pose=pose, ndc=ndc,
+        )  # fmt: skip
+        return _before_sky(gaussians, camera, given)
     chosen = ("gpu" if gaussians.means.is_cuda else "cpu") if backend == "auto" else backend
     inputs = _prepare(
         gaussians,
@@ -281,6 +291,29 @@ def render(
 
         outputs = gpu.render(inputs)
     return _result(outputs, inputs, camera, pose, chosen)
+
+
+def _before_sky(gaussians: Gaussians, camera: Camera, given: dict[str, Any]) -> Render:
+    """Render the splats within ``gaussians.far`` of the camera, over a picture of those beyond."""
+    moved = _checked_pose(given["pose"], camera).detach().numpy()
+    eye = torch.as_tensor(-moved[:3, :3].T @ moved[:3, 3] - gaussians.origin)
+    sky = (gaussians.means.detach() - eye.to(gaussians.means)).norm(dim=1) > gaussians.far
+    plain, features = replace(gaussians, far=math.inf), given["features"]
+    if features is not None:
+        features = check.tensor(features, "features")
+        check.shape(features, (len(gaussians), "C"), "features")
+        given = {**given, "features": features[~sky]}
+    else:
+        behind = render(plain.select(sky), camera, **given)
+        given = {**given, "background": None}
+    view = render(plain.select(~sky), camera, **given)
+    weight = torch.zeros(len(gaussians), dtype=view.weight.dtype, device=view.weight.device)
+    view.weight = weight.index_put((~sky,), view.weight)
+    if features is None:
+        view.weight = view.weight.index_put((sky,), behind.weight)
+        view.color = view.color + (1 - view.alpha)[..., None] * behind.color
+        view.counters = {name: n + behind.counters[name] for name, n in view.counters.items()}
+    return view
 
 
 def _result(

@@ -737,6 +737,15 @@ def test_a_screen_filter_is_kept_by_a_file_and_overruled_by_the_caller(tmp_path)
         replace(model(), screen_filter=0)
 
 
+def test_a_sky_is_kept_by_a_file(tmp_path):
+    write_ply(tmp_path / "a.ply", replace(model(), far=1234.5))
+    assert read_ply(tmp_path / "a.ply").far == 1234.5
+    text = (tmp_path / "a.ply").read_bytes().replace(b"far 1234.5", b"far -1")
+    (tmp_path / "bad.ply").write_bytes(text)
+    with pytest.raises(FileFormatError, match="far: got .*-1', expected a positive distance"):
+        read_ply(tmp_path / "bad.ply")
+
+
 @pytest.mark.parametrize("width", further(0.1, 1e-4, 2.0))
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_any_screen_filter_is_drawn_and_differentiated_as_the_reference_does(width, antialiased):

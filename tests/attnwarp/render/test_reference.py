@@ -4,6 +4,7 @@ in float64.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -267,3 +268,24 @@ def test_harmonics_agree_with_scipy() -> None:
             expected.append(part * (math.sqrt(2) if order else 1))
     ours = harmonics.basis(torch.tensor(d), 3).numpy().T
     assert np.abs(ours - np.array(expected)).max() < 1e-12
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_splat_of_the_sky_is_drawn_like_any_other_and_counts_in_colour_alone(
+    backend, make_camera, make_splats
+) -> None:
+    """Splats of the sky lie behind all others here, so plain rendering has their colour."""
+    camera = make_camera(8, 9, 7)
+    splats = make_splats(8, "3d", 11, camera).to(dtype=torch.float32)
+    away = splats.means - torch.from_numpy(camera.position).to(splats.means)
+    splats.means[::3] += 9 * away[::3]
+    splats.scales[::3] *= 10
+    sky = torch.arange(11) % 3 == 0
+    far = (10 * float(away[sky].norm(dim=1).min()) + float(away[~sky].norm(dim=1).max())) / 2
+    whole, scene, both = (
+        render(each, camera, backend=backend, background=[0.2, 0.4, 0.6])
+        for each in (splats, splats.select(~sky), dataclasses.replace(splats, far=far))
+    )
+    torch.testing.assert_close(both.color, whole.color, rtol=0, atol=2e-4)  # where a ray ends
+    for name in ("alpha", "depth", "median_depth", "normal", "distortion_ordered"):
+        torch.testing.assert_close(getattr(both, name), getattr(scene, name), equal_nan=True)
