@@ -19,10 +19,10 @@ import torch
 
 from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.errors import InputWarning
+from attnwarp.errors import InputWarning, suggest
 from attnwarp.io import Dataset, FileFormatError, read_image
 from attnwarp.io.file import is_file
-from attnwarp.io.images import weighted_by_alpha
+from attnwarp.io.images import read_mask, weighted_by_alpha
 
 HELD_OUT_EVERY = 8
 """Interval of held-out images for a dataset without splits (LLFF's share)."""
@@ -45,6 +45,7 @@ class Views:
         images: (H, W, 3), or (H, W, 4) with straight (not premultiplied) alpha; sRGB; uint8,
             uint16, or floating in [0, 1]. Their type is kept: 8 bits take a quarter of the
             memory.
+        masks: (H, W) bool, one for each picture or None; False where the picture is to be ignored.
 
     Raises:
         ValueError: the lists differ in length, a picture's size differs from its camera's, or a
@@ -61,6 +62,7 @@ class Views:
 
     cameras: Sequence[Camera]
     images: Sequence[npt.NDArray[Any]]
+    masks: Sequence[npt.NDArray[np.bool_] | None] = ()
 
     def __post_init__(self) -> None:
         if not self.cameras:
@@ -69,6 +71,15 @@ class Views:
             raise ValueError(
                 f"images: got {len(self.images)}, expected {len(self.cameras)}, as cameras"
             )
+        masks = list(self.masks) or [None] * len(self.cameras)
+        object.__setattr__(self, "masks", masks)
+        for camera, mask in zip(self.cameras, masks, strict=True):
+            if mask is not None:
+                check.shape(mask, (camera.height, camera.width), f"mask of {camera.name}")
+                if not mask.any():
+                    raise ValueError(
+                        f"masks: that of {camera.name} ignores the whole picture; leave it out"
+                    )
         arrays = [i.numpy() if isinstance(i, torch.Tensor) else i for i in self.images]
         object.__setattr__(self, "images", arrays)
         for i, (camera, image) in enumerate(zip(self.cameras, arrays, strict=True)):
@@ -118,6 +129,19 @@ class Views:
         alpha = picture[..., 3:]
         return picture[..., :3] * alpha + (1 - alpha) * background.to(picture.dtype)
 
+    def kept(self, index: int, device: torch.device) -> torch.Tensor | None:
+        """Return a picture's mask on a device, (H, W) bool, False where the picture is ignored."""
+        mask = self.masks[index]
+        return None if mask is None else torch.from_numpy(np.asarray(mask, bool)).to(device)
+
+    def error(self, index: int, image: torch.Tensor, background: torch.Tensor) -> float:
+        """Mean squared error of a render (H, W, 3) against a picture, where that is not ignored;
+        NaN if all of it is.
+        """
+        squared = (image - self.target(index, background)).square()
+        kept = self.kept(index, squared.device)
+        return float((squared if kept is None else squared[kept]).mean())
+
     def _on(self, device: torch.device, index: int) -> torch.Tensor:
         """Copy a picture's pixels to a GPU, which caches as many pictures as fit."""
         if (device, index) in self._held:
@@ -136,10 +160,11 @@ class Views:
         """Hash cameras and pictures (SHA-256), to check that a resumed fit has the same
         ones."""
         total = hashlib.sha256()
-        for camera, image in zip(self.cameras, self.images, strict=True):
+        for camera, image, mask in zip(self.cameras, self.images, self.masks, strict=True):
             spec = {**camera.to_dict(), "name": "", "dtype": str(image.dtype), "shape": image.shape}
             total.update(json.dumps(spec, sort_keys=True).encode())
             total.update(np.ascontiguousarray(image).tobytes())
+            total.update(b"" if mask is None else np.packbits(mask).tobytes())
         return total.hexdigest()
 
 
@@ -180,9 +205,9 @@ def load_views(
         >>> views.cameras[0].width, views.cameras[0].height
         (32, 24)
     """
-    cameras, images = [], []
-    for camera, path, lens in zip(
-        dataset.cameras, dataset.image_paths, dataset.lenses, strict=True
+    cameras, images, masks = [], [], []
+    for camera, path, lens, mask in zip(
+        dataset.cameras, dataset.image_paths, dataset.lenses, dataset.mask_paths, strict=True
     ):
         if path is None:
             continue
@@ -202,12 +227,13 @@ def load_views(
             camera = camera.resize(image.shape[1], image.shape[0])
         cameras.append(camera)
         images.append(image)
+        masks.append(None if mask is None else read_mask(mask, camera.height, camera.width))
     if not cameras:
         raise ValueError(
             "dataset: none of its cameras has an image that is there; put the images where the data"
             " set names them"
         )
-    return Views(cameras, images)
+    return Views(cameras, images, masks)
 
 
 def _shrink(image: npt.NDArray[Any], longest: int) -> npt.NDArray[Any]:
@@ -222,23 +248,27 @@ def _shrink(image: npt.NDArray[Any], longest: int) -> npt.NDArray[Any]:
     return averaged(image) if image.shape[2] == 3 else weighted_by_alpha(image, averaged)
 
 
-def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Dataset | None]:
+def hold_out(
+    dataset: Dataset, every: int | Sequence[str] = HELD_OUT_EVERY
+) -> tuple[Dataset, Dataset | None]:
     """Split a dataset into the part to fit on and the part to measure on.
 
-    The dataset's splits have priority: "train", and "test" or else "val".
+    The dataset's splits have priority over a number: "train", and "test" or else "val".
 
     Args:
         dataset: posed images, see :func:`attnwarp.io.read_dataset`.
-        every: interval of held-out images for a dataset without splits, in the order of their
-            names, beginning after the dataset's first, which edits take as their source; 0 holds
-            out none.
+        every: interval of held-out images for a dataset without splits, from the middle of each
+            run of so many in the order of their names, after the dataset's first, which edits take
+            as their source; 0 holds out none. Or names of images, with or without folder and
+            suffix.
 
     Returns:
         The part to fit on, and the held-out part or None. A fitted view is never held out: neither
         under another name or by a link, nor as a copy, nor at the same pose.
 
     Raises:
-        ValueError: the dataset's splits leave nothing to fit on, or ``every`` is 1 or negative.
+        ValueError: the dataset's splits or ``every`` leave nothing to fit on, ``every`` is
+            negative, or a name is that of no image or of several.
 
     Warns:
         InputWarning: held-out views that are also fitted on were left out.
@@ -253,8 +283,10 @@ def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Da
         ... ]
         >>> train, test = hold_out(Dataset(cameras, [None] * 9))
         >>> len(train), [camera.name for camera in test.cameras]
-        (8, ['01'])
+        (8, ['04'])
     """
+    if not isinstance(every, int):
+        return _split(dataset, {_named_view(dataset, name) for name in every})
     if every < 0 or every == 1:
         raise ValueError(f"every: got {every}, expected 0 or at least 2")
     named = {split for split in dataset.splits if split is not None}
@@ -268,11 +300,33 @@ def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Da
         return train, _apart(train, dataset.split(rest)) if rest else None
     order = sorted(range(len(dataset)), key=lambda i: dataset.cameras[i].name)
     after = order.index(0) + 1 if order else 0
-    out = set([*order[after:], *order[:after]][:-1:every]) if every else set()
+    others = [*order[after:], *order[:after]][:-1]
+    middle = max(0, min(every, len(others)) - 1) // 2
+    return _split(dataset, set(others[middle::every] if every else ()))
+
+
+def _split(dataset: Dataset, out: set[int]) -> tuple[Dataset, Dataset | None]:
     if not out:
         return dataset, None
     train = dataset.select([i for i in range(len(dataset)) if i not in out])
+    if not len(train):
+        raise ValueError("every: names every view, which leaves nothing to fit on")
     return train, _apart(train, dataset.select(sorted(out)))
+
+
+def _named_view(dataset: Dataset, name: str) -> int:
+    found = [
+        i
+        for i, camera in enumerate(dataset.cameras)
+        if name in (camera.name, Path(camera.name).name, Path(camera.name).stem)
+    ]
+    if len(found) != 1:
+        names = [camera.name for camera in dataset.cameras]
+        raise ValueError(
+            f"every: got the name {name!r}, which {len(found) or 'none'} of the {len(names)} views"
+            f" has{suggest(name, names)}"
+        )
+    return found[0]
 
 
 def _apart(train: Dataset, test: Dataset) -> Dataset | None:

@@ -24,8 +24,9 @@ from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.errors import InputWarning
 from attnwarp.io.dataset import Dataset, Distorted, Missing, with_images
-from attnwarp.io.file import FileFormatError, existing_file
+from attnwarp.io.file import FileFormatError, existing_file, is_file
 from attnwarp.io.find import FileFinder
+from attnwarp.io.images import IMAGE_SUFFIXES
 from attnwarp.io.lens import Lens
 from attnwarp.io.text import read_text
 
@@ -112,6 +113,8 @@ def read_colmap(
         scale: downscaling factor such as 4, which reads ``images_4`` if ``images`` is omitted;
             the cameras are resized to its pictures.
 
+    A folder ``masks`` beside the images has masks of the same names, or with ".png" appended.
+
     Warns:
         InputWarning: another model next to ``sparse/0`` has more images; the header of a text file
             states another number of entries than the file has.
@@ -178,13 +181,21 @@ def read_colmap(
         finder=finder,
         elsewhere="images=FOLDER (--images FOLDER)",
     )
+    masks = [_mask(folder.with_name("masks"), pose.name) for pose in poses]
     cloud = model / f"points3D{suffix}"
     if not points or not cloud.is_file():
-        return Dataset(cameras, paths, lenses=lenses)
+        return Dataset(cameras, paths, lenses=lenses, mask_paths=masks)
     # COLMAP's guide asks for an empty text file if poses are known and points are not: no
     # points, not a damaged file.
     xyz, colors = _binary_points(existing_file(cloud)) if binary else _text_points(cloud)
-    return Dataset(cameras, paths, xyz, colors, lenses=lenses)
+    return Dataset(cameras, paths, xyz, colors, lenses=lenses, mask_paths=masks)
+
+
+def _mask(folder: Path, name: str) -> Path | None:
+    """Find the mask of a picture: NAME.png (COLMAP's), or the picture's name, with any suffix."""
+    stem = (folder / name).with_suffix("")
+    each = [folder / f"{name}.png", folder / name, *(Path(f"{stem}{s}") for s in IMAGE_SUFFIXES)]
+    return next((path for path in each if is_file(path)), None)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -45,6 +45,8 @@ class Dataset:
             pictures of another lens must be undistorted first, see :func:`undistort`.
         applied_transform: (3, 4) transform from the original world to that of the cameras and
             points, as stated in a transforms.json. For information only.
+        mask_paths: pictures, one for each camera, whose dark pixels (below half of white) say
+            which pixels of the image to ignore; None without one.
 
     Raises:
         ValueError: lists of different lengths, a wrong shape or dtype.
@@ -67,11 +69,13 @@ class Dataset:
     splits: list[str | None] = field(default_factory=list)
     applied_transform: Array | None = None
     lenses: list[Lens | None] = field(default_factory=list)
+    mask_paths: list[Path | None] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.splits = self.splits or [None] * len(self.cameras)
         self.lenses = self.lenses or [None] * len(self.cameras)
-        for name in ("image_paths", "splits", "lenses"):
+        self.mask_paths = self.mask_paths or [None] * len(self.cameras)
+        for name in ("image_paths", "splits", "lenses", "mask_paths"):
             if len(getattr(self, name)) != len(self.cameras):
                 raise ValueError(
                     f"{name}: got {len(getattr(self, name))}, expected {len(self.cameras)}, as"
@@ -106,6 +110,7 @@ class Dataset:
             [self.splits[i] for i in indices],
             self.applied_transform,
             [self.lenses[i] for i in indices],
+            [self.mask_paths[i] for i in indices],
         )
 
     def split(self, name: str) -> Dataset:

@@ -54,7 +54,7 @@ def read_dataset(
         distorted: "error" to refuse lens distortion, or "keep" to return it in
             ``Dataset.lenses`` for :func:`undistort`.
         ignore_keys: keys of a transforms.json to ignore although they change a picture's content,
-            such as "mask_path".
+            such as "white_transparent", or "mask_path" to use whole pictures.
         scale: one of 1, 2, 4 and 8; 4 reads images from ``images_4`` instead of ``images`` and
             resizes the cameras to them.
 

@@ -204,6 +204,26 @@ def read_image(
     return np.asarray(cv2.cvtColor(image, code))
 
 
+def read_mask(path: str | os.PathLike[str], height: int, width: int) -> npt.NDArray[np.bool_]:
+    """Read a mask, (height, width) bool: False where it is dark, below half of white.
+
+    A smaller mask pixel is True if all that it covers is.
+
+    Raises:
+        FileFormatError: the mask is unreadable or of another aspect ratio.
+    """
+    import cv2
+
+    image = read_image(path)
+    bright = image[..., :3].max(axis=2) >= (np.iinfo(image.dtype).max + 1) // 2
+    try:
+        check.same_aspect((height, width), bright.shape, str(path), "draw it on its picture")
+    except ValueError as error:
+        raise FileFormatError(path, str(error).partition(": ")[2]) from None
+    shares = cv2.resize(bright.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(shares > 1 - 1e-4)
+
+
 def encode_png(rgb: npt.NDArray[Any]) -> bytes:
     """Encode a picture as PNG.
 

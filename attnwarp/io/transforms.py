@@ -57,7 +57,6 @@ INTRINSICS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy", "w
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 CHANGES_THE_PICTURE = {
-    "mask_path": "pixels that a mask leaves out",
     "rolling_shutter": "a rolling shutter",
     "transform_matrix_start": "a camera that moves during the exposure",
     "transform_matrix_end": "a camera that moves during the exposure",
@@ -86,8 +85,9 @@ UNUSED = {
 
 USED = {
     "camera_model", "is_fisheye", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy",
-    "w", "h", "file_path", "transform_matrix", "frames", "ply_file_path", "applied_transform",
-    "distortion_params", *DISTORTION, *(f"{split}_filenames" for split in SPLITS),
+    "w", "h", "file_path", "mask_path", "transform_matrix", "frames", "ply_file_path",
+    "applied_transform", "distortion_params", *DISTORTION,
+    *(f"{split}_filenames" for split in SPLITS),
 }  # fmt: skip
 
 OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])
@@ -124,7 +124,7 @@ def read_transforms(
         distorted: "error" to refuse lens distortion, or "keep" to return it in
             ``Dataset.lenses`` for :func:`undistort`.
         ignore_keys: keys to ignore although they change a picture's content, such as
-            "mask_path".
+            "white_transparent", or "mask_path" to use whole pictures.
         scale: downscaling factor; 4 reads ``images_4/a.png`` for the file's ``images/a.png``, in
             nerfstudio's layout, and resizes the cameras.
 
@@ -181,6 +181,7 @@ def read_transforms(
         [split for part in parts for split in part.splits],
         parts[0].applied_transform,
         [lens for part in parts for lens in part.lenses],
+        [mask for part in parts for mask in part.mask_paths],
     )
 
 
@@ -237,6 +238,9 @@ def write_transforms(
         pose[:3, 3] = camera.position
         # 0.0 + x turns -0.0, which the change of axes produces, into 0.0.
         frames.append({"file_path": name, "transform_matrix": (pose + 0.0).tolist()})
+        mask = dataset.mask_paths[i]
+        if mask is not None:
+            frames[-1]["mask_path"] = _relative(mask, path.parent)
         names.append(name)
     data: dict[str, Any] = {"camera_model": "OPENCV"}
     if intrinsics and all(each == intrinsics[0] for each in intrinsics):
@@ -312,6 +316,7 @@ def _read_file(
     lenses: list[Lens | None] = []
     names: list[str] = []
     paths: list[Path] = []
+    masks: list[Path | None] = []
     finder = FileFinder(path.parent, IMAGE_SUFFIXES)
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict):
@@ -337,6 +342,7 @@ def _read_file(
         cameras.append(_camera(values, image))
         lenses.append(lens)
         names.append(name)
+        masks.append(None if "mask_path" in ignore_keys else _mask(values, finder))
         # This camera has the full picture's size; with_images resizes it.
         paths.append(image if scale == 1 else finder.find(_scaled(path, name, scale)))
     keys = {key for level in (data, *frames) for key in level}
@@ -372,7 +378,21 @@ def _read_file(
     applied = None
     if "applied_transform" in data:
         applied = _matrix(path, "applied_transform", None, data["applied_transform"])[:3]
-    return Dataset(cameras, available, points, colors, splits, applied, lenses)
+    return Dataset(cameras, available, points, colors, splits, applied, lenses, masks)
+
+
+def _mask(values: _Values, finder: FileFinder) -> Path | None:
+    name = values.get("mask_path")
+    if not name:
+        return None
+    mask = finder.find(name) if isinstance(name, str) else None
+    if mask is None or not is_file(mask):
+        raise values.refuse(
+            "mask_path",
+            f"got {brief(name)}, which is not there; put it there, or fit on whole pictures:"
+            " ignore_keys=['mask_path'] (--ignore-key mask_path)",
+        )
+    return mask
 
 
 def brief(value: Any) -> str:

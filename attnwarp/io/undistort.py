@@ -12,7 +12,7 @@ from attnwarp.camera import Camera
 from attnwarp.errors import InputError
 from attnwarp.io.dataset import Dataset
 from attnwarp.io.file import is_file, write_atomically
-from attnwarp.io.images import encode_png, read_image
+from attnwarp.io.images import encode_png, read_image, read_mask
 from attnwarp.io.lens import undistorted_camera, undistorted_image
 from attnwarp.io.names import numbered
 from attnwarp.io.transforms import read_transforms, write_transforms
@@ -32,8 +32,8 @@ def undistort(
 
     Args:
         dataset: dataset read with ``distorted="keep"``; cameras without a picture are left out.
-        folder: target of transforms.json and images/NAME.png, numbered for equal names; created if
-            missing.
+        folder: target of transforms.json, images/NAME.png and masks/NAME.png, numbered for equal
+            names; created if missing.
         report: receiver of progress, picture by picture.
 
     Returns:
@@ -73,6 +73,7 @@ def undistort(
     paths: list[Path | None] = [folder / "images" / name for name in names]
     _check_apart(folder, paths, dataset.image_paths)
     _check_own(folder, cameras, names)
+    masks: list[Path | None] = [None] * len(cameras)
     for i, (camera, lens, target, source, path) in enumerate(
         zip(dataset.cameras, dataset.lenses, cameras, dataset.image_paths, paths, strict=True)
     ):
@@ -83,8 +84,21 @@ def undistort(
         path.parent.mkdir(parents=True, exist_ok=True)
         data = encode_png(image)
         write_atomically(path, lambda stream, data=data: stream.write(data))  # type: ignore[misc]
+        mask = dataset.mask_paths[i]
+        if mask is not None:
+            kept = read_mask(mask, camera.height, camera.width)
+            flat = np.repeat(kept[..., None], 3, axis=2).astype(np.uint8) * 255
+            if lens is not None:
+                flat = undistorted_image(flat, camera, lens, target)
+            masks[i] = folder / "masks" / names[i]
+            masks[i].parent.mkdir(parents=True, exist_ok=True)
+            data = encode_png(np.where(flat == 255, flat, 0))
+            write_atomically(masks[i], lambda stream, data=data: stream.write(data))
         report.step(i + 1, len(cameras), names[i])
-    result = replace(dataset, cameras=cameras, image_paths=paths, lenses=[None] * len(cameras))
+    result = replace(
+        dataset, cameras=cameras, image_paths=paths, mask_paths=masks,
+        lenses=[None] * len(cameras),
+    )  # fmt: skip
     write_transforms(folder, result)
     return result
 

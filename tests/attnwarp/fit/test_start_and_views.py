@@ -204,11 +204,14 @@ def test_one_of_eight_is_held_out_in_the_order_of_names_and_never_the_first_view
     for first in range(17):
         data = named(17).select([first, *(k for k in range(17) if k != first)])
         train, test = hold_out(data)
-        # The one after the first in the order of names, and the eighth after that.
+        # In the middle of the eight after the first in the order of names, and of the next eight.
         number = int(data.cameras[0].name[:2])
-        expected = {f"{(number + step) % 17:02d}.png" for step in (1, 9)}
+        expected = {f"{(number + step) % 17:02d}.png" for step in (4, 12)}
         assert {c.name for c in test.cameras} == expected
         assert len(train) == 15 and train.cameras[0] is data.cameras[0]
+    assert [c.name for c in hold_out(named(9), ["03", "05.png"])[1].cameras] == ["05.png", "03.png"]
+    with pytest.raises(ValueError, match="the name '9', which none of the 9 views has"):
+        hold_out(named(9), ["9"])
     everything, nothing = hold_out(named(17), 0)
     assert len(everything) == 17 and nothing is None
 
@@ -301,16 +304,16 @@ def test_views_that_are_alike_and_others_stay_held_out(tmp_path, recwarn):
 
 
 def test_copies_among_pictures_without_splits_are_not_held_out(tmp_path):
-    """The second and the last of ten pictures are held out, and the last is the third once more."""
-    paths = [tmp_path / f"{k}.png" for k in range(10)]
+    """The fifth and the thirteenth picture are held out, and that is the third once more."""
+    paths = [tmp_path / f"{k:02d}.png" for k in range(18)]
     for k, path in enumerate(paths):
-        seed = 2 if k == 9 else k
+        seed = 2 if k == 12 else k
         pixels = np.random.default_rng(seed).integers(0, 256, (6, 8, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(path)
     cameras = [camera(8, 6, name=path.name).moved([k, 0, 0]) for k, path in enumerate(paths)]
-    with pytest.warns(InputWarning, match=r"'9\.png', which is '2\.png'"):
+    with pytest.warns(InputWarning, match=r"'12\.png', which is '02\.png'"):
         train, test = hold_out(Dataset(cameras, paths))
-    assert len(train) == 8 and [c.name for c in test.cameras] == ["1.png"]
+    assert len(train) == 16 and [c.name for c in test.cameras] == ["04.png"]
 
 
 def test_a_single_picture_is_fitted_on_and_not_held_out():

@@ -440,3 +440,13 @@ def test_a_model_with_more_images_beside_the_one_that_is_read_is_named(tmp_path,
             tmp_path / "sparse" / "1" / f"images{'.bin' if write is write_binary else '.txt'}"
         ).unlink()
         assert len(read_dataset(tmp_path).cameras) == 2
+
+
+def test_masks_beside_the_images_have_their_names_with_or_without_suffix(tmp_path):
+    write_text(tmp_path / "sparse" / "0")
+    pictures(tmp_path / "images")
+    names = sorted(name for *_, name, _ in poses())
+    pictures(tmp_path / "masks", images=[(0, 0, 0, 0, f"{names[0]}.png", 0)])
+    assert read_colmap(tmp_path).mask_paths == [
+        tmp_path / "masks" / f"{names[0]}.png", *[None] * (len(names) - 1)
+    ]  # fmt: skip

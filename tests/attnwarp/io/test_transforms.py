@@ -9,12 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from attnwarp import Camera
 from attnwarp.errors import InputWarning
+from attnwarp.fit import load_views
 from attnwarp.io import (
     Dataset,
     FileFormatError,
     read_dataset,
     read_points,
     read_transforms,
+    undistort,
     write_transforms,
 )
 
@@ -602,3 +604,30 @@ def test_nerfstudio_finds_all_three_splits_in_what_we_write(tmp_path, held_out):
     for split, index in (("train", 0), ("val", 1), ("test", 1)):
         assert written[f"{split}_filenames"] == [written["frames"][index]["file_path"]]
     assert read_dataset(tmp_path).splits == ["train", "test"]
+
+
+def test_masks_are_read_with_the_pictures_and_follow_an_undistortion(tmp_path):
+    """A shrunk pixel is ignored where any of it is; a bent one, where its place in the mask is."""
+    image(tmp_path / "a.png", (48, 32))
+    dark = np.full((32, 48), 255, np.uint8)
+    dark[5:20, 10:31] = 0
+    Image.fromarray(dark).save(tmp_path / "m.png")
+    frame = {"file_path": "a.png", "transform_matrix": pose(0), "mask_path": "m.png"}
+    flat = {"w": 48, "h": 32, "fl_x": 40.0}
+    data = read_transforms(write(tmp_path, [frame], **flat))
+    (mask,) = load_views(data, max_size=24).masks
+    np.testing.assert_array_equal(mask, dark.reshape(16, 2, 24, 2).min(axis=(1, 3)) > 0)
+    assert load_views(read_transforms(tmp_path, ignore_keys=["mask_path"])).masks == [None]
+    bent = read_transforms(write(tmp_path, [frame], **flat, k1=-0.1), distorted="keep")
+    undistort(bent, tmp_path / "flat")
+    again = read_transforms(tmp_path / "flat")
+    (mask,) = load_views(again).masks
+    camera, lens = bent.cameras[0], bent.lenses[0]
+    rays = again.cameras[0].directions()
+    xy = (camera.K[:2, :2] @ lens.distort(rays.reshape(-1, 3)[:, :2]).T).T + camera.K[:2, 2]
+    column, row = np.floor(xy).astype(int).T.reshape(2, *mask.shape)
+    nearest = dark[row.clip(0, 31), column.clip(0, 47)] > 0
+    assert (mask <= nearest).all() and (mask != nearest).mean() < 0.08  # its border
+    (tmp_path / "m.png").unlink()
+    with pytest.raises(FileFormatError, match="mask_path: got 'm.png', which is not there"):
+        read_transforms(write(tmp_path, [frame], **flat))
