@@ -111,7 +111,14 @@ class Pace:
         return (now - since) / (done - had) * (total - done)
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Format seconds for a person.
+
+    Example:
+        >>> from attnwarp.reporting import duration
+        >>> duration(100), duration(5500)
+        ('2 min', '1.5 h')
+    """
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
@@ -152,7 +159,7 @@ class _Lines(_Shown):
             return
         self._last = now
         count = f"[{done}/{total}]" if total else ""
-        rest = "" if left is None else f", {_duration(left)} left"
+        rest = "" if left is None else f", {duration(left)} left"
         self.log(" ".join(part for part in (self.title, count, text + rest) if part))
 
 
@@ -185,7 +192,7 @@ def _bar(console: Console) -> Progress:
         def render(self, task: Task) -> Text:
             ends = task.fields["ends"]
             left = 0 if ends is None else ends - time.perf_counter()
-            return Text(f"{_duration(left)} left" if left > 0 else "")
+            return Text(f"{duration(left)} left" if left > 0 else "")
 
     def text(name: str, **column: Any) -> TextColumn:
         return TextColumn(name, markup=False, table_column=Column(**column))

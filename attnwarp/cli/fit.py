@@ -31,7 +31,7 @@ from attnwarp.process import asked_to_stop
 from attnwarp.reporting import Reporter, reporter
 
 if TYPE_CHECKING:
-    from attnwarp.fit import Fit, FitSettings, Views
+    from attnwarp.fit import Fit, Views
     from attnwarp.gaussians import Gaussians
 
 
@@ -41,8 +41,18 @@ OWN_OPTIONS = {
 
 
 OVERFITTED = 0.5
-"""Fall of the held-out PSNR from its best, dB, that triggers a message; the last evaluations of a
-sound fit differ by less."""
+"""Fall of the choosing views' PSNR from its best, dB, that triggers a message; the last evaluations
+of a sound fit differ by less."""
+
+PATIENCE = 4
+"""Evaluations without a gain after which a fit with held-out views stops."""
+
+SIZES = {"cpu": 512, "cuda": 1600}
+"""Longest side of larger pictures in px by default: the editors' size, and 3DGS's."""
+
+PIXELS_PER_SPLAT, GROWTH = 2, 2
+"""Default limit of the splats: one for so many pixels of a picture, or so many times the first
+ones if more."""
 
 
 RESULTS = ("splats.ply", "checkpoint.pt", "history.jsonl", "settings.json")
@@ -71,18 +81,25 @@ def fit(
     ] = None,
     max_size: MaxSizeOption = None,
     max_splats: Annotated[
-        int | None, typer.Option(min=1, help="Do not grow the model beyond.")
+        int | None,
+        typer.Option(
+            min=1,
+            help="Do not grow the model beyond (default: half of a picture's pixels, or twice the"
+            " first splats if more).",
+        ),
     ] = None,
     points: Annotated[
         int | None,
         typer.Option(min=1, help="Random first points, where DATA has none (default 10000)."),
     ] = None,
     hold_out: Annotated[
-        int,
+        str,
         typer.Option(
-            min=0, help="Hold out one view of so many, 0 none; splits that DATA names go first."
+            metavar="N|NAMES",
+            help="Hold out one view of so many, 0 none, where DATA names no splits; or these views,"
+            " with commas between.",
         ),
-    ] = 8,
+    ] = "8",
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     change: Annotated[
         list[str] | None,
@@ -118,10 +135,7 @@ def fit(
         first = None if start is None else _read_start(start, out, kind)
         kind = kind or (Kind.three if first is not None and first.kind == "3d" else Kind.two)
         _check_third_scale(third_scale, kind)
-        if hold_out == 1:
-            raise ValueError(
-                "--hold-out: got 1, which leaves nothing to fit on; expected 0 or at least 2"
-            )
+        apart = _held_out(hold_out)
         use_threads(threads)
         limits = {"iterations": iterations, "max_splats": max_splats}
         changes |= {"kind": kind.value[:2], "seed": seed}
@@ -129,15 +143,15 @@ def fit(
         if first is not None and first.antialiased:
             changes.setdefault("antialiased", True)
         result = _fit(
-            data, reading, out, changes, start, first, points, hold_out, max_size, device, report,
+            data, reading, out, changes, start, first, points, apart, max_size, device, report,
             restart=restart, max_seconds=max_seconds, checkpoint_seconds=checkpoint_seconds,
             third_scale=third_scale,
         )  # fmt: skip
         from attnwarp.devices import peak_memory
 
         place = result.gaussians.means.device
-        last = result.history[-1]
-        held = f", held-out PSNR {last.psnr:.2f} dB" if last.psnr is not None else ""
+        psnr = result.kept.psnr
+        held = f", held-out PSNR {psnr:.2f} dB" if psnr is not None else ""
         typer.echo(
             f"{out / 'splats.ply'}: {len(result.gaussians)} splats, {result.iteration} iterations"
             f" in {result.seconds:.0f} s{peak_memory(str(place))}{held}"
@@ -148,19 +162,26 @@ def fit(
             raise typer.Exit(STOPPED)
 
 
+def _held_out(text: str) -> int | list[str]:
+    """Read ``--hold-out``: a number, or names."""
+    if not text.isdecimal():
+        return [name.strip() for name in text.split(",")]
+    if int(text) == 1:
+        raise ValueError(
+            "--hold-out: got 1, which leaves nothing to fit on; expected 0, at least 2, or names"
+        )
+    return int(text)
+
+
 def _warn_of_overfit(result: Fit) -> None:
-    """Report if held-out views were nearer to their pictures in an earlier evaluation."""
-    every, whole = result.settings.evaluate_every, result.stopped == "iterations"
-    # A stopped fit may have just lowered its opacities.
-    said = [(r.psnr, r.iteration) for r in result.history if whole or r.iteration % every == 0]
-    known = [(psnr, iteration) for psnr, iteration in said if psnr is not None]
-    if not known or max(known)[0] <= known[-1][0] + OVERFITTED:
+    """Report if an earlier evaluation's splats are kept and the last ones are clearly worse."""
+    best, last = result.kept.choosing, result.history[-1].choosing
+    if best is None or last is None or best <= last + OVERFITTED:
         return
-    (best, iteration), (last, _) = max(known), known[-1]
-    fewer = f", or --iterations {iteration}" if iteration else ""
     warn(
-        f"the held-out views had {best:.2f} dB after {iteration} iterations, and have {last:.2f}:"
-        f" the fit learns its pictures by heart; take more of them{fewer}"
+        f"the splats of {result.kept.iteration} iterations are kept: views that choose had"
+        f" {best:.2f} dB then, and {last:.2f} in the end: the fit learns its pictures by heart;"
+        " take more of them"
     )
 
 
@@ -189,7 +210,7 @@ def _fit(
     start: Path | None,
     first: Gaussians | None,
     points: int | None,
-    every: int,
+    apart: int | list[str],
     max_size: int | None,
     device: str,
     report: Reporter,
@@ -210,9 +231,16 @@ def _fit(
     # A view without a picture can be neither fitted nor held out.
     there = [k for k, path in enumerate(dataset.image_paths) if path is not None]
     dataset = dataset.select(there) if there else dataset
-    train, test = attnwarp.fit.hold_out(dataset, every)
+    try:
+        train, test = attnwarp.fit.hold_out(dataset, apart)
+    except ValueError as error:
+        raise ValueError(str(error).replace("every:", "--hold-out:", 1)) from None
     shown = [] if test is None else [f"held_out/{stem}.png" for stem in file_stems(test.cameras)]
     check_inputs_stay((out / name for name in (*RESULTS, *shown)), dataset.image_paths)
+    largest = max(max(camera.width, camera.height) for camera in train.cameras)
+    if max_size is None and largest > (most := SIZES[device.partition(":")[0]]):
+        report.log(f"pictures of {largest} px are shrunk to {most} (--max-size {largest}: not)")
+        max_size = most
     views = attnwarp.fit.load_views(train, max_size=max_size)
     held_out = None
     if test is not None:
@@ -223,8 +251,13 @@ def _fit(
         first = first.with_sh_degree(settings.sh_degree)
     else:
         first = attnwarp.fit.first_splats(
-            dataset, views.cameras, settings, report, random=points or FIRST_POINTS
+            dataset, views.cameras, settings, report, random=points or FIRST_POINTS, views=views
         )
+    pixels = views.cameras[0].width * views.cameras[0].height
+    most = max(pixels // PIXELS_PER_SPLAT, GROWTH * len(first))
+    settings = attnwarp.fit.FitSettings.from_dict(
+        {"max_splats": most, "patience": PATIENCE if held_out else None, **changes}
+    )
     first = first.to(device=device)
     out.mkdir(parents=True, exist_ok=True)
     try:
@@ -268,12 +301,14 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
 
     import torch
 
-    from attnwarp.losses import psnr
+    from attnwarp.fit.loop import choosing
+    from attnwarp.losses import psnr_of_mse
     from attnwarp.render import render
 
     folder = out / "held_out"
     folder.mkdir(exist_ok=True)
-    near = _near(result.settings, result.extent)
+    near = result.settings.near * result.extent
+    chooses = choosing(len(held_out), result.settings)
     white = result.settings.background == "white"
     behind = 1.0 if white else 0.0
     background = torch.full((3,), behind, dtype=torch.float32, device=result.gaussians.means.device)
@@ -284,8 +319,6 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
         target = held_out.target(index, background)
         path = folder / f"{name}.png"
         write_image(path, torch.cat([target, color], dim=1).cpu().numpy())
-        typer.echo(f"{path}: {psnr(color, target):.2f} dB")
-
-
-def _near(settings: FitSettings, extent: float) -> float:
-    return settings.near * extent
+        psnr = psnr_of_mse(held_out.error(index, color, background))
+        role = ", one that chose the splats" if index in chooses else ""
+        typer.echo(f"{path}: {psnr:.2f} dB{role}")

@@ -4,6 +4,7 @@ docs/method/fitting.md.
 
 from attnwarp.fit.loop import Fit, Record, fit
 from attnwarp.fit.settings import FitSettings
+from attnwarp.fit.sky import with_sky
 from attnwarp.fit.start import extent_of, first_splats, from_points, random_points
 from attnwarp.fit.views import Views, hold_out, load_views
 from attnwarp.fit.warm import compile_kernels
@@ -21,4 +22,5 @@ __all__ = [
     "hold_out",
     "load_views",
     "random_points",
+    "with_sky",
 ]

@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from attnwarp import check, losses
 from attnwarp.devices import on_cpu_unless_named
 from attnwarp.errors import InputWarning
 from attnwarp.fit.densify import Density
+from attnwarp.fit.exposure import Exposure
 from attnwarp.fit.model import Model
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.start import extent_of
@@ -28,7 +29,7 @@ from attnwarp.fit.warm import compile_kernels
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError, write_ply
 from attnwarp.render import Render, render
-from attnwarp.reporting import SILENT, Reporter
+from attnwarp.reporting import SILENT, Reporter, duration
 from attnwarp.workdir import CheckpointClock, Workdir, results_in
 
 Tensor = torch.Tensor
@@ -40,8 +41,8 @@ SPLATS = "splats.ply"
 NAMED = {"start": "first splats", "held_out": "held-out views"}
 """Names of the parts of a fit's identity in messages."""
 
-GIANT = 30
-"""Splat size in scene extents that triggers a warning; skies and far hills have 5 to 20."""
+LEAST_SEEN = 1 / 255
+"""Least contribution of a splat to all pictures together: one grey level of one pixel."""
 
 SMOOTHING = 0.98
 """Weight of past values in the smoothed loss and PSNR shown during a fit."""
@@ -57,9 +58,10 @@ class Record:
             processes of the fit.
         splats: number of splats.
         loss: smoothed loss of the last iterations; None before the first.
-        psnr: mean over the held-out views, dB; None without held-out views. Infinite if all equal
-            their pictures.
-        psnr_pooled: PSNR of the held-out views' mean squared error.
+        psnr: mean over the held-out views that choose nothing, dB; None without such views.
+            Infinite if all equal their pictures.
+        psnr_pooled: PSNR of those views' mean squared error.
+        choosing: mean PSNR of the held-out views that choose the splats, dB; None without them.
         measures: figures of the caller's measure.
 
     Example:
@@ -76,6 +78,7 @@ class Record:
     loss: float | None
     psnr: float | None
     psnr_pooled: float | None
+    choosing: float | None = None
     measures: dict[str, float] = field(default_factory=dict)
 
 
@@ -84,13 +87,15 @@ class Fit:
     """Result of a fit.
 
     Attributes:
-        gaussians: the splats, float32, outside autograd.
+        gaussians: the splats, float32, outside autograd; with views that choose, those of
+            ``kept``. With ``densify``, without those that no fitted view shows.
         settings: settings used.
         history: evaluations, the first before the first iteration, the last at the end.
         iteration: iterations done.
         seconds, cpu_seconds: time of the iterations.
         stopped: reason of the end: "iterations" (all done), "time", "patience", or "asked".
         extent: extent of the scene, the unit of the settings' shares.
+        kept: evaluation of the returned splats.
 
     Example:
         >>> import numpy as np
@@ -112,6 +117,7 @@ class Fit:
     cpu_seconds: float
     stopped: str
     extent: float
+    kept: Record
 
 
 @on_cpu_unless_named
@@ -133,11 +139,15 @@ def fit(
 ) -> Fit:
     """Fit splats to posed pictures.
 
-    With ``folder``, a checkpoint is written there every ``checkpoint_seconds`` and at the end, when
-    the splats (``splats.ply``) are written too, each atomically. A fit with a checkpoint is
-    resumed. On the same machine, with the same number of torch threads, it gives the bits of an
-    uninterrupted fit. A fit planned with another number of iterations continues to the new end, and
-    the report says that its past iterations followed another schedule.
+    With ``folder``, a checkpoint and the splats so far (``splats.ply``) are written there every
+    ``checkpoint_seconds`` and at the end, each atomically. A fit with a checkpoint is resumed. On
+    the same machine, with the same number of torch threads, it gives the bits of an uninterrupted
+    fit. A fit planned with another number of iterations continues to the new end, and the report
+    says that its past iterations followed another schedule.
+
+    With ``settings.patience`` and at least two held-out views, every second one of them chooses:
+    the splats of the evaluation that shows these best are returned. The reported PSNR is that of
+    the others (:func:`choosing`).
 
     Args:
         start: first splats, of the settings' kind: from :func:`attnwarp.fit.from_points`, or from
@@ -170,8 +180,8 @@ def fit(
             suggests a remedy. The last checkpoint is kept.
 
     Warns:
-        InputWarning: held-out pictures are also fitted on; a splat is 30 times as large as the
-            scene; world coordinates in ``splats.ply`` exceed float32's precision.
+        InputWarning: held-out pictures are also fitted on; world coordinates in ``splats.ply``
+            exceed float32's precision.
 
     Example:
         >>> import numpy as np
@@ -238,6 +248,7 @@ class _Run:
     ) -> None:
         self.third_scale = third_scale
         self.settings, self.views, self.held_out = settings, views, held_out
+        self.chooses = choosing(len(held_out or ()), settings)
         self.backend, self.measure = backend, measure
         self.extent = extent_of(views.cameras, start.world_means())
         centers = np.stack([camera.position for camera in views.cameras])
@@ -246,6 +257,8 @@ class _Run:
         self.model = Model(start, settings, self.extent)
         middle = centers.mean(0) - self.model.origin
         self.density = Density(settings, self.extent, middle, len(start), self.model.device)
+        self.exposure = Exposure(len(views), self.model.device) if settings.exposure else None
+        self.best: dict[str, Tensor] = {}
         self.random = torch.Generator().manual_seed(settings.seed)
         self.queue: list[int] = []
         self.iteration = 0
@@ -299,6 +312,9 @@ class _Run:
         try:
             self.model.restore(state["model"])
             self.density.restore(state["density"])
+            if self.exposure is not None:
+                self.exposure.restore(state["exposure"])
+            self.best = dict(state["best"])
             self.random.set_state(state["random"])
             self.queue = list(state["queue"])
             self.iteration = int(state["iteration"])
@@ -324,7 +340,8 @@ class _Run:
                 f" {now} in one go has other splats"
             )
 
-    def save(self) -> None:
+    def save(self, gaussians: Gaussians) -> None:
+        """Write the checkpoint, then the splats: splats without a checkpoint count as foreign."""
         if self.folder is None:
             return
         self.folder.save(
@@ -333,6 +350,8 @@ class _Run:
                 **self.identity(),
                 "model": self.model.state(),
                 "density": self.density.state(),
+                "exposure": None if self.exposure is None else self.exposure.state(),
+                "best": self.best,
                 "random": self.random.get_state(),
                 "queue": list(self.queue),
                 "iteration": self.iteration,
@@ -343,6 +362,7 @@ class _Run:
                 "history": [asdict(record) for record in self.history],
             },
         )
+        write_ply(self.folder.path / SPLATS, gaussians, third_scale=self.third_scale)
 
     def go(
         self,
@@ -356,6 +376,8 @@ class _Run:
             compile_kernels(s.kind, report, self.model.device)
         if not self.history:
             self.evaluate()
+        if self.iteration < s.iterations:
+            self.announce(report)
         while True:
             stopped = self._reason_to_stop(max_seconds, stop)
             if stopped:
@@ -372,16 +394,15 @@ class _Run:
                 left = min(left, max_seconds - self.seconds)
             report.step(self.iteration, s.iterations, self.figures(), left)
             if self.folder is not None and clock.due:
-                with clock.saving():
-                    self.save()
+                with clock.saving(), warnings.catch_warnings():
+                    warnings.simplefilter("ignore", InputWarning)  # said at the end
+                    self.save(self.model.gaussians().detach())
         if self.history[-1].iteration != self.iteration:
             self.evaluate()
-        self.save()
-        gaussians = self.model.gaussians().detach()
-        self.warn_of_giants(gaussians)
-        if self.folder is not None:
-            # Written after the checkpoint: splats without a checkpoint count as foreign files.
-            write_ply(self.folder.path / SPLATS, gaussians, third_scale=self.third_scale)
+        gaussians = self.model.gaussians(self.best or None).detach()
+        if s.densify and stopped != "asked":
+            gaussians = self.shown(gaussians)
+        self.save(gaussians)
         return Fit(
             gaussians,
             s,
@@ -391,20 +412,44 @@ class _Run:
             self.cpu_seconds,
             stopped,
             self.extent,
+            max(self.history, key=_chosen) if self.chooses else self.history[-1],
         )
 
-    def warn_of_giants(self, gaussians: Gaussians) -> None:
-        """Warn of splats far larger than the scene, which spoil depth wherever they are visible."""
-        sizes = gaussians.scales.amax(dim=1) / self.extent
-        giants = int((sizes > GIANT).sum())
-        if giants:
-            warnings.warn(
-                f"{giants} of {len(gaussians)} splats are more than {GIANT} times as large as the"
-                f" scene, up to {float(sizes.max()):.0f} times: depth may be wrong where they show;"
-                " look at it (attnwarp render --depth), and try another seed",
-                InputWarning,
-                stacklevel=3,
-            )
+    def announce(self, report: Reporter) -> None:
+        """Tell the expected time, from the pace of three iterations that change nothing."""
+        background = self.background(fitting=False)
+        for k in range(4):
+            if k == 1:  # the first loads and warms up
+                begin = time.perf_counter()
+            index = k % len(self.views)
+            view = self.render(self.model.gaussians(), self.views.cameras[index], background)
+            self.loss_of(view.color.float(), view, self.views.target(index, background)).backward()
+            self.model.clear()
+        pace = (time.perf_counter() - begin) / 3
+        seconds = self.time_left.expect(pace, self.iteration, len(self.model))
+        report.log(
+            f"{self.settings.iterations - self.iteration} iterations on {len(self.views)} pictures,"
+            f" {len(self.model)} splats{self._growth()}: about {duration(seconds)}"
+        )
+
+    def _growth(self) -> str:
+        most = self.settings.max_splats
+        if not self.density.active(self.iteration + 1):
+            return ""
+        return " and as many as it takes, so longer" if most is None else f", at most {most}"
+
+    def shown(self, gaussians: Gaussians) -> Gaussians:
+        """Select the splats that the fitted views show."""
+        # The gradient of a picture's sum in a splat's value is the splat's weight, behind all
+        # that lies before it.
+        values = torch.ones_like(gaussians.means[:, :1]).requires_grad_(True)
+        all_alike = replace(gaussians, far=math.inf)
+        for camera in self.views.cameras:
+            near = self.settings.near * self.extent
+            view = render(all_alike, camera, backend=self.backend, features=values, near=near)
+            view.color.sum().backward()
+        assert values.grad is not None
+        return gaussians.select(values.grad[:, 0] >= LEAST_SEEN)
 
     def _reason_to_stop(self, max_seconds: float | None, stop: Callable[[], bool] | None) -> str:
         if self.iteration >= self.settings.iterations:
@@ -419,7 +464,7 @@ class _Run:
         patience, every = self.settings.patience, self.settings.evaluate_every
         # A stopped process evaluated once more, which must not shorten the patience.
         regular = (record for record in self.history if record.iteration % every == 0)
-        values = [record.psnr for record in regular if record.psnr is not None]
+        values = [record.choosing for record in regular if record.choosing is not None]
         if patience is None or len(values) <= patience:
             return False
         return max(values[-patience:]) < max(values[:-patience]) + self.settings.min_gain
@@ -462,7 +507,14 @@ class _Run:
                 f"after {self.iteration} iterations: {error}; lower the learning rates"
             ) from error
         view = self.render(gaussians, camera, background)
-        loss = self.loss_of(view, target)
+        image = view.color.float()
+        if self.exposure is not None:
+            image = self.exposure(image, index)
+        kept = self.views.kept(index, image.device)
+        if kept is not None:
+            # Black in both, since SSIM also reads the neighbours of a pixel.
+            image, target = image * kept[..., None], target * kept[..., None]
+        loss = self.loss_of(image, view, target)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise RuntimeError(
@@ -474,7 +526,9 @@ class _Run:
         if self.density.active(self.iteration):
             self.density.watch(self.model, gaussians, camera, view.weight.detach())
         self.model.step(self.iteration / s.iterations)
-        squared = float((view.color.detach() - target).square().mean())
+        if self.exposure is not None:
+            self.exposure.step(self.iteration / s.iterations)
+        squared = float((image.detach() - target).square().mean())
         self.loss = (
             value if math.isnan(self.loss) else SMOOTHING * self.loss + (1 - SMOOTHING) * value
         )
@@ -496,9 +550,8 @@ class _Run:
             near=self.settings.near * self.extent,
         )
 
-    def loss_of(self, view: Render, target: Tensor) -> Tensor:
+    def loss_of(self, image: Tensor, view: Render, target: Tensor) -> Tensor:
         s = self.settings
-        image = view.color.float()
         loss = (1 - s.ssim) * losses.l1(image, target)
         if s.ssim:
             loss = loss + s.ssim * (1 - losses.ssim(image, target))
@@ -513,30 +566,54 @@ class _Run:
 
     def evaluate(self) -> None:
         gaussians = self.model.gaussians().detach()
-        errors = []
+        both: list[list[float]] = [[], []]
         if self.held_out is not None:
             background = self.background(fitting=False)
             for index, camera in enumerate(self.held_out.cameras):
                 image = self.render(gaussians, camera, background).color.clamp(0, 1)
-                error = image - self.held_out.target(index, background)
-                errors.append(float(error.square().mean()))
-                if math.isnan(errors[-1]):
+                error = self.held_out.error(index, image, background)
+                both[index in self.chooses].append(error)
+                if math.isnan(error):
                     raise RuntimeError(
                         f"after {self.iteration} iterations: the held-out view {camera.name!r}"
                         " renders as NaN; lower the learning rates"
                     )
-        self.history.append(
-            Record(
-                iteration=self.iteration,
-                seconds=self.seconds,
-                cpu_seconds=self.cpu_seconds,
-                splats=len(self.model),
-                loss=None if math.isnan(self.loss) else self.loss,
-                psnr=sum(losses.psnr_of_mse(e) for e in errors) / len(errors) if errors else None,
-                psnr_pooled=losses.psnr_of_mse(sum(errors) / len(errors)) if errors else None,
-                measures=dict(self.measure(gaussians)) if self.measure else {},
-            )
+        errors, choosing = both
+        record = Record(
+            iteration=self.iteration,
+            seconds=self.seconds,
+            cpu_seconds=self.cpu_seconds,
+            splats=len(self.model),
+            loss=None if math.isnan(self.loss) else self.loss,
+            psnr=_mean_psnr(errors),
+            psnr_pooled=losses.psnr_of_mse(sum(errors) / len(errors)) if errors else None,
+            choosing=_mean_psnr(choosing),
+            measures=dict(self.measure(gaussians)) if self.measure else {},
         )
+        if choosing and _chosen(record) > max(map(_chosen, self.history), default=-math.inf):
+            self.best = self.model.snapshot()
+        self.history.append(record)
+
+
+def choosing(held_out: int, settings: FitSettings) -> range:
+    """Choose the held-out views that decide which splats are kept, by their numbers: every second
+    one. What is chosen on is never what is reported on, so none of a single view.
+
+    Example:
+        >>> from attnwarp.fit import FitSettings
+        >>> from attnwarp.fit.loop import choosing
+        >>> list(choosing(5, FitSettings(patience=4))), list(choosing(5, FitSettings()))
+        ([1, 3], [])
+    """
+    return range(1, held_out if settings.patience else 0, 2)
+
+
+def _chosen(record: Record) -> float:
+    return -math.inf if record.choosing is None else record.choosing
+
+
+def _mean_psnr(errors: list[float]) -> float | None:
+    return sum(map(losses.psnr_of_mse, errors)) / len(errors) if errors else None
 
 
 def _decibels(value: float) -> str:

@@ -20,9 +20,13 @@ Tensor = torch.Tensor
 
 NAMES = ("means", "dc", "rest", "opacity", "scales", "quats")
 
-SMALLEST, LARGEST = 1e-7, 1e3
-"""Limits of scales as shares of the extent, widened to the first splats' range: scales outside
-would leave float32."""
+SMALLEST, LARGEST = 1e-7, 30
+"""Limits of scales as shares of the extent, for scales with a learning rate: smaller ones leave
+float32, larger ones spoil depth wherever they show."""
+
+LARGEST_SKY = 0.1
+"""Limit of the scales of sky splats as a share of ``far``, hardly more than they begin with: none
+grows over the horizon, where it would stand in for surfaces."""
 
 EPSILON = 1e-15
 """Adam's epsilon (3DGS): gradients of a mean over pixels are tiny and must not be damped."""
@@ -31,6 +35,34 @@ LARGEST_LOGIT = 15.0
 """Limit of opacity's logit: opacity stays within sigmoid(+-15), 3e-7 from 0 and 1, where its
 float32 gradient can still bring it back.
 """
+
+
+def adam_step(tensor: Tensor, first: Tensor, second: Tensor, steps: int, rate: float) -> None:
+    """Take one Adam step along a leaf's gradient, in place, then clear the gradient.
+
+    Args:
+        tensor: leaf with a gradient.
+        first, second: Adam's moments, updated.
+        steps: steps done.
+        rate: learning rate.
+    """
+    adam(
+        [tensor.detach()],
+        [tensor.grad],
+        [first],
+        [second],
+        [],
+        [torch.tensor(float(steps), dtype=torch.float32, device=tensor.device)],
+        fused=True,
+        amsgrad=False,
+        beta1=0.9,
+        beta2=0.999,
+        lr=rate,
+        weight_decay=0.0,
+        eps=EPSILON,
+        maximize=False,
+    )
+    tensor.grad = None
 
 
 class Model:
@@ -45,13 +77,12 @@ class Model:
         steps: steps done.
         rates: learning rates by name.
         extent: extent of the scene, in its units.
-        scales_range: smallest and largest logarithm of a scale.
     """
 
     def __init__(self, start: Gaussians, settings: FitSettings, extent: float) -> None:
         self.settings, self.extent = settings, extent
         self.antialiased = settings.antialiased
-        self.screen_filter = start.screen_filter
+        self.screen_filter, self.far = start.screen_filter, start.far
         g = start.detach().to(dtype=torch.float32)
         # float32 would round float64 centres far from zero.
         offset, means = split_origin(start.means.detach().cpu().numpy())
@@ -64,12 +95,6 @@ class Model:
             "scales": g.scales.log(),
             "quats": g.quats.clone(),
         }
-        smallest, largest = math.log(SMALLEST * extent), math.log(LARGEST * extent)
-        if len(g):
-            # Otherwise clamping would move splats whose scales have the learning rate 0.
-            smallest = min(smallest, float(self.tensors["scales"].min()))
-            largest = max(largest, float(self.tensors["scales"].max()))
-        self.scales_range = smallest, largest
         self.rates = {
             "means": settings.lr_means * extent,
             "dc": settings.lr_dc,
@@ -96,9 +121,9 @@ class Model:
         """Device of the splats and of Adam's moments."""
         return self.tensors["means"].device
 
-    def gaussians(self) -> Gaussians:
-        """Build the splats, differentiable in the leaves."""
-        t = self.tensors
+    def gaussians(self, tensors: dict[str, Tensor] | None = None) -> Gaussians:
+        """Build the splats, differentiable in the leaves, or from ``tensors`` in their place."""
+        t = self.tensors if tensors is None else tensors
         return Gaussians(
             self.settings.kind,
             t["means"],
@@ -109,7 +134,15 @@ class Model:
             origin=self.origin,
             antialiased=self.antialiased,
             screen_filter=self.screen_filter,
+            far=self.far,
         )
+
+    def _clamp_scales(self) -> None:
+        sky = self.tensors["means"].norm(dim=1, keepdim=True) > self.far
+        largest = torch.where(
+            sky, math.log(LARGEST_SKY * self.far), math.log(LARGEST * self.extent)
+        )
+        self.tensors["scales"].clamp_(math.log(SMALLEST * self.extent)).clamp_(max=largest)
 
     def step(self, progress: float) -> None:
         """Take one Adam step along the leaves' gradients, then clear the gradients.
@@ -129,26 +162,11 @@ class Model:
         for name, tensor in self.tensors.items():
             if tensor.grad is None or tensor.numel() == 0:
                 continue
-            adam(
-                [tensor.detach()],
-                [tensor.grad],
-                [self.first[name]],
-                [self.second[name]],
-                [],
-                [torch.tensor(float(self.steps), dtype=torch.float32, device=tensor.device)],
-                fused=True,
-                amsgrad=False,
-                beta1=0.9,
-                beta2=0.999,
-                lr=self.rates[name],
-                weight_decay=0.0,
-                eps=EPSILON,
-                maximize=False,
-            )
-            tensor.grad = None
+            adam_step(tensor, self.first[name], self.second[name], self.steps, self.rates[name])
         self.steps += 1
         with torch.no_grad():
-            self.tensors["scales"].clamp_(*self.scales_range)
+            if s.lr_scales:
+                self._clamp_scales()
             self.tensors["opacity"].clamp_(-LARGEST_LOGIT, LARGEST_LOGIT)
 
     def replace(self, keep: Tensor, added: dict[str, Tensor]) -> None:
@@ -168,6 +186,15 @@ class Model:
             self.tensors["opacity"].clamp_(max=math.log(limit / (1 - limit)))
         self.first["opacity"].zero_()
         self.second["opacity"].zero_()
+
+    def clear(self) -> None:
+        """Clear the gradients."""
+        for tensor in self.tensors.values():
+            tensor.grad = None
+
+    def snapshot(self) -> dict[str, Tensor]:
+        """Copy the leaves, by name."""
+        return {name: tensor.detach().clone() for name, tensor in self.tensors.items()}
 
     def state(self) -> dict[str, Any]:
         """Collect the state that the next step depends on, in main memory."""

@@ -59,11 +59,14 @@ class FitSettings(Settings):
         reset_opacity: opacity after a reset, in (0, 1).
         antialiased: True fits "3d" splats for the opacity-compensated rasteriser.
         near: near-plane depth, as a share of the extent.
+        sky: True adds far splats to the first ones, for pictures without transparency; see
+            :func:`attnwarp.fit.with_sky`.
+        exposure: True fits an affine change of colour for each picture, absent from renders.
         evaluate_every: number of iterations between two evaluations on the held-out views, which
             also form the history.
-        patience: number of evaluations after which the fit stops if the held-out PSNR has not risen
-            by ``min_gain`` dB. None: never. The additional evaluation at a process's end does not
-            count. The held-out figures of a fit that stopped early are slightly optimistic.
+        patience: number of evaluations after which the fit stops if the PSNR of the choosing views
+            has not risen by ``min_gain`` dB. None: never, and no view chooses. The additional
+            evaluation at a process's end does not count.
         min_gain: least gain for ``patience``, dB.
 
     Raises:
@@ -109,6 +112,8 @@ class FitSettings(Settings):
     reset_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)] = 0.01  # keeps the logit finite
     antialiased: bool = False
     near: Annotated[float, Range(1e-9)] = 0.01
+    sky: bool = True
+    exposure: bool = False
     evaluate_every: Count = 500
     patience: Count | None = None
     min_gain: Weight = 0.02

@@ -16,6 +16,7 @@ from attnwarp.gaussians import Gaussians, Kind
 
 if TYPE_CHECKING:
     from attnwarp.fit.settings import FitSettings
+    from attnwarp.fit.views import Views
     from attnwarp.io import Dataset
 from attnwarp.reporting import SILENT, Reporter
 
@@ -171,8 +172,8 @@ equally large, and a few would outweigh all others in the depth distortion of 2D
 def within_reach(points: Array, cameras: Sequence[Camera]) -> npt.NDArray[np.bool_]:
     """Select points at most 100 times as far from the cameras as usual, (P,) bool.
 
-    The usual distance is the points' median distance, or the scene's extent if larger. Non-finite
-    points stay, so that a later check refuses them.
+    The usual distance is :func:`usual_distance`. Non-finite points stay, so that a later check
+    refuses them.
 
     Args:
         points: (P, 3) world coordinates.
@@ -186,11 +187,33 @@ def within_reach(points: Array, cameras: Sequence[Camera]) -> npt.NDArray[np.boo
         >>> within_reach(np.array([[0, 0, 0], [1, 0, 0], [0, 0, 9e3]]), [camera]).tolist()
         [True, True, False]
     """
-    middle = np.stack([camera.position for camera in cameras]).mean(0)
     with np.errstate(over="ignore"):
-        away = np.linalg.norm(points - middle, axis=1)
-        usual = max(float(np.median(away)), extent_of(cameras, points))
+        away = _distances(points, cameras)
+        usual = usual_distance(points, cameras)
     return ~(away > FAR * usual) | ~np.isfinite(points).all(1)
+
+
+def usual_distance(points: Array, cameras: Sequence[Camera]) -> float:
+    """Median distance of points from the cameras' mean, or the scene's extent if larger.
+
+    Args:
+        points: (P, 3) world coordinates.
+        cameras: cameras that see the points, at least one.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.fit.start import usual_distance
+        >>> camera = Camera.look_at((0, -3, 0), (0, 0, 0), width=64, height=48, fov_y=40)
+        >>> usual_distance(np.array([[0.0, 0, 0], [0, 1, 0], [0, 2, 0]]), [camera])
+        4.0
+    """
+    return max(float(np.median(_distances(points, cameras))), extent_of(cameras, points))
+
+
+def _distances(points: Array, cameras: Sequence[Camera]) -> Array:
+    middle = np.stack([camera.position for camera in cameras]).mean(0)
+    return np.asarray(np.linalg.norm(points - middle, axis=1))
 
 
 FIRST_POINTS = 10_000
@@ -205,8 +228,10 @@ def first_splats(
     report: Reporter = SILENT,
     *,
     random: int = FIRST_POINTS,
+    views: Views | None = None,
 ) -> Gaussians:
-    """Create first splats at a dataset's points, or at random points if it has none.
+    """Create first splats at a dataset's points, or at random points if it has none, and in the
+    sky.
 
     Args:
         dataset: dataset with points and colours.
@@ -215,6 +240,7 @@ def first_splats(
         report: receiver of a line if random points are used, or if points lie too far
             away (:func:`within_reach`).
         random: number of random points.
+        views: fitted pictures, which give the sky its colours; None begins without a sky.
 
     Example:
         >>> from attnwarp import Camera
@@ -241,7 +267,7 @@ def first_splats(
                 " cameras as the others"
             )
             points, colors = points[near], None if colors is None else colors[near]
-    return from_points(
+    start = from_points(
         points,
         colors,
         kind=settings.kind,
@@ -249,6 +275,11 @@ def first_splats(
         seed=settings.seed,
         cameras=cameras,
     )
+    if views is None or not settings.sky:
+        return start
+    from attnwarp.fit.sky import with_sky
+
+    return with_sky(start, views)
 
 
 def random_points(

@@ -40,6 +40,18 @@ class TimeLeft:
         left = self._pace.left(self._done, self._done + round(ahead or 1))
         return math.nan if ahead is None or left is None else left
 
+    def expect(self, pace: float, iteration: int, splats: int) -> float:
+        """Estimate the seconds from ``iteration`` on at ``pace`` seconds for the next one, if
+        refinements add splats evenly up to the limit.
+        """
+        s = self.settings
+        last = int(s.densify_until * s.iterations) if s.densify else 0
+        most = max(splats, s.max_splats or 0) if iteration < last else splats
+        ahead = np.arange(iteration, s.iterations)
+        grown = (ahead - s.densify_from) / max(1, last - s.densify_from)
+        counts = splats + (most - splats) * np.clip(grown, 0, 1)
+        return pace * float((counts + self.pixels).sum()) / (splats + self.pixels)
+
     def _ahead(self, iteration: int, splats: int) -> float | None:
         """Estimate the remaining work; None before two refinements show the growth."""
         s = self.settings

@@ -292,7 +292,7 @@ def _fitted(
             "seed": seed,
         }
     )
-    start = first_splats(dataset, views.cameras, settings, report).to(device=device)
+    start = first_splats(dataset, views.cameras, settings, report, views=views).to(device=device)
     report.log(f"no --ply: fitting splats to {len(views)} views first: {folder}")
     folder.mkdir(parents=True, exist_ok=True)
     with asked_to_stop(report) as stop:

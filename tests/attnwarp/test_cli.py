@@ -156,6 +156,8 @@ def test_fit_and_render_do_what_they_say(data, tmp_path):
         "sh_degree=0",
         "--set",
         "evaluate_every=20",
+        "--set",
+        "sky=false",
     )
     assert done.exit_code == 0, done.stderr
     assert "splats.ply: " in done.stdout and "held-out PSNR" in done.stdout
@@ -166,12 +168,12 @@ def test_fit_and_render_do_what_they_say(data, tmp_path):
     assert json.loads((out / "settings.json").read_text())["iterations"] == 60
     splats = read_ply(out / "splats.ply")
     assert splats.kind == "2d"
-    # Of 9 views the second is held out; picture and render side by side.
-    assert [p.name for p in (out / "held_out").iterdir()] == ["1.png"]
-    picture, drawn = np.split(cv2.imread(str(out / "held_out" / "1.png")).astype(float), 2, axis=1)
+    # Of 9 views the fifth is held out; picture and render side by side.
+    assert [p.name for p in (out / "held_out").iterdir()] == ["4.png"]
+    picture, drawn = np.split(cv2.imread(str(out / "held_out" / "4.png")).astype(float), 2, axis=1)
     assert picture.shape == (32, 32, 3)
     # Colours rounded to 8 bits: each off by half a step of 255 at most.
-    said = float(done.stdout.split("held_out/1.png: ")[1].split(" dB")[0])
+    said = float(done.stdout.split("held_out/4.png: ")[1].split(" dB")[0])
     error = np.sqrt(((picture - drawn) ** 2).mean())
     assert said == pytest.approx(20 * np.log10(255 / error), abs=20 * np.log10(1 + 0.6 / error))
     assert f"held-out PSNR {said:.2f} dB" in done.stdout  # of all, here of one
@@ -225,7 +227,7 @@ def test_a_fit_writes_over_no_picture_that_it_reads(data, tmp_path):
     path.write_text(path.read_text().replace("images/", "held_out/"))
     before = {p: p.read_bytes() for p in (tmp_path / "data").rglob("*.*")}
     done = in_process("fit", tmp_path / "data", "--out", tmp_path / "data", "--iterations", 1)
-    assert done.exit_code == 2 and "held_out/1.png: is read, and a result" in done.stderr
+    assert done.exit_code == 2 and "held_out/4.png: is read, and a result" in done.stderr
     assert {p: p.read_bytes() for p in (tmp_path / "data").rglob("*.*")} == before
 
 
@@ -304,30 +306,37 @@ def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
 
 
 def test_held_out_views_that_become_worse_are_said(data, tmp_path):
-    """All pictures are white but the one that is held out: the fit leaves it behind."""
+    """All pictures are white but the two that are held out: the fit leaves them behind, and the
+    splats are kept of before."""
     shutil.copytree(data, tmp_path / "data")
     for path in (tmp_path / "data" / "images").iterdir():
-        level = 0 if path.name == "1.png" else 255
+        level = 0 if path.name in ("1.png", "2.png") else 255
         cv2.imwrite(str(path), np.full((32, 32, 3), level, np.uint8))
     fit = ["fit", tmp_path / "data", "--out", tmp_path / "out", "--set", "evaluate_every=10"]
     fit += ["--iterations", 30, "--set", "densify=false", "--set", "lr_opacity=0.2"]
-    done = in_process(*fit)
+    done = in_process(*fit, "--hold-out", "1,2.png")
     assert done.exit_code == 0, done.stderr
     assert "learns its pictures by heart; take more of them" in done.stderr
     history = (tmp_path / "out" / "history.jsonl").read_text().splitlines()
-    first, *_, last = (json.loads(line)["psnr"] for line in history)
-    assert f"had {first:.2f} dB after 0 iterations, and have {last:.2f}: " in done.stderr
+    rows = [json.loads(line) for line in history]
+    first, *_, last = (row["choosing"] for row in rows)
+    assert (
+        f"the splats of 0 iterations are kept: views that choose had {first:.2f} dB" in done.stderr
+    )
+    assert f"and {last:.2f} in the end" in done.stderr
+    assert f"held-out PSNR {rows[0]['psnr']:.2f} dB" in done.stdout
+    assert done.stdout.count("one that chose the splats") == 1
 
 
 def test_views_without_pictures_are_neither_fitted_on_nor_held_out(data, tmp_path):
     shutil.copytree(data, tmp_path / "data")
-    (tmp_path / "data" / "images" / "1.png").unlink()  # the second by name would be held out
+    (tmp_path / "data" / "images" / "4.png").unlink()  # the fifth by name would be held out
     done = in_process(
         "fit", tmp_path / "data", "--out", tmp_path / "out", "--missing-images", "none",
         "--iterations", "2", "--set", "densify=false",
     )  # fmt: skip
     assert done.exit_code == 0, done.stderr
-    assert [path.name for path in (tmp_path / "out" / "held_out").iterdir()] == ["2.png"]
+    assert [path.name for path in (tmp_path / "out" / "held_out").iterdir()] == ["5.png"]
 
 
 def test_the_number_of_threads_changes_no_bit(data, tmp_path):
@@ -817,7 +826,9 @@ def test_what_is_read_is_not_written_over_by_its_name_or_a_link(data, tmp_path):
 
 
 def test_a_fit_writes_a_third_scale_for_other_viewers(data, tmp_path):
-    done = in_process("fit", data, "--out", tmp_path, "--iterations", 1, "--third-scale", "1e-5")
+    done = in_process("fit", data, "--out", tmp_path, "--iterations", 1, "--third-scale", "1e-5",
+        "--set", "sky=false",
+    )  # fmt: skip
     assert done.exit_code == 0, done.stderr
     vertex = PlyData.read(tmp_path / "splats.ply")["vertex"]
     np.testing.assert_allclose(vertex["scale_2"], np.log(1e-5), rtol=1e-6)

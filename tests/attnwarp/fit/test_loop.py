@@ -5,7 +5,6 @@ wrong.
 import dataclasses
 import itertools
 import json
-import warnings
 
 import numpy as np
 import pytest
@@ -157,7 +156,8 @@ def test_the_harmonics_come_in_one_degree_after_another(scene, monkeypatch):
     result = fit(start, scene[0], settings)
     # Iteration i is drawn with degree i // k, up to the settings' own: 0 at 0, 1 from k, 2 from 2k,
     # and 2 it stays.
-    assert asked == [0, 0, 0, 1, 1, 1, 2, 2, 2, 2, 2, 2]
+    # The four before are those that the time is told by.
+    assert asked[4:] == [0, 0, 0, 1, 1, 1, 2, 2, 2, 2, 2, 2]
     # What was not drawn had no gradient and stays as it began; what was drawn moved.
     only_first = fit(start, scene[0], dataclasses.replace(settings, iterations=k)).gaussians.sh
     assert bool((only_first[:, 1:] == 0).all()) and not torch.equal(
@@ -173,7 +173,7 @@ def test_the_harmonics_come_in_one_degree_after_another(scene, monkeypatch):
     ):
         asked.clear()
         fit(dataclasses.replace(result.gaussians, sh=sh), scene[0], settings)
-        assert asked == degrees
+        assert asked[4:] == degrees
 
 
 @pytest.mark.parametrize("kind", ["2d", "3d"])
@@ -234,7 +234,7 @@ def test_more_splats_than_a_fit_may_grow_to_are_told(scene):
     said = []
     result = fit(start, scene[0], settings, report=Watched(log=said.append))
     expected = f"{len(start)} first splats, more than max_splats 2: the fit keeps them all"
-    assert said == [f"{expected} and adds none"] and len(result.gaussians) == len(start)
+    assert said[:1] == [f"{expected} and adds none"] and len(result.gaussians) == len(start)
 
 
 def test_a_seed_decides_every_bit(scene):
@@ -391,8 +391,7 @@ def test_views_from_one_place_are_fitted_alike_in_any_unit(unit):
 def test_scales_without_a_learning_rate_stay_however_large_or_small(scene):
     start, settings = begin(scene, kind="3d", iterations=3, lr_scales=0, sh_degree=0, densify=False)
     start.scales[0], start.scales[1] = 1e5, 1e-9  # of an extent of 3
-    with pytest.warns(InputWarning, match="1 of 40 splats are more than 30 times"):
-        result = fit(start, scene[0], settings)
+    result = fit(start, scene[0], settings)
     # They are kept as logarithms of float32.
     torch.testing.assert_close(result.gaussians.scales, start.scales, rtol=1e-5, atol=0)
 
@@ -562,16 +561,12 @@ def test_a_restart_that_is_stopped_before_its_first_save_loses_nothing(scene, tm
 
 
 @pytest.mark.door
-def test_splats_that_are_far_larger_than_the_scene_are_warned_of(scene):
+def test_no_splat_stays_larger_than_30_extents(scene):
+    """Neither of a start with one, nor in a fit without densification."""
     start, settings = begin(scene, iterations=1, **FAST)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", InputWarning)
-        result = fit(start, scene[0], settings)
-    start.scales[3] = 100 * result.extent
-    with pytest.warns(
-        InputWarning, match=r"1 of 40 splats are more than 30 times .* up to \d\d times"
-    ):
-        fit(start, scene[0], settings)
+    start.scales[3] = 1000
+    result = fit(start, scene[0], settings)
+    assert float(result.gaussians.scales.max()) == pytest.approx(30 * result.extent, rel=1e-5)
 
 
 def test_numbers_that_explode_end_in_a_clear_error(scene):

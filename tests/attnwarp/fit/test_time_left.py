@@ -66,3 +66,11 @@ def test_growth_ends_at_the_limit_of_splats(clock):
     said = [row for row in told(clock, rows, settings, 0) if not math.isnan(row[1])]
     assert said[0][0] == 601
     assert all(left == pytest.approx(true, rel=0.02) for _, left, true in said)
+
+
+def test_the_time_told_before_a_fit_is_that_of_a_real_one():
+    """From the pace of its first iterations and the limit of its splats."""
+    _, seconds, splats = np.array(PHOTOGRAPHS).T
+    settings = FitSettings(iterations=3000, max_splats=int(splats[-1]))
+    told = TimeLeft(settings, int(splats[0]), 256 * 256).expect(seconds[3] / 500, 0, int(splats[0]))
+    assert told == pytest.approx(seconds[-1], rel=0.25)

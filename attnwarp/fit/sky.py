@@ -1,0 +1,138 @@
+"""First splats of a sky: a shell so far away that no camera's place shifts it by a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp.camera import Camera
+from attnwarp.devices import on_cpu_unless_named
+from attnwarp.fit.start import usual_distance
+from attnwarp.fit.views import Views
+from attnwarp.gaussians import Gaussians
+
+Array = npt.NDArray[np.float64]
+
+SHELL = 300
+"""Distance of the first sky splats, over the points' usual distance from the cameras. Cameras that
+stand half of that usual distance apart see them shifted by a tenth of a degree, half a pixel of
+256."""
+
+DIRECTIONS = 2000
+"""First sky splats around the whole sphere, 4.5 degrees apart; a fit splits those with detail."""
+
+CELLS = 16
+"""Cells along a picture's side. One without a first splat in it or above it shows sky: a ground
+without texture has none either. In a picture of 70 degrees a cell is as wide as the shell's splats
+are apart."""
+
+BAND = 0.1
+"""Width of the band around a picture whose directions get a splat, in sides."""
+
+OVERLAP = 0.6
+"""Size of a first sky splat over the distance to its neighbours."""
+
+OPACITY = 0.9
+"""Opacity of the first sky splats: a clear shell would let the scene's splats grow into the sky."""
+
+
+@on_cpu_unless_named
+def with_sky(start: Gaussians, views: Views) -> Gaussians:
+    """Add a shell of far splats to a fit's first ones, wherever a picture shows none of these up to
+    its upper edge.
+
+    A sky splat has the median colour of those pictures in its direction.
+
+    Args:
+        start: first splats, at least one.
+        views: pictures to fit on.
+
+    Returns:
+        Splats with ``far`` set at half of the shell's distance. ``start`` itself if it has a sky,
+        if it is seen everywhere, and for pictures with transparency, whose background is known.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.fit import Views, from_points, with_sky
+        >>> eyes = ((3, 0, 0), (0, 3, 0))
+        >>> cameras = [Camera.look_at(e, (0, 0, 0), width=16, height=16, fov_y=40) for e in eyes]
+        >>> blue = Views(cameras, [np.full((16, 16, 3), [0, 0, 1.0])] * 2)
+        >>> start = with_sky(from_points(np.eye(3), kind="3d"), blue)
+        >>> start.far > 100, start.sh[-1, 0].sign().tolist()
+        (True, [-1.0, -1.0, 1.0])
+    """
+    if views.transparent or np.isfinite(start.far):
+        return start
+    middle = np.stack([camera.position for camera in views.cameras]).mean(0)
+    radius = SHELL * usual_distance(start.world_means(), views.cameras)
+    toward = directions(DIRECTIONS)
+    places = middle + radius * toward
+    points = start.world_means()
+    seen = np.full((len(views), DIRECTIONS, 3), np.nan, np.float32)
+    for k, camera in enumerate(views.cameras):
+        scene = np.zeros((CELLS, CELLS), bool)
+        scene[_cells(camera, points)[1]] = True
+        scene = np.logical_or.accumulate(scene, axis=0)  # and what lies below a first splat
+        inside, cell = _cells(camera, places, BAND)
+        inside[inside] = ~scene[cell]
+        size = np.array([camera.width, camera.height])
+        column, row = camera.project(places[inside])[0].clip(0, size - 1).astype(int).T
+        picture = views.target(k, torch.zeros(3, dtype=torch.float32))
+        kept = views.kept(k, picture.device)
+        if kept is not None:
+            picture = torch.where(kept[..., None], picture, torch.nan)
+        seen[k, inside] = picture[row, column]
+    shown = ~np.isnan(seen[..., 0]).all(0)
+    if not shown.any():
+        return start
+    colors = torch.from_numpy(np.nanmedian(seen[:, shown], axis=0).astype(np.float32))
+    toward, n = toward[shown], int(shown.sum())
+    # Half-way between the axis z and the direction: half a turn about it lays one on the other.
+    turns = np.concatenate([np.zeros((n, 1)), toward + np.array([0.0, 0.0, 1.0])], axis=1)
+    sh = torch.cat([Gaussians.sh_from_rgb(colors), torch.zeros(n, start.sh.shape[1] - 1, 3)], dim=1)
+    size = OVERLAP * radius * np.sqrt(4 * np.pi / DIRECTIONS)
+    added = {
+        "means": torch.from_numpy(places[shown] - start.origin),
+        "quats": torch.from_numpy(turns),
+        "scales": torch.full((n, start.scales.shape[1]), size, dtype=torch.float32),
+        "opacities": torch.full((n,), OPACITY, dtype=torch.float32),
+        "sh": sh,
+    }
+    return replace(
+        start,
+        far=radius / 2,
+        **{
+            name: torch.cat([getattr(start, name), value.to(getattr(start, name))])
+            for name, value in added.items()
+        },
+    )
+
+
+def _cells(
+    camera: Camera, points: Array, band: float = 0.0
+) -> tuple[npt.NDArray[np.bool_], tuple[npt.NDArray[np.intp], ...]]:
+    """Select the points that a picture shows, (P,) bool, and find the cell of each: row, column."""
+    xy, z = camera.project(points)
+    place = xy / [camera.width, camera.height]
+    shown = (z > 0) & (np.abs(place - 0.5) < 0.5 + band).all(1)
+    column, row = (place[shown].clip(0, 1 - 1e-9) * CELLS).astype(np.intp).T
+    return shown, (row, column)
+
+
+def directions(count: int) -> Array:
+    """Spread unit vectors evenly over the sphere, (count, 3), along a Fibonacci spiral.
+
+    Example:
+        >>> from attnwarp.fit.sky import directions
+        >>> spread = directions(100)
+        >>> bool(abs(spread.mean(0)).max() < 0.01)
+        True
+    """
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
