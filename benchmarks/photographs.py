@@ -60,7 +60,9 @@ def draw(folder: Path, seed: int) -> None:
         eye = np.array(camera.position)
         eye[2] = scene.center[2] + 0.3 * (eye[2] - scene.center[2]) + 0.05 * radius
         aim = scene.center + np.array([0, 0, 0.2 * radius])
-        low = Camera.look_at(eye, aim, width=SIZE, height=SIZE, fov_y=55, name=f"{k:02d}.png")
+        low = Camera.look_at(
+            eye.tolist(), aim.tolist(), width=SIZE, height=SIZE, fov_y=55, name=f"{k:02d}.png"
+        )
         image, depth = picture(scene, low, 8), geometry.trace(low).depth
         sky = ~np.isfinite(depth)
         rays = low.directions()[sky] @ low.rotation
@@ -70,7 +72,7 @@ def draw(folder: Path, seed: int) -> None:
         depths[low.name] = np.where(sky, np.inf, depth)
     data = Dataset(cameras, list(paths), cloud.points[near], cloud.colors[near])
     write_transforms(folder, data, points_name="points.ply")
-    np.savez_compressed(folder / "depth.npz", **depths)
+    np.savez_compressed(folder / "depth.npz", allow_pickle=True, **depths)
 
 
 def measure(fit: Path, data: Path) -> dict[str, Any]:

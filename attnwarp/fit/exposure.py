@@ -30,7 +30,8 @@ class Exposure:
     def __init__(self, count: int, device: torch.device) -> None:
         self.leaf = torch.zeros(count, 3, 4, dtype=torch.float32, device=device)
         self.leaf.requires_grad_(True)
-        self.moments = [torch.zeros_like(self.leaf.detach()) for _ in range(2)]
+        self.first = torch.zeros_like(self.leaf.detach())
+        self.second = torch.zeros_like(self.first)
         self.steps = 0
 
     def __call__(self, color: Tensor, index: int) -> Tensor:
@@ -42,16 +43,17 @@ class Exposure:
         """Take one Adam step, then clear the gradient; ``progress`` is in [0, 1]."""
         if self.leaf.grad is not None:
             rate = RATE ** (1 - progress) * LAST_RATE**progress
-            adam_step(self.leaf, *self.moments, self.steps, rate)
+            adam_step(self.leaf, self.first, self.second, self.steps, rate)
         self.steps += 1
 
     def state(self) -> dict[str, Any]:
         """Collect the state that the next step depends on."""
-        parts = [self.leaf.detach(), *self.moments]
+        parts = [self.leaf.detach(), self.first, self.second]
         return {"steps": self.steps, "parts": [part.cpu().clone() for part in parts]}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Restore the result of :meth:`state`."""
         self.steps = int(state["steps"])
-        leaf, *self.moments = [part.to(self.leaf.device, copy=True) for part in state["parts"]]
+        parts = [part.to(self.leaf.device, copy=True) for part in state["parts"]]
+        leaf, self.first, self.second = parts
         self.leaf = leaf.requires_grad_(True)

@@ -46,6 +46,7 @@ def adam_step(tensor: Tensor, first: Tensor, second: Tensor, steps: int, rate: f
         steps: steps done.
         rate: learning rate.
     """
+    assert tensor.grad is not None
     adam(
         [tensor.detach()],
         [tensor.grad],

@@ -105,7 +105,7 @@ def with_sky(start: Gaussians, views: Views) -> Gaussians:
     return replace(
         start,
         far=radius / 2,
-        **{
+        **{  # type: ignore[arg-type]
             name: torch.cat([getattr(start, name), value.to(getattr(start, name))])
             for name, value in added.items()
         },

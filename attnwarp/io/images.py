@@ -219,7 +219,7 @@ def read_mask(path: str | os.PathLike[str], height: int, width: int) -> npt.NDAr
     try:
         check.same_aspect((height, width), bright.shape, str(path), "draw it on its picture")
     except ValueError as error:
-        raise FileFormatError(path, str(error).partition(": ")[2]) from None
+        raise FileFormatError(Path(path), str(error).partition(": ")[2]) from None
     shares = cv2.resize(bright.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
     return np.asarray(shares > 1 - 1e-4)
 

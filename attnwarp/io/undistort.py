@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp.errors import InputError
@@ -81,19 +83,15 @@ def undistort(
         image = read_image(source)
         if lens is not None:
             image = undistorted_image(image, camera, lens, target)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        data = encode_png(image)
-        write_atomically(path, lambda stream, data=data: stream.write(data))  # type: ignore[misc]
+        _write(path, image)
         mask = dataset.mask_paths[i]
         if mask is not None:
             kept = read_mask(mask, camera.height, camera.width)
             flat = np.repeat(kept[..., None], 3, axis=2).astype(np.uint8) * 255
             if lens is not None:
                 flat = undistorted_image(flat, camera, lens, target)
+            _write(folder / "masks" / names[i], np.where(flat == 255, flat, 0))
             masks[i] = folder / "masks" / names[i]
-            masks[i].parent.mkdir(parents=True, exist_ok=True)
-            data = encode_png(np.where(flat == 255, flat, 0))
-            write_atomically(masks[i], lambda stream, data=data: stream.write(data))
         report.step(i + 1, len(cameras), names[i])
     result = replace(
         dataset, cameras=cameras, image_paths=paths, mask_paths=masks,
@@ -101,6 +99,12 @@ def undistort(
     )  # fmt: skip
     write_transforms(folder, result)
     return result
+
+
+def _write(path: Path, image: npt.NDArray[Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    data = encode_png(image)
+    write_atomically(path, lambda stream: stream.write(data))
 
 
 def _check_apart(folder: Path, written: list[Path | None], read: list[Path | None]) -> None:

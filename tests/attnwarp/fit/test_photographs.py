@@ -1,4 +1,4 @@
-"""What photographs need: masks, exposure, views that choose. Oracles: the pictures' makers."""
+"""Needs of photographs: masks, exposure, views that choose. Oracles: the pictures' makers."""
 
 from dataclasses import replace
 
