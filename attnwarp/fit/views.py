@@ -7,11 +7,11 @@ import json
 import os
 import warnings
 from collections import Counter
-from collections.abc import Collection, Hashable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Collection, Hashable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -30,10 +30,54 @@ HELD_OUT_EVERY = 8
 HELD_BYTES = 2**31
 """Limit on the bytes of pictures kept on a GPU: 650 of 1297 x 840 px in 8 bits."""
 
+READ_BYTES = 2**29
+"""Limit on the bytes of pictures kept in main memory, the rest being read again when drawn: 194 of
+1280 x 720 px, where an iteration takes 20 times as long as reading."""
+
 SAME_POSE = 1e-6
 """Largest difference between two views that count as one, covering the rounding of printed poses:
 of rotations, of positions in extents of the cameras, of focal lengths and principal points in
 sides."""
+
+
+class Sized(Protocol):
+    """Array, or a value around one."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+        ...
+
+
+S = TypeVar("S", bound=Sized)
+
+
+class Drawn(Sequence[S]):
+    """Values created when drawn. The first that fit are kept, since all at once may fill the
+    memory.
+
+    Args:
+        makers: constructors, one per value.
+        held_bytes: limit on the bytes of kept values.
+    """
+
+    def __init__(self, makers: Sequence[Callable[[], S]], held_bytes: int) -> None:
+        self._makers = makers
+        self._held: dict[int, S] = {}
+        self._left = held_bytes
+
+    def __len__(self) -> int:
+        return len(self._makers)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Return the value of a number, created again unless kept."""
+        if index in self._held:
+            return self._held[index]
+        value = self._makers[index]()
+        if value.nbytes <= self._left:
+            self._left -= value.nbytes
+            self._held[index] = value
+        return value
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +90,9 @@ class Views:
             uint16, or floating in [0, 1]. Their type is kept: 8 bits take a quarter of the
             memory.
         masks: (H, W) bool, one for each picture or None; False where the picture is to be ignored.
+
+    Attributes:
+        transparent: True if any picture has non-opaque pixels.
 
     Raises:
         ValueError: the lists differ in length, a picture's size differs from its camera's, or a
@@ -63,6 +110,7 @@ class Views:
     cameras: Sequence[Camera]
     images: Sequence[npt.NDArray[Any]]
     masks: Sequence[npt.NDArray[np.bool_] | None] = ()
+    transparent: bool = field(init=False)
 
     def __post_init__(self) -> None:
         if not self.cameras:
@@ -80,9 +128,11 @@ class Views:
                     raise ValueError(
                         f"masks: that of {camera.name} ignores the whole picture; leave it out"
                     )
-        arrays = [i.numpy() if isinstance(i, torch.Tensor) else i for i in self.images]
-        object.__setattr__(self, "images", arrays)
-        for i, (camera, image) in enumerate(zip(self.cameras, arrays, strict=True)):
+        if not isinstance(self.images, Drawn):
+            arrays = [i.numpy() if isinstance(i, torch.Tensor) else i for i in self.images]
+            object.__setattr__(self, "images", arrays)
+        transparent = False
+        for i, (camera, image) in enumerate(zip(self.cameras, self.images, strict=True)):
             name = f"images[{i}] ({camera.name})"
             if image.ndim != 3 or image.shape[2] not in (3, 4):
                 raise ValueError(
@@ -103,17 +153,11 @@ class Views:
                     raise ValueError(
                         f"{name}: got values in [{image.min()}, {image.max()}], expected [0, 1]"
                     )
+            transparent |= image.shape[2] == 4 and bool((image[..., 3] < _top(image)).any())
+        object.__setattr__(self, "transparent", transparent)
 
     def __len__(self) -> int:
         return len(self.cameras)
-
-    @cached_property
-    def transparent(self) -> bool:
-        """True if any picture has non-opaque pixels."""
-        return any(
-            image.shape[2] == 4 and bool((image[..., 3] < _top(image)).any())
-            for image in self.images
-        )
 
     def target(self, index: int, background: check.Array) -> torch.Tensor:
         """Return a (H, W, 3) float32 picture in [0, 1], composited over ``background`` (3,), on the
@@ -178,7 +222,8 @@ def load_views(
     max_size: int | None = None,
     damaged: Literal["warn", "error"] = "warn",
 ) -> Views:
-    """Read the pictures of a dataset; cameras without a picture are left out.
+    """Read the pictures of a dataset; cameras without a picture are left out. Pictures beyond
+    :data:`READ_BYTES` are read again whenever they are drawn.
 
     Args:
         dataset: dataset, see :func:`attnwarp.io.read_dataset`.
@@ -205,7 +250,8 @@ def load_views(
         >>> views.cameras[0].width, views.cameras[0].height
         (32, 24)
     """
-    cameras, images, masks = [], [], []
+    cameras, readers, masks = [], [], []
+    seen: set[Path] = set()
     for camera, path, lens, mask in zip(
         dataset.cameras, dataset.image_paths, dataset.lenses, dataset.mask_paths, strict=True
     ):
@@ -215,35 +261,46 @@ def load_views(
             raise FileFormatError(
                 path, "was taken through a lens that distorts; undistort the data set first"
             )
-        image = read_image(path, damaged=damaged)
-        if image.shape[:2] != (camera.height, camera.width):
-            raise FileFormatError(
-                path,
-                f"is {image.shape[1]} x {image.shape[0]}, its camera has {camera.width} x"
-                f" {camera.height}",
-            )
-        if max_size is not None and max(image.shape[:2]) > max_size:
-            image = _shrink(image, max_size)
-            camera = camera.resize(image.shape[1], image.shape[0])
-        cameras.append(camera)
-        images.append(image)
-        masks.append(None if mask is None else read_mask(mask, camera.height, camera.width))
+        shown, longest = camera, max(camera.width, camera.height)
+        if max_size is not None and longest > max_size:
+            factor = max_size / longest
+            width, height = (max(1, round(factor * v)) for v in (camera.width, camera.height))
+            shown = camera.resize(width, height)
+        cameras.append(shown)
+        readers.append(partial(_read, path, camera, shown, damaged, seen))
+        masks.append(None if mask is None else read_mask(mask, shown.height, shown.width))
     if not cameras:
         raise ValueError(
             "dataset: none of its cameras has an image that is there; put the images where the data"
             " set names them"
         )
-    return Views(cameras, images, masks)
+    return Views(cameras, Drawn(readers, READ_BYTES), masks)
 
 
-def _shrink(image: npt.NDArray[Any], longest: int) -> npt.NDArray[Any]:
+def _read(
+    path: Path, camera: Camera, shown: Camera, damaged: Literal["warn", "error"], seen: set[Path]
+) -> npt.NDArray[Any]:
+    """Read a picture of a camera's size, averaged down to that of ``shown``; warn when it is first
+    seen."""
     import cv2
 
-    factor = longest / max(image.shape[:2])
-    width, height = (max(1, round(factor * side)) for side in (image.shape[1], image.shape[0]))
+    with warnings.catch_warnings():
+        if path in seen:
+            warnings.simplefilter("ignore", InputWarning)
+        image = read_image(path, damaged=damaged)
+    seen.add(path)
+    if image.shape[:2] != (camera.height, camera.width):
+        raise FileFormatError(
+            path,
+            f"is {image.shape[1]} x {image.shape[0]}, its camera has {camera.width} x"
+            f" {camera.height}",
+        )
+    if shown is camera:
+        return image
 
     def averaged(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        return np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA))
+        size = (shown.width, shown.height)
+        return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA))
 
     return averaged(image) if image.shape[2] == 3 else weighted_by_alpha(image, averaged)
 

@@ -30,6 +30,7 @@ from attnwarp.devices import on_cpu_unless_named
 from attnwarp.editing.editor import Editor
 from attnwarp.encoders import load_encoder
 from attnwarp.fit import compile_kernels
+from attnwarp.fit.views import Drawn
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
 from attnwarp.io.names import file_stems
@@ -52,7 +53,7 @@ from attnwarp.methods.scene import (
     render_picture,
 )
 from attnwarp.methods.settings import MethodSettings
-from attnwarp.methods.tuning import DrawnViews, Order, TrainingView, Tuning
+from attnwarp.methods.tuning import HELD_BYTES, Order, TrainingView, Tuning
 from attnwarp.methods.work import Work
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp.workdir import Budget, CheckpointClock, Workdir, results_in
@@ -534,7 +535,7 @@ class _Run:
         if self.work.backend in ("auto", "cpu"):
             # Excluded from the budget's seconds.
             compile_kernels(self.work.frozen.kind, device=self.tuning.model.device)
-        views = DrawnViews([partial(self._training, view) for view in training])
+        views = Drawn([partial(self._training, view) for view in training], HELD_BYTES)
         text = f"round {number + 1} of {len(self.rounds)}: tuning"
 
         def step() -> None:

@@ -90,43 +90,18 @@ class TrainingView:
         """Copy the picture (H, W, 3) to a device and cache it there while the view lives."""
         return self._tensors.setdefault(device, torch.from_numpy(self.picture).to(device))
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the picture."""
+        return self.picture.nbytes
+
     @cached_property
     def _tensors(self) -> dict[torch.device, Tensor]:
         return {}
 
 
 HELD_BYTES = 2**31
-"""Bytes of pictures that :class:`DrawnViews` keeps: 164 of 1297 x 840 px."""
-
-
-class DrawnViews(Sequence[TrainingView]):
-    """Views to tune on, created when drawn. The first views whose pictures fit are kept, since
-    floating pictures of all views at once may fill the memory.
-
-    Args:
-        makers: constructors, one per view.
-        held_bytes: limit on the bytes of kept pictures.
-    """
-
-    def __init__(
-        self, makers: Sequence[Callable[[], TrainingView]], held_bytes: int = HELD_BYTES
-    ) -> None:
-        self._makers = makers
-        self._held: dict[int, TrainingView] = {}
-        self._left = held_bytes
-
-    def __len__(self) -> int:
-        return len(self._makers)
-
-    def __getitem__(self, index: Any) -> Any:
-        """Return the view of a number, created again unless kept."""
-        if index in self._held:
-            return self._held[index]
-        view = self._makers[index]()
-        if view.picture.nbytes <= self._left:
-            self._left -= view.picture.nbytes
-            self._held[index] = view
-        return view
+"""Bytes of views to tune on that are kept: 164 of 1297 x 840 px."""
 
 
 FEATURE_BYTES = 2**30

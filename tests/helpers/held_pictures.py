@@ -1,10 +1,8 @@
 """Number of pictures that a run keeps while it tunes on them."""
 
 import weakref
-from functools import partial
 
 from attnwarp.methods.pictures import full_size
-from attnwarp.methods.tuning import DrawnViews
 
 
 def watch(monkeypatch, module, held_bytes):
@@ -22,5 +20,5 @@ def watch(monkeypatch, module, held_bytes):
         return picture
 
     monkeypatch.setattr(module, "full_size", watched)
-    monkeypatch.setattr(module, "DrawnViews", partial(DrawnViews, held_bytes=held_bytes))
+    monkeypatch.setattr(module, "HELD_BYTES", held_bytes)
     return counts
