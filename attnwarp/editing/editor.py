@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -23,6 +24,9 @@ from attnwarp.errors import InputWarning
 
 Image = npt.NDArray[np.float32]
 Guide = Literal["picture", "depth"]
+
+Begin = Literal["noise", "picture"]
+"""State at the first step: pure noise, or the guide noised to it."""
 
 STEPS = 20
 
@@ -82,8 +86,28 @@ class Editor(Network, Protocol):
         ...
 
     @property
+    def begins(self) -> Begin:
+        """State at the first step of an edit without ``start``."""
+        ...
+
+    @property
     def own_size(self) -> int:
         """Longest side in px of the pictures the model was trained for."""
+        ...
+
+    @property
+    def own_steps(self) -> int:
+        """Number of denoising steps that the model was made for."""
+        ...
+
+    @property
+    def references(self) -> int:
+        """Largest number of pictures beside the guide that a view's edit can see."""
+        ...
+
+    @property
+    def block_sets(self) -> Mapping[str, Sequence[int]]:
+        """Numbers of the layers' blocks, by the name of a set."""
         ...
 
     @property
@@ -110,7 +134,8 @@ class Editor(Network, Protocol):
         """Prepare an edit of views.
 
         Args:
-            guides: pictures or depth maps, depending on :attr:`guide`.
+            guides: pictures or depth maps, depending on :attr:`guide`. An editor that takes
+                references takes (1 + R, H, W, 3) too: a picture, then its references.
             prompt: instruction or description, depending on the editor.
             regions: (H, W) edited region of each view in [0, 1]; None for all of it. Some editors
                 ignore regions.
@@ -184,7 +209,7 @@ def edit(
     guides: Sequence[npt.NDArray[Any]],
     prompt: str,
     *,
-    steps: int = STEPS,
+    steps: int | None = None,
     seed: int = 0,
     start: int | None = None,
     grid: Grid = "even",
@@ -202,12 +227,12 @@ def edit(
         editor: the model.
         guides: guides of the views, all of one size, as ``editor.task`` takes them.
         prompt: instruction or description, depending on the editor.
-        steps: number of DDIM steps.
+        steps: number of denoising steps; the editor's own if omitted.
         seed: seed of the noise shared by the views.
         start: Stable Diffusion's timestep T to start from, as in publications. The views' latents
             are noised to T's share of signal, then ``steps`` steps follow
-            (:meth:`attnwarp.editing.schedule.Schedule.published`). None starts from pure
-            noise.
+            (:meth:`attnwarp.editing.schedule.Schedule.published`). None starts as the editor
+            :attr:`~Editor.begins`.
         grid: grid of the steps below ``start``; noise is added at ``start`` in both grids.
         pictures: (H, W, 3) pictures noised to ``start``; ``guides`` if omitted.
         noise: (B, C, h, w) noise that replaces the seed's.
@@ -218,7 +243,6 @@ def edit(
             their replacement.
         regions: (H, W) edited region of each view in [0, 1]; a bundled editor averages its noise
             there to settle choices that the prompt leaves open. None is the full picture.
-            draws what the prompt leaves open; None for all of it.
 
     Returns:
         The edited views.
@@ -242,7 +266,7 @@ def edit(
         raise ValueError("pictures: got pictures without start, which alone begins from them")
     task = editor.task(guides, prompt, regions)
     device, dtype = editor.network.device, editor.network.dtype
-    schedule = editor.schedule
+    schedule, steps = editor.schedule, editor.own_steps if steps is None else steps
     timesteps = (
         schedule.timesteps(steps, (task.shape[2], task.shape[3]))
         if start is None
@@ -255,12 +279,12 @@ def edit(
     if latents is not None:
         check.shape(latents, task.shape, "latents")
         x = latents.to(device, dtype)
-    elif start is None:
+    elif start is None and editor.begins == "noise":
         x = noise
     else:
         before = editor.encode(guides if pictures is None else pictures)
         check.shape(before, task.shape, "pictures")
-        (noised,) = schedule.published(start, 1)
+        noised = timesteps[0] if start is None else schedule.published(start, 1)[0]
         x = schedule.add_noise(before, noise, noised)
     with torch.no_grad():
         for number, (now, then) in enumerate(following(timesteps)):
@@ -335,6 +359,15 @@ def tensor_of(images: Sequence[npt.NDArray[Any]], name: str, multiple: int) -> T
     return torch.from_numpy(stacked).permute(0, 3, 1, 2).contiguous()
 
 
+def check_length(text: str, length: int, limit: int) -> None:
+    """Raise ValueError if a text has more tokens than its encoder takes."""
+    if length > limit:
+        raise ValueError(
+            f"prompt: {textwrap.shorten(text, 60)!r} has {length} tokens, the text encoder"
+            f" takes {limit}; shorten it"
+        )
+
+
 def check_networks(
     network: Mapping[str, Any],
     text_encoder: Mapping[str, Any],
@@ -401,7 +434,81 @@ def check_scheduler(scheduler: Any) -> None:
         )
 
 
-class Latent(ABC):
+class Defaults:
+    """Members of :class:`Editor` that most editors leave as they are."""
+
+    begins: Begin = "noise"
+    own_steps: int = STEPS
+    references: int = 0
+    block_sets: Mapping[str, Sequence[int]] = MappingProxyType({})
+
+
+class Coder(Defaults, ABC):
+    """Base of editors whose pictures an autoencoder turns into latents, one picture at a time.
+
+    Attributes:
+        vae: the autoencoder, of diffusers.
+        factor: side of a latent in px.
+    """
+
+    vae: Any
+    factor: int
+
+    @abstractmethod
+    def latents(self, pixels: Tensor) -> Tensor:
+        """Encode (B, 3, H, W) pixels as (B, C, h, w) scaled latents; pixels may leave [0, 1]."""
+
+    @abstractmethod
+    def unscaled(self, latents: Tensor) -> Tensor:
+        """Convert (B, C, h, w) scaled latents to those of the autoencoder."""
+
+    def raw_latents(self, pictures: Tensor) -> Tensor:
+        """Encode (B, 3, H, W) in [0, 1] as (B, C, h, w): the distribution's mode, not scaled.
+
+        Pictures are encoded one by one: Stable Diffusion's autoencoder takes 0.6 GiB for 512 px.
+        """
+        rows = []
+        with torch.no_grad():
+            for picture in pictures.split(1):
+                coded = self.vae.encode((2 * picture - 1).to(self.vae.device, self.vae.dtype))
+                plain = hasattr(coded, "latent_dist")
+                rows.append(coded.latent_dist.mode() if plain else coded.latents)
+        return torch.cat(rows)
+
+    def encode(self, pictures: Sequence[Image]) -> Tensor:
+        """Encode (H, W, 3) pictures in [0, 1] as (B, C, h, w) scaled latents."""
+        return self.latents(tensor_of(pictures, "pictures", self.factor))
+
+    def pixels(self, latents: Tensor) -> Tensor:
+        """Decode scaled latents to (B, 3, H, W) without clamping: values may leave [0, 1].
+
+        Pictures are decoded one by one, as in :meth:`raw_latents`.
+        """
+        with torch.no_grad():
+            plain = self.unscaled(latents)
+            rows = [self.vae.decode(one, return_dict=False)[0] for one in plain.split(1)]
+        return torch.cat(rows).float() / 2 + 0.5
+
+    def decode(self, latents: Tensor) -> list[Image]:
+        """Decode scaled latents to (H, W, 3) float32 pictures in [0, 1].
+
+        Raises:
+            ValueError: the latents or the decoded values are not finite.
+        """
+        pixels = self.pixels(latents)
+        # A NaN would become a black pixel.
+        for name, values in (("latents", latents), ("decoded latents", pixels)):
+            finite = values.isfinite()
+            if not finite.all():
+                raise ValueError(
+                    f"{name}: {int((~finite).sum())} of {finite.numel()} values are not finite;"
+                    " lower the guidance, or load the editor in float32 if it runs in half"
+                    " precision"
+                )
+        return list(pixels.clamp(0, 1).permute(0, 2, 3, 1).cpu().numpy())
+
+
+class Latent(Coder):
     """UNet with an autoencoder and a text encoder: the base of both Stable Diffusion editors."""
 
     def __init__(
@@ -460,54 +567,13 @@ class Latent(ABC):
         h, w = size
         return int(self.unet.config.out_channels), h // self.factor, w // self.factor
 
-    def raw_latents(self, pictures: Tensor) -> Tensor:
-        """Encode (B, 3, H, W) in [0, 1] as (B, C, h, w): the distribution's mode, not scaled.
-
-        Pictures are encoded one by one: Stable Diffusion's autoencoder takes 0.6 GiB for 512 px.
-        """
-        rows = []
-        with torch.no_grad():
-            for picture in pictures.split(1):
-                coded = self.vae.encode((2 * picture - 1).to(self.vae.device, self.vae.dtype))
-                plain = hasattr(coded, "latent_dist")
-                rows.append(coded.latent_dist.mode() if plain else coded.latents)
-        return torch.cat(rows)
-
-    def encode(self, pictures: Sequence[Image]) -> Tensor:
-        """Encode (H, W, 3) pictures in [0, 1] as (B, C, h, w) scaled latents."""
-        return self.latents(tensor_of(pictures, "pictures", self.factor))
-
     def latents(self, pixels: Tensor) -> Tensor:
         """Encode (B, 3, H, W) pixels as (B, C, h, w) scaled latents; pixels may leave [0, 1]."""
         return self.raw_latents(pixels) * self.vae.config.scaling_factor
 
-    def pixels(self, latents: Tensor) -> Tensor:
-        """Decode scaled latents to (B, 3, H, W) without clamping: values may leave [0, 1].
-
-        Pictures are decoded one by one, as in :meth:`raw_latents`.
-        """
-        with torch.no_grad():
-            scaled = latents.to(self.vae.dtype) / self.vae.config.scaling_factor
-            rows = [self.vae.decode(one, return_dict=False)[0] for one in scaled.split(1)]
-        return torch.cat(rows).float() / 2 + 0.5
-
-    def decode(self, latents: Tensor) -> list[Image]:
-        """Decode scaled latents to (H, W, 3) float32 pictures in [0, 1].
-
-        Raises:
-            ValueError: the latents or the decoded values are not finite.
-        """
-        pixels = self.pixels(latents)
-        # A NaN would become a black pixel.
-        for name, values in (("latents", latents), ("decoded latents", pixels)):
-            finite = values.isfinite()
-            if not finite.all():
-                raise ValueError(
-                    f"{name}: {int((~finite).sum())} of {finite.numel()} values are not finite;"
-                    " lower the guidance, or load the editor in float32 if it runs in half"
-                    " precision"
-                )
-        return list(pixels.clamp(0, 1).permute(0, 2, 3, 1).cpu().numpy())
+    def unscaled(self, latents: Tensor) -> Tensor:
+        """Convert (B, C, h, w) scaled latents to those of the autoencoder."""
+        return latents.to(self.vae.dtype) / self.vae.config.scaling_factor
 
     @property
     def text_limit(self) -> int:
@@ -517,13 +583,7 @@ class Latent(ABC):
 
     def check_text(self, text: str) -> None:
         """Raise ValueError if a text exceeds the encoder's limit."""
-        limit = self.text_limit
-        length = len(self.tokenizer(text, verbose=False).input_ids)
-        if length > limit:
-            raise ValueError(
-                f"prompt: {textwrap.shorten(text, 60)!r} has {length} tokens, the text encoder"
-                f" takes {limit}; shorten it"
-            )
+        check_length(text, len(self.tokenizer(text, verbose=False).input_ids), self.text_limit)
 
     def embed(self, texts: Sequence[str]) -> Tensor:
         """Embed texts, (N, L, D); a text beyond the encoder's limit is refused."""

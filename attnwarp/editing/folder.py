@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -39,29 +39,7 @@ def load_parts(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -
     Raises:
         InputError: the device is unknown, or files are missing (named) or unreadable.
     """
-    require_diffusers()
-    device_of(device)
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; expected a model in diffusers' format")
-    missing = [
-        *_missing(folder / "unet"),
-        *_missing(folder / "vae"),
-        *_missing(folder / "text_encoder"),
-    ]
-    if not (folder / "scheduler" / "scheduler_config.json").is_file():
-        missing.append("scheduler/scheduler_config.json")
-    words = folder / "tokenizer"
-    pair = all((words / name).is_file() for name in ("vocab.json", "merges.txt"))
-    if not pair and not (words / "tokenizer.json").is_file():
-        missing.append("tokenizer/vocab.json with merges.txt, or tokenizer/tokenizer.json")
-    # This file defines the padding token.
-    if not (words / "tokenizer_config.json").is_file():
-        missing.append("tokenizer/tokenizer_config.json")
-    if missing:
-        raise InputError(
-            f"{folder}: lacks {', '.join(missing)}; fetch the model again in diffusers' format"
-        )
+    folder = _checked(folder, ("unet", "vae", "text_encoder"), ("tokenizer",), device)
 
     from diffusers import AutoencoderKL, AutoencoderTiny, DDIMScheduler, UNet2DConditionModel
     from transformers import AutoTokenizer, CLIPTextModel
@@ -78,6 +56,7 @@ def load_parts(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -
         "vae": model("vae", AutoencoderKL, AutoencoderTiny, HaarLatents),
         "text_encoder": model("text_encoder", CLIPTextModel),
     }
+    words = folder / "tokenizer"
     with readable(words):
         parts["tokenizer"] = AutoTokenizer.from_pretrained(words, local_files_only=True)
     with readable(folder / "scheduler"):
@@ -85,6 +64,87 @@ def load_parts(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -
         told = DDIMScheduler.load_config(folder / "scheduler", local_files_only=True)
         parts["scheduler"] = DDIMScheduler.from_config({"clip_sample": False, **told})
     return parts
+
+
+def load_pipeline(
+    folder: str | Path,
+    networks: Mapping[str, str],
+    optional: Sequence[str] = (),
+    *,
+    device: str = "cpu",
+    dtype: torch.dtype,
+) -> dict[str, Any]:
+    """Load all parts of a pipeline with a flow: its networks, tokenizers, processor and scheduler.
+
+    Args:
+        folder: folder in diffusers' format.
+        networks: classes of diffusers or transformers by the name of the network's folder.
+        optional: networks that may be missing; they become None, and their tokenizers.
+        device: device name.
+        dtype: dtype of the networks.
+
+    Raises:
+        InputError: the device is unknown, or files are missing (named), unreadable, or of another
+            class.
+    """
+    folder = Path(folder)
+    left_out = {name for name in optional if not (folder / name).is_dir()}
+    present = [name for name in networks if name not in left_out]
+    tokenizers = [_tokenizer_of(name) for name in present if name.startswith("text_encoder")]
+    _checked(folder, present, tokenizers, device)
+    parts: dict[str, Any] = dict.fromkeys([*left_out, *map(_tokenizer_of, left_out)])
+
+    import diffusers
+    import transformers
+
+    for name in present:
+        home = diffusers if hasattr(diffusers, networks[name]) else transformers
+        kind = class_of(folder / name, getattr(home, networks[name]))
+        parts[name] = load_network(kind, folder / name, device, dtype)
+    readers = dict.fromkeys(tokenizers, transformers.AutoTokenizer)
+    if (folder / "processor").is_dir():
+        readers["processor"] = transformers.AutoProcessor
+    for name, kind in readers.items():
+        with readable(folder / name):
+            parts[name] = kind.from_pretrained(folder / name, local_files_only=True)
+    with readable(folder / "scheduler"):
+        config = json.loads(read_text(folder / "scheduler" / "scheduler_config.json"))
+        kind = getattr(diffusers, config["_class_name"])
+        parts["scheduler"] = kind.from_pretrained(folder / "scheduler", local_files_only=True)
+    return parts
+
+
+def _tokenizer_of(text_encoder: str) -> str:
+    return text_encoder.replace("text_encoder", "tokenizer")
+
+
+def _checked(
+    folder: str | Path, networks: Sequence[str], tokenizers: Sequence[str], device: str
+) -> Path:
+    """Refuse an unknown device, and a folder that lacks files; all are named."""
+    require_diffusers()
+    device_of(device)
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; expected a model in diffusers' format")
+    missing = [lost for name in networks for lost in _missing(folder / name)]
+    if not (folder / "scheduler" / "scheduler_config.json").is_file():
+        missing.append("scheduler/scheduler_config.json")
+    for name in tokenizers:
+        words = folder / name
+        pair = all((words / file).is_file() for file in ("vocab.json", "merges.txt"))
+        if not pair and not any(
+            (words / file).is_file() for file in ("tokenizer.json", "spiece.model")
+        ):
+            missing.append(f"{name}/vocab.json with merges.txt, or {name}/tokenizer.json")
+        # This file defines the padding token.
+        if not (words / "tokenizer_config.json").is_file():
+            missing.append(f"{name}/tokenizer_config.json")
+    if missing:
+        raise InputError(
+            f"{folder}: lacks {', '.join(missing)}; fetch the model again in diffusers' format"
+        )
+    return folder
 
 
 def load_controlnet(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -> Any:
@@ -144,17 +204,28 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
     return network.to(device)
 
 
+def index_of(folder: str | Path) -> dict[str, Any]:
+    """Read a folder's model_index.json; empty without the file.
+
+    Raises:
+        InputError: the file is unreadable.
+    """
+    path = Path(folder) / "model_index.json"
+    if not path.is_file():
+        return {}
+    with readable(Path(folder)):
+        return dict(json.loads(read_text(path)))
+
+
 def pipeline_of(folder: Path) -> str | None:
     """Read the pipeline's name from a folder's model_index.json; None without the file.
 
     Raises:
         InputError: the file is unreadable.
     """
-    path = folder / "model_index.json"
-    if not path.is_file():
-        return None
+    index = index_of(folder)
     with readable(folder):
-        return str(json.loads(read_text(path))["_class_name"])
+        return str(index["_class_name"]) if index else None
 
 
 def config_of(folder: str | Path, name: str) -> dict[str, Any]:
@@ -213,7 +284,9 @@ def _missing(folder: Path) -> list[str]:
     name = folder.name
     lost = [] if (folder / "config.json").is_file() else [f"{name}/config.json"]
     if not _variants(folder):
-        lost.append(f"{name}/{'model' if name == 'text_encoder' else WEIGHTS[0]}.safetensors")
+        lost.append(
+            f"{name}/{'model' if name.startswith('text_encoder') else WEIGHTS[0]}.safetensors"
+        )
     return lost
 
 

@@ -19,7 +19,11 @@ from torch import Tensor
 from attnwarp import check
 from attnwarp.editing.schedule import Size
 
-Kind = Literal["self", "cross", "joint"]
+Kind = Literal["self", "cross", "joint", "key", "value"]
+"""Kinds of features: outputs of self-, cross- and joint attention, and its keys and values. Keys are
+taken before positions turn them, so a carried key is turned at the place where it arrives."""
+
+OUTPUTS: tuple[Kind, ...] = ("self", "cross", "joint")
 
 Rows = Literal["image", "image first", "after text"]
 """Image rows of a layer's sequence: all rows, the first ones (rows of reference pictures or of the
@@ -63,13 +67,14 @@ class Layer:
 
     Attributes:
         name: name of the module, such as ``up_blocks.3.attentions.2.transformer_blocks.0.attn2``.
-        kind: "self", "cross" or "joint".
+        kind: kind of the features, :data:`Kind`.
         level: number of halvings of the latents before the layer.
         channels: C of the layer's features.
         block: number of the layer's block, in the editor's count.
         at: "output" takes the features from the module's output, "input" from its input. Parallel
             blocks use the input of their projection, since their output mixes in more.
         rows: image rows of the sequence.
+        first: number of the features' first channel, where a module puts others before them.
 
     Example:
         >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 1, 64)
@@ -84,6 +89,7 @@ class Layer:
     block: int = 0
     at: Literal["output", "input"] = "output"
     rows: Rows = "image"
+    first: int = 0
 
     def size(self, latent_size: Size) -> Size:
         """Compute the (h, w) of the layer. Each stride of 2 rounds an odd side up.
@@ -99,7 +105,7 @@ class Layer:
 
     def image_tokens(self, value: Any, call: Call) -> Tensor:
         """Extract (B, h w, C) image tokens of the module's output or input: a tuple's first tensor,
-        the image rows, and of an input the first C channels.
+        the image rows, heads side by side, and of an input or a shared projection C channels.
 
         Example:
             >>> layer = Layer("attn", "joint", 0, 2, rows="after text")
@@ -110,8 +116,9 @@ class Layer:
         """
         tensor = value[0] if isinstance(value, tuple) else value
         tokens: Tensor = tensor if self.rows == "image" else tensor[:, self._span(call)]
-        if self.at == "input":
-            tokens = tokens[..., : self.channels]
+        tokens = tokens.flatten(2)
+        if self.at == "input" or self.first:
+            tokens = tokens[..., self.first : self.first + self.channels]
         h, w = self.size(call.latent_size)
         check.shape(tokens, (call.batch, h * w, self.channels), self.name)
         return tokens
@@ -122,8 +129,9 @@ class Layer:
         if tensor.shape == tokens.shape:
             changed = tokens
         else:
-            changed = tensor.clone()
-            changed[:, self._span(call), : self.channels] = tokens
+            changed = tensor.clone(memory_format=torch.contiguous_format)
+            channels = slice(self.first, self.first + self.channels)
+            changed.view(*tensor.shape[:2], -1)[:, self._span(call), channels] = tokens
         return (changed, *value[1:]) if isinstance(value, tuple) else changed
 
     def _span(self, call: Call) -> slice:
@@ -221,17 +229,19 @@ def choose_layers(
     layers: Sequence[Layer],
     *,
     kinds: Sequence[Kind] | None = None,
-    blocks: Sequence[int] | None = None,
+    blocks: Sequence[int | str] | None = None,
+    sets: Mapping[str, Sequence[int]] | None = None,
 ) -> tuple[Layer, ...]:
     """Select layers of an editor.
 
     Args:
         layers: layers that the editor offers.
-        kinds: kinds of attention to choose; None for all.
-        blocks: numbers of blocks; None for all.
+        kinds: kinds of features to choose; None for all outputs of attention.
+        blocks: numbers of blocks, or names of ``sets``; None for all.
+        sets: numbers of blocks by the name of their set.
 
     Raises:
-        ValueError: a kind is unknown, or no layer matches.
+        ValueError: a kind or a set is unknown, or no layer matches.
 
     Example:
         >>> from attnwarp.editing.small import load_editor
@@ -241,10 +251,16 @@ def choose_layers(
     """
     for kind in kinds or ():
         check.one_of(kind, get_args(Kind), "kinds")
+    named, numbers = sets or {}, set[int]()
+    for block in blocks or ():
+        if isinstance(block, str):
+            check.one_of(block, list(named), "blocks")
+        numbers.update(named[block] if isinstance(block, str) else [block])
     chosen = tuple(
         layer
         for layer in layers
-        if (kinds is None or layer.kind in kinds) and (blocks is None or layer.block in blocks)
+        if layer.kind in (OUTPUTS if kinds is None else kinds)
+        and (blocks is None or layer.block in numbers)
     )
     if not chosen:
         there = sorted({(layer.block, layer.kind) for layer in layers})

@@ -282,6 +282,39 @@ class Flow:
     spacing: Callable[[int, Size], Sequence[float]] = even_shares
     needs_noise: bool = False
 
+    @classmethod
+    def of(
+        cls, scheduler: Any, mu: Callable[[Any, int, int], float], token: int, *, even: bool = True
+    ) -> Flow:
+        """Convert a diffusers FlowMatchEulerDiscreteScheduler, including its shift.
+
+        Args:
+            scheduler: the scheduler.
+            mu: function of the scheduler and the numbers of tokens and steps that returns the
+                shift, for a scheduler that shifts by it.
+            token: side of a token in latents.
+            even: True shifts even shares, as the model's pipeline does; False the scheduler's own.
+
+        Raises:
+            ValueError: the scheduler is of another class.
+        """
+        from diffusers import FlowMatchEulerDiscreteScheduler
+
+        if not isinstance(scheduler, FlowMatchEulerDiscreteScheduler):
+            raise ValueError(
+                f"scheduler: got {type(scheduler).__name__}, expected a"
+                " FlowMatchEulerDiscreteScheduler"
+            )
+
+        def spacing(steps: int, size: Size) -> list[float]:
+            tokens = (size[0] // token) * (size[1] // token)
+            shares = even_shares(steps, size) if even else None
+            scheduler.set_timesteps(steps, sigmas=shares, mu=mu(scheduler, tokens, steps))
+            shifted: list[float] = scheduler.sigmas[:-1].tolist()
+            return shifted
+
+        return cls(spacing)
+
     def timesteps(self, steps: int, size: Size) -> list[float]:
         """Compute shares from pure noise: see :class:`Schedule`."""
         check.number(steps, 1, PUBLISHED_STEPS, "steps", whole=True)
