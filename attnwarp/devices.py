@@ -75,13 +75,14 @@ def choose(name: str, report: Reporter = SILENT, *, splats: bool = True) -> str:
     return "cuda"
 
 
-def type_of(name: str, device: str) -> torch.dtype:
+def type_of(name: str, device: str, half: torch.dtype | None = None) -> torch.dtype:
     """Resolve the precision of an editor's networks.
 
     Args:
-        name: "float32", "float16", "bfloat16" or "auto": float16 on a GPU, float32 elsewhere. Edits
-            by the bundled editors stay within 71 dB of float32 in float16, and 51 dB in bfloat16.
+        name: "float32", "float16", "bfloat16" or "auto": half on a GPU, float32 elsewhere. Edits by
+            the bundled editors stay within 71 dB of float32 in float16, and 51 dB in bfloat16.
         device: device name, as returned by :func:`choose`.
+        half: half precision of "auto"; float16 if omitted.
 
     Raises:
         InputError: the precision is unknown.
@@ -95,7 +96,7 @@ def type_of(name: str, device: str) -> torch.dtype:
     if name not in TYPES:
         raise InputError(f"dtype {name!r}: unknown, expected one of {', '.join(TYPES)}")
     if name == "auto":
-        return torch.float32 if device == "cpu" else torch.float16
+        return torch.float32 if device == "cpu" else half or torch.float16
     dtype: torch.dtype = getattr(torch, name)
     return dtype
 

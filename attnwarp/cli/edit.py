@@ -37,7 +37,7 @@ from attnwarp.cli.options import (
     options_of,
 )
 from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
-from attnwarp.editing.small import check_words, guide_of
+from attnwarp.editing.small import check_words, own_steps_of
 from attnwarp.errors import InputWarning
 from attnwarp.reporting import reporter
 
@@ -101,7 +101,12 @@ def edit(
     ] = None,
     steps: Annotated[
         int | None,
-        typer.Option(min=1, metavar="N", help="Of denoising (20).", rich_help_panel=METHOD),
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Of denoising; the editor's own if left out.",
+            rich_help_panel=METHOD,
+        ),
     ] = None,
     iterations: Annotated[
         int | None,
@@ -207,6 +212,7 @@ def edit(
         if scene:
             changes.setdefault("size", SIZE)
         changes |= assignments(change or [], flags)
+        changes.setdefault("steps", own_steps_of(editor))  # refuses an unknown editor
         _check_splat_options(
             ply,
             of_fit={"--fit-iterations": fit_iterations, "--max-splats": max_splats},
@@ -216,7 +222,6 @@ def edit(
         results = ("edited.ply", "edited-3dgs.ply")
         files = [path for path in (source_picture, ply, editing.mask) if path is not None]
         check_inputs_stay((out / name for name in results), files)
-        guide_of(editor)  # refuses an unknown editor
         check_words(editor, instruction, anyway=anyway)
         from attnwarp import check, methods
         from attnwarp.io.file import existing_file

@@ -54,7 +54,10 @@ def edit_image(
     out: Annotated[Path, typer.Option(help="PNG file for the result.")],
     editor: PictureEditorOption = "small-plain",
     seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 0,
-    steps: Annotated[int, typer.Option(min=1, max=1000, help="Of denoising.")] = 20,
+    steps: Annotated[
+        int | None,
+        typer.Option(min=1, max=1000, help="Of denoising; the editor's own if left out."),
+    ] = None,
     size: Annotated[
         int | None,
         typer.Option(
@@ -123,18 +126,18 @@ def edit_image(
     import torch
 
     from attnwarp import check
-    from attnwarp.devices import choose, type_of
+    from attnwarp.devices import choose
     from attnwarp.drift import drift
     from attnwarp.editing.editor import edit
     from attnwarp.editing.segment import load_segmenter
-    from attnwarp.editing.small import load_editor
+    from attnwarp.editing.small import dtype_of, load_editor
     from attnwarp.methods.pictures import enlarged_change
 
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
     given = {name: value for name, value in guidance.items() if value is not None}
     device = choose(device, splats=False)
     model = load_editor(
-        editor, device=device, dtype=type_of(dtype, device), low_memory=low_memory, **given
+        editor, device=device, dtype=dtype_of(dtype, device, editor), low_memory=low_memory, **given
     )
     model.check_text(instruction)
     torch.set_num_threads(threads or core_count())

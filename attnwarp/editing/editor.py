@@ -442,6 +442,14 @@ class Defaults:
     references: int = 0
     block_sets: Mapping[str, Sequence[int]] = MappingProxyType({})
 
+    half: torch.dtype = torch.float16
+    """Half precision that the networks stand."""
+
+    @classmethod
+    def steps_of(cls, index: Mapping[str, Any]) -> int:
+        """Find :attr:`own_steps` from the model_index.json of a folder."""
+        return cls.own_steps
+
 
 class Coder(Defaults, ABC):
     """Base of editors whose pictures an autoencoder turns into latents, one picture at a time.

@@ -69,8 +69,9 @@ def stack_layers(
 
     Example:
         >>> config = {"num_layers": 2, "num_attention_heads": 2, "attention_head_dim": 8}
-        >>> [(layer.name, layer.kind) for layer in stack_layers([Stack("b", "num_layers")], config, 1)][:2]
-        [('b.0.attn.to_out.0', 'joint'), ('b.0.attn.norm_k', 'key')]
+        >>> layers = stack_layers([Stack("blocks", "num_layers")], config, 1)
+        >>> [(layer.name, layer.kind) for layer in layers][:2]
+        [('blocks.0.attn.to_out.0', 'joint'), ('blocks.0.attn.norm_k', 'key')]
     """
     width = config["num_attention_heads"] * config["attention_head_dim"]
     layers = []
@@ -78,14 +79,12 @@ def stack_layers(
         count, before = config[stack.count], config[stack.after] if stack.after else 0
         for index in range(count) if isinstance(count, int) else count:
             place, block = f"{stack.name}.{index}", before + index
+            same = {"level": level, "channels": width, "block": block, "rows": stack.rows}
             layers += [
-                Layer(f"{place}.{stack.projection}", "joint", level, width, block, "input", stack.rows),
-                Layer(f"{place}.{stack.keys}", "key", level, width, block, rows=stack.rows),
-                Layer(
-                    f"{place}.{stack.values}", "value", level, width, block, rows=stack.rows,
-                    first=stack.fused * width,
-                ),
-            ]  # fmt: skip
+                Layer(f"{place}.{stack.projection}", "joint", at="input", **same),
+                Layer(f"{place}.{stack.keys}", "key", **same),
+                Layer(f"{place}.{stack.values}", "value", first=stack.fused * width, **same),
+            ]
     return tuple(layers)
 
 

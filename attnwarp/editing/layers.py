@@ -20,7 +20,7 @@ from attnwarp import check
 from attnwarp.editing.schedule import Size
 
 Kind = Literal["self", "cross", "joint", "key", "value"]
-"""Kinds of features: outputs of self-, cross- and joint attention, and its keys and values. Keys are
+"""Kinds of features: outputs of self-, cross- and joint attention, and keys and values. Keys are
 taken before positions turn them, so a carried key is turned at the place where it arrives."""
 
 OUTPUTS: tuple[Kind, ...] = ("self", "cross", "joint")

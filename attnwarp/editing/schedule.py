@@ -309,6 +309,8 @@ class Flow:
         def spacing(steps: int, size: Size) -> list[float]:
             tokens = (size[0] // token) * (size[1] // token)
             shares = even_shares(steps, size) if even else None
+            if shares == [1.0]:  # shifts keep 1; a stretch of the last share would divide by 0
+                return shares
             scheduler.set_timesteps(steps, sigmas=shares, mu=mu(scheduler, tokens, steps))
             shifted: list[float] = scheduler.sigmas[:-1].tolist()
             return shifted

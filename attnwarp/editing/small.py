@@ -12,11 +12,13 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from attnwarp.devices import on_cpu_unless_named
+from attnwarp.devices import on_cpu_unless_named, type_of
 from attnwarp.errors import InputError, InputWarning, suggest
 from attnwarp.process import core_count
 
 if TYPE_CHECKING:
+    import torch
+
     from attnwarp.editing.editor import Editor, Guide
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -177,6 +179,38 @@ def guide_of(name_or_folder: str) -> Guide:
     return guide
 
 
+def own_steps_of(name_or_folder: str) -> int:
+    """Find an editor's own number of steps without loading it.
+
+    Example:
+        >>> own_steps_of("small-plain")
+        20
+    """
+    from attnwarp.editing.folder import index_of
+
+    steps: int = _kind_named(name_or_folder).steps_of(index_of(folders_of(name_or_folder)[0]))
+    return steps
+
+
+def dtype_of(name: str, device: str, name_or_folder: str) -> torch.dtype:
+    """Resolve the precision of an editor's networks: see :func:`attnwarp.devices.type_of`.
+
+    Args:
+        name: name of the precision; "auto" is on a GPU the half precision that the editor stands.
+        device: device name.
+        name_or_folder: name or folder of the editor.
+    """
+    return type_of(name, device, _kind_named(name_or_folder).half)
+
+
+def _kind_named(name_or_folder: str) -> Any:
+    from attnwarp.editing.editor import Defaults
+
+    folder, control = folders_of(name_or_folder)
+    plain = control is not None or name_or_folder in bundled()
+    return Defaults if plain else kind_of(folder)
+
+
 def kind_of(folder: Path) -> Any:
     """Find the editor class of a folder by the pipeline in its model_index.json;
     InstructPix2Pix if the file names none.
@@ -189,12 +223,14 @@ def kind_of(folder: Path) -> Any:
 
     known, named = kinds(), pipeline_of(folder)
     # A UNet's folder may belong to any Stable Diffusion pipeline.
-    if named not in known and named is not None and not (folder / "unet").is_dir():
+    if named is None or (named not in known and (folder / "unet").is_dir()):
+        named = "StableDiffusionInstructPix2PixPipeline"
+    if named not in known:
         raise InputError(
             f"{folder}: is of the pipeline {named!r}, which no editor reads; expected one of"
             f" {', '.join(sorted(known))}"
         )
-    return known.get(named or "", known["StableDiffusionInstructPix2PixPipeline"])
+    return known[named]
 
 
 def folders_of(name_or_folder: str) -> tuple[Path, Path | None]:
@@ -264,7 +300,6 @@ def load_editor(name_or_folder: str, **settings: Any) -> Editor:
 
     require_diffusers()
 
-    from attnwarp.editing.editors.controlnet import DepthControlNet
     from attnwarp.editing.memory import save_memory
 
     folder, control = folders_of(name_or_folder)
@@ -282,6 +317,8 @@ def load_editor(name_or_folder: str, **settings: Any) -> Editor:
         settings["device"] = "cpu"
     editor: Editor
     if control is not None:
+        from attnwarp.editing.editors.controlnet import DepthControlNet
+
         editor = DepthControlNet.from_folder(folder, control, **settings)
     else:
         editor = kind_of(folder).from_folder(folder, **settings)

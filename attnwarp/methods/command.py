@@ -16,7 +16,7 @@ from attnwarp.camera import Camera
 from attnwarp.devices import choose, device_of, peak_memory, type_of
 from attnwarp.editing.memory import weight_bytes
 from attnwarp.editing.segment import check_marks, segmenter_folders
-from attnwarp.editing.small import bundled, load_editor
+from attnwarp.editing.small import bundled, dtype_of, load_editor
 from attnwarp.errors import InputError, suggest
 from attnwarp.fit import (
     FitSettings,
@@ -219,7 +219,10 @@ def _by_hand(
 def _editor(name: str, device: str, options: EditOptions, report: Reporter) -> Any:
     """Load the editor; on a GPU, report the memory of its weights."""
     editor = load_editor(
-        name, device=device, dtype=type_of(options.dtype, device), low_memory=options.low_memory
+        name,
+        device=device,
+        dtype=dtype_of(options.dtype, device, name),
+        low_memory=options.low_memory,
     )
     if device != "cpu":
         kind = str(editor.network.dtype).removeprefix("torch.")

@@ -36,7 +36,10 @@ class Features:
         self.layers: tuple[Layer, ...] = ()
         if settings.a0 > 0:
             self.layers = choose_layers(
-                editor.layers(), kinds=settings.kinds, blocks=settings.blocks
+                editor.layers(),
+                kinds=settings.kinds,
+                blocks=settings.blocks,
+                sets=editor.block_sets,
             )
             self._check_branches()
 

@@ -172,9 +172,12 @@ class AttentionWarpingSettings(MethodSettings):
         a0: weight of the injected features at the first step. 0 records nothing and edits each view
             alone, with all else equal: the control.
         decay: "linear", a_t = a0 (T - t) / T, or "constant".
-        kinds: kinds of attention whose features are warped, such as ["self"]; None for all.
-        blocks: numbers of the editor's blocks whose features are warped; None for all it offers,
-            such as the up-sampling blocks of a UNet at the latents' size and at half of it.
+        kinds: kinds of features that are warped, such as ["self"]; None for all outputs of
+            attention. ["key", "value"] warps a transformer's keys, before positions turn them, and
+            its values.
+        blocks: numbers of the editor's blocks whose features are warped, or names of its sets of
+            blocks, such as ["double"]; None for all it offers, such as the up-sampling blocks of a
+            UNet at the latents' size and at half of it.
         feature_steps: (from, until) shares of the steps whose features are recorded and injected.
             In other steps views keep their features: [0, 0.5] halves the memory.
         branches: guidance branches that get features. None: text and image of InstructPix2Pix,
@@ -235,7 +238,7 @@ class AttentionWarpingSettings(MethodSettings):
     a0: Share = 0.9
     decay: Literal["linear", "constant"] = "linear"
     kinds: tuple[Kind, ...] | None = None
-    blocks: tuple[int, ...] | None = None
+    blocks: tuple[int | str, ...] | None = None
     feature_steps: tuple[float, float] = (0.0, 1.0)
     branches: tuple[str, ...] | None = None
     feature_type: Literal["float32", "float16", "bfloat16"] = "float32"

@@ -96,8 +96,9 @@ def check_editor(editor: Editor, settings: AttentionWarpingSettings) -> int | No
             editor.check_text(s.source_prompt)
         if editor.guide != "depth":
             raise ValueError(
-                f"latents: {s.latents!r} is made for a depth ControlNet, got InstructPix2Pix, which"
-                " takes pictures; choose another editor, or 'random'"
+                f"latents: {s.latents!r} is made for a depth ControlNet, got"
+                f" {type(editor).__name__}, which takes pictures; choose another editor, or"
+                " 'random'"
             )
     if s.start is None:
         return None

@@ -133,10 +133,10 @@ class Work:
         kinds = {"picture": "InstructPix2Pix, which takes pictures", "depth": "a depth ControlNet"}
         editor = self.editor
         if editor.guide != guide or not (kind is None or isinstance(editor, kind)):
-            got = type(editor).__name__ if editor.guide == guide else kinds[editor.guide]
+            takes = {"picture": "pictures", "depth": "depth maps"}[editor.guide]
             raise ValueError(
-                f"editor: {method} is made for {kinds[guide]}, got {got}; choose another editor or"
-                " method"
+                f"editor: {method} is made for {kinds[guide]}, got {type(editor).__name__}, which"
+                f" takes {takes}; choose another editor or method"
             )
 
     def starts_at(self, lowest: int, field: str) -> None:

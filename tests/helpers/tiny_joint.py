@@ -4,7 +4,6 @@ Texts are random embeddings of their words, given to editor and pipeline alike.
 """
 
 import hashlib
-import warnings
 
 import diffusers
 import numpy as np
@@ -15,6 +14,10 @@ from attnwarp.editing.editors import kinds
 
 diffusers.utils.logging.set_verbosity_error()
 diffusers.utils.logging.disable_progress_bar()
+
+# Imported here, so that no test waits for it.
+for _name in ("Flux2KleinPipeline", "FluxKontextPipeline", "QwenImageEditPipeline"):
+    getattr(diffusers, _name)
 
 NAMES = ("klein", "kontext", "qwen", "qwen-plus", "sd3")
 PIPELINES = {
@@ -132,7 +135,9 @@ def editor(name, dtype=torch.float32, changes=None, **settings):
             views = len(pictures[0])
             return {k: v.to(dtype).expand(views, *v.shape[1:]) for k, v in rows.items()}
 
-    settings = {"negative_prompt": "", **settings} if "negative_prompt" in kind.options else settings
+    settings = (
+        {"negative_prompt": "", **settings} if "negative_prompt" in kind.options else settings
+    )
     return Told(**parts(name, dtype, **(changes or {})), **settings)
 
 
@@ -141,3 +146,37 @@ def picture(name, h=6, w=8, seed=0):
     side = SIDE[name]
     levels = np.random.default_rng(seed).integers(0, 256, (h * side, w * side, 3))
     return (levels / 255).astype(np.float32)
+
+
+CHAT = "{% for message in messages %}<|im_start|>{{ message.content }}{% endfor %}"
+
+
+def byte_tokenizer(kind, **settings):
+    """A tokenizer of every byte."""
+    from tokenizers.pre_tokenizers import ByteLevel
+
+    letters = sorted(ByteLevel.alphabet())
+    special = ["<|im_start|>", "<|endoftext|>"]
+    return kind(
+        vocab={letter: i for i, letter in enumerate([*letters, *special])}, merges=[], **settings
+    )
+
+
+def klein_folder(folder, *, distilled=True):
+    """A folder of a tiny FLUX.2 klein, as diffusers' saver writes it."""
+    from transformers import Qwen2Tokenizer, Qwen3Config, Qwen3ForCausalLM
+
+    words = byte_tokenizer(Qwen2Tokenizer, pad_token="<|endoftext|>")
+    words.chat_template = CHAT
+    torch.manual_seed(2)
+    reader = Qwen3ForCausalLM(
+        Qwen3Config(
+            vocab_size=len(words), hidden_size=8, intermediate_size=8, num_hidden_layers=28, num_attention_heads=2,
+            num_key_value_heads=1, head_dim=4, max_position_embeddings=512,
+        )
+    )  # fmt: skip
+    changes = {"joint_attention_dim": 24}
+    told = {**parts("klein", **changes), "text_encoder": reader, "tokenizer": words}
+    pipe = diffusers.Flux2KleinPipeline(**told, is_distilled=distilled)
+    pipe.save_pretrained(folder)
+    return pipe

@@ -51,7 +51,7 @@ class Flux2Klein(Joint):
             raise ValueError("text_guidance: this model is distilled and takes none; leave it out")
         own = 1.0 if is_distilled else 4.0
         super().__init__(text_guidance=own if text_guidance is None else text_guidance, **parts)
-        self.own_steps = 4 if is_distilled else 50
+        self.own_steps = self.steps_of({"is_distilled": is_distilled})
         self.options = () if is_distilled else type(self).options
 
     @classmethod
@@ -59,8 +59,13 @@ class Flux2Klein(Joint):
         """Load an editor from a local folder; its model_index.json says whether it is distilled."""
         from attnwarp.editing.folder import index_of
 
-        distilled = bool(index_of(folder).get("is_distilled", False))
+        distilled = bool(index_of(folder).get("is_distilled"))
         return super().from_folder(folder, is_distilled=distilled, **settings)
+
+    @classmethod
+    def steps_of(cls, index: Mapping[str, Any]) -> int:
+        """Find the number of steps: few of a distilled model."""
+        return 4 if index.get("is_distilled") else 50
 
     def mu(self, scheduler: Any, tokens: int, steps: int) -> float:
         """Compute the shift fitted for FLUX.2 at 10 and at 200 steps, linear between them."""
@@ -96,7 +101,7 @@ class Flux2Klein(Joint):
         return {"encoder_hidden_states": text.expand(len(pictures[0]), -1, -1)}
 
     def places(self, size: Size, pictures: int, text: Mapping[str, Any]) -> dict[str, Any]:
-        """Compute positions: (picture, row, column, word) of pictures 0, 10, 20, ... and of text."""
+        """Compute positions (picture, row, column, word) of pictures 0, 10, ... and of text."""
         count, device = text["encoder_hidden_states"].shape[1], self.network.device
         words = torch.zeros(count, 4)
         words[:, 3] = torch.arange(count)

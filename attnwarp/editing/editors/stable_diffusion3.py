@@ -50,12 +50,12 @@ class StableDiffusion3(Joint):
     )  # fmt: skip
     words = ("tokenizer", 77)
     begins: Begin = "picture"
+    own_steps = 30
     options = ("text_guidance", "strength", "negative_prompt")
 
     def __init__(self, *, text_guidance: float = 7.0, strength: float = 0.6, **parts: Any) -> None:
         self.strength = check.number(strength, 0.001, 1, "strength")
         super().__init__(text_guidance=text_guidance, **parts)
-        self.own_steps = max(1, round(50 * self.strength))
 
     @classmethod
     def token_of(cls, config: Mapping[str, Any]) -> int:

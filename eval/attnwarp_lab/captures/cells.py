@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from attnwarp.editing.small import guide_of, load_editor, thread_count
+from attnwarp.editing.small import dtype_of, guide_of, load_editor, own_steps_of, thread_count
 from attnwarp.encoders import Kind, load_encoder
 from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
@@ -144,9 +144,7 @@ def _own_device(devices: Sequence[str]) -> str:
 @lru_cache(maxsize=1)
 def editor_of(name: str, device: str) -> Any:
     """Load an editor; each process caches the last one."""
-    from attnwarp.devices import type_of
-
-    return load_editor(name, device=device, dtype=type_of("auto", device))
+    return load_editor(name, device=device, dtype=dtype_of("auto", device, name))
 
 
 @cache
@@ -466,9 +464,13 @@ def _fit_settings(manifest: Manifest, kind: str) -> Json:
 
 
 def settings_of(loaded: Loaded, row: Row, seed: int, size: int) -> Json:
-    """All settings of a row's method; the library's use the manifest's size and encoder."""
-    shared = {"size": size, "perceptual_encoder": loaded.encoder("perceptual")}
-    own = {**row.options, **(shared if row.method in METHODS else {})}
+    """All settings of a row's method; the library's use the manifest's size and encoder, and the
+    editor's own steps.
+    """
+    own = dict(row.options)
+    if row.method in METHODS:
+        own.setdefault("steps", own_steps_of(loaded.editor(row.editor)))
+        own |= {"size": size, "perceptual_encoder": loaded.encoder("perceptual")}
     return EDITING_METHODS[row.method].settings(row.preset, own, seed)
 
 

@@ -166,7 +166,8 @@ def _check_editor(loaded: Loaded, name: str, device: str, done: Checked) -> None
                     f" {name!r} is guided by a {editor.guide}; name another editor"
                 )
             if row.method == "attention_warping":
-                check_editor(editor, preset(row.method, row.preset, **row.options))
+                own = {"steps": editor.own_steps, **row.options}
+                check_editor(editor, preset(row.method, row.preset, **own))
     del editor, tensors
     gc.collect()
 

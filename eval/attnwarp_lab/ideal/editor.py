@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
-from attnwarp.editing.editor import Guide, Image, tensor_of
+from attnwarp.editing.editor import Defaults, Guide, Image, tensor_of
 from attnwarp.editing.layers import Call, Layer, unet_call
 from attnwarp.editing.schedule import DDIM, Size, Time, stable_diffusion_alphas
 
@@ -214,7 +214,7 @@ def schedule(share: float = 1.0) -> DDIM:
     return DDIM((share * a / (share * a + 1 - a)).float(), "sample", 1.0)
 
 
-class IdealEditor:
+class IdealEditor(Defaults):
     """An :class:`~attnwarp.editing.editor.Editor` with the answers of every view.
 
     Args:
