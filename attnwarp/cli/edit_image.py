@@ -131,7 +131,8 @@ def edit_image(
     from attnwarp.editing.editor import edit
     from attnwarp.editing.segment import load_segmenter
     from attnwarp.editing.small import dtype_of, load_editor
-    from attnwarp.methods.pictures import enlarged_change
+    from attnwarp.methods.change import mean_change, say_little
+    from attnwarp.methods.pictures import enlarged_change, to_bytes
 
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
     given = {name: value for name, value in guidance.items() if value is not None}
@@ -175,6 +176,10 @@ def edit_image(
         )
     edited = result.images[0]
     masked = edited if share is None else share * edited + (1 - share) * image
+    where = None if share is None else share[..., 0] > 0.5
+    change = mean_change([(to_bytes(image), to_bytes(edited), where)])
+    if little := say_little({"scene": None, "picture": change}):
+        warnings.warn(little, InputWarning, stacklevel=1)
     # The photograph keeps its detail, and the enlarged change is added.
     _write(out, enlarged_change(whole, masked.astype(np.float32)))
     if sheet is not None:

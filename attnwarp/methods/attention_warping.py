@@ -208,6 +208,7 @@ class AttentionWarping(Method):
             ExitStack() as stack,
         ):
             start = views.start([view], work.frozen, by_hand=number == 0)
+            start = views.referenced(start, sights, number)
             views.attend(stack, [view], sights)
             self._inject(stack, before, sights)
             tokens, recording = views.keeping(stack, number), None
@@ -229,6 +230,7 @@ class AttentionWarping(Method):
             sights = [views.sight(count, view, model) for view in batch]
         with work.guided(self.settings.guidance(stage)), ExitStack() as stack:
             start = views.start(batch, model, stage=stage)
+            start = views.referenced(start, sights, count)
             views.attend(stack, batch, sights)
             self._inject(stack, recorded, sights)
             pictures, _ = views.denoise(start, sights, step)

@@ -34,7 +34,7 @@ from attnwarp.fit.views import Drawn
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
 from attnwarp.io.names import file_stems
-from attnwarp.methods.change import Change, change_of, drift_of
+from attnwarp.methods.change import Change, change_of, drift_of, say_little
 from attnwarp.methods.pictures import (
     Bytes,
     Image,
@@ -596,7 +596,8 @@ class _Run:
         tuned = {self.names[view]: n for view, n in sorted(self.tuning.visits.items())}
         limit = None if cut is None else cut["limit"]
         about = {"edit_psnr": psnr, "counters": counters, "tuned": tuned, "cut": limit}
-        self.folder.write_json("result.json", {"change": change, "drift": drift, **about})
+        said = {"change": change, "advice": say_little(change), "drift": drift}
+        self.folder.write_json("result.json", {**said, **about})
         self.seconds.write()
         return Result(
             self.name,

@@ -51,7 +51,7 @@ class Estimates:
             [] if sight is None else [sight.warp(k, picture=True) for k in range(sources)]
             for sight in sights
         ]
-        carry = self._carry_picture if pictures else _carry
+        blend = self._carry_picture if pictures else carry
 
         def change(number: int, x0: Tensor) -> Tensor:
             weight, result = self.weight(number), x0
@@ -60,7 +60,7 @@ class Estimates:
                     self._picture(k, number, x0) if pictures else self.sources[k][number].to(x0)
                     for k in range(sources)
                 ]
-                rows = [carry(own, maps, ws, weight) for own, ws in zip(x0, warps, strict=True)]
+                rows = [blend(own, maps, ws, weight) for own, ws in zip(x0, warps, strict=True)]
                 result = torch.stack(rows)
             if keep is not None:
                 keep.append(result[0].clone())
@@ -98,14 +98,14 @@ class Estimates:
     ) -> Tensor:
         """Encode a target's picture after warping the sources' (3, H, W) into it, (C, h, w)."""
         before = self.editor.pixels(own[None])
-        after = _carry(before[0], pictures, warps, weight)[None]
+        after = carry(before[0], pictures, warps, weight)[None]
         # The autoencoder's loss of detail affects both pictures alike, so pixels without a warped
         # source do not change.
         change = self.editor.latents(after) - self.editor.latents(before)
         return own + change[0].to(own)
 
 
-def _carry(
+def carry(
     own: Tensor, maps: Sequence[Tensor], warps: Sequence[SourceWarp], weight: float
 ) -> Tensor:
     """Blend the sources' warped (C, h', w') maps into a target's (C, h, w) map.

@@ -168,6 +168,9 @@ class AttentionWarpingSettings(MethodSettings):
         estimate_margin: margin on either side of a source's depth edge excluded from the warped
             estimate, since pixels there mix near and far; a share of the source's shorter side,
             rounded to whole pixels.
+        reference: the source's edit as a further picture that the editor sees beside the view's
+            own, if it takes any: "plain" as it is, or "warped" to the view, whose own picture stays
+            where the source sees nothing.
         depth_from: model of the depth: before the edit ("frozen") or as tuned so far ("current").
         a0: weight of the injected features at the first step. 0 records nothing and edits each view
             alone, with all else equal: the control.
@@ -234,6 +237,7 @@ class AttentionWarpingSettings(MethodSettings):
     estimate_until: Weight = 0.5
     estimate_in: Literal["latents", "picture"] = "latents"
     estimate_margin: Share = 0.0
+    reference: Literal["none", "plain", "warped"] = "none"
     depth_from: Literal["frozen", "current"] = "frozen"
     a0: Share = 0.9
     decay: Literal["linear", "constant"] = "linear"

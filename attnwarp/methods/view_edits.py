@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from numbers import Integral
 from typing import Any
 
@@ -23,7 +23,7 @@ from attnwarp.editing.schedule import Time
 from attnwarp.gaussians import Gaussians
 from attnwarp.io.names import file_stems
 from attnwarp.methods.base import ViewEdit, edit_file
-from attnwarp.methods.carried import Estimates, Noise
+from attnwarp.methods.carried import Estimates, Noise, carry
 from attnwarp.methods.features import Features
 from attnwarp.methods.geometry import Geometry, Warps
 from attnwarp.methods.pictures import (
@@ -91,6 +91,11 @@ def check_editor(editor: Editor, settings: AttentionWarpingSettings) -> int | No
             too long, or the start is too low for the number of steps.
     """
     s = settings
+    if s.reference != "none" and editor.references == 0:
+        raise ValueError(
+            f"reference: got {s.reference!r}, but {type(editor).__name__} sees one picture alone;"
+            " set it to 'none', or choose an editor that sees several"
+        )
     if s.latents != "random":
         if s.source_prompt:
             editor.check_text(s.source_prompt)
@@ -280,7 +285,8 @@ class ViewEdits:
     def sight(self, sources: int, view: int, model: Gaussians) -> Sight | None:
         """Compute the visibility of a view from the first sources; None if nothing is warped."""
         s = self.settings
-        if not sources or (s.a0 == 0 and s.noise != "surface" and s.estimate == 0):
+        warps = s.a0 > 0 or s.noise == "surface" or s.estimate > 0 or s.reference == "warped"
+        if not sources or not warps:
             return None
         return self.geometry.sight(self.sources[:sources], view, model)
 
@@ -318,6 +324,24 @@ class ViewEdits:
             ]
         )
         return Start(views, guides, latents=latents)
+
+    def referenced(self, start: Start, sights: Sequence[Sight | None], sources: int) -> Start:
+        """Show the edits of the first ``sources`` beside the views' guides, as settings say."""
+        kind, edits = self.settings.reference, [s.picture for s in self._recorded[:sources]]
+        if kind == "none" or not edits:
+            return start
+        guides = []
+        for guide, sight in zip(start.guides, sights, strict=True):
+            size = guide.shape[0], guide.shape[1]
+            if kind == "plain":
+                shown = [resized(edit, size) for edit in edits[: self.work.editor.references]]
+            else:
+                assert sight is not None
+                own, *maps = (torch.from_numpy(p).permute(2, 0, 1) for p in (guide, *edits))
+                warps = [sight.warp(number, picture=True) for number in range(len(edits))]
+                shown = [carry(own, maps, warps, 1.0).permute(1, 2, 0).numpy().clip(0, 1)]
+            guides.append(np.stack([guide, *shown]))
+        return replace(start, guides=guides)
 
     def denoise(
         self, start: Start, sights: Sequence[Sight | None], step: Callable[[], None]

@@ -1,5 +1,5 @@
-"""Qwen-Image-Edit (Alibaba 2025): edits by an instruction that a vision model reads with the
-picture.
+"""Qwen-Image-Edit and -Plus (Alibaba 2025): edits by an instruction that a vision model reads with
+the picture.
 """
 
 from __future__ import annotations
@@ -103,3 +103,12 @@ class QwenImageEdit(Joint):
         """Combine the branches' velocities, each token with the length of the text's."""
         guided = super().combined(text, uncond)
         return guided * (text.norm(dim=-1, keepdim=True) / guided.norm(dim=-1, keepdim=True))
+
+
+@reads("QwenImageEditPlusPipeline")
+class QwenImageEditPlus(QwenImageEdit):
+    """Editor of Qwen-Image-Edit-Plus (releases 2509 and later), which sees several pictures."""
+
+    pipeline = "QwenImageEditPlusPipeline"
+    references = 2
+    read_area = 384**2
