@@ -24,6 +24,7 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import STEPS, edit
+from attnwarp.editing.layers import choose_layers
 from attnwarp.editing.recording import Recording, RecordingPlan, record
 from attnwarp.editing.small import load_editor, thread_count
 from attnwarp.methods.attention_warping import inject
@@ -83,7 +84,7 @@ def measure(editor: Any, size: int, *, steps: int = STEPS, rounds: int = 5) -> R
     view = np.random.default_rng(0).random((size, size, 3), dtype=np.float32)
     _, h, w = editor.noise_shape((size, size))
     keep = tuple(name for name in editor.branches if name in editor.carries)
-    plan = RecordingPlan(editor.layers(), (h, w), keep, steps)
+    plan = RecordingPlan(choose_layers(editor.layers()), (h, w), keep, steps)
     warp = plane_warp(size)
     with record(editor, plan) as recording:
         edit(editor, [view], INSTRUCTION, steps=steps)

@@ -107,11 +107,38 @@ def load_pipeline(
     for name, kind in readers.items():
         with readable(folder / name):
             parts[name] = kind.from_pretrained(folder / name, local_files_only=True)
-    with readable(folder / "scheduler"):
-        config = json.loads(read_text(folder / "scheduler" / "scheduler_config.json"))
-        kind = getattr(diffusers, config["_class_name"])
-        parts["scheduler"] = kind.from_pretrained(folder / "scheduler", local_files_only=True)
-    return parts
+    return {**parts, "scheduler": _scheduler(folder)}
+
+
+def load_empty(folder: Path, networks: Mapping[str, str], dtype: torch.dtype) -> dict[str, Any]:
+    """Build a pipeline's transformer and autoencoder without weights, on torch's device "meta", and
+    its scheduler; text encoders and tokenizers are None.
+    """
+    import diffusers
+
+    parts: dict[str, Any] = {}
+    for name, kind in networks.items():
+        if name.startswith("text_encoder"):
+            parts |= {name: None, _tokenizer_of(name): None}
+            continue
+        with readable(folder / name), torch.device("meta"):
+            network = getattr(diffusers, kind).from_config(config_of(folder, name))
+            # diffusers' own `to` warns.
+            parts[name] = torch.nn.Module.to(network, dtype)
+    if (folder / "processor").is_dir():
+        parts["processor"] = None
+    return {**parts, "scheduler": _scheduler(folder)}
+
+
+def _scheduler(folder: Path) -> Any:
+    import diffusers
+
+    place = folder / "scheduler"
+    with readable(place):
+        config = json.loads(read_text(place / "scheduler_config.json"))
+        return getattr(diffusers, config["_class_name"]).from_pretrained(
+            place, local_files_only=True
+        )
 
 
 def _tokenizer_of(text_encoder: str) -> str:

@@ -202,6 +202,47 @@ class Joint(Coder):
             parts = load_pipeline(folder, cls.networks, cls.optional, device=device, dtype=dtype)
             return cls(**parts, **settings)
 
+    @classmethod
+    def rehearsed(
+        cls, folder: Path, dtype: torch.dtype, size: int | None = None
+    ) -> tuple[int, int]:
+        """Find the memory of an edit without weights: its networks run on torch's device "meta".
+
+        Args:
+            folder: folder of the editor.
+            dtype: dtype of the networks.
+            size: side of the square view in px; the model's own if omitted.
+
+        Returns:
+            The side, and the largest number of bytes beside the weights.
+        """
+        from attnwarp.editing.folder import load_empty
+        from attnwarp.editing.memory import peak_bytes
+
+        parts = load_empty(folder, cls.networks, dtype)
+        config = parts["transformer"].config
+
+        class Empty(cls):  # type: ignore[valid-type,misc]
+            def embed(self, words: str, pictures: Sequence[Tensor]) -> dict[str, Any]:
+                views, like = len(pictures[0]), {"dtype": dtype, "device": "meta"}
+                rows = torch.empty(views, self.words[1], config.joint_attention_dim, **like)
+                given = {"encoder_hidden_states": rows}
+                if pooled := config.get("pooled_projection_dim"):
+                    given["pooled_projections"] = torch.empty(views, pooled, **like)
+                return given
+
+        editor = Empty(**parts)
+        side = -(-(size or cls.own_size) // editor.side_multiple) * editor.side_multiple
+        view = np.zeros((side, side, 3), np.float32)
+        latents = torch.empty(1, *editor.noise_shape((side, side)), dtype=dtype, device="meta")
+        task = editor.task([view], "")
+        runs = (
+            lambda: editor.encode([view]),
+            lambda: task.predict(latents, 0.5),
+            lambda: editor.pixels(latents),
+        )
+        return side, max(map(peak_bytes, runs))
+
     # --- layers
 
     @classmethod

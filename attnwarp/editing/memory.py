@@ -1,10 +1,18 @@
-"""Memory of an editor: the size of its weights, and diffusers' memory-saving options."""
+"""Memory of an editor: its weights and activations, and diffusers' memory-saving options."""
 
 from __future__ import annotations
 
+import json
+import math
+import weakref
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from attnwarp.devices import device_of
 from attnwarp.editing.editor import Editor
@@ -34,6 +42,110 @@ def weight_bytes(editor: Editor) -> int:
         for network in networks_of(editor).values()
         for tensor in network.state_dict().values()
     )
+
+
+def folder_bytes(folder: Path, dtype: torch.dtype) -> int:
+    """Count the bytes of a folder's weights in a dtype, from the heads of its safetensors files;
+    networks in other formats count as their files.
+    """
+    total = 0
+    for place in {path.parent for path in folder.glob("*/config.json")}:
+        files = [f for f in place.glob("*.safetensors") if ".fp16." not in f.name]
+        for path in files or [*place.glob("*.safetensors"), *place.glob("*.bin")]:
+            total += (
+                _tensor_bytes(path, dtype) if path.suffix == ".safetensors" else path.stat().st_size
+            )
+    return total
+
+
+def _tensor_bytes(path: Path, dtype: torch.dtype) -> int:
+    with path.open("rb") as stream:
+        head = json.loads(stream.read(int.from_bytes(stream.read(8), "little")))
+    head.pop("__metadata__", None)
+    return sum(math.prod(tensor["shape"]) for tensor in head.values()) * dtype.itemsize
+
+
+class _Live(TorchDispatchMode):
+    """Counter of the bytes of live tensors that operations create."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = self.most = 0
+        self._seen: set[int] = set()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        # A view of what an operation reads, such as of a weight, is no new memory.
+        read = {s._cdata for s in _storages((args, kwargs))}
+        for storage in _storages(result):
+            if storage._cdata not in self._seen | read:
+                self._seen.add(storage._cdata)
+                self.now += storage.nbytes()
+                self.most = max(self.most, self.now)
+                weakref.finalize(storage, self._free, storage._cdata, storage.nbytes())
+        return result
+
+    def _free(self, key: int, count: int) -> None:
+        self._seen.discard(key)
+        self.now -= count
+
+
+def _storages(values: Any) -> list[Any]:
+    tensors = (value for value in tree_leaves(values) if isinstance(value, torch.Tensor))
+    return [tensor.untyped_storage() for tensor in tensors]
+
+
+class _Fused(TorchFunctionMode):
+    """Attention as fused kernels run it: without its table of scores."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is torch.nn.functional.scaled_dot_product_attention:
+            return torch.empty_like(args[0] if args else kwargs["query"])
+        return func(*args, **(kwargs or {}))
+
+
+def peak_bytes(run: Callable[[], Any]) -> int:
+    """Measure the largest number of bytes that tensors created by a function hold at once.
+
+    Attention counts as fused. On torch's device "meta" nothing is computed or held.
+
+    Example:
+        >>> def twice():
+        ...     x = torch.zeros(10, dtype=torch.float32, device="meta")
+        ...     return x + 1
+        >>> peak_bytes(twice)
+        80
+    """
+    with torch.no_grad(), _Live() as live, _Fused():
+        run()
+    return live.most
+
+
+def announced(name_or_folder: str, dtype: torch.dtype, size: int | None = None) -> str:
+    """Describe the memory of an editor's weights and of a view's edit, before anything is loaded.
+
+    Args:
+        name_or_folder: name or folder of the editor.
+        dtype: dtype of the networks.
+        size: longest side of a square view in px; the editor's own if omitted.
+
+    Example:
+        >>> announced("small-plain", torch.float32)
+        'weights of the editor in float32: 0.01 GiB'
+    """
+    from attnwarp.editing.small import bundled, folders_of, kind_of
+
+    folders = [place for place in folders_of(name_or_folder) if place is not None]
+    weights = sum(folder_bytes(place, dtype) for place in {folders[0], *folders[1:]})
+    kind = str(dtype).removeprefix("torch.")
+    line = f"weights of the editor in {kind}: {weights / 2**30:.2f} GiB"
+    rehearse = None
+    if name_or_folder not in bundled() and len(folders) == 1:
+        rehearse = getattr(kind_of(folders[0]), "rehearsed", None)
+    if rehearse is None:
+        return line
+    side, peak = rehearse(folders[0], dtype, size)
+    return f"{line}; an edit of a view of {side} x {side} px beside them: {peak / 2**30:.2f} GiB"
 
 
 def save_memory(editor: Editor, device: str) -> None:

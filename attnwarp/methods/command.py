@@ -14,7 +14,7 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.devices import choose, device_of, peak_memory, type_of
-from attnwarp.editing.memory import weight_bytes
+from attnwarp.editing.memory import announced
 from attnwarp.editing.segment import check_marks, segmenter_folders
 from attnwarp.editing.small import bundled, dtype_of, load_editor
 from attnwarp.errors import InputError, suggest
@@ -150,7 +150,7 @@ def edit_dataset(
     """
     index = view_of(dataset, options.source)
     device = choose(options.device, report)
-    editor = _editor(editor_name, device, options, report)
+    editor = _editor(editor_name, device, options, settings.size, report)
     editor.check_text(instruction)
     if settings.size is None:
         settings = settings.changed(size=editor.own_size)
@@ -216,21 +216,14 @@ def _by_hand(
     return by_hand
 
 
-def _editor(name: str, device: str, options: EditOptions, report: Reporter) -> Any:
-    """Load the editor; on a GPU, report the memory of its weights."""
-    editor = load_editor(
-        name,
-        device=device,
-        dtype=dtype_of(options.dtype, device, name),
-        low_memory=options.low_memory,
-    )
-    if device != "cpu":
-        kind = str(editor.network.dtype).removeprefix("torch.")
-        place = "main memory" if options.low_memory else "the GPU"
-        report.log(
-            f"weights of the editor, {kind}: {weight_bytes(editor) / 2**30:.2f} GiB of {place}"
-        )
-    return editor
+def _editor(
+    name: str, device: str, options: EditOptions, size: int | None, report: Reporter
+) -> Any:
+    """Load the editor; before, report its memory, unless a bundled one stays in main memory."""
+    dtype = dtype_of(options.dtype, device, name)
+    if device != "cpu" or name not in bundled():
+        report.log(announced(name, dtype, size))
+    return load_editor(name, device=device, dtype=dtype, low_memory=options.low_memory)
 
 
 def _report_memory(device: str, report: Reporter) -> None:
