@@ -129,6 +129,7 @@ def edit_image(
     from attnwarp.devices import choose
     from attnwarp.drift import drift
     from attnwarp.editing.editor import edit
+    from attnwarp.editing.memory import announced
     from attnwarp.editing.segment import load_segmenter
     from attnwarp.editing.small import dtype_of, load_editor
     from attnwarp.methods.change import mean_change, say_little
@@ -137,9 +138,10 @@ def edit_image(
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
     given = {name: value for name, value in guidance.items() if value is not None}
     device = choose(device, splats=False)
-    model = load_editor(
-        editor, device=device, dtype=dtype_of(dtype, device, editor), low_memory=low_memory, **given
-    )
+    kind = dtype_of(dtype, device, editor)
+    if editor not in bundled():
+        typer.echo(announced(editor, kind, size), err=True)
+    model = load_editor(editor, device=device, dtype=kind, low_memory=low_memory, **given)
     model.check_text(instruction)
     torch.set_num_threads(threads or core_count())
     longest = size or model.own_size

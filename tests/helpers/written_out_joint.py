@@ -68,7 +68,7 @@ def velocity(w, config, image, text, pooled, ids, share, guidance, change):
     Args:
         image: (S, C) tokens of the picture and of its reference.
         ids: (T + S, 3) positions.
-        change: of "double" and "single", given all (S, D) rows of image and reference.
+        change: function of "double" or "single" and all (S, D) rows of image and reference.
     """
     heads, axes, count = config["num_attention_heads"], config["axes_dims_rope"], len(text)
 

@@ -117,7 +117,7 @@ def test_in_half_precision_the_loop_is_within_a_level_of_diffusers(name, monkeyp
     noise = drawn((1, *editor.noise_shape(picture.shape[:2])), 3).bfloat16()
 
     def step(self, output, x, timestep, following, clean=None):
-        """As diffusers rounds: the change too, before it is added."""
+        """Round as diffusers does: the change too, before it is added."""
         change = torch.tensor(following or 0.0) - torch.tensor(timestep)
         return (x.float() + change * output).to(x.dtype)
 
