@@ -139,8 +139,8 @@ def edit_image(
     given = {name: value for name, value in guidance.items() if value is not None}
     device = choose(device, splats=False)
     kind = dtype_of(dtype, device, editor)
-    if editor not in bundled():
-        typer.echo(announced(editor, kind, size), err=True)
+    if line := announced(editor, kind, device, size):
+        typer.echo(line, err=True)
     model = load_editor(editor, device=device, dtype=kind, low_memory=low_memory, **given)
     model.check_text(instruction)
     torch.set_num_threads(threads or core_count())

@@ -49,7 +49,7 @@ def folder_bytes(folder: Path, dtype: torch.dtype) -> int:
     networks in other formats count as their files.
     """
     total = 0
-    for place in {path.parent for path in folder.glob("*/config.json")}:
+    for place in {path.parent for name in ("", "*/") for path in folder.glob(f"{name}config.json")}:
         files = [f for f in place.glob("*.safetensors") if ".fp16." not in f.name]
         for path in files or [*place.glob("*.safetensors"), *place.glob("*.bin")]:
             total += (
@@ -121,30 +121,39 @@ def peak_bytes(run: Callable[[], Any]) -> int:
     return live.most
 
 
-def announced(name_or_folder: str, dtype: torch.dtype, size: int | None = None) -> str:
+def announced(
+    name_or_folder: str, dtype: torch.dtype, device: str, size: int | None = None
+) -> str | None:
     """Describe the memory of an editor's weights and of a view's edit, before anything is loaded.
 
     Args:
         name_or_folder: name or folder of the editor.
         dtype: dtype of the networks.
-        size: longest side of a square view in px; the editor's own if omitted.
+        device: device name.
+        size: side of a square view in px; the editor's own if omitted.
+
+    Returns:
+        A line; None for a UNet in main memory, where it takes little.
 
     Example:
-        >>> announced("small-plain", torch.float32)
-        'weights of the editor in float32: 0.01 GiB'
+        >>> announced("small-plain", torch.float16, "cuda")
+        'weights of the editor in float16: 0.01 GiB'
     """
     from attnwarp.editing.small import bundled, folders_of, kind_of
 
-    folders = [place for place in folders_of(name_or_folder) if place is not None]
-    weights = sum(folder_bytes(place, dtype) for place in {folders[0], *folders[1:]})
+    folder, control = folders_of(name_or_folder)
+    plain = name_or_folder in bundled() or control is not None
+    rehearse = None if plain else getattr(kind_of(folder), "rehearsed", None)
+    if rehearse is None and device == "cpu":
+        return None
+    weights = folder_bytes(folder, dtype)
+    if control is not None and control.parent != folder:
+        weights += folder_bytes(control, dtype)
     kind = str(dtype).removeprefix("torch.")
     line = f"weights of the editor in {kind}: {weights / 2**30:.2f} GiB"
-    rehearse = None
-    if name_or_folder not in bundled() and len(folders) == 1:
-        rehearse = getattr(kind_of(folders[0]), "rehearsed", None)
     if rehearse is None:
         return line
-    side, peak = rehearse(folders[0], dtype, size)
+    side, peak = rehearse(folder, dtype, size)
     return f"{line}; an edit of a view of {side} x {side} px beside them: {peak / 2**30:.2f} GiB"
 
 

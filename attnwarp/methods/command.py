@@ -219,10 +219,10 @@ def _by_hand(
 def _editor(
     name: str, device: str, options: EditOptions, size: int | None, report: Reporter
 ) -> Any:
-    """Load the editor; before, report its memory, unless a bundled one stays in main memory."""
+    """Load the editor; before, report its memory."""
     dtype = dtype_of(options.dtype, device, name)
-    if device != "cpu" or name not in bundled():
-        report.log(announced(name, dtype, size))
+    if line := announced(name, dtype, device, size):
+        report.log(line)
     return load_editor(name, device=device, dtype=dtype, low_memory=options.low_memory)
 
 

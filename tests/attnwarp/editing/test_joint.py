@@ -14,6 +14,7 @@ from PIL import Image
 from attnwarp.editing.editor import drawn, edit
 from attnwarp.editing.joint import pack
 from attnwarp.editing.layers import choose_layers, hooked
+from attnwarp.editing.memory import announced, folder_bytes, weight_bytes
 from attnwarp.editing.recording import RecordingPlan, record
 from attnwarp.editing.schedule import Flow
 from attnwarp.editing.small import guide_of, load_editor, own_steps_of
@@ -453,3 +454,29 @@ def test_what_a_folder_cannot_give_is_refused_by_name(klein, tmp_path):
     shutil.rmtree(other / "tokenizer")
     with pytest.raises(InputError, match=r"lacks text_encoder/model.safetensors, tokenizer/vocab"):
         load_editor(str(other))
+
+
+def test_memory_is_announced_before_anything_is_loaded(klein, monkeypatch):
+    """Oracles: the loaded weights, and every allocation that torch's profiler saw."""
+    folder, _ = klein
+    weights = folder_bytes(folder, torch.float32)
+    editor = load_editor(str(folder))
+    # A tied tensor is stored once, and a counter of the norm is no weight.
+    assert weights == pytest.approx(weight_bytes(editor), rel=0.1)
+    line = announced(str(folder), torch.bfloat16, "cpu", 64)
+    assert line.startswith(
+        "weights of the editor in bfloat16: 0.00 GiB; an edit of a view of 64 x 64"
+    )
+    side, peak = type(editor).rehearsed(folder, torch.float32, 64)
+    view = np.zeros((side, side, 3), np.float32)
+    task, latents = editor.task([view], "red"), drawn((1, *editor.noise_shape((side, side))), 0)
+    most = 0
+    for run in (lambda: task.predict(latents, 0.5), lambda: editor.pixels(latents)):
+        with torch.no_grad(), torch.profiler.profile(profile_memory=True) as profile:
+            run()
+        now = 0
+        for event in profile.profiler.kineto_results.events():
+            if event.name() == "[memory]":
+                now += event.nbytes()
+                most = max(most, now)
+    assert peak == pytest.approx(most, rel=0.1)
