@@ -79,10 +79,11 @@ class Density:
     ) -> None:
         self.settings, self.extent = settings, extent
         self.center = torch.tensor(np.asarray(center, dtype=np.float32), device=device)
-        self._clear(count)
+        self.clear(count)
         self.last = int(settings.densify_until * settings.iterations)
 
-    def _clear(self, count: int) -> None:
+    def clear(self, count: int) -> None:
+        """Forget the gradients; ``count``: number of splats."""
         self.total = torch.zeros(count, dtype=torch.float32, device=self.center.device)
         self.seen = torch.zeros_like(self.total)
 
@@ -160,7 +161,7 @@ class Density:
                 " splats describe; check that cameras and points are in one coordinate system"
             )
         model.replace(keep, added)
-        self._clear(len(model))
+        self.clear(len(model))
 
     def _half(
         self, t: dict[str, Tensor], index: Tensor, random: torch.Generator

@@ -88,7 +88,7 @@ class Fit:
 
     Attributes:
         gaussians: the splats, float32, outside autograd; with views that choose, those of
-            ``kept``. With ``densify``, without those that no fitted view shows.
+            ``kept``.
         settings: settings used.
         history: evaluations, the first before the first iteration, the last at the end.
         iteration: iterations done.
@@ -400,8 +400,6 @@ class _Run:
         if self.history[-1].iteration != self.iteration:
             self.evaluate()
         gaussians = self.model.gaussians(self.best or None).detach()
-        if s.densify and stopped != "asked":
-            gaussians = self.shown(gaussians)
         self.save(gaussians)
         return Fit(
             gaussians,
@@ -438,18 +436,23 @@ class _Run:
             return ""
         return " and as many as it takes, so longer" if most is None else f", at most {most}"
 
-    def shown(self, gaussians: Gaussians) -> Gaussians:
-        """Select the splats that the fitted views show."""
+    def drop_unseen(self) -> None:
+        """Remove the splats that no fitted view shows."""
         # The gradient of a picture's sum in a splat's value is the splat's weight, behind all
         # that lies before it.
+        gaussians = replace(self.model.gaussians().detach(), far=math.inf)
         values = torch.ones_like(gaussians.means[:, :1]).requires_grad_(True)
-        all_alike = replace(gaussians, far=math.inf)
+        near = self.settings.near * self.extent
         for camera in self.views.cameras:
-            near = self.settings.near * self.extent
-            view = render(all_alike, camera, backend=self.backend, features=values, near=near)
+            view = render(gaussians, camera, backend=self.backend, features=values, near=near)
             view.color.sum().backward()
         assert values.grad is not None
-        return gaussians.select(values.grad[:, 0] >= LEAST_SEEN)
+        seen = torch.nonzero(values.grad[:, 0] >= LEAST_SEEN)[:, 0]
+        if len(seen):
+            self.model.replace(
+                seen, {name: t.detach()[:0] for name, t in self.model.tensors.items()}
+            )
+            self.density.clear(len(seen))
 
     def _reason_to_stop(self, max_seconds: float | None, stop: Callable[[], bool] | None) -> str:
         if self.iteration >= self.settings.iterations:
@@ -494,6 +497,8 @@ class _Run:
         # Refined at the beginning of an iteration, so that evaluated or written splats are never
         # fresh from a refinement, which costs some dB at first.
         self.density.refine(self.model, self.iteration, self.random)
+        if s.densify and self.iteration == self.density.last:
+            self.drop_unseen()
         if not self.queue:
             self.queue = torch.randperm(len(self.views), generator=self.random).tolist()
         index = self.queue.pop()
