@@ -10,6 +10,7 @@ import typer
 from attnwarp.cli import shell
 from attnwarp.cli.options import program_options
 from attnwarp_eval.cli import (
+    bench,
     cache,
     compare,
     doctor,
@@ -47,6 +48,7 @@ COMMANDS: dict[str, Any] = {
     "stability": stability.stability,
     "metrics": metrics.metrics,
     "tracks": tracks.tracks,
+    "bench": bench.app,
     "encoders": metrics.encoders,
     "inspect": inspect.inspect,
     "doctor": doctor.doctor,

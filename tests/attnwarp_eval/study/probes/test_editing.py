@@ -27,10 +27,10 @@ from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.probe import probe
-from attnwarp_eval.study.probes.editing import measure, result
+from attnwarp_eval.study.probes.editing import measure
 from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.run import execute, plan
-from attnwarp_eval.study.shared import edits
+from attnwarp_eval.study.shared import edit_figures, edits
 from attnwarp_eval.study.shared.budgets import Spent, Stopwatch
 from attnwarp_eval.study.shared.edit_truth import edit_truth
 from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, EditedScene, Method
@@ -161,7 +161,7 @@ def test_agreement_over_fewer_pixels_than_a_cell_of_the_latents_is_undefined(
     black = np.zeros((*mask.shape, 3))
     pair = of.between(of.source.name, "yaw030")
     count = metrics.cross_view(black, black, pair, mask=mask).counted.sum()
-    monkeypatch.setattr(result, "LEAST_PIXELS", count + more)
+    monkeypatch.setattr(edit_figures, "LEAST_PIXELS", count + more)
     record = record_of(folder, tmp_path)
     view = next(v for v in record.views if v.name.endswith("yaw030"))
     for key in ("delta_e", "delta_e_floor", "delta_e_above"):

@@ -20,18 +20,14 @@ from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.schema import StudyError
 from attnwarp_eval.study.shared import pictures
 from attnwarp_eval.study.shared.budgets import Spent
+from attnwarp_eval.study.shared.edit_figures import EditFigures, full_size
 from attnwarp_eval.study.shared.edit_truth import EditTruth, Judgement, neighbours
 from attnwarp_eval.study.shared.editing_methods import EditedScene
-from attnwarp_eval.study.shared.edits import LEAST_PIXELS
 
 if TYPE_CHECKING:
     from attnwarp_eval.two_view import Hits
 
 Image = npt.NDArray[np.float32]
-
-FIDELITY = ("psnr", "mse", "ssim")
-"""Figures of :func:`attnwarp_eval.metrics.fidelity` in a record, of the whole picture and inside
-the edited object."""
 
 
 @dataclass(frozen=True)
@@ -118,27 +114,29 @@ class Measurement:
                 if result.cut is None
                 else f"budget: it ended {method} before its first edit; give more"
             )
-        edited = {names[k]: _full(truth.originals[names[k]], v) for k, v in result.edited.items()}
+        edited = {
+            names[k]: full_size(truth.originals[names[k]], v) for k, v in result.edited.items()
+        }
         self.pictures = {"edit": edited, "render": self._renders(result.gaussians)}
         # A method cut short may have left the source unedited: it then shows no edit.
         image = edited.get(self.source, truth.originals[self.source])
         self.judged = truth.judge({self.source: image})
-        self.nearest = {k: self._nearest(pictures) for k, pictures in self.pictures.items()}
+        self.figures = {
+            kind: EditFigures(work.world, truth, self.source, pictures, self.judged, kind)
+            for kind, pictures in self.pictures.items()
+        }
         self.neighbours = neighbours(work.world, work.spec["views"])
 
     def record(self) -> EditResult:
         """Add the figures of every target to the work; return the record's extra."""
         work, truth = self.work, self.truth
         figures: dict[str, dict[str, float]] = {name: {} for name in self.names[1:]}
-        overall: dict[str, str | None] = {}
-        for kind, images in self.pictures.items():
-            part = truth.of(list(images))
-            overall[kind], fidelity = metrics.edit_fidelity(
-                images, part.answers, part.masks, originals=part.originals
-            )
+        for kind, of in self.figures.items():
             for name, row in figures.items():
-                row |= self._fidelity(kind, fidelity.get(name))
-                row |= self._agreement(kind, name, overall[kind])
+                row |= of.row(name)
+                row[f"multiview.delta_e_above.{kind}_next"] = of.next_to(
+                    self.neighbours[name], name
+                )
         embedded = self._embedded()
         both = [name for name in self.pictures["edit"] if name != self.source]
         psnr = metrics.edit_psnr(
@@ -160,85 +158,12 @@ class Measurement:
             work.spec["edit"]["instruction"],
             self.judged,
             truth.judge(self.pictures["edit"]),
-            self.nearest,
-            overall,
+            {kind: of.nearest for kind, of in self.figures.items()},
+            {kind: of.fidelity[0] for kind, of in self.figures.items()},
             psnr.pooled,
             len(self.pictures["edit"]),
             self.injected,
         )
-
-    def _nearest(self, images: Mapping[str, Image]) -> dict[str, str | None]:
-        part = self.truth.of(list(images))
-        return metrics.answers_by_view(images, part.answers, part.union)
-
-    def _pair(self, first: str, second: str) -> Any:
-        return self.work.world.between(first, second)
-
-    def _fidelity(self, kind: str, figures: Mapping[str, float] | None) -> dict[str, float]:
-        if figures is None:
-            figures = {}
-        return {
-            f"fidelity.{key}.{kind}{place}": figures.get(
-                f"fidelity.{key}{'.inside' if place else ''}", math.nan
-            )
-            for key in FIDELITY
-            for place in ("", "_inside")
-        } | {
-            f"fidelity.{key}.{kind}": figures.get(f"fidelity.{key}", math.nan)
-            for key in ("preserved_psnr", "preserved_mse")
-        }
-
-    def _agreement(self, kind: str, name: str, answer: str | None) -> dict[str, float]:
-        """Agreement of a target with the source, and with its neighbour; NaN if the target was not
-        edited or the source's edit failed.
-        """
-        keys = ("same_answer", "delta_e", "delta_e_floor", "delta_e_above")
-        row = dict.fromkeys(
-            [
-                *(f"multiview.same_answer.{kind}{end}" for end in ("", "_seen")),
-                *(f"multiview.{k}.{kind}{end}" for k in keys[1:] for end in ("", "_inside")),
-                f"multiview.delta_e_above.{kind}_next",
-            ],
-            math.nan,
-        )
-        images, truth = self.pictures[kind], self.truth
-        if not self.judged.done or answer is None or name not in images:
-            return row
-        pair = self._pair(self.source, name)
-        own = self.nearest[kind][name]
-        if truth.ambiguous:
-            row[f"multiview.same_answer.{kind}"] = _equal(own, self.judged.answer)
-            part = truth.of([name])
-            seen = {name: truth.union[name] & pair.visible}
-            if seen[name].sum() >= LEAST_PIXELS:
-                there = metrics.answers_by_view({name: images[name]}, part.answers, seen)[name]
-                row[f"multiview.same_answer.{kind}_seen"] = _equal(there, self.judged.answer)
-        for end, mask in (("", None), ("_inside", truth.masks[answer][name])):
-            figures = self._above(images, answer, self.source, name, mask)
-            for key in keys[1:]:
-                row[f"multiview.{key}.{kind}{end}"] = figures[f"multiview.{key}"]
-        other = self.neighbours[name]
-        if other in images:
-            mask = truth.masks[answer][name]
-            figures = self._above(images, answer, other, name, mask)
-            row[f"multiview.delta_e_above.{kind}_next"] = figures["multiview.delta_e_above"]
-        return row
-
-    def _above(
-        self, images: Mapping[str, Image], answer: str, first: str, second: str, mask: Any
-    ) -> dict[str, float]:
-        """Disagreement of two views above its floor; NaN if fewer than :data:`LEAST_PIXELS` are
-        compared.
-        """
-        true = self.truth.answers[answer]
-        figures = metrics.above_floor(
-            (images[first], images[second]),
-            (true[first], true[second]),
-            self._pair(first, second),
-            mask=mask,
-        )
-        few = figures["multiview.pixels"] < LEAST_PIXELS
-        return dict.fromkeys(figures, math.nan) if few else figures
 
     def _embedded(self) -> dict[str, dict[str, float]]:
         """The paper's similarities of renders; none without encoders."""
@@ -307,14 +232,3 @@ class Measurement:
             for content, image in images.items()
             if image is not None
         }
-
-
-def _full(original: Image, edited: npt.NDArray[np.uint8]) -> Image:
-    """An edited view at the size of the original."""
-    from attnwarp.methods.pictures import enlarged_change
-
-    return enlarged_change(original, edited.astype(np.float32) / np.float32(255))
-
-
-def _equal(answer: str | None, expected: str | None) -> float:
-    return math.nan if answer is None else float(answer == expected)

@@ -1,0 +1,65 @@
+"""Commands of the bench: scenes for methods that live elsewhere, and scores of their pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from attnwarp.reporting import reporter
+from attnwarp_eval.cli.shell import clear_errors, resumable
+
+app = typer.Typer(
+    help="A bench for methods that live elsewhere: scenes as files, and scores.",
+    no_args_is_help=True,
+)
+
+SMALL = 3
+
+
+@app.command()
+def export(
+    folder: Annotated[Path, typer.Argument(help="Folder; one begun earlier is continued.")],
+    scenes: Annotated[int, typer.Option(min=1, help="How many drawn scenes.")] = 12,
+    small: Annotated[bool, typer.Option("--small", help=f"{SMALL} scenes.")] = False,
+    size: Annotated[int, typer.Option(min=16, max=1024, help="Edge of the pictures in px.")] = 256,
+    spp: Annotated[int, typer.Option(min=1, help="Samples a pixel.")] = 16,
+    targets: Annotated[int, typer.Option(min=1, max=15, help="Views beside the source.")] = 15,
+    seed: Annotated[int, typer.Option(min=0, help="Of the drawn scenes.")] = 0,
+) -> None:
+    """Write scenes with pictures, cameras, depth, masks, splats, instructions, and their truth."""
+    with clear_errors(), reporter(title=folder.name) as report:
+        from attnwarp_eval.bench.suite import export as write
+
+        with resumable(lambda: "finished scenes are kept"):
+            write(
+                folder, count=SMALL if small else scenes, seed=seed, size=size, spp=spp,
+                targets=targets, report=report,
+            )  # fmt: skip
+    typer.echo(folder / "README.md")
+
+
+@app.command()
+def score(
+    folder: Annotated[Path, typer.Argument(help="The exported bench.")],
+    edited: Annotated[Path, typer.Argument(help="Folder with SCENE/EDIT/VIEW.png.")],
+    out: Annotated[Path, typer.Option(help="Folder for bench-score.json and its page.")] = Path(
+        "runs/bench"
+    ),
+) -> None:
+    """Score edited pictures of a bench against its truth, which is rendered again."""
+    from rich.console import Console
+
+    with clear_errors(), reporter(title=edited.name) as report:
+        from attnwarp_eval.bench.score import score as measure
+        from attnwarp_eval.bench.score import table
+        from attnwarp_eval.document.write import terminal
+
+        with resumable(lambda: "finished edits are kept"):
+            scores = measure(folder, edited, out, report)
+    Console().print(terminal(table(scores)))
+    for one in scores:
+        for remark in one.remarks:
+            typer.echo(f"{one.scene}, {one.edit}: {remark}", err=True)
+    typer.echo(out / "bench-score.html")
