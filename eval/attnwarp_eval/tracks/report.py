@@ -209,7 +209,7 @@ class Page:
             image = self.folder / "pictures" / f"{label}-{name}.png"
             shown = self.views.target(pair.target, np.zeros(3)).numpy()
             draw(pair, self.tracks, shown, image)
-            self.pictures[f"{label}, {name}: {cameras[pair.target].name}"] = image
+            self.pictures[f"{label}, {name}: {Path(cameras[pair.target].name).name}"] = image
 
     def write(self, inputs: Mapping[str, Any]) -> list[Path]:
         """Write tracks.json and the page; return their paths, the page at the end.
@@ -274,5 +274,5 @@ def draw(pair: Pair, tracks: Tracks, image: np.ndarray[Any, Any], path: Path) ->
     for xy, error, kept in zip(tracks.xy[at], pair.error, pair.kept, strict=True):
         color = (40, 200, 60) if error <= 1 else (250, 210, 30) if error <= OFF else (235, 40, 40)
         center = tuple(int(v) for v in np.round(xy * scale))
-        cv2.circle(canvas, center, 3, color, -1 if kept else 1, cv2.LINE_AA)
+        cv2.circle(canvas, center, 5, color, -1 if kept else 2, cv2.LINE_AA)
     write_atomic(path, encode_picture(canvas / 255))
