@@ -83,7 +83,8 @@ def resend_lost_interrupts() -> None:
 
     def resend(lost: Any) -> None:
         if issubclass(lost.exc_type, KeyboardInterrupt):
-            threading.Timer(RETRY_SECONDS, signal.pthread_kill, (main, signal.SIGINT)).start()
+            again = heeded((signal.SIGINT, *STOPS))[0]
+            threading.Timer(RETRY_SECONDS, signal.pthread_kill, (main, again)).start()
         else:
             report(lost)
 
