@@ -69,7 +69,7 @@ def edit(
         typer.Option(
             metavar="NAME",
             help="attention_warping, or by_view, igs2gs, dge, gaussctrl, corresponding, fused,"
-            " warped_reference; see docs/method/baselines.md.",
+            " guided, warped_reference; see docs/method/baselines.md.",
             show_default=False,
             rich_help_panel=METHOD,
         ),

@@ -490,11 +490,10 @@ class Coder(Defaults, ABC):
     def pixels(self, latents: Tensor) -> Tensor:
         """Decode scaled latents to (B, 3, H, W) without clamping: values may leave [0, 1].
 
-        Pictures are decoded one by one, as in :meth:`raw_latents`.
+        Pictures are decoded one by one, as in :meth:`raw_latents`. Gradients flow to the latents.
         """
-        with torch.no_grad():
-            plain = self.unscaled(latents)
-            rows = [self.vae.decode(one, return_dict=False)[0] for one in plain.split(1)]
+        plain = self.unscaled(latents)
+        rows = [self.vae.decode(one, return_dict=False)[0] for one in plain.split(1)]
         return torch.cat(rows).float() / 2 + 0.5
 
     def decode(self, latents: Tensor) -> list[Image]:

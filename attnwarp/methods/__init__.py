@@ -17,6 +17,7 @@ from attnwarp.methods.corresponding import corresponding
 from attnwarp.methods.dge import dge
 from attnwarp.methods.fused import fused
 from attnwarp.methods.gaussctrl import gaussctrl
+from attnwarp.methods.guided import guided
 from attnwarp.methods.igs2gs import igs2gs
 from attnwarp.methods.settings import (
     PRESETS,
@@ -26,6 +27,7 @@ from attnwarp.methods.settings import (
     DGESettings,
     FusedSettings,
     GaussCtrlSettings,
+    GuidedSettings,
     IGS2GSSettings,
     MethodSettings,
     WarpedReferenceSettings,
@@ -49,6 +51,7 @@ __all__ = [
     "DGESettings",
     "FusedSettings",
     "GaussCtrlSettings",
+    "GuidedSettings",
     "IGS2GSSettings",
     "MethodSettings",
     "Options",
@@ -61,6 +64,7 @@ __all__ = [
     "dge",
     "fused",
     "gaussctrl",
+    "guided",
     "igs2gs",
     "preset",
     "warped_reference",

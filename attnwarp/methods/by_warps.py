@@ -64,17 +64,23 @@ class ByWarps(Method):
         self, number: int, view: int, start: int | None, grid: Grid
     ) -> tuple[Tensor, Sequence[Time]]:
         """Return the latents (1, C, h, w) that a view's edit begins at, and its timesteps: of its
-        noised picture, or of pure noise without a start.
+        noised picture, or without a start of what the editor begins at.
         """
         editor, s = self.work.editor, self.work.settings
         network = editor.network
         noise = self.work.noise(number, (view,)).to(network.device, network.dtype)
         schedule = editor.schedule
-        if start is None:
-            return noise, schedule.timesteps(s.steps, (noise.shape[2], noise.shape[3]))
-        (noised,) = schedule.published(start, 1)
-        x = schedule.add_noise(editor.encode([self.work.picture(view)]), noise, noised)
-        return x, schedule.published(start, s.steps, grid)
+        size = noise.shape[2], noise.shape[3]
+        if start is not None:
+            (noised,) = schedule.published(start, 1)
+            timesteps = schedule.published(start, s.steps, grid)
+        else:
+            timesteps = schedule.timesteps(s.steps, size)
+            if editor.begins == "noise":
+                return noise, timesteps
+            noised = timesteps[0]
+        before = editor.encode([self.work.picture(view)])
+        return schedule.add_noise(before, noise, noised), timesteps
 
 
 def checked_source(source: int, work: Work) -> int:

@@ -127,7 +127,7 @@ class Corresponding(ByWarps):
                 rule = aligned(1, s.self_share, len(editor.branches))
                 stack.enter_context(self_attention(editor.unet, rule))
             offered = all_layers(editor.unet) if isinstance(editor, Latent) else editor.layers()
-            layers = [layer for layer in offered if layer.kind != "cross"]
+            layers = [layer for layer in offered if layer.kind in ("self", "joint")]
 
             def warp(source: int, target: int) -> Any:
                 return self.warp(views[source], views[target])

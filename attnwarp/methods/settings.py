@@ -548,6 +548,40 @@ class FusedSettings(CarriedSettings):
         _needs_start(self.start)
 
 
+@dataclass(frozen=True)
+class GuidedSettings(CarriedSettings):
+    """Settings of :func:`attnwarp.methods.guided`.
+
+    Args:
+        batch: unused; views are edited one at a time.
+        partners: number of views edited before that guide a view.
+        below: timestep of Stable Diffusion below which steps are guided.
+        forward: weight of the gradient through the network; 0 takes none.
+        backward: number of steps of the predicted picture at each guided step.
+        rate: share of Polyak's step that each of them takes.
+        points: number of matched points of a picture of 512 x 512 px.
+        patches: number of patches of such a picture.
+        patch: side of its patches, in px.
+        patch_weight: weight of the patches' perceptual distance against L1.
+
+    Example:
+        >>> from attnwarp.methods import GuidedSettings
+        >>> GuidedSettings(below=1000)
+        Traceback (most recent call last):
+        ValueError: below: got 1000, expected a whole number in [0, 999]
+    """
+
+    partners: Count = 2
+    below: Annotated[int, Range(0, LAST_STEP)] = 700
+    forward: Weight = 0.1
+    backward: Number = 3
+    rate: Weight = 1.0
+    points: Count = 50_000
+    patches: Count = 1_500
+    patch: Count = 64
+    patch_weight: Weight = 2.0
+
+
 def _needs_start(start: tuple[int, int] | None) -> None:
     if start is None:
         raise ValueError("start: got None, but views begin at pictures; give [lowest, highest]")
@@ -643,6 +677,10 @@ PRESETS: Named[Named[MethodSettings]] = Named({
         "default": FusedSettings(),
         "paper": _FUSED,
         "released": replace(_FUSED, occlusion=False, holes="black", perceptual_scaled=False),
+    }),
+    "guided": Named({
+        "default": GuidedSettings(),
+        "paper": GuidedSettings(text_guidance=7.5, image_guidance=1.5),
     }),
     "warped_reference": Named({"default": WarpedReferenceSettings()}),
 })  # fmt: skip

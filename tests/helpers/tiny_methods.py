@@ -17,6 +17,7 @@ from attnwarp.methods import (
     DGESettings,
     FusedSettings,
     GaussCtrlSettings,
+    GuidedSettings,
     IGS2GSSettings,
     WarpedReferenceSettings,
 )
@@ -31,6 +32,7 @@ QUICK = {
     "gaussctrl": GaussCtrlSettings(steps=2, iterations=3, references=2, batch=2),
     "corresponding": CorrespondingSettings(steps=2, iterations=3, perceptual=0.0, batch=2),
     "fused": FusedSettings(steps=2, iterations=3, perceptual=0.0),
+    "guided": GuidedSettings(steps=2, iterations=3, perceptual=0.0),
     "warped_reference": WarpedReferenceSettings(steps=2, iterations=3, perceptual=0.0, batch=2),
 }
 

@@ -26,6 +26,7 @@ from attnwarp.methods import (
     DGESettings,
     FusedSettings,
     GaussCtrlSettings,
+    GuidedSettings,
     IGS2GSSettings,
     WarpedReferenceSettings,
     attention_warping,
@@ -75,6 +76,7 @@ SETTINGS = {
     "gaussctrl": GaussCtrlSettings(latents="random", references=2, batch=2),
     "corresponding": CorrespondingSettings(self_share=0.7),
     "fused": FusedSettings(),
+    "guided": GuidedSettings(rate=0.3),  # a whole step goes after the rounding of files
     "warped_reference": WarpedReferenceSettings(),
 }
 

@@ -1,6 +1,8 @@
 # ruff: noqa: F811  (fixtures that are imported)
 """Methods of 2025 and 2026 against their formulas, in float64 and pixel by pixel; walls that face the cameras have warps in closed form."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import tiny_editors
@@ -10,9 +12,16 @@ from tiny_methods import QUICK, close, depth_editor, editor, run, scene  # noqa:
 from attnwarp import Camera
 from attnwarp.editing.editors.pix2pix import InstructPix2Pix
 from attnwarp.editing.layers import BareUNet, all_layers
+from attnwarp.editing.schedule import DDIM
+from attnwarp.methods import GuidedSettings
 from attnwarp.methods.corresponding import mixing
 from attnwarp.methods.fused import blended, guided_by, splat
+from attnwarp.methods.guided import Guided, guided_step, mosaic
+from attnwarp.methods.scene import Scene
+from attnwarp.methods.work import Work
+from attnwarp.reporting import SILENT
 from attnwarp.warp import Surface, warp_surfaces
+from attnwarp.workdir import Workdir
 
 SIDE = 8
 
@@ -100,6 +109,15 @@ CONSTANTS = [
     ("fused", "occlusion", False),
     ("fused", "holes", "black"),
     ("fused", "start", (900, 980)),
+    ("guided", "partners", 1),
+    ("guided", "below", 500),
+    ("guided", "forward", 0.0),
+    ("guided", "backward", 1),
+    ("guided", "rate", 0.3),
+    ("guided", "points", 10_000),
+    ("guided", "patches", 10_000),
+    ("guided", "patch", 160),
+    ("guided", "patch_weight", 0.0),
 ]
 
 
@@ -191,3 +209,79 @@ def test_the_guidance_of_fused_views_is_its_formula_of_six_rows():
     handle.remove()
     assert rows == [6]
     assert (got - expected).abs().max() < 1e-6  # pictures pass in float32
+
+
+# --- Correspondence Guidance
+
+
+def test_a_guided_step_is_universal_guidance_written_out():
+    """With noise e = M x and the loss L = ||x_0 - b||^2 / 2 all gradients g are known; a step is L g / ||g||^2."""
+    random = torch.Generator().manual_seed(0)
+    M, x, b = (
+        torch.randn(shape, generator=random, dtype=torch.float64) for shape in ((9, 9), 9, 9)
+    )
+    alphas = torch.linspace(0.99, 0.01, 1000, dtype=torch.float64)
+    a, after, s, rate = alphas[600], alphas[550], 0.2, 0.05
+
+    def polyak(z, g):
+        return (z - b).square().sum() / 2 * g / g.square().sum()
+
+    noise = M @ x
+    clean = (x - (1 - a).sqrt() * noise) / a.sqrt()
+    through = (torch.eye(9, dtype=torch.float64) - (1 - a).sqrt() * M) / a.sqrt()
+    noise = noise + s * (1 - a).sqrt() * polyak(clean, through.T @ (clean - b))
+    clean, moved = (x - (1 - a).sqrt() * noise) / a.sqrt(), torch.zeros_like(x)
+    for _ in range(3):
+        moved = moved - rate * polyak(clean + moved, clean + moved - b)
+    noise = noise - (a / (1 - a)).sqrt() * moved
+    clean = (x - (1 - a).sqrt() * noise) / a.sqrt()
+    expected = after.sqrt() * clean + (1 - after).sqrt() * noise
+
+    got = guided_step(
+        DDIM(alphas, "epsilon", 1.0),
+        lambda z, _: (M @ z.flatten()).reshape(z.shape),
+        lambda z: (z.flatten() - b).square().sum() / 2,
+        x.reshape(1, 1, 3, 3), 600, 550, s, 3, rate,
+    )  # fmt: skip
+    assert (got.flatten() - expected).abs().max() < 1e-12
+
+
+def test_patches_are_cut_around_their_points_and_laid_side_by_side():
+    random = np.random.default_rng(0)
+    picture = random.random((3, 9, 7))
+    centers = np.array([[2.5, 3.5], [4.5, 5.5], [3.5, 1.5], [0.5, 8.5], [6.0, 6.0]])
+    got = mosaic(torch.from_numpy(picture), torch.from_numpy(centers), 3).numpy()
+    assert got.shape == (6, 6, 3)  # four of the five points make a square
+    for k, (x, y) in enumerate(centers[:4]):
+        for i in range(3):
+            for j in range(3):
+                row, column = (
+                    int(np.clip(v, 0, n - 1)) for v, n in ((y + i - 1.5, 9), (x + j - 1.5, 7))
+                )
+                cell = got[3 * (k // 2) + i, 3 * (k % 2) + j]
+                assert np.abs(cell - picture[:, row, column]).max() < 1e-12
+
+
+def test_the_loss_is_l1_and_twice_the_distance_of_patches_at_matched_points(scene, editor):
+    """Every pixel of a wall is matched with itself: twins, as many points as pixels."""
+    model, views, images = scene
+    twins = [Camera(views[1].K, views[1].world_to_camera, 32, 32, f"{k}.png") for k in range(2)]
+    settings = GuidedSettings(points=10**9, patches=1024, patch=128)
+    seen = Scene.checked(twins, [images[1]] * 2, None)
+    folder = Workdir(Path("unused"), "an edit")
+    work = Work(model, seen, editor, "a bear", settings, "auto", folder, SILENT)
+    guide = Guided(work, settings, None)
+    edited = np.random.default_rng(0).random((32, 32, 3)).astype(np.float32)
+    guide.kept = lambda number, view: edited
+    warp = guide.of_edits(0, 1)
+    pixels = torch.rand((3, 32, 32), generator=torch.Generator().manual_seed(0))
+    mask = warp.mask.numpy()
+    l1 = np.abs(pixels.permute(1, 2, 0).numpy() - edited)[mask].mean()
+    losses = []
+    for weight in (0.0, 1.0, 2.0):
+        guide.settings = settings.changed(patch_weight=weight)
+        losses.append(float(guide.loss(0, warp, 1)(pixels)))
+        same = guide.loss(0, warp, 1)(torch.from_numpy(edited).permute(2, 0, 1))
+        assert abs(float(same)) < 1e-6
+    assert abs(losses[0] - l1) < 1e-6
+    assert abs((losses[2] - l1) - 2 * (losses[1] - l1)) < 1e-6 < losses[1] - l1
