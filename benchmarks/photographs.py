@@ -101,8 +101,8 @@ def measure(fit: Path, data: Path) -> dict[str, Any]:
             "beyond": float((alpha < OPAQUE).mean()),
             "distortion": min(float(form.min()) for form in forms),
         }
-        if camera.name in depths:
-            views[path.stem] |= against(view, depths[camera.name])
+        if path.name in depths:
+            views[path.stem] |= against(view, depths[path.name])
     return {
         "seed": settings["seed"],
         "iterations": history[-1]["iteration"],

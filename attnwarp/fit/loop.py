@@ -271,9 +271,9 @@ class _Run:
         """Settings and data that a checkpoint must match to be resumed."""
         return {
             "settings": self.settings.to_dict(),
-            "start": self.start,
             "views": self.views.digest,
             "held_out": self.held_out.digest if self.held_out else None,
+            "start": self.start,  # after the views, which give a sky its colours
             "origin": [float(v) for v in self.model.origin],
         }
 
