@@ -74,7 +74,8 @@ def tried(
         "weights, GiB": _gib(weight_bytes(editor)),
     }
     torch.set_num_threads(thread_count(editor))
-    h, w = edit_size(*picture.shape[:2], size or editor.own_size, editor.side_multiple)
+    height, width = picture.shape[:2]
+    h, w = edit_size(height, width, size or editor.own_size, editor.side_multiple)
     view = resized(picture, (h, w))
     about |= {"editor": type(editor).__name__, "size": f"{w} x {h}", "steps": editor.own_steps}
 

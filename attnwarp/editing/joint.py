@@ -224,12 +224,16 @@ class Joint(Coder):
 
         class Empty(cls):  # type: ignore[valid-type,misc]
             def embed(self, words: str, pictures: Sequence[Tensor]) -> dict[str, Any]:
-                views, like = len(pictures[0]), {"dtype": dtype, "device": "meta"}
-                rows = torch.empty(views, self.words[1], config.joint_attention_dim, **like)
-                given = {"encoder_hidden_states": rows}
-                if pooled := config.get("pooled_projection_dim"):
-                    given["pooled_projections"] = torch.empty(views, pooled, **like)
-                return given
+                views = len(pictures[0])
+                shapes = {
+                    "encoder_hidden_states": (views, self.words[1], config.joint_attention_dim),
+                    "pooled_projections": (views, config.get("pooled_projection_dim")),
+                }
+                return {
+                    name: torch.empty(shape, dtype=dtype, device="meta")
+                    for name, shape in shapes.items()
+                    if None not in shape
+                }
 
         editor = Empty(**parts)
         side = -(-(size or cls.own_size) // editor.side_multiple) * editor.side_multiple

@@ -39,13 +39,14 @@ class IdealPart(Part):
     """The ideal editor (docs/measuring/ideal-editor.md).
 
     ``parts`` of the thing, each in one of ``colors``; ``settled``: mean share of the steps until
-    an answer holds; ``cross``: output of cross-attention.
+    an answer holds; ``cross``: output of cross-attention, or "joint" for its twin with joint
+    attention on a flow.
     """
 
     parts: Annotated[Whole, Field(ge=1, le=1000)] = 12
     colors: Annotated[Whole, Field(ge=2, le=12)] = 4
     settled: Annotated[float, Field(gt=0, lt=1)] = 0.4
-    cross: Literal["paint", "word"] = "paint"
+    cross: Literal["paint", "word", "joint"] = "paint"
 
 
 class EditorPart(Part):
