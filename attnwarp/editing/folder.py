@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -92,6 +93,12 @@ def load_pipeline(
     present = [name for name in networks if name not in left_out]
     tokenizers = [_tokenizer_of(name) for name in present if name.startswith("text_encoder")]
     _checked(folder, present, tokenizers, device)
+    processor = (folder / "processor").is_dir()
+    if processor and importlib.util.find_spec("torchvision") is None:
+        raise InputError(
+            f"{folder / 'processor'}: needs torchvision, which is not installed; install the one"
+            f" that is made for torch {torch.__version__}"
+        )
     parts: dict[str, Any] = dict.fromkeys([*left_out, *map(_tokenizer_of, left_out)])
 
     import diffusers
@@ -102,7 +109,7 @@ def load_pipeline(
         kind = class_of(folder / name, getattr(home, networks[name]))
         parts[name] = load_network(kind, folder / name, device, dtype)
     readers = dict.fromkeys(tokenizers, transformers.AutoTokenizer)
-    if (folder / "processor").is_dir():
+    if processor:
         readers["processor"] = transformers.AutoProcessor
     for name, kind in readers.items():
         with readable(folder / name):

@@ -1,8 +1,8 @@
 """The ideal editor's twin with joint attention on a flow: the same exact posterior mean.
 
 A sequence has a text token for each answer, the picture's tokens, and those of its reference, the
-picture before. The block ``double`` averages evidence over the tokens of a part, the block
-``single`` sums the answers' changes. Features are the first channels of a projection's input, whose
+picture before. The block ``pair`` averages evidence over the tokens of a part, the block
+``stream`` sums the answers' changes. Features are the first channels of a projection's input, whose
 other channels are none. With x = (1 - s) z + s n, the evidence of the ideal editor becomes
 ((1 - s) <x - (1 - s) z_0, D> - ((1 - s)^2 / 2) |D|^2) / s^2, and the velocity is (x - x_0) / s.
 
@@ -37,7 +37,7 @@ class IdealTransformer(IdealUNet):
 
     def __init__(self, views: Sequence[Answers], alphas: Tensor) -> None:
         super().__init__(views, alphas)
-        self.double, self.single = Projection(), Projection()
+        self.pair, self.stream = Projection(), Projection()
 
     def forward(self, hidden_states: Tensor, timestep: float, views: Sequence[int]) -> Tensor:  # type: ignore[override]
         """(B, n, C) velocity of the first n of (B, 2 n, C) tokens; the others are the picture
@@ -54,13 +54,13 @@ class IdealTransformer(IdealUNet):
 
         answers = shared.shape[-1]
         beside = torch.cat([shared, before[..., :answers]], dim=1)  # rows of the reference
-        shared = self.double(torch.cat([beside, beside], dim=-1))[:, :count, :answers]
+        shared = self.pair(torch.cat([beside, beside], dim=-1))[:, :count, :answers]
         weights = torch.softmax(self.members[rows][..., None] * shared, dim=-1)
         painted = torch.einsum("bnk,bknc->bnc", weights, change)
         painted = torch.where((self.parts[rows] >= 0)[..., None], painted, 0.0)
         text = before.new_ones(len(rows), answers, painted.shape[-1])
         joined = torch.cat([text, painted, before], dim=1)
-        joined = self.single(torch.cat([joined, joined], dim=-1))
+        joined = self.stream(torch.cat([joined, joined], dim=-1))
         painted = joined[:, answers : answers + count, : painted.shape[-1]]
         return (x - before - painted) / noise
 
@@ -89,8 +89,8 @@ class IdealJointEditor(IdealEditor):
         """The two blocks' projections."""
         answers, channels = self.unet.change.shape[1], self.unet.change.shape[-1]
         return (
-            Layer("double", "joint", 0, answers, 0, "input", "image first"),
-            Layer("single", "joint", 0, channels, 1, "input", "after text"),
+            Layer("pair", "joint", 0, answers, 0, "input", "image first"),
+            Layer("stream", "joint", 0, channels, 1, "input", "after text"),
         )
 
     def call(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:

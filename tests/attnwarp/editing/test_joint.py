@@ -1,5 +1,6 @@
 """Editors with joint attention against diffusers' pipelines, closed forms, and planted mistakes."""
 
+import importlib.util
 import json
 import shutil
 from dataclasses import replace
@@ -450,6 +451,11 @@ def test_what_a_folder_cannot_give_is_refused_by_name(klein, tmp_path):
     with pytest.raises(InputError, match=r"'FluxPipeline'.*no editor reads.*Flux2KleinPipeline"):
         load_editor(str(other))
     (other / "model_index.json").write_text(json.dumps(index))
+    if importlib.util.find_spec("torchvision") is None:
+        (other / "processor").mkdir()
+        with pytest.raises(InputError, match=r"processor: needs torchvision, which is not"):
+            load_editor(str(other))
+        (other / "processor").rmdir()
     (other / "text_encoder" / "model.safetensors").unlink()
     shutil.rmtree(other / "tokenizer")
     with pytest.raises(InputError, match=r"lacks text_encoder/model.safetensors, tokenizer/vocab"):

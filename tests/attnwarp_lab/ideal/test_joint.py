@@ -75,14 +75,14 @@ def test_text_and_reference_keep_their_bits():
         editor.network.get_submodule(name).register_forward_hook(
             lambda m, a, out, n=name: seen.setdefault(n, []).append(out)
         )
-        for name in ("double", "single")
+        for name in ("pair", "stream")
     ]
     for hook in (lambda *_: None, lambda layer, tokens, call: 0 * tokens):
         with hooked(editor, editor.layers(), hook):
             edit(editor, [own.before], "red", steps=1, noise=drawn((1, 48, 3, 3), 4))
     for handle in handles:
         handle.remove()
-    (plain, zeros), (line, empty) = seen["double"], seen["single"]
+    (plain, zeros), (line, empty) = seen["pair"], seen["stream"]
     assert (zeros[:, :9, :3] == 0).all()
     assert torch.equal(zeros[:, 9:], plain[:, 9:])
     assert torch.equal(empty[:, :3], line[:, :3])
