@@ -54,7 +54,7 @@ class Answers:
     parts: npt.NDArray[Any]
 
 
-class _Output(torch.nn.Module):
+class Output(torch.nn.Module):
     """The output of an attention layer, where hooks read and replace it."""
 
     def forward(self, features: Tensor) -> Tensor:
@@ -93,7 +93,7 @@ class IdealUNet(torch.nn.Module):
         self.register_buffer("members", _members(parts))  # (V, n) tokens of the token's part
         self.register_buffer("energy", self.change.square().sum(dim=-1))  # (V, K, n)
         self.register_buffer("alphas", alphas)
-        self.self_attention, self.cross_attention = _Output(), _Output()
+        self.self_attention, self.cross_attention = Output(), Output()
         self.size = int(views[0].parts.shape[0]), int(views[0].parts.shape[1])
 
     @property

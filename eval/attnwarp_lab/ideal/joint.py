@@ -26,10 +26,10 @@ from attnwarp_lab.ideal.editor import (
     IdealEditor,
     IdealTask,
     IdealUNet,
+    Output,
     part_means,
     schedule,
 )
-from attnwarp_lab.ideal.editor import _Output as Projection
 
 
 class IdealTransformer(IdealUNet):
@@ -37,7 +37,7 @@ class IdealTransformer(IdealUNet):
 
     def __init__(self, views: Sequence[Answers], alphas: Tensor) -> None:
         super().__init__(views, alphas)
-        self.pair, self.stream = Projection(), Projection()
+        self.pair, self.stream = Output(), Output()
 
     def forward(self, hidden_states: Tensor, timestep: float, views: Sequence[int]) -> Tensor:  # type: ignore[override]
         """(B, n, C) velocity of the first n of (B, 2 n, C) tokens; the others are the picture
