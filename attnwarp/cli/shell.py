@@ -174,17 +174,18 @@ class Program(TyperGroup):
 
 
 def use_threads(threads: int | None) -> None:
-    """Set the threads of the renderer only: other work is too small to gain, and its bits would
-    depend on the number of threads.
+    """Set the threads of the renderer and of torch. Splats fitted without an exposure have the same
+    bits for any number.
     """
     import cv2
     import torch
 
     from attnwarp.render.threads import set_thread_count
 
-    torch.set_num_threads(1)
+    count = threads or core_count()
+    torch.set_num_threads(count)
     cv2.setNumThreads(1)
-    set_thread_count(threads or core_count())
+    set_thread_count(count)
 
 
 def assignments(changes: list[str], options: dict[str, str]) -> dict[str, Any]:

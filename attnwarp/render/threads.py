@@ -37,11 +37,7 @@ _chosen: int | None = None
 
 
 def set_thread_count(threads: int | None) -> None:
-    """Set the number of threads, independent of torch's setting; None restores torch's setting.
-
-    A fit spends the rest of its time in tensor operations too small to gain from torch's threads,
-    which then only wait, and wait by spinning.
-    """
+    """Set the number of threads, independent of torch's setting; None restores torch's setting."""
     global _chosen
     if threads is not None and threads < 1:
         raise ValueError(f"threads: got {threads}, expected at least 1")

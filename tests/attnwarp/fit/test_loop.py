@@ -199,6 +199,21 @@ def test_stopped_anywhere_and_gone_on_with_a_fit_gives_the_same_bits(scene, kind
     assert untimed(r for r in parts.history if r.iteration in common) == untimed(whole.history)
 
 
+def test_torchs_threads_change_no_bit_of_the_splats():
+    """Pictures and harmonics are large enough to be shared out, from 32,768 numbers on."""
+    points = np.random.default_rng(0).normal(size=(3000, 3)) / 3
+    start = from_points(points, kind="2d", sh_degree=2)
+    cameras = ring(3, size=112)
+    views = pictures(blobs(), cameras)
+    settings = FitSettings(iterations=3, sh_degree=2, sh_every=1, densify=False, normal_from=0)
+    results, before = [], torch.get_num_threads()
+    for count in (1, 3):
+        torch.set_num_threads(count)
+        results.append(fit(start, views, settings).gaussians)
+    torch.set_num_threads(before)
+    assert same_bits(*results)
+
+
 def test_a_fit_that_is_stopped_leaves_its_splats_and_a_checkpoint(scene, tmp_path):
     start, settings = begin(scene, **BUSY)
     asked = itertools.count()
