@@ -1,0 +1,69 @@
+"""Overlap of what a click marks with outlines drawn by hand.
+
+    python reports/photographs/click/measure.py CAPTURES FITS
+
+CAPTURES/NAME are pinhole captures, FITS/NAME/splats.ply their splats. Draws the masks, PNG of one
+bit, and writes results.json and the table of click.md.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from attnwarp.fit import load_views
+from attnwarp.io import read_dataset, read_ply
+from attnwarp.methods.command import marked, view_of
+from attnwarp.methods.marks import Marks
+from attnwarp.methods.scene import images_of
+from attnwarp.reporting import SILENT
+
+HERE = Path(__file__).parent
+SIDE = 256
+
+
+def drawn(outline: dict, width: int, height: int) -> np.ndarray:
+    """Fill an outline without its holes, (h, w) bool with a longest side of 256 px."""
+    scale = SIDE / max(width, height)
+    mask = np.zeros((round(scale * height), round(scale * width)), np.uint8)
+    for points, value in ((outline["around"], 1), *((hole, 0) for hole in outline["holes"])):
+        # Fractions of 1/16 px; pixel centres lie at +0.5.
+        cv2.fillPoly(mask, [np.rint(16 * (scale * np.array(points) - 0.5)).astype(int)], value, shift=4)
+    return mask > 0
+
+
+def overlaps(captures: Path, fits: Path) -> dict:
+    """Intersection over union, by capture, clicked view and drawn view."""
+    results: dict = {}
+    for name, about in json.loads((HERE / "outlines.json").read_text()).items():
+        masks = {view: drawn(outline, *about["size"]) for view, outline in about["outlines"].items()}
+        for view, mask in masks.items():
+            Image.fromarray(mask).save(HERE / f"{name}-{view}.png", bits=1, optimize=True)
+        dataset = read_dataset(captures / name)
+        views, splats = load_views(dataset, max_size=SIDE), read_ply(fits / name / "splats.ply")
+        images, results[name] = images_of(views), {}
+        for source, at in about["clicks"].items():
+            index = view_of(dataset, source)
+            segments = marked(
+                Marks(at=tuple(at)), "", dataset, views, images, index, Path(), "cpu", SILENT
+            )(splats)
+            results[name][source] = each = {}
+            for view, mask in masks.items():
+                found = segments[view_of(dataset, view)] > 0.5
+                each[view] = round(float((found & mask).sum() / (found | mask).sum()), 3)
+    return results
+
+
+if __name__ == "__main__":
+    results = overlaps(*map(Path, sys.argv[1:3]))
+    (HERE / "results.json").write_text(json.dumps(results, indent=1) + "\n")
+    for name, clicks in results.items():
+        for source, each in clicks.items():
+            print(name, source, each, "median", np.median(list(each.values())).round(3))
+    values = np.array([list(each.values()) for clicks in results.values() for each in clicks.values()])
+    print("first clicks", np.median(values[[0, 3]]), "all clicks", np.median(values))
