@@ -432,6 +432,10 @@ CORE, WITHIN = 0.5, 0.9
 """Shares of a box's half axes: sure foreground, and initial foreground."""
 
 
+BAND = 0.0125
+"""Distance over the longest side within which an outline moves to an edge of colour."""
+
+
 def cut_out(
     image: Image,
     *,
@@ -491,6 +495,37 @@ def cut_out(
         )
         raise InputError(f"{name}: nothing stands out there by its colours; try {other}")
     return mask
+
+
+def snap(image: Image, region: Mask) -> Mask:
+    """Move a region's outline to edges of colour near it, by OpenCV's grabCut, (H, W) bool.
+
+    Args:
+        image: (H, W, 3) sRGB, floating, in [0, 1].
+        region: (H, W) bool.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.editing.segment import snap
+        >>> picture = np.full((60, 80, 3), 0.2, np.float32)
+        >>> picture[20:40, 30:60] = (0.8, 0.1, 0.1)
+        >>> rough = np.zeros((60, 80), bool)
+        >>> rough[21:40, 31:61] = True
+        >>> bool((snap(picture, rough) == (picture[..., 0] > 0.5)).all())
+        True
+    """
+    import cv2
+
+    side = 2 * max(1, round(BAND * max(region.shape))) + 1
+    square, inside = np.ones((side, side), np.uint8), region.astype(np.uint8)
+    core = cv2.erode(inside, square, borderType=cv2.BORDER_REPLICATE)
+    labels = np.where(region, _label("PR_FGD"), _label("PR_BGD"))
+    labels[core > 0] = _label("FGD")
+    labels[cv2.dilate(inside, square) == 0] = _label("BGD")
+    # grabCut needs pixels of both kinds, and a thin region is all outline.
+    if not core.any() or region.all():
+        return region
+    return _grab_cut(np.rint(255 * image).astype(np.uint8), labels.astype(np.uint8))
 
 
 def check_marks(

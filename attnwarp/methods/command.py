@@ -15,7 +15,7 @@ import torch
 from attnwarp.camera import Camera
 from attnwarp.devices import choose, device_of, peak_memory, type_of
 from attnwarp.editing.memory import announced
-from attnwarp.editing.segment import check_marks, segmenter_folders
+from attnwarp.editing.segment import Mask, check_marks, segmenter_folders
 from attnwarp.editing.small import bundled, dtype_of, load_editor
 from attnwarp.errors import InputError, suggest
 from attnwarp.fit import (
@@ -52,6 +52,7 @@ from attnwarp.methods.tuning import perceptual_net
 from attnwarp.methods.view_edits import check_editor
 from attnwarp.process import asked_to_stop, core_count
 from attnwarp.reporting import Reporter
+from attnwarp.warp import piece_around
 from attnwarp.workdir import FORMAT, Budget
 
 FIT_FOLDER = "fit"
@@ -254,11 +255,19 @@ def marked(
         return lambda splats: None
     camera, full = views.cameras[index], _with_picture(dataset)[index]
     size = full.width, full.height
-    mask = source_mask(marks, camera, images[index], pictures[index], size, out, device, report)
-    at = None if marks.at is None else [camera.width / size[0] * v for v in marks.at]
+    check_marks(*size, box=marks.box, at=marks.at)
+
+    def of_source(piece: Mask | None = None) -> Mask:
+        return source_mask(
+            marks, camera, images[index], pictures[index], size, out, device, report, piece
+        )
+
+    early = None if marks.at is not None else of_source()
 
     def segments(splats: Gaussians) -> list[Segment]:
-        lifted = lifted_segments(mask, splats, views.cameras, index, report, at)
+        at = [camera.width / size[0] * v for v in marks.at or ()]
+        mask = of_source(piece_around(splats, camera, at)) if early is None else early
+        lifted = lifted_segments(mask, splats, views.cameras, index, report)
         if not any((segment > 0.5).any() for segment in lifted):
             raise InputError(
                 f"{marks.option}: lifted through the splats, what it marks covers no pixel of any"

@@ -15,14 +15,14 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.digest import digest
-from attnwarp.editing.segment import CORE, Mask, check_marks, cut_out, load_segmenter, segments_of
+from attnwarp.editing.segment import CORE, Mask, cut_out, load_segmenter, segments_of, snap
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import read_upright
 from attnwarp.methods.pictures import Segment, check_view_aspect, mask_picture
 from attnwarp.methods.scene import to_float
 from attnwarp.reporting import Reporter
-from attnwarp.warp import lift_masks, piece_around
+from attnwarp.warp import lift_masks
 from attnwarp.workdir import Workdir
 
 COLORED = 0.1
@@ -140,9 +140,8 @@ def picture_mask(marks: Marks, image: npt.NDArray[Any], size: tuple[int, int]) -
         size: width and height, in px, of the file that the marks refer to.
 
     Raises:
-        InputError: a mark lies outside the picture, a box has no area, or nothing is found.
+        InputError: nothing is found.
     """
-    check_marks(*size, box=marks.box, at=marks.at)
     # Shrunk sides are rounded, so a mark on the border could leave the picture.
     scales = [(side / full, side) for side, full in zip(image.shape[1::-1], size, strict=True)]
 
@@ -163,6 +162,7 @@ def source_mask(
     out: Path,
     device: str,
     report: Reporter,
+    piece: Mask | None = None,
 ) -> Mask:
     """Compute the mask of the marked source view, (H, W) bool.
 
@@ -175,6 +175,8 @@ def source_mask(
         out: folder of the edit, which stores masks found by words.
         device: device of a segmenter.
         report: receiver of the result.
+        piece: (H, W) bool surface around a point, :func:`attnwarp.warp.piece_around`; all True if
+            unknown, and colours alone decide.
 
     Raises:
         InputError: the marks select nothing, or nothing was found.
@@ -185,6 +187,8 @@ def source_mask(
             raise InputError(f"--mask: {marks.mask} is black; white is edited")
     elif marks.words is not None:
         mask = mask_by_words(marks, camera, image, out, device)
+    elif piece is not None and not piece.all():
+        mask = snap(to_float(image), piece)
     else:
         mask = picture_mask(marks, image, size)
     report.log(f"{marks.option} marks {mask.mean():.1%} of the source view {camera.name}")
@@ -225,16 +229,11 @@ def lifted_segments(
     cameras: Sequence[Camera],
     source: int,
     report: Reporter,
-    at: Sequence[float] | None = None,
 ) -> list[Segment]:
     """Lift the source's mask through splats into all views, (H, W) in [0, 1] each.
 
-    Values are multiples of 1/255, as in mask pictures. The mask of a point ``at``, in px of the
-    source view, is restricted to the surface around the point.
+    Values are multiples of 1/255, as in mask pictures.
     """
-    if at is not None:
-        mask = mask & piece_around(splats, cameras[source], at)
-        report.log(f"held to the surface around the point, it marks {mask.mean():.1%}")
     lifted = lift_masks(splats, [cameras[source]], [mask])
     (agreement,) = lifted.agreement
     left_out = int((~lifted.reached).sum())

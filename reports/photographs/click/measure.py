@@ -33,37 +33,39 @@ def drawn(outline: dict, width: int, height: int) -> np.ndarray:
     mask = np.zeros((round(scale * height), round(scale * width)), np.uint8)
     for points, value in ((outline["around"], 1), *((hole, 0) for hole in outline["holes"])):
         # Fractions of 1/16 px; pixel centres lie at +0.5.
-        cv2.fillPoly(mask, [np.rint(16 * (scale * np.array(points) - 0.5)).astype(int)], value, shift=4)
+        cv2.fillPoly(
+            mask, [np.rint(16 * (scale * np.array(points) - 0.5)).astype(int)], value, shift=4
+        )
     return mask > 0
 
 
-def overlaps(captures: Path, fits: Path) -> dict:
-    """Intersection over union, by capture, clicked view and drawn view."""
-    results: dict = {}
-    for name, about in json.loads((HERE / "outlines.json").read_text()).items():
-        masks = {view: drawn(outline, *about["size"]) for view, outline in about["outlines"].items()}
-        for view, mask in masks.items():
-            Image.fromarray(mask).save(HERE / f"{name}-{view}.png", bits=1, optimize=True)
-        dataset = read_dataset(captures / name)
-        views, splats = load_views(dataset, max_size=SIDE), read_ply(fits / name / "splats.ply")
-        images, results[name] = images_of(views), {}
-        for source, at in about["clicks"].items():
-            index = view_of(dataset, source)
-            segments = marked(
-                Marks(at=tuple(at)), "", dataset, views, images, index, Path(), "cpu", SILENT
-            )(splats)
-            results[name][source] = each = {}
-            for view, mask in masks.items():
-                found = segments[view_of(dataset, view)] > 0.5
-                each[view] = round(float((found & mask).sum() / (found | mask).sum()), 3)
-    return results
+def overlaps(name: str, about: dict, captures: Path, fits: Path) -> dict:
+    """Intersection over union, by clicked view and drawn view."""
+    masks = {view: drawn(outline, *about["size"]) for view, outline in about["outlines"].items()}
+    for view, mask in masks.items():
+        Image.fromarray(mask).save(HERE / f"{name}-{view}.png", bits=1, optimize=True)
+    dataset = read_dataset(captures / name)
+    views, splats = load_views(dataset, max_size=SIDE), read_ply(fits / name / "splats.ply")
+    images, result = images_of(views), {}
+    for source, at in about["clicks"].items():
+        index, marks = view_of(dataset, source), Marks(at=tuple(at))
+        lifted = marked(marks, "", dataset, views, images, index, Path(), "cpu", SILENT)(splats)
+        found = {view: lifted[view_of(dataset, view)] > 0.5 for view in masks}
+        result[source] = {
+            view: round(float((found[view] & mask).sum() / (found[view] | mask).sum()), 3)
+            for view, mask in masks.items()
+        }
+    return result
 
 
 if __name__ == "__main__":
-    results = overlaps(*map(Path, sys.argv[1:3]))
+    drawings = json.loads((HERE / "outlines.json").read_text())
+    results = {
+        name: overlaps(name, about, *map(Path, sys.argv[1:3])) for name, about in drawings.items()
+    }
     (HERE / "results.json").write_text(json.dumps(results, indent=1) + "\n")
     for name, clicks in results.items():
         for source, each in clicks.items():
-            print(name, source, each, "median", np.median(list(each.values())).round(3))
-    values = np.array([list(each.values()) for clicks in results.values() for each in clicks.values()])
-    print("first clicks", np.median(values[[0, 3]]), "all clicks", np.median(values))
+            print(name, source, *each.values(), "median", np.median([*each.values()]))
+    every = [[*each.values()] for clicks in results.values() for each in clicks.values()]
+    print("first clicks", np.median([every[0], every[3]]), "all clicks", np.median(every))

@@ -26,7 +26,7 @@ from typer.testing import CliRunner
 
 from attnwarp import Camera, Gaussians
 from attnwarp.cli.main import app
-from attnwarp.editing.segment import GroundedSam, cut_out
+from attnwarp.editing.segment import GroundedSam, cut_out, snap
 from attnwarp.errors import InputError
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp.io.images import encode_png
@@ -262,16 +262,14 @@ def test_a_box_marks_what_opencv_cuts_out(place, tmp_path, option, value):
         assert one == two
 
 
-def test_a_click_is_held_to_the_surface_around_it(place, tmp_path):
-    """Oracle: the cut of the source's picture on the piece around the point, given as a file."""
+def test_a_click_marks_the_surface_around_it_up_to_edges_of_colour(place, tmp_path):
+    """Oracle: grabCut from the piece around the point, given as a file."""
     source = read_image(place / "data" / "images" / "v0.png").astype(np.float32) / 255
-    mask = cut_out(source, at=(8, 20))
-    mask &= piece_around(read_ply(place / "splats.ply"), cameras()[0], (8, 20))
+    mask = snap(source, piece_around(read_ply(place / "splats.ply"), cameras()[0], (8, 20)))
     picture = 255 * np.repeat(mask[..., None], 3, axis=2).astype(np.uint8)
     (tmp_path / "mask.png").write_bytes(encode_png(picture))
     ply = ("--ply", place / "splats.ply")
-    done = run(place, tmp_path / "a", *ply, "--at", "8,20")
-    assert done.exit_code == 0 and "held to the surface around the point" in done.output
+    assert run(place, tmp_path / "a", *ply, "--at", "8,20").exit_code == 0
     assert run(place, tmp_path / "b", *ply, "--mask", tmp_path / "mask.png").exit_code == 0
     for k in range(len(cameras())):
         one, two = ((tmp_path / f / "segments" / f"v{k}.png").read_bytes() for f in "ab")

@@ -23,14 +23,20 @@ def rectangle(low, high, normal_quat):
     return place, np.tile(normal_quat, (len(place), 1))
 
 
+FLAT, UPRIGHT = (1, 0, 0, 0), (np.sqrt(0.5), np.sqrt(0.5), 0, 0)
+FLOOR = rectangle((-2, -2, 0), (2, 3, 0), FLAT)
+
+
 @pytest.fixture(scope="module")
 def splats():
-    half = np.sqrt(0.5)
-    parts = [
-        rectangle((-2, -2, 0), (2, 3, 0), (1, 0, 0, 0)),  # the floor
-        rectangle((-0.5, 0, 0), (0.5, 0, 1), (half, half, 0, 0)),  # the card
-        rectangle((-1.2, 1.5, 0), (1.2, 1.5, 2), (half, half, 0, 0)),  # the one behind
-    ]
+    return discs(
+        FLOOR,
+        rectangle((-0.5, 0, 0), (0.5, 0, 1), UPRIGHT),  # the card
+        rectangle((-1.2, 1.5, 0), (1.2, 1.5, 2), UPRIGHT),  # the one behind
+    )
+
+
+def discs(*parts):
     means, quats = (
         torch.tensor(np.concatenate(v), dtype=torch.float32) for v in zip(*parts, strict=True)
     )
@@ -75,3 +81,18 @@ def test_a_point_on_the_floor_has_the_floor_and_one_on_nothing_all(splats):
     assert piece[thing == 0].mean() > 0.9
     row, column = np.argwhere(thing == -1)[0]
     assert piece_around(splats, CAMERA, (column, row)).all()
+
+
+def test_a_piece_ends_at_the_slab_that_it_stands_on():
+    """Oracle: the card's rectangle in the picture, above a slab a fifth as high."""
+    slab = [
+        rectangle((-0.8, -0.4, 0.2), (0.8, 0.4, 0.2), FLAT),
+        rectangle((-0.8, -0.4, 0), (0.8, -0.4, 0.2), UPRIGHT),
+    ]
+    scene = discs(FLOOR, *slab, rectangle((-0.5, 0, 0.2), (0.5, 0, 1), UPRIGHT))
+    corners = np.array([[x, 0, z] for x in (-0.5, 0.5) for z in (0.2, 1)])
+    (left, top), (right, bottom) = (f(CAMERA.project(corners)[0], 0) for f in (np.min, np.max))
+    piece = piece_around(scene, CAMERA, ((left + right) / 2, (top + bottom) / 2))
+    rows, columns = np.nonzero(piece)
+    found = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+    assert np.abs(np.array(found) - (left, top, right, bottom)).max() < 3  # discs are 2 px wide
