@@ -37,7 +37,7 @@ from attnwarp.cli.options import (
     options_of,
 )
 from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
-from attnwarp.editing.small import check_words, own_steps_of
+from attnwarp.editing.small import check_words, own_steps_of, say_foreign
 from attnwarp.errors import InputWarning
 from attnwarp.reporting import reporter
 
@@ -260,13 +260,14 @@ def edit(
                 edit_options = replace(edit_options, marks=marks)
         dataset = read_views(data, reading)
         check_marked(edit_options, dataset)
-        note = ""
+        notes = ["" if scene else say_foreign(editor)]
         splats = None if ply is None else read_splats(ply, kind, antialiased, screen_filter)
         if ply is not None and splats is not None:
             check_seen(ply, splats, dataset.cameras, report)
             warn_of_misfit(ply, splats, dataset)
-            if note := note_held_out(ply, dataset, view_of(dataset, editing.source)):
-                warnings.warn(note, InputWarning, stacklevel=1)
+            notes.append(note_held_out(ply, dataset, view_of(dataset, editing.source)))
+        for note in filter(None, notes):
+            warnings.warn(note, InputWarning, stacklevel=1)
         result, page = edit_dataset(
             method, dataset, splats, editor, instruction, settings, out, edit_options,
             fit_plan=FitPlan(
@@ -274,7 +275,7 @@ def edit(
                 (kind or Kind.two).value[:2],
                 max_splats or FIT_SPLATS,
             ),
-            note=note, origin=origin, budget=budget, report=report, **own,
+            notes=notes, origin=origin, budget=budget, asked=asked, report=report, **own,
         )  # fmt: skip
         typer.echo(say_change(result.change, edit_options.marks.option != ""))
         if little := say_little(result.change):

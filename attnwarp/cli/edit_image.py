@@ -26,7 +26,7 @@ from attnwarp.cli.options import (
     WhereOption,
     check_segmenter,
 )
-from attnwarp.editing.small import bundled, check_words, guide_of
+from attnwarp.editing.small import bundled, check_words, guide_of, say_foreign
 from attnwarp.errors import InputWarning
 from attnwarp.process import core_count
 from attnwarp.reporting import reporter
@@ -164,6 +164,8 @@ def edit_image(
             _write(mask_out, np.repeat(share, 3, axis=2))
     tiles: list[Image] = [image]
     with reporter(title=out.name) as report:
+        if foreign := say_foreign(editor):
+            report.log(foreign)
         if share is None and editor in bundled():
             say_unmarked(editor, report)
 

@@ -51,6 +51,16 @@ def bundled() -> list[str]:
     return sorted(path.parent.name for path in WEIGHTS.glob("*/model_index.json"))
 
 
+def say_foreign(name: str) -> str:
+    """Write a sentence on what a bundled editor is not made for; empty for another editor."""
+    if name not in bundled():
+        return ""
+    return (
+        f"{name} was trained on drawn worlds, so photographs are not its world: its edits of them"
+        " show how the method works, not how well"
+    )
+
+
 def check_sums(folder: Path) -> None:
     """Check the files of a bundled editor against their recorded SHA-256.
 

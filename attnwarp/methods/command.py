@@ -119,7 +119,7 @@ def edit_dataset(
     *,
     fit_plan: FitPlan | None = None,
     source_picture: Path | None = None,
-    note: str = "",
+    notes: Sequence[str] = (),
     origin: str = "",
     report: Reporter,
     **own: Any,
@@ -137,7 +137,7 @@ def edit_dataset(
         options: options of the edit.
         fit_plan: plan of the fit, if splats are None.
         source_picture: file of the source view edited elsewhere, for attention warping.
-        note: warning about the inputs, for the page.
+        notes: warnings about the inputs, for the page.
         origin: sentence on the origin of the inputs, for the page.
         report: receiver of progress.
         own: additional options of the method, such as "budget".
@@ -196,7 +196,7 @@ def edit_dataset(
     control = editor_name in bundled() if options.control is None else options.control
     page = show_edit(
         workdir_of(out), splats, views.cameras, images, turntable=options.turntable, report=report,
-        editor=editor if control else None, note=note, origin=origin,
+        editor=editor if control else None, notes=notes, origin=origin,
     )  # fmt: skip
     return result, page
 

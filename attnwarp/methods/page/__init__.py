@@ -61,7 +61,7 @@ def show_edit(
     *,
     editor: Editor | None = None,
     turntable: Path | None = None,
-    note: str = "",
+    notes: Sequence[str] = (),
     origin: str = "",
     report: Reporter = SILENT,
 ) -> Path:
@@ -74,7 +74,7 @@ def show_edit(
         images: (H, W, 3) photograph of each view, sRGB, uint8, uint16 or floating in [0, 1].
         editor: editor of the control, which edits the page's views alone; None for no control.
         turntable: file of the orbit's film, GIF or MP4; None for no film.
-        note: warning at the top of the page.
+        notes: warnings at the top of the page.
         origin: sentence on the origin of the inputs, without its full stop.
         report: receiver of the control's progress, view by view.
 
@@ -90,7 +90,7 @@ def show_edit(
     turns = [renders(model, page.turn) for model in (before, page.after)]
     if turntable is not None:
         write_film(turntable, *turns)
-    parts = [page.head(note, origin), page.scene(), page.views(), page.agreement(), page.outside()]
+    parts = [page.head(notes, origin), page.scene(), page.views(), page.agreement(), page.outside()]
     parts += [page.orbit(turns), page.costs()]
     text = Template(_file("page.html")).substitute(
         title=escape(f"{page.manifest['instruction']} - attnwarp"),
@@ -142,7 +142,7 @@ class _Page:
         method, noise = self.manifest["method"], self.manifest["settings"]["noise"]
         return bool(method == "by_view" and noise == "fresh")
 
-    def head(self, note: str, origin: str) -> str:
+    def head(self, given: Sequence[str], origin: str) -> str:
         """Write the instruction, a summary of the run, warnings, and the origin of the inputs."""
         method = self.manifest["method"]
         cut = self.result["cut"]
@@ -150,7 +150,7 @@ class _Page:
         change = self.result["change"]
         said, little = say_change(change, self.segments is not None), say_little(change)
         moved, warned = say_drift(self.result["drift"])
-        notes = (little, note, moved if warned else "")
+        notes = (little, *given, moved if warned else "")
         lines = [
             f"<h1>{escape(self.manifest['instruction'])}</h1>",
             f"<p><b>{said[0].upper()}{said[1:]}.</b></p>",

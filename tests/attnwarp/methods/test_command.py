@@ -132,6 +132,15 @@ def test_a_source_that_the_fit_held_out_is_told_on_the_page_too(place, tmp_path,
             assert ("was not fitted to the source v2" in said) == told
 
 
+def test_a_bundled_editor_says_that_photographs_are_not_its_world(place, tmp_path):
+    more = ("--editor", "small-plain", "--no-control", "--stages", 1, "--iterations", 1)
+    ply = ("--ply", place / "splats.ply")
+    done = run(place, tmp_path, *ply, *more, instruction="make it red")
+    assert done.exit_code == 0, done.output
+    for said in (" ".join(done.stderr.split()), (tmp_path / "index.html").read_text()):
+        assert "small-plain was trained on drawn worlds, so photographs are not its world" in said
+
+
 def test_the_page_is_written_where_the_name_of_a_view_is_no_utf_8(place, tmp_path):
     shutil.copytree(place, tmp_path / "place")
     data, name = tmp_path / "place" / "data", "f\udcfcr.png"  # Latin-1, as Python hands it on
