@@ -27,7 +27,7 @@ from attnwarp.io.splat import RECORD
 from attnwarp.methods.base import VIEWER_PLY, edit_file
 from attnwarp.methods.change import say_change, say_drift, say_little
 from attnwarp.methods.page.measured import CONTROL, disagreement, edited_alone, spill
-from attnwarp.methods.page.orbit import focus_of, orbit, renders, up_of, write_film
+from attnwarp.methods.page.orbit import degrees_apart, focus_of, orbit, renders, up_of, write_film
 from attnwarp.methods.pictures import SOURCE_COLORS, Bytes, resized, to_bytes
 from attnwarp.methods.scene import Scene, near_of, to_float
 from attnwarp.reporting import SILENT, Reporter
@@ -134,6 +134,7 @@ class _Page:
         self.after = read_ply(folder.path / "edited.ply")
         self.first = self.names.index(self.shown[0]) if self.shown else 0
         self.points = before.world_means()
+        self.focus = focus_of(cameras, self.points)
         self.turn = orbit(cameras, self.points, first=self.first)
 
     @property
@@ -173,7 +174,7 @@ class _Page:
         """Write the slider and the splats, side by side."""
         buttons = "".join(
             f'<button aria-pressed="{str(k == 0).lower()}"'
-            f' data-pictures=\'["before-{k}", "after-{k}"]\'>{escape(name)}</button>'
+            f' data-pictures=\'["before-{k}", "after-{k}"]\'>{escape(self._title(name))}</button>'
             for k, name in enumerate(self.shown)
         )
         first = self.names[self.first]
@@ -212,7 +213,7 @@ class _Page:
             "cx": scale * camera.K[0, 2], "cy": scale * camera.K[1, 2],
             "position": (camera.position - origin).tolist(),
             "rotation": camera.rotation.T.tolist(),
-            "focus": (focus_of(self.cameras, self.points) - origin).tolist(),
+            "focus": (self.focus - origin).tolist(),
             "up": up_of(self.cameras).tolist(),
             "near": near_of(self.cameras, self.after),
         }  # fmt: skip
@@ -263,7 +264,12 @@ class _Page:
         )
 
     def _title(self, name: str) -> str:
-        return f"{name} (source)" if name in self.sources else name
+        if not self.sources or name in self.sources:
+            return f"{name} (source)" if self.sources else name
+        first = self.sources[0]
+        source, view = (self.cameras[self.names.index(n)] for n in (first, name))
+        whose = "the source" if len(self.sources) == 1 else first
+        return f"{name}, {degrees_apart(source, view, self.focus):.0f}° from {whose}"
 
     def _where(self) -> str:
         if len(self.sources) < 2:

@@ -73,6 +73,21 @@ def focus_of(cameras: Sequence[Camera], points: Array) -> Array:
     return np.asarray(ahead.mean(axis=0) if parallel or behind else point)
 
 
+def degrees_apart(one: Camera, other: Camera, middle: Array) -> float:
+    """Compute the angle in degrees between two cameras' directions to the middle of a scene, (3,).
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> view = dict(width=8, height=8, fov_y=40)
+        >>> east, north = (Camera.look_at(p, (0, 0, 1), **view) for p in ((3, 0, 1), (0, 5, 1)))
+        >>> round(degrees_apart(east, north, np.array([0, 0, 1])))
+        90
+    """
+    cosine = _unit(middle - one.position) @ _unit(middle - other.position)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
 def orbit(cameras: Sequence[Camera], points: Array, *, first: int = 0) -> list[Camera]:
     """Create cameras that orbit the point a capture looks at: all around, or to and fro if the
     capture was taken from one side.

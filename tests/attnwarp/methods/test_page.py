@@ -90,6 +90,14 @@ def test_its_pictures_are_those_of_the_folder(warped, scene):
     assert np.array_equal(pictures["v0, photograph"], negative)
 
 
+def test_views_are_told_by_their_degrees_from_the_source(warped, scene):
+    """Oracle: the axes of level cameras that meet in one point, three steps behind the discs."""
+    for k, camera in enumerate(scene[1][1:], 1):
+        angle = np.degrees(np.arccos(camera.forward @ scene[1][0].forward))
+        assert f"v{k}, {angle:.0f}° from the source" in warped[1]
+    assert "v0 (source)" in warped[1]
+
+
 def test_a_mask_is_lit_on_the_photograph(edits, scene):
     marked = np.zeros(scene[2][0].shape[:2], bool)
     marked[10:20, 5:30] = True
@@ -121,7 +129,7 @@ def test_of_too_many_splats_those_that_cover_most_are_on_the_page(warped, scene,
 def test_further_sources_are_shown_in_their_order_with_their_colours(edits):
     folder, text = edits("attention_warping", stages=1, sources=3)
     sources = json.loads((folder / "manifest.json").read_text())["sources"]
-    assert re.findall(r">(v\d) \(source\)", text) == sources
+    assert re.findall(r'small">(v\d) \(source\)', text) == sources
     colors = re.findall(r"background:rgb\((\d+), (\d+), (\d+)\)", text)
     allowed = {(0, 0, 0), *(tuple(map(int, color)) for color in colors)}
     mask = read_image(folder / "masks" / f"{sources[2]}.png").reshape(-1, 3)
