@@ -14,6 +14,7 @@ edited.ply, result.json, times.json: splats; change, drift, counters, Edit PSNR;
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -55,7 +56,7 @@ from attnwarp.methods.scene import (
 from attnwarp.methods.settings import MethodSettings
 from attnwarp.methods.tuning import HELD_BYTES, Order, TrainingView, Tuning
 from attnwarp.methods.work import Work
-from attnwarp.reporting import SILENT, Reporter
+from attnwarp.reporting import PACE_SECONDS, SILENT, Reporter
 from attnwarp.workdir import Budget, CheckpointClock, Workdir, results_in
 
 FOLDERS = ("rounds", "masks", "features", "segments", "views", "renders/before", "renders/after")
@@ -361,12 +362,14 @@ class _Run:
         )  # fmt: skip
         tuned = sorted({view for part in self.rounds for view in part.training})
         self.tuning.check_sizes([work.scene.cameras[view] for view in tuned])
-        self.done, self.rows, self.edits = 0, 0, 0
+        self.rows, self.edits = 0, 0
         self.latest: dict[int, int] = {}  # round of each view's last edit
         self.places = [0] * len(self.rounds)  # groups edited so far in each round
-        self.total = sum(
-            len(part.views) * work.settings.steps + part.iterations for part in self.rounds
-        )
+        self.done = {"edit": 0, "tune": 0}  # steps of denoising, iterations of tuning
+        self.total = {
+            "edit": sum(len(part.views) for part in self.rounds) * work.settings.steps,
+            "tune": sum(part.iterations for part in self.rounds),
+        }
         self.folder.folders = (
             *FOLDERS, *(f"rounds/{number + 1}" for number in range(len(self.rounds))),
         )  # fmt: skip
@@ -406,7 +409,8 @@ class _Run:
         self.method.clear()
         result = self._finish()
         if self.cut is None:
-            self._tell("done", done=self.total)
+            self.done = self.total
+            self._tell("done")
         else:
             self._tell(f"cut short by its {self.cut['limit'].replace('_', ' ')}")
         return result
@@ -451,7 +455,7 @@ class _Run:
         place = self.places[number]
         self.places[number] += 1
         if all([self.folder.made(self._picture(number, view)) for view in views]):
-            self.done += len(views) * self.work.settings.steps
+            self.done["edit"] += len(views) * self.work.settings.steps
         else:
             limit = None if self.cut else self._limit(rows)
             if limit is not None:
@@ -473,7 +477,7 @@ class _Run:
         # Earlier rounds are tuned by now, so this is the current model.
         model = self.tuning.gaussians()
         with self.seconds.part("edit"):
-            edits = edit(model, lambda: self._tell(text, len(views)))
+            edits = edit(model, lambda: self._tell(text, edit=len(views)))
         with self.seconds.part("write"):
             for view, result in zip(views, edits, strict=True):
                 self._write_edit(number, view, result)
@@ -512,7 +516,7 @@ class _Run:
         end, state = begin + iterations, f"rounds/{number + 1}.pt"
         if self.folder.has(state):
             self.tuning.restore(self.folder, state)
-            self.done += self.tuning.iteration - begin
+            self.done["tune"] += self.tuning.iteration - begin
         finished = self.folder.has(state) and self.tuning.iteration >= end
         training = [view for view in views if view in self.latest]
         if not training or (cut is not None and cut["limit"] == "seconds"):
@@ -539,7 +543,7 @@ class _Run:
         text = f"round {number + 1} of {len(self.rounds)}: tuning"
 
         def step() -> None:
-            self._tell(f"{text}, loss {self.tuning.loss:.4f}", 1)
+            self._tell(f"{text}, loss {self.tuning.loss:.4f}", tune=1)
             if self.tuning.iteration < end and self.clock.due:
                 with self.clock.saving():
                     self.folder.save(state, self.tuning.state())
@@ -661,6 +665,15 @@ class _Run:
 
     # --- progress
 
-    def _tell(self, text: str, steps: int = 0, *, done: int | None = None) -> None:
-        self.done = self.done + steps if done is None else done
-        self.work.report.step(min(self.done, self.total), self.total, text)
+    def _tell(self, text: str, **steps: int) -> None:
+        """Report finished steps; the seconds left once both kinds of steps have shown their pace,
+        as a step of denoising may take as long as many iterations.
+        """
+        seconds, left = self.seconds.parts, 0.0
+        for part, total in self.total.items():
+            done = self.done[part] = min(self.done[part] + steps.get(part, 0), total)
+            if done < total:
+                spent = seconds.get(part, 0.0) if done else 0.0
+                left += (total - done) * spent / done if spent >= PACE_SECONDS else math.nan
+        count = sum(self.done.values())
+        self.work.report.step(count, sum(self.total.values()), text, left)

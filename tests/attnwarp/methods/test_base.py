@@ -2,9 +2,11 @@
 """Oracles: rows counted by hooks on the network, bytes of files, a clock that counts."""
 
 import json
+import math
 import shutil
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import held_pictures
 import numpy as np
@@ -78,6 +80,22 @@ def test_counters_are_what_hooks_and_files_count(name, whole, run, editor, depth
     for view, pixels in result.edited.items():
         assert np.array_equal(again.edited[view], pixels)
     assert all(again.seconds[part] == result.seconds[part] for part in ("edit", "tune"))
+
+
+def test_the_first_estimate_of_the_time_left_is_right_within_a_factor_of_two(run, monkeypatch):
+    """Oracle: a clock on which a step of denoising takes fifty times as long as an iteration."""
+    now, told = 0.0, []
+
+    def step(done, total, text, left):
+        nonlocal now
+        told.append((now, left))
+        now += 0.3 if "tuning" in text else 15
+
+    monkeypatch.setattr("attnwarp.workdir.time", SimpleNamespace(perf_counter=lambda: now))
+    settings = replace(QUICK["igs2gs"], iterations=200)
+    run("igs2gs", settings, report=Watched(step))
+    first, left = next((at, left) for at, left in told if not math.isnan(left))
+    assert 0.5 < left / (told[-1][0] - first) < 2
 
 
 # --- killed and resumed
