@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,6 +31,7 @@ from attnwarp.cli.options import (
     EditorOption,
     InstructionOption,
     Kind,
+    Marking,
     Reading,
     ScreenFilterOption,
     Store,
@@ -46,6 +47,9 @@ NO_FEATURES = 0.001
 
 FIT_ITERATIONS, FIT_SPLATS = 3_000, 30_000
 """Limits of the fit that precedes an edit without splats."""
+
+DECIDING = (*(field.name for field in fields(Marking)), "tune_outside", "max_size")
+"""Fields of `Editing` that decide the result of an edit."""
 
 
 @options_of(Editing, Reading)
@@ -248,7 +252,13 @@ def edit(
         use_threads(editing.threads)
         for path in files:
             existing_file(path)
-        check_asked(method, instruction, settings, budget, out, edit_options)
+        typed = {
+            "scene": scene, "editor": editor, "fit_iterations": fit_iterations,
+            "max_splats": max_splats, "kind": kind,
+            **{name: value for name, value in vars(editing).items() if name in DECIDING},
+        }  # fmt: skip
+        asked = {k: v if v is None else str(v) for k, v in typed.items()}
+        check_asked(method, instruction, settings, budget, out, edit_options, asked)
         origin = ""
         if scene:
             data = out / "scene"

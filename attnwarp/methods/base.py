@@ -90,6 +90,7 @@ class Options(TypedDict, total=False):
         checkpoint_seconds: time between checkpoints of tuning (30); longer if writing one is slow.
         backend: renderer name, as for :func:`attnwarp.render.render` ("auto").
         report: receiver of progress, :class:`attnwarp.reporting.Reporter`.
+        asked: further options of the user's command, by name, for the manifest.
         load: loader of the perceptual distance, :func:`attnwarp.encoders.load_encoder`. A caching
             loader can serve several runs.
 
@@ -106,6 +107,7 @@ class Options(TypedDict, total=False):
     checkpoint_seconds: float
     backend: str
     report: Reporter
+    asked: dict[str, Any]
     load: Callable[..., Any]
 
 
@@ -380,6 +382,7 @@ class _Run:
                 "settings": work.settings.to_dict(),
                 "budget": self.budget.to_dict(),
                 **({"tuned": "what is marked"} if self.bound else {}),
+                **({"options": options["asked"]} if "asked" in options else {}),
                 **method.about,
                 "rounds": [
                     {

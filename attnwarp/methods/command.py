@@ -314,12 +314,14 @@ def check_asked(
     budget: Budget,
     out: Path,
     options: EditOptions,
+    asked: dict[str, Any],
 ) -> None:
     """Refuse invalid arguments before a capture is rendered or read.
 
     Args:
         method, instruction, settings, out, options: see :func:`edit_dataset`.
         budget: budget of the method.
+        asked: further options that decide the result, by name, as typed.
 
     Raises:
         InputError: an unknown device, precision or segmenter; an unsupported film format; an edit
@@ -339,6 +341,7 @@ def check_asked(
             "instruction": instruction,
             "settings": known,
             "budget": budget.to_dict(),
+            "options": asked,
         }
     )
 

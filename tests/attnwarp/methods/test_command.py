@@ -546,12 +546,14 @@ def test_an_edit_of_other_settings_or_words_is_refused_before_a_picture_is_read(
     for picture in (tmp_path / "copy/data/images").iterdir():
         picture.write_bytes(b"")
     for more, message in (
-        ({"instruction": "a cat"}, 'holds an edit of other instruction ("a bear", now "a cat")'),
-        ({}, "holds an edit of other settings.seed (0, now 3). Go on with the same ones, or name"),
+        (("--instruction", "a cat"), 'other instruction ("a bear", now "a cat")'),
+        (("--seed", 3), "other settings.seed (0, now 3). Go on with the same ones, or name"),
+        (("--at", "8,20"), 'other options.at (null, now "8,20")'),
+        (("--source", 1), 'other options.source (null, now "1")'),
+        (("--max-size", 16), 'other options.max_size (null, now "16")'),
     ):
-        again = run(
-            tmp_path / "copy", tmp_path / "out", *ply, *(() if more else ("--seed", 3)), **more
-        )
+        again = run(tmp_path / "copy", tmp_path / "out", *ply, *more)
+        message = f"holds an edit of {message}"
         assert again.exit_code == 2 and message in again.output
 
 
@@ -706,10 +708,8 @@ def test_a_refused_edit_leaves_the_masks_of_the_edit_that_is_there(place, tmp_pa
     assert run(place, tmp_path / "out", *ply, "--masks", masks).exit_code == 0
     stored = {p.name: p.read_bytes() for p in (tmp_path / "out" / "segments").iterdir()}
     assert stored == {camera.name: encode_png(half) for camera in cameras()}
-    save_dino(tmp_path / "dino")
-    save_sam(tmp_path / "sam", seed=2)
-    segmenter = ("--segmenter", f"{tmp_path / 'dino'},{tmp_path / 'sam'}")
-    result = run(place, tmp_path / "out", *ply, "--where", "bear", *segmenter)
+    (masks / cameras()[0].name).write_bytes(encode_png(255 - half))
+    result = run(place, tmp_path / "out", *ply, "--masks", masks)
     assert result.exit_code == 2
     assert "holds an edit of other inputs.segments" in result.output
     assert {p.name: p.read_bytes() for p in (tmp_path / "out" / "segments").iterdir()} == stored
