@@ -47,7 +47,7 @@ from attnwarp.methods.page import show_edit
 from attnwarp.methods.page.orbit import check_film
 from attnwarp.methods.pictures import Segment, check_view_aspect
 from attnwarp.methods.scene import images_of
-from attnwarp.methods.settings import AttentionWarpingSettings
+from attnwarp.methods.settings import AttentionWarpingSettings, SourceSettings
 from attnwarp.methods.tuning import perceptual_net
 from attnwarp.methods.view_edits import check_editor
 from attnwarp.process import asked_to_stop, core_count
@@ -161,6 +161,8 @@ def edit_dataset(
     if warping:
         by_hand = _by_hand(source_picture, dataset, views, index)
         own = {"source": index, "source_picture": by_hand, **own}
+    elif isinstance(settings, SourceSettings):
+        own = {"source": index, **own}
     segments = marked(
         options.marks, editor_name, dataset, views, images, index, out, device, report
     )

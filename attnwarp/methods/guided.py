@@ -18,7 +18,7 @@ from attnwarp.editing.schedule import Schedule, Time, following
 from attnwarp.encoders import load_encoder
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Options, Result, ViewEdit, run
-from attnwarp.methods.by_warps import ByWarps
+from attnwarp.methods.by_warps import ByWarps, checked_source
 from attnwarp.methods.geometry import Warps
 from attnwarp.methods.settings import GuidedSettings
 from attnwarp.methods.tuning import PerceptualLoss
@@ -40,6 +40,7 @@ def guided(
     instruction: str,
     settings: GuidedSettings | None = None,
     *,
+    source: int = 0,
     warps: Warps | None = None,
     **options: Unpack[Options],
 ) -> Result:
@@ -58,6 +59,7 @@ def guided(
         gaussians, cameras, images, instruction, options: see :func:`by_view`.
         editor: any editor whose passes have gradients. Passes back are not counted as rows.
         settings: :class:`GuidedSettings`; the defaults if omitted.
+        source: number of the first view.
         warps: see :func:`attention_warping`.
 
     Raises:
@@ -78,7 +80,7 @@ def guided(
         8
     """
     return run(
-        "guided", partial(Guided, warps=warps), GuidedSettings,
+        "guided", partial(Guided, source=source, warps=warps), GuidedSettings,
         gaussians, cameras, images, editor, instruction, settings, **options,
     )  # fmt: skip
 
@@ -86,10 +88,13 @@ def guided(
 class Guided(ByWarps):
     """Method that edits views in order, guided by those before."""
 
-    def __init__(self, work: Work, settings: GuidedSettings, warps: Warps | None) -> None:
+    def __init__(
+        self, work: Work, settings: GuidedSettings, source: int, warps: Warps | None
+    ) -> None:
         if settings.start is not None:
             work.starts_at(settings.start[0], "start")
-        self.settings = settings
+        self.settings, first = settings, checked_source(source, work)
+        self.views = [first, *(view for view in range(len(work.sizes)) if view != first)]
         super().__init__(work, settings, warps)
         # Loaded here, not at its first use, which may follow hours of editing.
         device = str(work.editor.network.device)
@@ -101,16 +106,16 @@ class Guided(ByWarps):
 
     def run(self, loop: Loop) -> None:
         """Edit all views in order, then tune."""
-        views = range(len(self.names))
-        for view in views:
+        for view in self.views:
             rows = self.settings.steps * self.work.branches()
             loop.edit(0, (view,), partial(self.edit, view), rows=rows)
-        loop.tune(0, views, self.settings.iterations)
+        loop.tune(0, self.views, self.settings.iterations)
 
     def edit(self, view: int, model: Gaussians, step: Callable[[], None]) -> list[ViewEdit]:
         """Edit a view, guided by those before that show most of it."""
         work, s, editor = self.work, self.settings, self.work.editor
-        matched = [(other, self.of_edits(other, view)) for other in range(view)]
+        before = self.views[: self.views.index(view)]
+        matched = [(other, self.of_edits(other, view)) for other in before]
         matched = [pair for pair in matched if bool(pair[1].mask.any())]
         matched.sort(key=lambda pair: -int(pair[1].mask.sum()))
         matched = matched[: s.partners]

@@ -473,7 +473,12 @@ class CarriedSettings(ByViewSettings):
 
 
 @dataclass(frozen=True)
-class CorrespondingSettings(CarriedSettings):
+class SourceSettings(CarriedSettings):
+    """Settings shared by those of them that give one view, the source, a part of its own."""
+
+
+@dataclass(frozen=True)
+class CorrespondingSettings(SourceSettings):
     """Settings of :func:`attnwarp.methods.corresponding`.
 
     Args:
@@ -493,7 +498,7 @@ class CorrespondingSettings(CarriedSettings):
 
 
 @dataclass(frozen=True)
-class WarpedReferenceSettings(CarriedSettings):
+class WarpedReferenceSettings(SourceSettings):
     """Settings of :func:`attnwarp.methods.warped_reference`.
 
     Args:
@@ -549,7 +554,7 @@ class FusedSettings(CarriedSettings):
 
 
 @dataclass(frozen=True)
-class GuidedSettings(CarriedSettings):
+class GuidedSettings(SourceSettings):
     """Settings of :func:`attnwarp.methods.guided`.
 
     Args:

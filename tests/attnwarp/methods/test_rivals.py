@@ -13,7 +13,7 @@ from attnwarp import Camera
 from attnwarp.editing.editors.pix2pix import InstructPix2Pix
 from attnwarp.editing.layers import BareUNet, all_layers
 from attnwarp.editing.schedule import DDIM
-from attnwarp.methods import GuidedSettings
+from attnwarp.methods import ByViewSettings, GuidedSettings
 from attnwarp.methods.corresponding import mixing
 from attnwarp.methods.fused import blended, guided_by, splat
 from attnwarp.methods.guided import Guided, guided_step, mosaic
@@ -270,7 +270,7 @@ def test_the_loss_is_l1_and_twice_the_distance_of_patches_at_matched_points(scen
     seen = Scene.checked(twins, [images[1]] * 2, None)
     folder = Workdir(Path("unused"), "an edit")
     work = Work(model, seen, editor, "a bear", settings, "auto", folder, SILENT)
-    guide = Guided(work, settings, None)
+    guide = Guided(work, settings, 0, None)
     edited = np.random.default_rng(0).random((32, 32, 3)).astype(np.float32)
     guide.kept = lambda number, view: edited
     warp = guide.of_edits(0, 1)
@@ -285,3 +285,14 @@ def test_the_loss_is_l1_and_twice_the_distance_of_patches_at_matched_points(scen
         assert abs(float(same)) < 1e-6
     assert abs(losses[0] - l1) < 1e-6
     assert abs((losses[2] - l1) - 2 * (losses[1] - l1)) < 1e-6 < losses[1] - l1
+
+
+@pytest.mark.parametrize("method", ["warped_reference", "guided"])
+def test_the_source_that_is_asked_for_is_edited_first_and_alone(method, run):
+    """Oracle: view by view, at the same noise."""
+    quick = QUICK[method].changed(iterations=0)
+    edited = run(method, quick, source=2).edited
+    plain = {k: v for k, v in quick.to_dict().items() if k in ByViewSettings().to_dict()}
+    alone = run("by_view", ByViewSettings(**{**plain, "start": None})).edited
+    assert next(iter(edited)) == 2
+    assert close(edited[2], alone[2]) and not close(edited[0], alone[0])

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.encoders import load_encoder
-from attnwarp.methods.settings import PRESETS, CarriedSettings
+from attnwarp.methods.settings import PRESETS, CarriedSettings, SourceSettings
 from attnwarp.reporting import SILENT, Reporter
 
 if TYPE_CHECKING:
@@ -296,7 +296,6 @@ def _drawn_views(settings: Mapping[str, Any], views: int) -> int:
 def _baseline(name: str) -> Method:
     """A method of :mod:`attnwarp.methods`; those that carry edits take the job's warps."""
     kind = type(next(iter(PRESETS[name].values())))
-    warps = issubclass(kind, CarriedSettings)
 
     def settings(wanted: str | None, fields: dict[str, Any], seed: int) -> dict[str, Any]:
         from attnwarp.methods import preset
@@ -306,7 +305,9 @@ def _baseline(name: str) -> Method:
     def run(job: Job) -> EditedScene:
         from attnwarp import methods
 
-        given: dict[str, Any] = {**job.options, **({"warps": job.warps} if warps else {})}
+        given: dict[str, Any] = {**job.options}
+        given |= {"warps": job.warps} if issubclass(kind, CarriedSettings) else {}
+        given |= {"source": job.source} if issubclass(kind, SourceSettings) else {}
         return _edited(
             methods.METHODS[name](
                 job.gaussians,
