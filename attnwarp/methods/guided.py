@@ -26,7 +26,7 @@ from attnwarp.methods.work import VIEWS, Work
 from attnwarp.warp import FeatureWarp
 
 PUBLISHED_SIDE = 512
-"""Side in px of the published edits, for which numbers of points and sizes of patches hold."""
+"""Side in px of the published edits, for which the patches' side holds."""
 
 Loss = Callable[[Tensor], Tensor]
 """Loss () of (3, h, w) pixels in [0, 1]."""
@@ -50,10 +50,10 @@ def guided(
     around them. Below a timestep each step is guided as in Universal Guidance (Bansal et al. 2024):
     forward by the loss's gradient through the network, backward by steps of the predicted picture.
 
-    No code is released. Matches are the warp's here and RoMa's there. Steps are Polyak's
-    here, since theirs are not known. Numbers of points and patches, and the patches' side, scale
-    with the picture. Patches are compared side by side in one picture, where a network sees across
-    their borders. Models of flow are guided in the same way; the paper optimises their noise.
+    No code is released. Matches are the warp's here and RoMa's there. Steps are shares of Polyak's
+    here, since theirs are not known. The patches' side scales with the picture. Patches are
+    compared side by side in one picture, where a network sees across their borders. Models of flow
+    are guided in the same way; the paper optimises their noise.
 
     Args:
         gaussians, cameras, images, instruction, options: see :func:`by_view`.
@@ -149,12 +149,10 @@ class Guided(ByWarps):
         s, size = self.settings, self.work.sizes[view]
         device = self.work.editor.network.device
         edited = torch.from_numpy(self.kept(0, other)).permute(2, 0, 1).contiguous()
-        scale = size[0] * size[1] / PUBLISHED_SIDE**2
         shown = warp.mask.flatten().nonzero()[:, 0]
         generator = self.work.generator(VIEWS, view, other)
         drawn = shown[torch.randperm(len(shown), generator=generator)]
-        points = drawn[: max(1, round(s.points * scale))]
-        chosen = drawn[: max(1, round(s.patches * scale))]
+        points, chosen = drawn[: s.points], drawn[: s.patches]
         side = max(2, round(s.patch * min(size) / PUBLISHED_SIDE))
         colors = warp.warp(edited).flatten(1)[:, points].to(device)
         own = torch.stack([chosen % size[1], chosen // size[1]], dim=-1) + 0.5

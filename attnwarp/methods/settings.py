@@ -564,9 +564,8 @@ class GuidedSettings(SourceSettings):
         forward: weight of the gradient through the network; 0 takes none.
         backward: number of steps of the predicted picture at each guided step.
         rate: share of Polyak's step that each of them takes.
-        points: number of matched points of a picture of 512 x 512 px.
-        patches: number of patches of such a picture.
-        patch: side of its patches, in px.
+        points, patches: largest numbers of matched points and patches.
+        patch: side of the patches in px of a picture of 512 px; others are scaled alike.
         patch_weight: weight of the patches' perceptual distance against L1.
 
     Example:
@@ -580,7 +579,7 @@ class GuidedSettings(SourceSettings):
     below: Annotated[int, Range(0, LAST_STEP)] = 700
     forward: Weight = 0.1
     backward: Number = 3
-    rate: Weight = 1.0
+    rate: Weight = 0.3
     points: Count = 50_000
     patches: Count = 1_500
     patch: Count = 64

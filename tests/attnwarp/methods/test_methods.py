@@ -76,7 +76,7 @@ SETTINGS = {
     "gaussctrl": GaussCtrlSettings(latents="random", references=2, batch=2),
     "corresponding": CorrespondingSettings(self_share=0.7),
     "fused": FusedSettings(),
-    "guided": GuidedSettings(rate=0.3),  # a whole step goes after the rounding of files
+    "guided": GuidedSettings(),
     "warped_reference": WarpedReferenceSettings(),
 }
 
