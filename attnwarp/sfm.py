@@ -79,7 +79,13 @@ def run(task: str, *paths: Path, report: Reporter = SILENT) -> None:
         raise MissingExtraError("pycolmap", "colmap")
     command = [sys.executable, "-m", "attnwarp.sfm", task, *map(str, paths)]
     last = "nothing"
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, errors="replace") as process:
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+    ) as process:
         assert process.stderr is not None
         try:
             for line in process.stderr:
