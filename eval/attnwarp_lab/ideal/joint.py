@@ -39,7 +39,7 @@ class IdealTransformer(IdealUNet):
         super().__init__(views, alphas)
         self.pair, self.stream = Output(), Output()
 
-    def forward(self, hidden_states: Tensor, timestep: float, views: Sequence[int]) -> Tensor:  # type: ignore[override]
+    def forward(self, hidden_states: Tensor, timestep: float, views: Sequence[int]) -> Tensor:
         """(B, n, C) velocity of the first n of (B, 2 n, C) tokens; the others are the picture
         before.
         """
