@@ -46,8 +46,8 @@ def bundle(name: str) -> None:
 def pack(capture: Path, out: Path) -> None:
     """Write a capture as an archive, its pictures as JPEG, transforms.json last."""
     for path in capture.glob("images/*.png"):
-        options = {"quality": JPEG_QUALITY, "subsampling": 0, "optimize": True}
-        Image.open(path).save(path.with_suffix(".jpg"), **options)
+        picture = path.with_suffix(".jpg")
+        Image.open(path).save(picture, quality=JPEG_QUALITY, subsampling=0, optimize=True)
     cameras = capture / "transforms.json"
     cameras.write_text(cameras.read_text().replace(".png", ".jpg"))
     with ZipFile(out, "w", ZIP_LZMA) as archive:
