@@ -298,21 +298,17 @@ def _before_sky(gaussians: Gaussians, camera: Camera, given: dict[str, Any]) -> 
     moved = _checked_pose(given["pose"], camera).detach().numpy()
     eye = torch.as_tensor(-moved[:3, :3].T @ moved[:3, 3] - gaussians.origin)
     sky = (gaussians.means.detach() - eye.to(gaussians.means)).norm(dim=1) > gaussians.far
-    plain, features = replace(gaussians, far=math.inf), given["features"]
-    if features is not None:
-        features = check.tensor(features, "features")
-        check.shape(features, (len(gaussians), "C"), "features")
-        given = {**given, "features": features[~sky]}
-    else:
-        behind = render(plain.select(sky), camera, **given)
-        given = {**given, "background": None}
-    view = render(plain.select(~sky), camera, **given)
-    weight = torch.zeros(len(gaussians), dtype=view.weight.dtype, device=view.weight.device)
-    view.weight = weight.index_put((~sky,), view.weight)
-    if features is None:
-        view.weight = view.weight.index_put((sky,), behind.weight)
-        view.color = view.color + (1 - view.alpha)[..., None] * behind.color
-        view.counters = {name: n + behind.counters[name] for name, n in view.counters.items()}
+    plain, index = replace(gaussians, far=math.inf), torch.nonzero(sky)[:, 0]
+    # Without opacity rather than left out, which would copy the scene.
+    scene = replace(plain, opacities=torch.where(sky, 0.0, plain.opacities))
+    if given["features"] is not None:
+        return render(scene, camera, **given)
+    behind = render(plain.select(index), camera, **given)
+    view = render(scene, camera, **{**given, "background": None})
+    view.weight = view.weight.index_add(0, index, behind.weight)
+    view.color = view.color + (1 - view.alpha)[..., None] * behind.color
+    counts = {name: n + behind.counters[name] for name, n in view.counters.items()}
+    view.counters = {**counts, "splats": len(gaussians)}
     return view
 
 
