@@ -154,6 +154,7 @@ def row(name: str, fits: list[dict[str, Any]], apart: set[str]) -> str:
         f"{statistics.mean(fit['cpu_seconds'] for fit in fits):.0f} s",
         f"{max(fit['largest'] for fit in fits):.2g}",
         f"{min(each('distortion', min)):.1g}",
+        span(each("psnr", statistics.mean)),
         span(each("psnr", statistics.median)),
         span(each("psnr", min)),
         f"{100 * statistics.mean(each('beyond', statistics.mean)):.1f} %",
@@ -174,9 +175,9 @@ def depth_row(name: str, fits: list[dict[str, Any]]) -> str:
 def report(results: dict[str, list[dict[str, Any]]]) -> str:
     """Text of the report."""
     lines = [
-        "| fit | seeds | splats | CPU | largest | distortion | held out, median view, dB |"
+        "| fit | seeds | splats | CPU | largest | distortion | held out, mean, dB | median view, dB |"
         " worst view, dB | beyond |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, fits in results.items():
         capture = name.split(",")[0]
