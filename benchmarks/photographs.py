@@ -175,8 +175,8 @@ def depth_row(name: str, fits: list[dict[str, Any]]) -> str:
 def report(results: dict[str, list[dict[str, Any]]]) -> str:
     """Text of the report."""
     lines = [
-        "| fit | seeds | splats | CPU | largest | distortion | held out, mean, dB | median view, dB |"
-        " worst view, dB | beyond |",
+        "| fit | seeds | splats | CPU | largest | distortion | held out, mean, dB |"
+        " median view, dB | worst view, dB | beyond |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, fits in results.items():
