@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Unpack
+from typing import Any, Unpack, cast
 
 import numpy.typing as npt
 import torch
@@ -98,9 +98,8 @@ class Guided(ByWarps):
         super().__init__(work, settings, warps)
         # Loaded here, not at its first use, which may follow hours of editing.
         device = str(work.editor.network.device)
-        self.perceptual: PerceptualLoss = load_encoder(
-            settings.perceptual_encoder, "perceptual", device=device
-        )
+        encoder = load_encoder(settings.perceptual_encoder, "perceptual", device=device)
+        self.perceptual = cast(PerceptualLoss, encoder)
         digest = self.perceptual.about.weights_sha256
         self.inputs = {**self.inputs, "patches": digest}
 

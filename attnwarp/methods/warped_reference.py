@@ -107,7 +107,7 @@ class WarpedReference(ByWarps):
         if self.source not in batch:
             assert s.start is not None
             start = work.timestep(0, self.source, s.start)
-            pictures, shares = map(list, zip(*map(self.begin, batch), strict=True))
+            pictures, shares = map(list, zip(*map(self.starts, batch), strict=True))
         with work.guided(s.text_guidance):
             result = edit(
                 work.editor,
@@ -125,7 +125,7 @@ class WarpedReference(ByWarps):
             for picture, share in zip(result.images, shares, strict=True)
         ]
 
-    def begin(self, view: int) -> tuple[Image, float]:
+    def starts(self, view: int) -> tuple[Image, float]:
         """Compose the picture (h, w, 3) that a view starts from, and the warped share of it."""
         warp, before = self.of_edits(self.source, view), self.work.picture(view)
         edited = torch.from_numpy(self.kept(0, self.source)).permute(2, 0, 1)
