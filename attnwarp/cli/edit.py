@@ -270,14 +270,17 @@ def edit(
                 edit_options = replace(edit_options, marks=marks)
         dataset = read_views(data, reading)
         check_marked(edit_options, dataset)
-        notes = ["" if scene else say_foreign(editor)]
+        notes = []
+        if not scene and (foreign := say_foreign(editor)):
+            notes.append(foreign)
+            report.log(foreign)
         splats = None if ply is None else read_splats(ply, kind, antialiased, screen_filter)
         if ply is not None and splats is not None:
             check_seen(ply, splats, dataset.cameras, report)
             warn_of_misfit(ply, splats, dataset)
-            notes.append(note_held_out(ply, dataset, view_of(dataset, editing.source)))
-        for note in filter(None, notes):
-            warnings.warn(note, InputWarning, stacklevel=1)
+            if note := note_held_out(ply, dataset, view_of(dataset, editing.source)):
+                notes.append(note)
+                warnings.warn(note, InputWarning, stacklevel=1)
         result, page = edit_dataset(
             method, dataset, splats, editor, instruction, settings, out, edit_options,
             fit_plan=FitPlan(

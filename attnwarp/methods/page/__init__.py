@@ -253,23 +253,22 @@ class _Page:
                 id_ = {"scene before": f"before-{k}", "edited scene": f"after-{k}"}.get(what, "")
                 cells.append(_figure(f"{name}, {what}", data, id_))
         count = (
-            f"<p>{len(self.shown)} of {len(self.edited)} edited views; the folder has all.</p>"
+            f"{len(self.shown)} of {len(self.edited)} edited views; the folder has all."
             if len(self.shown) < len(self.edited)
             else ""
         )
+        if len(self.shown) > 1 and self.sources:
+            count += f" Degrees are from {escape(self.sources[0])}, about the scene's middle."
         style = f"grid-template-columns: repeat({max(1, len(self.shown))}, minmax(0, 1fr))"
         shares = self._shares() if carried else ""
-        return (
-            f'<h2>Views</h2>{count}{shares}<div class="grid" style="{style}">{"".join(cells)}</div>'
-        )
+        grid = f'<div class="grid" style="{style}">{"".join(cells)}</div>'
+        return f"<h2>Views</h2><p>{count}</p>{shares}{grid}"
 
     def _title(self, name: str) -> str:
         if not self.sources or name in self.sources:
             return f"{name} (source)" if self.sources else name
-        first = self.sources[0]
-        source, view = (self.cameras[self.names.index(n)] for n in (first, name))
-        whose = "the source" if len(self.sources) == 1 else first
-        return f"{name}, {degrees_apart(source, view, self.focus):.0f}° from {whose}"
+        source, view = (self.cameras[self.names.index(n)] for n in (self.sources[0], name))
+        return f"{name}, {degrees_apart(source, view, self.focus):.0f}°"
 
     def _where(self) -> str:
         if len(self.sources) < 2:
