@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from attnwarp.editing.small import say_foreign
 from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import without_nan, write_json
 from attnwarp_eval.document import write
@@ -165,6 +166,8 @@ def report(results: Results) -> Report:
             f"**The encoders of {' and '.join(bundled)} are bundled ones, whose figures do not"
             " compare with published ones.**"
         )
+    foreign = {say_foreign(loaded.editor(row.editor)) for row in m.variants.values()}
+    lead += [f"{text}." for text in sorted(foreign - {""})]
     sections = [_table(results, table) for table in loaded.tables()]
     sections += [_pictures(results), *_geometry(results), *_variability(results), _cost(results)]
     if (results.root / ASKING).is_file():
@@ -249,7 +252,8 @@ def _pictures(results: Results) -> Section:
             for label, folder in folders.items()
         ]
         if len(rows) > 1:
-            grids.append(Grid(f"{scene} / {title}", [names[k] for k in views], rows))
+            heads = [Path(names[k]).stem for k in views]  # folders would run into each other
+            grids.append(Grid(f"{scene} / {title}", heads, rows))
     table = Table(["edit", "variant", "page"], pages, "The splats, and all else of a variant.",
                   folded=len(edits) > 1)  # fmt: skip
     return Section("Edited scenes", ["Renders of the tuned splats."], [table], grids=grids)

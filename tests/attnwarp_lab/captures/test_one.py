@@ -114,6 +114,7 @@ def test_what_is_left_out_cut_or_unequal_is_told_before_and_in_the_report(done):
         assert text in result.stderr and text in report
     assert "**Did not finish within their budget: short.**" in report
     assert "Edits without words for `source` have no CLIP directional similarity." in report
+    assert "small-plain was trained on drawn worlds, so photographs are not its world" in report
     assert (out / "report.html").read_text().count("data:image/png") >= 3 * 5
 
 
