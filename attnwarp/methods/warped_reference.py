@@ -129,7 +129,8 @@ class WarpedReference(ByWarps):
         """Compose the picture (h, w, 3) that a view starts from, and the warped share of it."""
         warp, before = self.of_edits(self.source, view), self.work.picture(view)
         edited = torch.from_numpy(self.kept(0, self.source)).permute(2, 0, 1)
-        warped = warp.warp(edited).permute(1, 2, 0).numpy()
+        # Weights that add up to more than 1 by rounding must not leave [0, 1].
+        warped = warp.warp(edited).clamp(0, 1).permute(1, 2, 0).numpy()
         mask = warp.mask.numpy()
         picture = np.where(mask[..., None], warped, before).astype(np.float32)
         return picture, float(mask.mean())

@@ -18,6 +18,7 @@ from attnwarp.methods.corresponding import mixing
 from attnwarp.methods.fused import blended, guided_by, splat
 from attnwarp.methods.guided import Guided, guided_step, mosaic
 from attnwarp.methods.scene import Scene
+from attnwarp.methods.warped_reference import WarpedReference
 from attnwarp.methods.work import Work
 from attnwarp.reporting import SILENT
 from attnwarp.warp import Surface, warp_surfaces
@@ -296,3 +297,18 @@ def test_the_source_that_is_asked_for_is_edited_first_and_alone(method, run):
     alone = run("by_view", ByViewSettings(**{**plain, "start": None})).edited
     assert next(iter(edited)) == 2
     assert close(edited[2], alone[2]) and not close(edited[0], alone[0])
+
+
+def test_a_start_from_a_white_edit_is_white_and_no_more(scene, editor):
+    """Weights of four taps add up to more than 1 in float32, and encoders refuse such pictures."""
+    model, views, images = scene
+    settings = QUICK["warped_reference"]
+    folder = Workdir(Path("unused"), "an edit")
+    seen = Scene.checked(views, images, None)
+    work = Work(model, seen, editor, "a bear", settings, "auto", folder, SILENT)
+    method = WarpedReference(work, settings, 0, None)
+    method.kept = lambda number, view: np.ones((32, 32, 3), np.float32)
+    for view in (1, 2):
+        picture, share = method.starts(view)
+        assert 0.1 < share < 1
+        assert picture.max() == 1
