@@ -38,7 +38,7 @@ from attnwarp.cli.options import (
     options_of,
 )
 from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
-from attnwarp.editing.small import check_words, own_steps_of, say_foreign
+from attnwarp.editing.small import check_words, guide_of, own_steps_of, say_foreign
 from attnwarp.errors import InputWarning
 from attnwarp.reporting import reporter
 
@@ -216,7 +216,6 @@ def edit(
         if scene:
             changes.setdefault("size", SIZE)
         changes |= assignments(change or [], flags)
-        changes.setdefault("steps", own_steps_of(editor))  # refuses an unknown editor
         _check_splat_options(
             ply,
             of_fit={"--fit-iterations": fit_iterations, "--max-splats": max_splats},
@@ -226,6 +225,7 @@ def edit(
         results = ("edited.ply", "edited-3dgs.ply")
         files = [path for path in (source_picture, ply, editing.mask) if path is not None]
         check_inputs_stay((out / name for name in results), files)
+        guide_of(editor)  # refuses an unknown editor
         check_words(editor, instruction, anyway=anyway)
         from attnwarp import check, methods
         from attnwarp.io.file import existing_file
@@ -247,6 +247,7 @@ def edit(
         if used and method != "attention_warping":
             name = used[0].replace("_", "-")
             raise ValueError(f"--{name}: is of attention_warping, not of {method}; leave it out")
+        changes.setdefault("steps", own_steps_of(editor))
         settings = methods.preset(method, preset, **changes)
         budget = methods.Budget(seconds, network_rows)
         use_threads(editing.threads)

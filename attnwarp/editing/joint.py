@@ -112,7 +112,7 @@ def grid_ids(size: Size, picture: int, axes: int) -> Tensor:
         [[10.0, 0.0, 0.0, 0.0], [10.0, 0.0, 1.0, 0.0]]
     """
     y, x = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
-    ids = torch.zeros(*size, axes)
+    ids = torch.zeros(*size, axes, dtype=torch.float32)
     ids[..., 0], ids[..., 1], ids[..., 2] = picture, y, x
     return ids.flatten(0, 1)
 

@@ -93,7 +93,8 @@ def with_sky(start: Gaussians, views: Views) -> Gaussians:
     toward, n = toward[shown], int(shown.sum())
     # Half-way between the axis z and the direction: half a turn about it lays one on the other.
     turns = np.concatenate([np.zeros((n, 1)), toward + np.array([0.0, 0.0, 1.0])], axis=1)
-    sh = torch.cat([Gaussians.sh_from_rgb(colors), torch.zeros(n, start.sh.shape[1] - 1, 3)], dim=1)
+    rest = torch.zeros(n, start.sh.shape[1] - 1, 3, dtype=torch.float32)
+    sh = torch.cat([Gaussians.sh_from_rgb(colors), rest], dim=1)
     size = OVERLAP * radius * np.sqrt(4 * np.pi / DIRECTIONS)
     added = {
         "means": torch.from_numpy(places[shown] - start.origin),

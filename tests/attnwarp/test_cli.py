@@ -256,8 +256,9 @@ def test_an_infinite_psnr_is_null_in_the_history(data, tmp_path):
         tmp_path / "data", Dataset(cameras, there.image_paths, there.points, there.colors)
     )
     done = in_process(
-        "fit", tmp_path / "data", "--out", tmp_path / "fit", "--iterations", 1, "--hold-out", 9
-    )
+        "fit", tmp_path / "data", "--out", tmp_path / "fit", "--iterations", 1,
+        "--hold-out", Path(held_out.name).name,
+    )  # fmt: skip
     assert done.exit_code == 0, done.output
 
     def refuse(constant):

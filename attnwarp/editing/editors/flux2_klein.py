@@ -103,7 +103,7 @@ class Flux2Klein(Joint):
     def places(self, size: Size, pictures: int, text: Mapping[str, Any]) -> dict[str, Any]:
         """Compute positions (picture, row, column, word) of pictures 0, 10, ... and of text."""
         count, device = text["encoder_hidden_states"].shape[1], self.network.device
-        words = torch.zeros(count, 4)
+        words = torch.zeros(count, 4, dtype=torch.float32)
         words[:, 3] = torch.arange(count)
         ids = [grid_ids(size, REFERENCE_GAP * number, 4) for number in range(pictures + 1)]
         return {"txt_ids": words.to(device), "img_ids": torch.cat(ids).to(device), "guidance": None}

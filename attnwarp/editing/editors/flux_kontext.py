@@ -78,7 +78,7 @@ class FluxKontext(Joint):
         ids = torch.cat([grid_ids(size, number, 3) for number in range(pictures + 1)])
         guidance = torch.full((views,), self.text_guidance, dtype=torch.float32, device=device)
         return {
-            "txt_ids": torch.zeros(count, 3, device=device),
+            "txt_ids": torch.zeros(count, 3, dtype=torch.float32, device=device),
             "img_ids": ids.to(device),
             "guidance": guidance if self.network.config.guidance_embeds else None,
         }

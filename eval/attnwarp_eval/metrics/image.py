@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp.drift import drift
 from attnwarp_eval.colors import to_linear
 from attnwarp_eval.metrics._pictures import pair
 from attnwarp_eval.metrics.arrays import Array, Mask, mean, share
@@ -406,5 +405,7 @@ def edit_drift(original: npt.NDArray[Any], edited: npt.NDArray[Any]) -> float:
         >>> edit_drift(flat, flat)
         nan
     """
+    from attnwarp.drift import drift
+
     found = drift(original, edited)
     return math.nan if found is None else found.largest

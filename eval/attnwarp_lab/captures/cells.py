@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
@@ -469,7 +470,8 @@ def settings_of(loaded: Loaded, row: Row, seed: int, size: int) -> Json:
     """
     own = dict(row.options)
     if row.method in METHODS:
-        own.setdefault("steps", own_steps_of(loaded.editor(row.editor)))
+        with suppress(InputError):  # a missing editor is named by the checks
+            own.setdefault("steps", own_steps_of(loaded.editor(row.editor)))
         own |= {"size": size, "perceptual_encoder": loaded.encoder("perceptual")}
     return EDITING_METHODS[row.method].settings(row.preset, own, seed)
 

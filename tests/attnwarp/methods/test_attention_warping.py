@@ -439,7 +439,7 @@ def test_the_seconds_of_a_sitting_that_was_killed_are_counted_up_to_its_last_che
     """Oracle: a clock on which each iteration takes one second, and all else none."""
     now, iterations = 0, 0
 
-    def watch(done, total, text):
+    def watch(done, total, text, left):
         nonlocal now, iterations
         if "tuning" in text:
             now, iterations = now + 1, iterations + 1
