@@ -34,7 +34,7 @@ FLOOR = np.array([0.03, 0.03, 3e-4, 3.5e-4])
 """Half widths (px at the working size, twice; log scale; radians) below which resampling and
 rounding to 8 bits dominate, added in quadrature."""
 
-WIDENING = 1.5
+WIDENING = 2.0
 """Factor on the half widths of the sandwich estimate, which neglects that residuals correlate
 beyond a cell and that tiles are selected."""
 
