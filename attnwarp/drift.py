@@ -69,7 +69,7 @@ class Drift:
         values = (self.right, self.down, self.scale, self.turn)
         names = ("px right", "px down", "% larger", "degrees clockwise")
         return ", ".join(
-            f"{value + 0.0:.2f} ± {half:.2f} {name}"
+            f"{round(value, 2) + 0.0:.2f} ± {half:.2f} {name}"
             for value, half, name in zip(values, self.half_widths, names, strict=True)
         )
 

@@ -35,7 +35,7 @@ from attnwarp.fit.views import Drawn
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
 from attnwarp.io.names import file_stems
-from attnwarp.methods.change import Change, change_of, drift_of, say_little
+from attnwarp.methods.change import MOST_DRIFTS, Change, change_of, drift_of, say_little
 from attnwarp.methods.pictures import (
     Bytes,
     Image,
@@ -494,6 +494,9 @@ class _Run:
         for name, picture in pictures.items():
             self.folder.write_picture(name, picture)
         about = {"view": self.names[view], "round": number + 1, **edit.about}
+        source, place = self.method.about.get("source"), self.rounds[number].views.index(view)
+        if source == self.names[view] or (source is None and place < MOST_DRIFTS):
+            about["drift"] = drift_of(self.work, view, edit.picture)
         self.folder.write_record(file, pixels, {**about, "pictures": list(pictures)})
 
     def _picture(self, number: int, view: int) -> str:
@@ -584,13 +587,18 @@ class _Run:
                         self.folder.write_picture(path, to_bytes(picture))
             self.folder.write_picture("sheet.png", self._sheet())
             psnr = self._edit_psnr(final)
-            source = self.method.about.get("source")
-            change = change_of(self.work, self.names, source, edited)
-            drift = drift_of(self.work, self.names, source, edited)
+            change = change_of(self.work, self.names, self.method.about.get("source"), edited)
         records = {
             view: self.folder.record(self._picture(number, view))
             for view, number in self.latest.items()
         }
+        drifts = {
+            record["view"]: record["drift"] for record in records.values() if "drift" in record
+        }
+        moved = max(
+            drifts, key=lambda name: (drifts[name] or {"largest": -1.0})["largest"], default=""
+        )
+        drift = {"view": moved, "drift": drifts.get(moved)}
         counters = {
             "network_rows": self.rows,
             "edits": self.edits,

@@ -10,7 +10,7 @@ import numpy as np
 
 from attnwarp.colors import ciede2000, to_lab
 from attnwarp.drift import Drift, drift
-from attnwarp.methods.pictures import Bytes, Mask, Size, resized, to_bytes
+from attnwarp.methods.pictures import Bytes, Image, Mask, Size, resized, to_bytes
 from attnwarp.methods.work import Work
 
 LITTLE = 3.0
@@ -21,7 +21,7 @@ MOST_PIXELS = 20_000
 """Compared pixels per view, evenly spread; more pixels would change no displayed digit."""
 
 MOST_DRIFTS = 4
-"""Edited views, evenly spread, whose drift is measured if no view is the source."""
+"""Number of views whose drift is measured if no view is the source."""
 
 Change = Mapping[str, float | None]
 """Mean CIEDE2000 of "scene" and of "source view", or of "edited views" for a method without a
@@ -72,44 +72,38 @@ def change_of(
     }
 
 
-def drift_of(
-    work: Work, names: Sequence[str], source: str | None, edited: Mapping[int, Bytes]
-) -> dict[str, Any]:
-    """Measure how far an editor moved what lies outside the mask, before composition.
+def drift_of(work: Work, view: int, picture: Image) -> dict[str, Any] | None:
+    """Measure how far an editor moved what lies outside the mask.
 
     Args:
-        work, names, edited: see :func:`change_of`.
-        source: name of the source view; None to measure a few views and return the largest drift.
+        work: the scene before the edit.
+        view: number of the view.
+        picture: (h, w, 3) its edit, before it is composed with the original outside the mask.
 
     Returns:
-        "view", and the attributes of a :class:`attnwarp.drift.Drift` as "drift", None if it can't
-        be told.
+        Attributes of a :class:`attnwarp.drift.Drift`; None if it can't be told.
     """
-    chosen = [view for view in edited if names[view] == source]
-    chosen = chosen or list(edited)[:: 1 + len(edited) // MOST_DRIFTS]
-    found: list[tuple[str, Drift | None]] = []
-    for view in chosen:
-        pixels, segments = edited[view], work.scene.segments
-        before = to_bytes(resized(work.scene.picture(view), pixels.shape[:2]))
-        left = None
-        if segments is not None:
-            touched = np.asarray(segments[view] > 0, np.float32)[..., None].repeat(3, 2)
-            left = resized(touched, pixels.shape[:2])[..., 0] == 0
-        found.append((names[view], drift(before, pixels, left)))
-    view_name, most = max(found, key=lambda f: f[1].largest if f[1] else -1, default=(None, None))
-    return {"view": view_name, "drift": asdict(most) if most else None}
+    size, segments = picture.shape[:2], work.scene.segments
+    left = None
+    if segments is not None:
+        touched = np.asarray(segments[view] > 0, np.float32)[..., None].repeat(3, 2)
+        left = resized(touched, size)[..., 0] == 0
+    found = drift(to_bytes(resized(work.scene.picture(view), size)), to_bytes(picture), left)
+    return None if found is None else asdict(found)
 
 
 def say_drift(of: Mapping[str, Any]) -> tuple[str, bool]:
     """Write a line about the drift of an edit, and whether it warns.
 
     Args:
-        of: see :func:`drift_of`.
+        of: "view", and its "drift" as of :func:`drift_of`.
 
     Example:
         >>> say_drift({"view": "bear", "drift": None})
         ("whether the edit of bear moved the picture can't be told", False)
     """
+    if not of["view"]:
+        return "no view was edited", False
     if of["drift"] is None:
         return f"whether the edit of {of['view']} moved the picture can't be told", False
     moved = Drift(**of["drift"])

@@ -12,6 +12,8 @@ import torch
 from attnwarp import Gaussians
 from attnwarp.camera import Camera
 from attnwarp.drift import drift
+from attnwarp.editing.small import load_editor
+from attnwarp.methods import attention_warping, preset
 from attnwarp.methods.change import say_drift
 from attnwarp.render import render
 
@@ -123,3 +125,26 @@ def test_a_line_warns_of_a_moved_picture_alone() -> None:
     assert warns and "the edit of front moved the picture, corners by 3.0 px" in line
     line, warns = say_drift({"view": "front", "drift": vars(stays)})
     assert not warns and "left the picture in place" in line
+
+
+def test_an_edit_says_how_far_its_source_moved_before_it_is_composed() -> None:
+    formula = Formula(4)
+    K = np.array([[128.0, 0, 64], [0, 128, 64], [0, 0, 1]])
+    cameras = [Camera(K, np.eye(4), 128, 128, name) for name in ("one", "two")]
+    disc = Gaussians(
+        "2d", torch.tensor([[0.0, 0, 3]]), torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3),
+    )  # fmt: skip
+    before = formula.picture(128).astype(np.float32)
+    marked = np.zeros((128, 128), bool)
+    marked[:32, :32] = True
+    result = attention_warping(
+        disc, cameras, [before, before], load_editor("small-plain"), "red",
+        preset("attention_warping", stages=1, steps=2, iterations=0),
+        source_picture=formula.picture(128, (3, 0, 0, 0)).astype(np.float32),
+        segments=[marked, marked],
+    )  # fmt: skip
+    assert result.drift["view"] == "one"
+    assert result.drift["drift"]["right"] == pytest.approx(3, abs=0.1)
+    # The picture that is handed out is the original outside the mask.
+    assert drift(before, result.edited[0].astype(np.float32) / 255, ~marked).largest < 0.1
