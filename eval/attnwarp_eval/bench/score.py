@@ -25,7 +25,7 @@ from attnwarp.io import read_image, read_ply
 from attnwarp.io.text import read_text
 from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.reporting import SILENT, Reporter
-from attnwarp_eval.bench.suite import Suite, to_bytes
+from attnwarp_eval.bench.suite import Suite, to_bytes, truth_file
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.document.model import Report, Section, Table
 from attnwarp_eval.document.write import write_files
@@ -80,7 +80,9 @@ class Score:
     remarks: list[str]
 
 
-def score(suite: Path, edited: Path, out: Path, report: Reporter = SILENT) -> list[Score]:
+def score(
+    suite: Path, edited: Path, out: Path, report: Reporter = SILENT, *, key: Path | None = None
+) -> list[Score]:
     """Score a folder of edited pictures; finished edits are kept in ``out`` and not done again.
 
     Args:
@@ -88,11 +90,14 @@ def score(suite: Path, edited: Path, out: Path, report: Reporter = SILENT) -> li
         edited: folder with SCENE/EDIT/VIEW.png.
         out: folder for bench-score.json and its page.
         report: receiver of progress.
+        key: folder of a sealed bench's key.
 
     Raises:
-        InputError: the bench is damaged, no edit is there, or a picture has another size.
+        InputError: the bench is damaged, its key is missing, no edit is there, or a picture has
+            another size.
     """
     bench = Suite.read(suite)
+    root = bench.open(suite, key)
     told = json.loads(read_text(edited / "method.json")) if _has(edited, "method.json") else {}
     there = [
         (scene, edit["name"])
@@ -107,11 +112,11 @@ def score(suite: Path, edited: Path, out: Path, report: Reporter = SILENT) -> li
         report.step(number, len(given), f"{scene}, {edit}")
         folder = edited / scene / edit
         kept = out / "scores" / f"{scene}-{edit}.json"
-        key = _key(bench, scene, folder)
+        digest = _digest(truth_file(root, scene), bench.spp, folder)
         stored = json.loads(read_text(kept)) if kept.is_file() else {}
-        if stored.get("key") != key:
-            made = _score(bench, suite, scene, edit, folder)
-            stored = {"key": key, "score": without_nan(asdict(made))}
+        if stored.get("key") != digest:
+            made = _score(bench, root, scene, edit, folder)
+            stored = {"key": digest, "score": without_nan(asdict(made))}
             write_atomic(kept, json.dumps(stored).encode())
         scores.append(Score(**_read(stored["score"])))
     missing = [f"{scene}/{edit}" for scene, edit in there if (scene, edit) not in given]
@@ -119,8 +124,8 @@ def score(suite: Path, edited: Path, out: Path, report: Reporter = SILENT) -> li
     return scores
 
 
-def _score(bench: Suite, suite: Path, scene: str, edit: str, folder: Path) -> Score:
-    of, truth = bench.truth(suite, scene, edit)
+def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path) -> Score:
+    of, truth = bench.truth(root, scene, edit)
     pictures, remarks = _pictures(bench, folder)
     source = bench.views[0]
     if source not in pictures:
@@ -231,9 +236,9 @@ def _mean(values: Any) -> float:
     return float(np.mean(finite)) if finite else math.nan
 
 
-def _key(bench: Suite, scene: str, folder: Path) -> str:
+def _digest(truth: Path, spp: int, folder: Path) -> str:
     files = sorted(path for path in folder.iterdir() if path.suffix in (".png", ".ply"))
-    parts = [str(PROTOCOL), bench.files[f"{scene}/truth/scene.yaml"], str(bench.spp)]
+    parts = [str(PROTOCOL), read_text(truth), str(spp)]
     parts += [f"{path.name}:{hashlib.sha256(path.read_bytes()).hexdigest()}" for path in files]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 

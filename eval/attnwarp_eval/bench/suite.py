@@ -1,12 +1,20 @@
-"""Scenes of a bench as files: captures for any method, their truth beside them."""
+"""Scenes of a bench as files: captures for any method, their truth beside them or sealed.
+
+A sealed bench is drawn from a secret of 256 bits. Its public folder follows from pictures, cameras
+and masks alone; the secret and the truth stand in a second folder. The public folder commits to
+the truth by hashes salted with the secret, so that the truth can't be exchanged later, nor guessed.
+"""
 
 from __future__ import annotations
 
 import copy
 import hashlib
+import hmac
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+import os
+import secrets
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from importlib import resources
 from pathlib import Path
 from string import Template
@@ -16,14 +24,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from attnwarp.errors import InputError
-from attnwarp.io import Dataset, write_ply, write_transforms
+from attnwarp.gaussians import Gaussians
+from attnwarp.io import Dataset, read_image, write_ply, write_transforms
 from attnwarp.io.text import read_text
-from attnwarp.reporting import SILENT, Reporter
+from attnwarp.reporting import SILENT, Part, Reporter
 from attnwarp_eval.drawn.files import to_text
 from attnwarp_eval.drawn.scenes import draw
 from attnwarp_eval.files import write_atomic, write_picture
+from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.splats.export import first_points
-from attnwarp_eval.study.shared.edit_truth import EditTruth, edit_truth
+from attnwarp_eval.study.shared.edit_truth import EditTruth, answers_of, edit_truth
 from attnwarp_eval.world import World, splats, world
 
 FORMAT = 1
@@ -39,26 +49,35 @@ POINTS = 5000
 SPLATS = {"kind": "2d", "count": 16_000, "position_noise": 0.1, "normal_noise": 3.0}
 """Splats sampled on the surfaces, as in the studies."""
 
+FIT = {"iterations": 1000, "max_splats": 12_000, "sh_degree": 1, "evaluate_every": 1000}
+"""Settings of a sealed bench's splats, fitted to the pictures from random points."""
+
+KEY = "key.json"
+TIME = 946_684_800
+"""Time of a sealed bench's files, 2000-01-01 UTC: the real ones would tell how long each took."""
+
 
 @dataclass(frozen=True)
 class Suite:
     """Definition of a bench, as in its ``bench.json``.
 
     Attributes:
-        seed: seed of the drawn scenes.
+        seed: seed of the drawn scenes; None if sealed.
         size: edge of the pictures, px.
         spp: samples per pixel.
         scenes: names of the scenes.
         views: names of the views, the source first.
         files: SHA-256 of every file by its path.
+        sealed: salted hashes of all right answers, sorted; empty if open.
     """
 
-    seed: int
+    seed: int | None
     size: int
     spp: int
     scenes: tuple[str, ...]
     views: tuple[str, ...]
     files: Mapping[str, str]
+    sealed: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, folder: Path) -> Suite:
@@ -73,17 +92,35 @@ class Suite:
         data = json.loads(read_text(path))
         if data.pop("format", None) != FORMAT:
             raise InputError(f"{path}: is of another version; export the bench again")
-        data |= {name: tuple(data[name]) for name in ("scenes", "views")}
+        data |= {name: tuple(data[name]) for name in ("scenes", "views", "sealed")}
         suite = cls(**data)
         for name, digest in suite.files.items():
             if not (folder / name).is_file() or _sha256(folder / name) != digest:
                 raise InputError(f"{folder / name}: is missing or changed; export the bench again")
         return suite
 
-    def truth(self, folder: Path, scene: str, edit: str) -> tuple[World, EditTruth]:
-        """Render the truth of an edit from the scene's file."""
-        path = str(folder / scene / "truth" / "scene.yaml")
+    def truth(self, root: Path, scene: str, edit: str) -> tuple[World, EditTruth]:
+        """Render the truth of an edit from the scene's file below the truth's folder."""
+        path = str(truth_file(root, scene))
         return world(path, self.size), edit_truth(path, self.size, self.spp, edit, self.views)
+
+    def open(self, folder: Path, key: Path | None) -> Path:
+        """Return the folder of the truth: of the bench if open, else ``key``.
+
+        Raises:
+            InputError: a sealed bench without its key, or with another bench's.
+        """
+        if not self.sealed:
+            return folder
+        if key is None:
+            raise InputError(f"{folder}: is sealed; its host scores it, with --key")
+        try:
+            hashes = _salted(key, self.scenes, _secret(key))
+        except FileNotFoundError as error:
+            raise InputError(f"{key}: lacks {error.filename}, a file of the key") from None
+        if hashes != self.sealed:
+            raise InputError(f"{key}: is not the key of {folder}; name the one made with it")
+        return key
 
 
 def export(
@@ -94,6 +131,7 @@ def export(
     size: int = 256,
     spp: int = 16,
     targets: int = len(YAWS),
+    sealed: Path | None = None,
     report: Reporter = SILENT,
 ) -> Suite:
     """Write a bench of drawn scenes; a folder begun earlier is continued.
@@ -101,14 +139,15 @@ def export(
     Args:
         folder: output folder.
         count: number of scenes.
-        seed: seed of the drawn scenes.
+        seed: seed of the drawn scenes; unused if sealed.
         size: edge of the pictures, px.
         spp: samples per pixel.
         targets: number of views besides the source.
+        sealed: folder for the secret and the truth; None puts the truth beside the pictures.
         report: receiver of progress.
 
     Raises:
-        InputError: the folder has another bench.
+        InputError: the folder has another bench, or the key's folder lies within it.
 
     Example:
         >>> from pathlib import Path
@@ -117,34 +156,102 @@ def export(
         (('drawn-0',), ('source', 'yaw010'))
     """
     folder = Path(folder)
+    root = folder if sealed is None else Path(sealed)
+    if sealed is not None:
+        if root.resolve().is_relative_to(folder.resolve()):
+            raise InputError(f"{root}: lies in the bench, which is given away; name another folder")
+        if not (root / KEY).is_file():
+            secret = json.dumps({"secret": secrets.token_hex(32)}).encode()
+            write_atomic(root / KEY, secret)
+            (root / KEY).chmod(0o600)
+        seed = _secret(root)
     scenes = tuple(f"drawn-{number}" for number in range(count))
     asked = {"seed": seed, "size": size, "spp": spp, "targets": targets}
     files: dict[str, str] = {}
     views: tuple[str, ...] = ()
     for number, name in enumerate(scenes):
         report.step(number, count, name)
-        place = folder / name
-        listing = place / "files.json"
+        listing = root / name / "files.json"
         if not listing.is_file():
-            _write_scene(place, number, asked, report)
+            part = Part(report, number, count)
+            _write_scene(folder / name, root / name, number, asked, part)
+            place = folder / name
             written = sorted(path for path in place.rglob("*") if path.is_file())
-            of_scene = {str(path.relative_to(folder).as_posix()): _sha256(path) for path in written}
+            of_scene = {path.relative_to(folder).as_posix(): _sha256(path) for path in written}
             write_atomic(listing, json.dumps({"asked": asked, "files": of_scene}).encode())
         found = json.loads(read_text(listing))
         if found["asked"] != asked:
-            raise InputError(f"{place}: is of a bench with other settings; name another folder")
+            raise InputError(f"{root / name}: has other settings; name another folder")
         files |= found["files"]
-        views = tuple(json.loads(read_text(place / "edits.json"))["views"])
-    sheet = Template(resources.files(__package__).joinpath("datasheet.md").read_text("utf-8"))
-    words = sheet.substitute(count=count, seed=seed, views=len(views), size=size)
+        views = tuple(json.loads(read_text(folder / name / "edits.json"))["views"])
+    words = _datasheet(count, None if sealed else seed, len(views), size)
     write_atomic(folder / "README.md", words.encode())
-    suite = Suite(seed, size, spp, scenes, views, files)
+    hashes = _salted(root, scenes, seed) if sealed else ()
+    suite = Suite(None if sealed else seed, size, spp, scenes, views, files, hashes)
     text = json.dumps({"format": FORMAT, **asdict(suite)}, indent=1) + "\n"
     write_atomic(folder / FILE, text.encode())
+    if sealed:
+        for path in (*folder.rglob("*"), folder):
+            os.utime(path, (TIME, TIME))
     return suite
 
 
-def _write_scene(place: Path, number: int, asked: Mapping[str, int], report: Reporter) -> None:
+def truth_file(root: Path, scene: str) -> Path:
+    """Path of a scene's definition below the truth's folder."""
+    return root / scene / "truth" / "scene.yaml"
+
+
+def _secret(key: Path) -> int:
+    path = key / KEY
+    try:
+        return int(json.loads(read_text(path))["secret"], 16)
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{path}: holds no secret; the bench can't be opened with it") from None
+
+
+def _salted(root: Path, scenes: Sequence[str], secret: int) -> tuple[str, ...]:
+    """Hashes of every right answer of all scenes, salted with the secret."""
+    hashes = []
+    for name in scenes:
+        scene = load_scene(str(truth_file(root, name)))
+        for edit in scene.edits:
+            for answer, spec in answers_of(scene, edit.name):
+                content = scene.edited(edit.name, spec).content_hash
+                hashes.append(salted(f"{name}/{edit.name}/{answer}/{content}", secret))
+    return tuple(sorted(hashes))
+
+
+def salted(text: str, secret: int) -> str:
+    """HMAC-SHA256 of a text with a 256-bit secret, in hexadecimal.
+
+    Example:
+        >>> salted("a", 1) == salted("a", 2)
+        False
+    """
+    return hmac.new(secret.to_bytes(32, "big"), text.encode(), hashlib.sha256).hexdigest()
+
+
+def _datasheet(count: int, seed: int | None, views: int, size: int) -> str:
+    sheet = resources.files(__package__).joinpath("datasheet.md").read_text("utf-8")
+    words = {
+        "drawn": f"seed {seed}", "splats": "sampled on the true surfaces",
+        "points": "`points.ply`, a rough point cloud", "key": "",
+        "truth": "The truth is open, so a method must not be tuned on these scenes.",
+    }  # fmt: skip
+    if seed is None:
+        hidden = ("| `SCENE/depth/", "| `SCENE/truth/")
+        sheet = "".join(x for x in sheet.splitlines(True) if not x.startswith(hidden))
+        words = {
+            "drawn": "from a secret of 256 bits", "splats": "fitted to the pictures",
+            "points": "no points", "key": " --key KEY",
+            "truth": "The truth is sealed: the host, who has the key, runs this command.",
+        }  # fmt: skip
+    return Template(sheet).substitute(count=count, views=views, size=size, **words)
+
+
+def _write_scene(
+    place: Path, root: Path, number: int, asked: Mapping[str, int], report: Reporter
+) -> None:
     size, spp = asked["size"], asked["spp"]
     data = copy.deepcopy(draw(number, asked["seed"]).data)
     heights = [view["height"] for view in data["cameras"]["targets"]]
@@ -153,22 +260,27 @@ def _write_scene(place: Path, number: int, asked: Mapping[str, int], report: Rep
         for k, yaw in enumerate(YAWS[: asked["targets"]])
     ]
     data["edits"] = [edit for edit in data["edits"] if edit["name"] in EDITS]
-    path = place / "truth" / "scene.yaml"
+    path = root / "truth" / "scene.yaml"
     write_atomic(path, to_text(data).encode())
     of = world(str(path), size)
-    views = [camera.name for camera in of.scene.cameras]
+    cameras = list(of.scene.cameras)
+    views = [camera.name for camera in cameras]
     images = [place / "images" / f"{view}.png" for view in views]
     for image, view in zip(images, views, strict=True):
         report.step(0, 0, f"{place.name}: {view}")
         write_picture(image, to_bytes(of.image(view, spp)))
-        _write_geometry(place, of, view)
-    cloud = first_points(of.scene, POINTS, seed=0, geometry=of.geometry)
-    cameras = list(of.scene.cameras)
-    dataset = Dataset(cameras, list(images), cloud.points, cloud.colors)
+        _write_geometry(root, of, view)
+    dataset = Dataset(cameras, list(images))
+    if root == place:
+        cloud = first_points(of.scene, POINTS, seed=0, geometry=of.geometry)
+        dataset = replace(dataset, points=cloud.points, colors=cloud.colors)
+        model = splats(str(path), size, 0, **SPLATS)
+    else:
+        model = fitted_splats(dataset, root / "fit", report)
     write_transforms(place, dataset, points_name="points.ply")
     for name, text in colmap_text(dataset).items():
         write_atomic(place / "sparse" / "0" / name, text.encode())
-    write_ply(place / "splats.ply", splats(str(path), size, 0, **SPLATS))
+    write_ply(place / "splats.ply", model)
     for edit in data["edits"]:
         report.step(0, 0, f"{place.name}: {edit['name']}")
         truth = edit_truth(str(path), size, spp, edit["name"], tuple(views))
@@ -176,7 +288,7 @@ def _write_scene(place: Path, number: int, asked: Mapping[str, int], report: Rep
             mask = np.repeat(255 * truth.union[view][..., None].astype(np.uint8), 3, axis=2)
             write_picture(place / "masks" / edit["name"] / f"{view}.png", mask)
             for answer, pictures in truth.answers.items():
-                path_of = place / "truth" / edit["name"] / answer / f"{view}.png"
+                path_of = root / "truth" / edit["name"] / answer / f"{view}.png"
                 write_picture(path_of, to_bytes(pictures[view]))
     told = ("name", "instruction", "source", "target")
     edits = [
@@ -187,18 +299,35 @@ def _write_scene(place: Path, number: int, asked: Mapping[str, int], report: Rep
     write_atomic(place / "edits.json", text.encode())
 
 
-def _write_geometry(place: Path, of: World, view: str) -> None:
+def fitted_splats(dataset: Dataset, folder: Path, report: Reporter = SILENT) -> Gaussians:
+    """Fit splats to a data set's pictures, from random points; see :data:`FIT`.
+
+    Args:
+        dataset: cameras and pictures, without points.
+        folder: folder of the fit; one begun earlier is continued.
+        report: receiver of progress.
+    """
+    from attnwarp.fit import FitSettings, Views, first_splats, fit
+
+    settings = FitSettings.from_dict(FIT)
+    pictures = [read_image(path) for path in dataset.image_paths if path is not None]
+    views = Views(dataset.cameras, pictures)
+    start = first_splats(dataset, dataset.cameras, settings, report, views=views)
+    return fit(start, views, settings, folder=folder, report=report).gaussians
+
+
+def _write_geometry(root: Path, of: World, view: str) -> None:
     depth = of.geometry.trace(of.camera(view)).depth.astype(np.float32)
-    _write_array(place / "depth" / f"{view}.npy", depth)
+    _write_array(root / "depth" / f"{view}.npy", depth)
     if view == of.source.name:
         return
     pair = of.between(of.source.name, view)
     shown = np.full(pair.label.shape, 128, np.uint8)
     shown[pair.visible], shown[pair.unseen] = 255, 0
     write_picture(
-        place / "truth" / "visible" / f"{view}.png", np.repeat(shown[..., None], 3, axis=2)
+        root / "truth" / "visible" / f"{view}.png", np.repeat(shown[..., None], 3, axis=2)
     )
-    _write_array(place / "truth" / "source_pixel" / f"{view}.npy", pair.xy.astype(np.float32))
+    _write_array(root / "truth" / "source_pixel" / f"{view}.npy", pair.xy.astype(np.float32))
 
 
 def _write_array(path: Path, array: Any) -> None:

@@ -27,6 +27,10 @@ def export(
     spp: Annotated[int, typer.Option(min=1, help="Samples a pixel.")] = 16,
     targets: Annotated[int, typer.Option(min=1, max=15, help="Views beside the source.")] = 15,
     seed: Annotated[int, typer.Option(min=0, help="Of the drawn scenes.")] = 0,
+    sealed: Annotated[
+        Path | None,
+        typer.Option(help="Folder for the secret and the truth; scenes are drawn from the secret."),
+    ] = None,
 ) -> None:
     """Write scenes with pictures, cameras, depth, masks, splats, instructions, and their truth."""
     with clear_errors(), reporter(title=folder.name) as report:
@@ -35,7 +39,7 @@ def export(
         with resumable(lambda: "finished scenes are kept"):
             write(
                 folder, count=SMALL if small else scenes, seed=seed, size=size, spp=spp,
-                targets=targets, report=report,
+                targets=targets, sealed=sealed, report=report,
             )  # fmt: skip
     typer.echo(folder / "README.md")
 
@@ -47,6 +51,7 @@ def score(
     out: Annotated[Path, typer.Option(help="Folder for bench-score.json and its page.")] = Path(
         "runs/bench"
     ),
+    key: Annotated[Path | None, typer.Option(help="Folder of a sealed bench's truth.")] = None,
 ) -> None:
     """Score edited pictures of a bench against its truth, which is rendered again."""
     from rich.console import Console
@@ -57,7 +62,7 @@ def score(
         from attnwarp_eval.document.write import terminal
 
         with resumable(lambda: "finished edits are kept"):
-            scores = measure(folder, edited, out, report)
+            scores = measure(folder, edited, out, report, key=key)
     Console().print(terminal(table(scores)))
     for one in scores:
         for remark in one.remarks:
