@@ -17,7 +17,7 @@ from attnwarp_eval.report.build import build
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import StudyError, cells_of, load_study
 from attnwarp_eval.study.probe import probe
-from attnwarp_eval.study.probe_report import report_of
+from attnwarp_eval.study.probe_report import Layout, report_of
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.two_view import HIDDEN
 from attnwarp_eval.world import splats, world
@@ -131,6 +131,18 @@ def test_an_editor_with_a_favourite_is_not_ideal(records, tmp_path, monkeypatch)
     ]
     sound = written_runs.outcome("ideal", "spheres", ["full"], record.to_json(), "one")
     assert report_of("ideal").problems(written_runs.results(study, [sound])) == []
+
+
+@pytest.mark.parametrize("cross", ["paint", "joint"])
+def test_the_twins_page_says_what_holds_by_construction(records, tmp_path, cross):
+    data = records["full"].to_json()
+    ideal = {**data["spec"]["editor"]["ideal"], "cross": cross}
+    data = {**data, "spec": {**data["spec"], "editor": {"ideal": ideal}}}
+    one = written_runs.outcome("ideal", "spheres", ["full"], data, "one")
+    ((_, section),) = report_of("ideal").sections(
+        written_runs.results(STUDY, [one]), Layout(tmp_path)
+    )
+    assert ("it says by construction" in " ".join(section.text)) == (cross == "joint")
 
 
 def test_a_run_whose_editor_is_not_ideal_ends_with_3(tmp_path, monkeypatch):

@@ -81,6 +81,14 @@ class IdealReport(ProbeReport):
             ),
             *self.problems(results),
         ]
+        if any(
+            record.spec["editor"]["ideal"]["cross"] == "joint"
+            for _, record in results.finished(self.name)
+        ):
+            text.append(
+                "With joint attention it judges geometry alone: what it says of blocks, keys or"
+                " positions it says by construction."
+            )
         yield (
             Place.INSTRUMENT,
             Section("The ideal editor", text, [Table(columns, [found[k] for k in found])]),
