@@ -196,16 +196,21 @@ class Joint(Coder):
         Raises:
             InputError: files are missing or of another kind; the message names them.
         """
-        from attnwarp.editing.folder import load_pipeline, named
+        from attnwarp.editing.folder import index_of, load_pipeline, named
 
         with named(folder):
             parts = load_pipeline(folder, cls.networks, cls.optional, device=device, dtype=dtype)
-            return cls(**parts, **settings)
+            return cls(**parts, **cls.told(index_of(folder)), **settings)
+
+    @classmethod
+    def told(cls, index: Mapping[str, Any]) -> dict[str, Any]:
+        """Read settings from a folder's model_index.json."""
+        return {}
 
     @classmethod
     def rehearsed(
         cls, folder: Path, dtype: torch.dtype, size: int | None = None
-    ) -> tuple[int, int]:
+    ) -> tuple[Self, int, int]:
         """Find the memory of an edit without weights: its networks run on torch's device "meta".
 
         Args:
@@ -214,9 +219,9 @@ class Joint(Coder):
             size: side of the square view in px; the model's own if omitted.
 
         Returns:
-            The side, and the largest number of bytes beside the weights.
+            The editor without weights, the side, and the largest number of bytes beside weights.
         """
-        from attnwarp.editing.folder import load_empty
+        from attnwarp.editing.folder import index_of, load_empty
         from attnwarp.editing.memory import peak_bytes
 
         parts = load_empty(folder, cls.networks, dtype)
@@ -235,7 +240,7 @@ class Joint(Coder):
                     if None not in shape
                 }
 
-        editor = Empty(**parts)
+        editor = Empty(**parts, **cls.told(index_of(folder)))
         side = -(-(size or cls.own_size) // editor.side_multiple) * editor.side_multiple
         view = np.zeros((side, side, 3), np.float32)
         latents = torch.empty(1, *editor.noise_shape((side, side)), dtype=dtype, device="meta")
@@ -245,7 +250,7 @@ class Joint(Coder):
             lambda: task.predict(latents, 0.5),
             lambda: editor.pixels(latents),
         )
-        return side, max(map(peak_bytes, runs))
+        return editor, side, max(map(peak_bytes, runs))
 
     # --- layers
 

@@ -122,15 +122,21 @@ def peak_bytes(run: Callable[[], Any]) -> int:
 
 
 def announced(
-    name_or_folder: str, dtype: torch.dtype, device: str, size: int | None = None
+    name_or_folder: str,
+    dtype: torch.dtype,
+    device: str,
+    size: int | None = None,
+    recorded: Callable[[Editor, tuple[int, int]], str] | None = None,
 ) -> str | None:
-    """Describe the memory of an editor's weights and of a view's edit, before anything is loaded.
+    """Describe the memory of an editor's weights, a view's edit and its features, before anything
+    is loaded.
 
     Args:
         name_or_folder: name or folder of the editor.
         dtype: dtype of the networks.
         device: device name.
         size: side of a square view in px; the editor's own if omitted.
+        recorded: (editor without weights, (h, w) of a view's latents) -> words on recorded features.
 
     Returns:
         A line; None for a UNet in main memory, where it takes little.
@@ -153,8 +159,9 @@ def announced(
     line = f"weights of the editor in {kind}: {weights / 2**30:.2f} GiB"
     if rehearse is None:
         return line
-    side, peak = rehearse(folder, dtype, size)
-    return f"{line}; an edit of a view of {side} x {side} px beside them: {peak / 2**30:.2f} GiB"
+    editor, side, peak = rehearse(folder, dtype, size)
+    line += f"; an edit of a view of {side} x {side} px beside them: {peak / 2**30:.2f} GiB"
+    return f"{line}; {recorded(editor, editor.noise_shape((side, side))[1:])}" if recorded else line
 
 
 def save_memory(editor: Editor, device: str) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -55,12 +54,9 @@ class Flux2Klein(Joint):
         self.options = () if is_distilled else type(self).options
 
     @classmethod
-    def from_folder(cls, folder: str | Path, **settings: Any) -> Self:
-        """Load an editor from a local folder; its model_index.json says whether it is distilled."""
-        from attnwarp.editing.folder import index_of
-
-        distilled = bool(index_of(folder).get("is_distilled"))
-        return super().from_folder(folder, is_distilled=distilled, **settings)
+    def told(cls, index: Mapping[str, Any]) -> dict[str, Any]:
+        """Read whether a folder's model is distilled."""
+        return {"is_distilled": bool(index.get("is_distilled"))}
 
     @classmethod
     def steps_of(cls, index: Mapping[str, Any]) -> int:

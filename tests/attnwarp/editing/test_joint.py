@@ -473,7 +473,11 @@ def test_memory_is_announced_before_anything_is_loaded(klein, monkeypatch):
     assert line.startswith(
         "weights of the editor in bfloat16: 0.00 GiB; an edit of a view of 64 x 64"
     )
-    side, peak = type(editor).rehearsed(folder, torch.float32, 64)
+    # Before weights are read, a distilled model is known to have one branch.
+    said = announced(str(folder), torch.bfloat16, "cpu", 64, lambda *empty: f"features of {empty}")
+    assert said.startswith(f"{line}; features of (<") and said.endswith("(64, 64))")
+    empty, side, peak = type(editor).rehearsed(folder, torch.float32, 64)
+    assert empty.branches == editor.branches and empty.network.device.type == "meta"
     view = np.zeros((side, side, 3), np.float32)
     task, latents = editor.task([view], "red"), drawn((1, *editor.noise_shape((side, side))), 0)
     most = 0
