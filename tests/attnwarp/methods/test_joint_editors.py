@@ -1,6 +1,11 @@
 """Attention warping with editors of joint attention: references, sets of blocks, kills."""
 
 import json
+import os
+import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +14,7 @@ import tiny_joint as tiny
 from edit_folders import Killed, Watched, events, files
 from tiny_scenes import cameras, pictures, splats
 
+import attnwarp
 from attnwarp.methods import attention_warping, preset
 
 
@@ -77,12 +83,57 @@ def test_a_killed_edit_goes_on_to_the_same_bytes(scene, tmp_path):
         assert files(folder) == files(tmp_path / "whole")
 
 
+WITHOUT = """
+import json, sys
+from pathlib import Path
+import tiny_joint as tiny
+from attnwarp.editing.editor import edit
+from attnwarp.editing.editors import __file__ as home, kinds
+from attnwarp.editing.small import load_editor
+from attnwarp.errors import InputError
+
+assert Path(home).is_relative_to(Path.cwd())
+left = [name for name in tiny.NAMES if tiny.PIPELINES[name] in kinds()]
+print(*left)
+for name in left:
+    edit(tiny.editor(name), [tiny.picture(name, 3, 2)], "red", steps=1)
+for name in set(tiny.NAMES) - set(left):
+    Path(name).mkdir()
+    index = {"_class_name": tiny.PIPELINES[name]}
+    (Path(name) / "model_index.json").write_text(json.dumps(index))
+    try:
+        load_editor(name)
+    except InputError as error:
+        assert tiny.PIPELINES[name] in str(error) and tiny.PIPELINES[left[0]] in str(error)
+    else:
+        raise AssertionError(name)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("file", "gone"),
+    [
+        ("qwen_image_edit", {"qwen", "qwen-plus"}),
+        ("flux2_klein", {"klein"}),
+        ("flux_kontext", {"kontext"}),
+        ("stable_diffusion3", {"sd3"}),
+    ],
+)
+def test_without_the_file_of_an_editor_the_others_edit(file, gone, tmp_path):
+    shutil.copytree(Path(attnwarp.__file__).parent, tmp_path / "attnwarp", copy_function=os.link)
+    (tmp_path / f"attnwarp/editing/editors/{file}.py").unlink()
+    paths = [tmp_path, Path(tiny.__file__).parent]
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT], cwd=tmp_path, capture_output=True, text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert set(tiny.NAMES) - set(done.stdout.split()) == gone
+
+
 def test_no_module_but_an_editors_own_names_an_architecture():
     """So that an editor can be taken away, or added, as one file."""
-    import re
-
-    import attnwarp
-
     home = Path(attnwarp.__file__).parent
     named = re.compile(r"flux|klein|kontext|qwen|sd3|stable.?diffusion.?3", re.IGNORECASE)
     for place in ("methods", "editing"):
