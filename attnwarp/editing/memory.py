@@ -136,7 +136,7 @@ def announced(
         dtype: dtype of the networks.
         device: device name.
         size: side of a square view in px; the editor's own if omitted.
-        recorded: (editor without weights, (h, w) of a view's latents) -> words on recorded features.
+        recorded: (editor without weights, (h, w) of a view's latents) -> words on features.
 
     Returns:
         A line; None for a UNet in main memory, where it takes little.
