@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from cv2 import INTER_NEAREST
 
 from attnwarp.camera import Camera
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.shared.drifts import Motion, moved
 from attnwarp_eval.truth import Geometry, appearance
 from attnwarp_eval.two_view import TwoView
 from attnwarp_lab.ideal.editor import FACTOR, Answers, Cross, IdealEditor
@@ -99,6 +101,20 @@ class Thing:
         after = [pictures(painted(scene, objects, color)) for color in answer_colors(colors)]
         return cls(
             labels, before, {name: np.stack([one[name] for one in after]) for name in before}, parts
+        )
+
+    def moved(self, motion: Callable[[np.ndarray], Motion]) -> Thing:
+        """The thing in pictures that an editor moves.
+
+        Args:
+            motion: function of a view's picture before.
+        """
+        motions = {name: motion(before) for name, before in self.before.items()}
+        return Thing(
+            {n: moved(labels, motions[n], INTER_NEAREST) for n, labels in self.labels.items()},
+            {n: moved(before, motions[n]) for n, before in self.before.items()},
+            {n: np.stack([moved(one, motions[n]) for one in a]) for n, a in self.after.items()},
+            self.parts,
         )
 
     def tokens(self, view: str) -> Labels:

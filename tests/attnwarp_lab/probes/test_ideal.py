@@ -253,3 +253,14 @@ def test_a_record_survives_json(records):
     again = probe("ideal").read(json.loads(json.dumps(record.to_json())))
     assert again.extra == record.extra
     assert dataclasses.asdict(again.extra)["answers"] and math.isfinite(again.extra.part_share)
+
+
+def test_an_editor_that_drifts_moves_what_it_edits_and_a_cell_measures_it(tmp_path):
+    variants = {"full": {}, "drifts": {"drift": {"shift": 4}}}
+    study = load(tmp_path, variants=variants, probes={"ideal": list(variants)})
+    full, drifts = (compute(probe("ideal"), cell, tmp_path) for cell in cells(study))
+    assert full.id != drifts.id
+    moved = [record.views[0].metrics["edit.drift"] for record in (full, drifts)]
+    assert moved[0] < 1 and moved[1] == pytest.approx(4, abs=0.5)  # 64 px, repainted in part
+    seen = [np.mean([v.metrics["parts.delta_e.edit"] for v in r.views]) for r in (full, drifts)]
+    assert seen[1] > seen[0] + 1

@@ -6,6 +6,7 @@ A method gets a :class:`Job` and gives an :class:`EditedScene`. A new one is one
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -130,6 +131,8 @@ class EditedScene:
         counters: counts of work, such as ``network_rows``.
         cut: the limit of the budget that ended the method; None for a whole run.
         rounds: the views of each round, as planned; empty where a method does not tell them.
+        drift: px by which the edit of the source, or of the view that moved most, moves a corner;
+            NaN if it can't be told.
     """
 
     gaussians: Gaussians
@@ -138,6 +141,7 @@ class EditedScene:
     counters: Mapping[str, float]
     cut: str | None = None
     rounds: Sequence[Round] = ()
+    drift: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -229,9 +233,11 @@ def _with_features_of(job: Job, donor: Donor) -> EditedScene:
 
 
 def _edited(result: Any) -> EditedScene:
+    found = result.drift.get("drift")
     return EditedScene(
-        result.gaussians, result.edited, result.seconds, result.counters, result.cut, result.rounds
-    )
+        result.gaussians, result.edited, result.seconds, result.counters, result.cut, result.rounds,
+        math.nan if found is None else found["largest"],
+    )  # fmt: skip
 
 
 def _true_pictures(job: Job) -> EditedScene:

@@ -23,6 +23,7 @@ from attnwarp_eval.study.shared.controls import (
     SEED_STEP,
     Control,
 )
+from attnwarp_eval.study.shared.drifts import DriftPart
 from attnwarp_eval.study.shared.edit_truth import answers_of
 from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS
 from attnwarp_eval.study.shared.splats import splats_meaning, splats_spec
@@ -97,7 +98,7 @@ class VariantPart(Part):
     ``source`` words. ``mask: truth`` injects where the source truly sees the
     surface, ``geometry: truth`` warps by exact depth. ``budget`` limits the method.
     ``control`` takes features from the wrong place or scene, or uses another seed
-    (:mod:`attnwarp_eval.study.shared.controls`).
+    (:mod:`attnwarp_eval.study.shared.controls`). ``drift`` makes the editor move what it edits.
     """
 
     method: str = "attention_warping"
@@ -106,6 +107,7 @@ class VariantPart(Part):
     editor: EditorPart | None = None
     budget: BudgetPart | None = None
     control: Control | None = None
+    drift: DriftPart | None = None
 
 
 class MethodProbe(Probe[E]):
@@ -130,6 +132,7 @@ class MethodProbe(Probe[E]):
             **splats_spec(study, variant, seed),
             **limits,
             **({"control": own.control} if own.control not in (None, OTHER_SEED) else {}),
+            **({"drift": own.drift.model_dump()} if own.drift else {}),
         }
 
     def other_scene(
@@ -175,7 +178,7 @@ class MethodProbe(Probe[E]):
         settings = settings_of(study, variant, 0)
         return (
             own.method, settings, variant.geometry, own.mask, splats_meaning(study, variant),
-            editor_of(study, variant), own.budget, own.control,
+            editor_of(study, variant), own.budget, own.control, own.drift,
         )  # fmt: skip
 
     def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:

@@ -19,6 +19,7 @@ from attnwarp_eval.study.probe import Work
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.schema import StudyError
 from attnwarp_eval.study.shared.controls import OTHER_SCENE, MovedView
+from attnwarp_eval.study.shared.drifts import DriftPart, drifting
 from attnwarp_eval.study.shared.edit_truth import EditTruth
 from attnwarp_eval.study.shared.editing_methods import (
     EDITING_METHODS,
@@ -75,6 +76,8 @@ def run_method(
         other = other_world(work) if donor is None else None
         if other is not None:
             donor = Donor(editor, other.image(other.source.name, spec["spp"]))
+        if "drift" in spec:
+            editor = drifting(editor, DriftPart(**spec["drift"]), spec["seed"])
     with tempfile.TemporaryDirectory() as folder:
         job = Job(
             before,

@@ -20,6 +20,7 @@ from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.schema import Study
+from attnwarp_eval.study.shared.drifts import DriftPart
 from attnwarp_eval.study.shared.edit_truth import EditTruth
 from attnwarp_eval.study.shared.editing_methods import Donor
 from attnwarp_eval.study.shared.edits import (
@@ -83,7 +84,7 @@ class IdealProbe(MethodProbe[IdealResult]):
 
     name = "ideal"
     whole = True
-    metrics = metrics_of("parts.")
+    metrics = metrics_of("parts.", "edit.drift")
 
     def check(self, study: Study) -> None:
         """Require the ideal editor for every variant, and a method that it supports."""
@@ -135,7 +136,11 @@ class IdealProbe(MethodProbe[IdealResult]):
             steps = spec["settings"]["steps"]
             share = solve_share(thing.grams, ideal["settled"], steps)
             checked = alone(thing.grams, share, steps)
-            editor = thing.editor(share, ideal["cross"])
+            shown = thing
+            if "drift" in spec:
+                drift = DriftPart(**spec["drift"])
+                shown = thing.moved(lambda before: drift.motion(before, spec["seed"]))
+            editor = shown.editor(share, ideal["cross"])
             donor = self._donor(work, share)
         with meter.stage("splats"):
             before = splats_of(work)
@@ -154,9 +159,10 @@ class IdealProbe(MethodProbe[IdealResult]):
                 pictures["render"] = _renders(world, names, before, result.gaussians)
             answers = part_answers(edited[names[0]], thing.truth(names[0]), thing.parts)
             for name in names[1:]:
-                work.add(f"parts/{name}", self._figures(world, thing, name, pictures, answers))
-        shown = [labels[labels >= 0] for labels in thing.labels.values()]
-        counts = [np.unique(own, return_counts=True)[1] for own in shown]
+                row = self._figures(world, thing, name, pictures, answers)
+                work.add(f"parts/{name}", row | {"edit.drift": result.drift})
+        inside = [labels[labels >= 0] for labels in thing.labels.values()]
+        counts = [np.unique(own, return_counts=True)[1] for own in inside]
         return IdealResult(
             share,
             checked.settled,

@@ -5,10 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import ClassVar
 
-from attnwarp_eval.document.model import Section, Table
-from attnwarp_eval.document.numbers import number
+from attnwarp_eval.document import charts
+from attnwarp_eval.document.model import Picture, Section, Table
+from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
 from attnwarp_eval.study.results import Results
+
+DRIFTING = {
+    "ideal": ("ideal editor: parts with the source's answer", "parts.seen.edit"),
+    "editing": ("bundled editor: dE00 between views above the floor",
+                "multiview.delta_e_above.edit_inside"),
+}  # fmt: skip
+"""Probes of methods whose editor drifts: what is shown, and its metric."""
 
 
 @register_report
@@ -50,7 +59,9 @@ class IdealReport(ProbeReport):
         ]
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """The editor by scene: share of signal, settling of answers, statistics alone."""
+        """The editor by scene: share of signal, settling of answers, statistics alone; figures by
+        planted drift.
+        """
         found: dict[tuple[object, ...], list[str]] = {}
         for cell, record in results.finished(self.name):
             ideal, extra = record.spec["editor"]["ideal"], record.extra
@@ -93,3 +104,39 @@ class IdealReport(ProbeReport):
             Place.INSTRUMENT,
             Section("The ideal editor", text, [Table(columns, [found[k] for k in found])]),
         )
+        if any("drift" in record.spec for _, record in results.finished(self.name)):
+            yield Place.RESULT, _drift(results, layout)
+
+
+def _drift(results: Results, layout: Layout) -> Section:
+    """Figures of each method by the shift of its editor; a variant's method is its name up to the
+    first comma.
+    """
+    path, tables = layout.figure("drift.svg"), []
+    shown = {probe: said for probe, said in DRIFTING.items() if results.finished(probe)}
+    with charts.drawing(path, columns=len(shown), height=4.2, width=6.5 * len(shown)) as all_axes:
+        for axes, (probe, (title, key)) in zip(all_axes, shown.items(), strict=True):
+            found: dict[str, dict[float, dict[str, list[float]]]] = {}
+            for cell, record in results.finished(probe):
+                shift = record.spec.get("drift", {"shift": 0.0})["shift"]
+                of_scene = found.setdefault(cell.variant.partition(",")[0], {}).setdefault(shift, {})
+                values = [view.metrics[key] for view in record.views]
+                of_scene.setdefault(cell.scene, []).extend(values)
+            means = {
+                name: {shift: interval(by[shift]) for shift in sorted(by)}
+                for name, by in found.items()
+            }
+            series = [charts.Line(name, list(by), list(by.values())) for name, by in means.items()]
+            charts.lines(axes, series, x="planted shift, px", y=title, title=title.split(":")[0])
+            shifts = sorted({shift for by in means.values() for shift in by})
+            rows = [
+                [name, *(spread(by[s], len(results.study.scenes)) if s in by else "" for s in shifts)]
+                for name, by in means.items()
+            ]
+            tables.append(Table(["method", *(f"{shift:g} px" for shift in shifts)], rows, title))
+    text = (
+        "An editor that moves every picture it edits by this shift, each view in a direction of its"
+        f" own; pictures are of {results.study.size} px. Warps assume that it stays."
+    )
+    picture = Picture("figures/drift.svg", "Agreement by the drift of the editor.")
+    return Section("How much drift does each method stand?", [text], tables, [picture])

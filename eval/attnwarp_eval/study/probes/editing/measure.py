@@ -62,7 +62,9 @@ class EditingProbe(MethodProbe[EditResult]):
     protocol = 3
     study_part = EditingPart
     variant_part = VariantPart
-    metrics = metrics_of("multiview.", "fidelity.", "embedding.", "depth.", "image.", "cost.")
+    metrics = metrics_of(
+        "multiview.", "fidelity.", "embedding.", "depth.", "image.", "cost.", "edit.drift"
+    )
 
     # From a study to cells
 

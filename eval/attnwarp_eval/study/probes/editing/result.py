@@ -104,6 +104,7 @@ class Measurement:
         encoders: Mapping[str, Any],
     ) -> None:
         self.work, self.truth, self.names = work, truth, names
+        self.drift = result.drift
         self.injected = float(result.counters.get("injected", 0.0))
         self.before, self.after, self.encoders = before, result.gaussians, encoders
         self.source = names[0]
@@ -150,7 +151,7 @@ class Measurement:
             decibels, error = errors.get(name, (math.nan, math.nan))
             row |= {"image.psnr.edit_render": decibels, "image.mse.edit_render": error}
             row |= embedded[name]
-            row |= self._depth(name)
+            row |= self._depth(name) | {"edit.drift": self.drift}
             edit = work.spec["edit"]["name"]
             work.add(f"{edit}/{name}", row, partial(self._draw, name))
         return EditResult(
