@@ -84,6 +84,7 @@ class Disagreement:
         values = {
             "mae_linear": mean(np.abs(linear)),
             "rmse_linear": float(np.sqrt(mean(linear**2))),
+            "mae_srgb": mean(np.abs(srgb)),
             "rmse_srgb": float(np.sqrt(mean(srgb**2))),
             "delta_e": mean(delta_e),
             "delta_e_p95": quantile(delta_e, 0.95),

@@ -177,7 +177,7 @@ def test_a_changed_file_of_an_encoder_is_found(tmp_path):
             "spp": 1,
             "timing_rounds": 3,
             "encoders": {"dino": f"dinov2:{encoder}"},
-            "audit": {"edit": "some_colour", "yaws": [10], "splats": {"count": 1000}},
+            "audit": {"edits": ["some_colour"], "yaws": [10], "splats": {"count": 1000}},
             "probes": {"audit": []},
         }
     )
@@ -188,7 +188,7 @@ def test_a_changed_file_of_an_encoder_is_found(tmp_path):
         assert summary.complete, summary.failures
         sides.append(read_snapshot(store))
     result = compare(*sides)
-    assert ("redefined", "bear / audit / metrics / seed 0") in {
+    assert ("redefined", "bear / audit / some_colour / seed 0") in {
         (fault.kind, fault.name) for fault in result.faults
     }
 

@@ -133,7 +133,6 @@ def test_ids_change_with_the_content_and_not_with_the_names(tmp_path):
         ),
         ({"encoders": {"clip": "dino-small"}}, "encoders.clip: 'dino-small' is of kind 'dino'"),
         ({"encoders": {"vlm": "clip-small"}}, "encoders.vlm"),
-        ({"probes": {"audit": ["again"]}}, r"probes.audit: got variants, expected \[\]"),
         (
             {"variants": {}, "probes": {"warp": []}},
             "variants: got none, expected at least one for probes.warp",

@@ -44,15 +44,16 @@ class VariantPart(Part):
     fit: dict[str, Any] = Field(default_factory=dict)
 
 
-def settings_of(study: Study, variant: Variant, seed: int) -> FitSettings:
-    """The study's fit settings, overridden by the variant's fields."""
-    shared, own = study.part(StudyPart).fit.settings, variant.part(VariantPart).fit
+def settings_of(study: Study, variant: Variant | None, seed: int) -> FitSettings:
+    """The study's fit settings, overridden by the variant's fields, if any."""
+    shared = study.part(StudyPart).fit.settings
+    own = {} if variant is None else variant.part(VariantPart).fit
     if "seed" in {**shared, **own}:
         raise ValueError("fit.seed: the seeds are the study's own; set seeds there")
     return FitSettings.from_dict({**shared, **own, "seed": seed})
 
 
-def fit_spec(study: Study, variant: Variant, seed: int) -> Json:
+def fit_spec(study: Study, variant: Variant | None, seed: int) -> Json:
     """Spec of a fit of one scene."""
     fits = study.part(StudyPart).fit
     return {**fits.model_dump(), "settings": settings_of(study, variant, seed).to_dict()}

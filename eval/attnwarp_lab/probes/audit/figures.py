@@ -6,12 +6,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import binary_dilation
+import numpy.typing as npt
 
 from attnwarp.camera import fundamental
 from attnwarp.warp import WarpedView
@@ -20,6 +20,7 @@ from attnwarp_eval.metrics.arrays import Array, Mask, mean
 from attnwarp_eval.metrics.consistency import FlowMethod
 from attnwarp_eval.metrics.known_geometry import GRID
 from attnwarp_eval.two_view import TwoView
+from attnwarp_lab.ideal.figures import UNKNOWN, PartTruth, part_answers
 
 Where = tuple[Array, Mask]
 """(H, W, 2) source position in px for each target pixel, and (H, W) bool of trusted ones."""
@@ -64,58 +65,53 @@ class Pair:
     Attributes:
         truth: exact relation of the two.
         mask: (H, W) bool, the edited object in the target.
-        warp: function that makes the warp by rendered depth.
-        refit: function that gives the Edit PSNR of several pairs.
+        warps: functions that make the warp by rendered depth, by the kind of splats.
         before: source and target before the edit.
         partners: the true target of each true source after the edit, first the right edit's.
+        labels: true answers of source and target, by parts of the edited object.
         encoders: encoders by kind.
         texts: descriptions of the source and of the edit.
     """
 
     truth: TwoView
     mask: Mask
-    warp: Callable[[], WarpedView]
-    refit: Callable[[Sequence[tuple[Shown, Shown]]], list[float]]
+    warps: Mapping[str, Callable[[], WarpedView]]
     before: tuple[Shown, Shown]
     partners: Mapping[Shown, Shown]
+    labels: tuple[PartTruth, PartTruth]
     encoders: Mapping[str, Any]
     texts: Sequence[str]
 
-    def again(self, warp: Callable[[], WarpedView]) -> Pair:
+    def again(self, warps: Mapping[str, Callable[[], WarpedView]]) -> Pair:
         """Copy of the pair with an empty cache."""
         before = self.before[0].again(), self.before[1].again()
         partners = {source.again(): target.again() for source, target in self.partners.items()}
-        return Pair(
-            self.truth, self.mask, warp, self.refit, before, partners, self.encoders, self.texts
-        )
-
-    def refit_all(self, pairs: Sequence[tuple[Shown, Shown]]) -> None:
-        """Fit splats' colours to all pairs at once, at little more than the cost of one."""
-        for (_, target), value in zip(pairs, self.refit(pairs), strict=True):
-            target.once("refit", partial(float, value))
+        return replace(self, warps=warps, before=before, partners=partners)
 
     @property
     def measures(self) -> dict[str, Measure]:
-        """Measures of :data:`FIGURES` that the available encoders allow, by figure."""
+        """Measures of :data:`FIGURES` that the available encoders and splats allow, by figure."""
         at_hand = (None, *self.encoders)
-        return {f.key: f.measure for f in FIGURES if f.measure and f.encoder in at_hand}
+        return {
+            f.key: f.measure
+            for f in FIGURES
+            if f.measure and f.encoder in at_hand and f.splats in (None, *self.warps)
+        }
 
     @property
     def exact(self) -> Where:
         """True correspondences of surfaces visible in both views."""
         return self.truth.xy, self.truth.visible & ~self.truth.edge
 
-    @cached_property
-    def rendered(self) -> Where:
+    def rendered(self, splats: str) -> Where:
         """Correspondences by rendered depth."""
-        view = self.warp()
-        return view.correspondence.xy.numpy(), view.mask.numpy()
 
-    @cached_property
-    def outside(self) -> Mask:
-        """(H, W) bool: pixels of neither the object nor its neighbourhood."""
-        grown: Mask = binary_dilation(self.mask, np.ones((3, 3), dtype=bool))
-        return ~grown
+        def make() -> Where:
+            view = self.warps[splats]()
+            return view.correspondence.xy.numpy(), view.mask.numpy()
+
+        found: Where = self.before[1].once(splats, make)
+        return found
 
     @cached_property
     def words(self) -> Array:
@@ -146,6 +142,7 @@ class Figure:
         measure: function of a pair and its edited source and target; None for figures of sets.
         encoder: kind of the encoder needed.
         truth: whether the truth is needed.
+        splats: kind of the splats needed, "sampled" or "fitted".
     """
 
     key: str
@@ -154,6 +151,7 @@ class Figure:
     measure: Measure | None = None
     encoder: str | None = None
     truth: bool = False
+    splats: str | None = None
 
 
 def _epipolar(pair: Pair, source: Shown, target: Shown) -> float:
@@ -187,19 +185,58 @@ def _above_floor(pair: Pair, source: Shown, target: Shown) -> float:
     return _exactly(pair, source, target) - _exactly(pair, true, pair.partners[true])
 
 
-def _added(suffix: str) -> Measure:
-    """Measure of the colour difference between the views that the edit adds."""
+def _nearest(shown: Shown, truth: PartTruth) -> npt.NDArray[np.intp]:
+    """(H, W) nearest answer of each pixel of a picture."""
+    found: npt.NDArray[np.intp] = shown.once(
+        "labels", lambda: truth.errors(shown.picture.astype(np.float32)).argmin(axis=0)
+    )
+    return found
 
-    def measure(pair: Pair, source: Shown, target: Shown) -> float:
-        figures = target.once(
-            "edit",
-            lambda: metrics.edit_agreement(
-                (pair.before[0].picture, pair.before[1].picture[GRID]),
-                (source.picture, target.picture[GRID]),
-                *(part[GRID] for part in pair.rendered),
-            ),
+
+def _labels(pair: Pair, source: Shown, target: Shown) -> float:
+    """Share of the object's pixels, exactly seen by both, whose nearest answers agree."""
+    xy, seen = pair.exact
+    there, here = map(_nearest, (source, target), pair.labels)
+    seen = seen & pair.mask
+    column, row = np.floor(xy[seen]).astype(np.int64).T
+    h, w = there.shape
+    return mean((there[row.clip(0, h - 1), column.clip(0, w - 1)] == here[seen]).astype(float))
+
+
+def _parts(pair: Pair, source: Shown, target: Shown) -> float:
+    """Share of the object's parts, seen by both, whose nearest answers agree."""
+    count = 1 + max(int(truth.pixels.max(initial=0)) for truth in pair.labels)
+    there, here = (
+        part_answers(one.picture.astype(np.float32), truth, count, among)
+        for one, truth, among in zip(
+            (source, target), pair.labels, (None, pair.exact[1]), strict=True
         )
-        return float(figures[f"consistency.edit_delta_e{suffix}"])
+    )
+    known = (there != UNKNOWN) & (here != UNKNOWN)
+    return mean((there == here)[known].astype(float))
+
+
+def _added(pair: Pair, splats: str, source: Shown, target: Shown) -> float:
+    """Colour difference between the views that the edit adds."""
+    figures = metrics.edit_agreement(
+        (pair.before[0].picture, pair.before[1].picture[GRID]),
+        (source.picture, target.picture[GRID]),
+        *(part[GRID] for part in pair.rendered(splats)),
+    )
+    return float(figures["consistency.edit_delta_e"])
+
+
+def _at_depth(name: str) -> Callable[[Pair, str, Shown, Shown], float]:
+    """Difference of the two views along rendered depth."""
+
+    def measure(pair: Pair, splats: str, source: Shown, target: Shown) -> float:
+        figures = target.once(
+            f"at depth, {splats}",
+            lambda: metrics.disagreement_at(
+                source.picture, target.picture[GRID], *(p[GRID] for p in pair.rendered(splats))
+            ).figures("rendered_"),
+        )
+        return float(figures[name])
 
     return measure
 
@@ -238,20 +275,33 @@ def _similar(kind: str) -> Measure:
     return lambda _, s, t: metrics.image_similarity(s.part(kind), t.part(kind)).mean
 
 
-def _perceptual(pair: Pair, source: Shown, target: Shown) -> float:
+def _perceptual(pair: Pair, splats: str, source: Shown, target: Shown) -> float:
     network = pair.encoders["perceptual"]
     return metrics.perceptual_consistency(
         source.picture,
         target.picture,
-        *pair.rendered,
+        *pair.rendered(splats),
         lambda a, b: float(network.distance([a], [b])[0]),
     )
 
 
-def _preserved(compare: Callable[[Array, Array, Mask], float]) -> Measure:
-    """Measure of the target outside the object against the picture before the edit."""
-    return lambda p, _, t: compare(t.picture, p.before[1].picture, p.outside)
+def _along(
+    measure: Callable[[Pair, str, Shown, Shown], float], splats: str
+) -> Callable[[Pair, Shown, Shown], float]:
+    """Measure along the depth of one kind of splats."""
+    return lambda pair, source, target: measure(pair, splats, source, target)
 
+
+_DEPTH: tuple[tuple[str, str, str, Any, str | None], ...] = (
+    ("consistency.features", "features (MEt3R's scheme), depth", "splats",
+     lambda p, splats, s, t: _features(p, p.rendered(splats), s, t), "dino"),
+    ("consistency.perceptual", "perceptual distance, depth", "splats", _perceptual, "perceptual"),
+    ("consistency.rendered_mae_srgb", "reprojection loss, depth", "splats",
+     _at_depth("consistency.rendered_mae_srgb"), None),
+    ("consistency.rendered_delta_e", "colour, depth", "splats",
+     _at_depth("consistency.rendered_delta_e"), None),
+    ("consistency.edit_delta_e", "colour the edit adds, depth", "splats, originals", _added, None),
+)  # fmt: skip
 
 FIGURES = (
     # A pair with too few matches counts as inconsistent.
@@ -261,12 +311,8 @@ FIGURES = (
     ),
     Figure("consistency.tsed_distance", "epipolar distance", "poses", _epipolar),
     Figure(
-        "consistency.flow_delta_e.dis", "flow warp error, DIS", "originals",
+        "consistency.flow_delta_e", "flow warp error", "originals",
         lambda p, s, t: _colors(p.flow("dis"), s, t),
-    ),
-    Figure(
-        "consistency.flow_delta_e.farneback", "flow warp error, Farneback", "originals",
-        lambda p, s, t: _colors(p.flow("farneback"), s, t),
     ),
     Figure("embedding.match_similarity", "DINO match similarity", "originals", _matched, "dino"),
     Figure(
@@ -279,53 +325,40 @@ FIGURES = (
     ),
     Figure("embedding.clip_similarity", "CLIP similarity", "prompt", _words, "clip"),
     Figure(
-        "embedding.clip_image", "CLIP image similarity", "nothing", _similar("clip"), "clip"
+        "embedding.clip_image", "CLIP between neighbours", "nothing", _similar("clip"), "clip"
     ),
     Figure(
-        "embedding.dino_image", "DINO image similarity", "nothing", _similar("dino"), "dino"
+        "embedding.dino_image", "DINO between neighbours", "nothing", _similar("dino"), "dino"
     ),
     Figure("consistency.colmap_registered", "COLMAP, registered views", "set of views"),
     Figure("consistency.colmap_points", "COLMAP, points", "set of views"),
     Figure("consistency.colmap_track_length", "COLMAP, track length", "set of views"),
     Figure("consistency.colmap_error", "COLMAP, reprojection error", "set of views"),
-    Figure(
-        "fidelity.preserved_mse", "rest unchanged, PSNR", "originals, mask",
-        _preserved(metrics.mse),
+    *(
+        Figure(f"consistency.{key}{end}", f"{title}{said}", "splats, set of views", splats=splats)
+        for splats, end, said in (("sampled", "", ""), ("fitted", ".fitted", ", fitted splats"))
+        for key, title in (
+            ("fitted_psnr", "Edit PSNR, colours refitted"), ("held_psnr", "held-out PSNR"),
+            ("held_distance", "held-out perceptual distance"),
+        )
     ),
-    Figure(
-        "fidelity.preserved_ssim", "rest unchanged, SSIM", "originals, mask",
-        _preserved(metrics.ssim),
-    ),
-    Figure(
-        "consistency.edit_psnr", "Edit PSNR, colours refitted", "splats",
-        lambda p, s, t: t.once("refit", lambda: p.refit([(s, t)])[0]),
-    ),
-    Figure(
-        "consistency.features.rendered", "features, rendered depth", "splats",
-        lambda p, s, t: _features(p, p.rendered, s, t), "dino",
-    ),
-    Figure(
-        "consistency.perceptual", "perceptual, rendered depth", "splats", _perceptual, "perceptual"
-    ),
-    Figure(
-        "consistency.rendered_delta_e", "colour, rendered depth", "splats",
-        lambda p, s, t: _colors(p.rendered, s, t),
-    ),
-    Figure(
-        "consistency.edit_delta_e", "colour the edit adds", "splats, originals", _added("")
-    ),
-    Figure(
-        "consistency.edit_delta_e_p90", "colour the edit adds, p90", "splats, originals",
-        _added("_p90"),
-    ),
-    Figure(
-        "consistency.features.exact", "features, exact", "truth",
-        lambda p, s, t: _features(p, p.exact, s, t), "dino", truth=True,
+    *(
+        Figure(
+            f"{key}{end}", f"{title}{said}", needs,
+            _along(measure, splats), encoder, splats=splats,
+        )
+        for splats, end, said in (("sampled", "", ""), ("fitted", ".fitted", " of fitted splats"))
+        for key, title, needs, measure, encoder in _DEPTH
     ),
     Figure("consistency.delta_e", "colour, exact", "truth", _exactly, truth=True),
     Figure(
-        "multiview.delta_e_above", "colour above its floor, exact", "truth", _above_floor,
+        "multiview.delta_e_above", "truth: colour above its floor", "truth", _above_floor,
         truth=True,
     ),
+    Figure("multiview.labels", "truth: labels that agree", "truth", _labels, truth=True),
+    Figure("multiview.parts", "truth: parts that agree", "truth", _parts, truth=True),
 )  # fmt: skip
 """Figures; those without truth come first."""
+
+TRUTHS = tuple(figure for figure in FIGURES if figure.key.startswith("multiview."))
+"""Figures by whose order real edits are ranked."""

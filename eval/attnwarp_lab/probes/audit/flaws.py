@@ -16,6 +16,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 from attnwarp_eval.colors import to_linear, to_srgb
 from attnwarp_eval.metrics.arrays import Array, Mask
 from attnwarp_eval.metrics.consistency import has_taps, sampled
+from attnwarp_eval.study.shared.drifts import Motion, moved
 from attnwarp_eval.two_view import HIDDEN, TwoView
 
 STEP = 1e-4
@@ -189,10 +190,18 @@ def _mixed(picture: Array, other: Array, weight: float) -> Array:
     return to_srgb(np.clip(light, 0, 1))
 
 
-def _moved(edited: Edited, size: float) -> Array:
-    """The picture ``size`` px to the right; the left border is repeated."""
-    columns = np.maximum(np.arange(edited.after.shape[1]) - round(size), 0)
-    return edited.after[:, columns]
+def _flat(edited: Edited, size: float) -> Array:
+    """Texture removed by a share: each object is mixed with its mean light."""
+    light, ids = to_linear(edited.after), edited.pair.hits.object_id
+    for one in np.unique(ids):
+        here = ids == one
+        light[here] += size * (light[here].mean(axis=0) - light[here])
+    return to_srgb(np.clip(light, 0, 1))
+
+
+def _moved(edited: Edited, motion: Motion) -> Array:
+    """The picture after a motion about its middle; the border is repeated."""
+    return moved(edited.after, motion)
 
 
 def _bled(edited: Edited, size: float) -> Array:
@@ -211,22 +220,34 @@ def _noisy(edited: Edited, size: float) -> Array:
 
 
 FLAWS = (
-    Flaw("answer", "another answer", "of the object", (0.1, 0.3, 1.0), 1.0, _answer, counts=True),
+    Flaw("answer", "another answer", "of the object", (0.3, 1.0), 1.0, _answer, counts=True),
     Flaw("unedited", "view left unedited", "", (1.0,), 1.0, lambda e, _: e.before, counts=True),
     Flaw(
-        "ghost", "two answers at once", "of the light", (0.1, 0.25, 0.5), 0.5,
+        "ghost", "two answers at once", "of the light", (0.25, 0.5), 0.5,
         lambda e, size: _mixed(e.after, e.another, size), counts=True,
     ),
-    Flaw("hue", "hue shift", "degrees", (5.0, 15.0, 45.0), 45.0, _hue, counts=True),
-    Flaw("slid", "texture slid", "px", (0.5, 1.0, 2.0, 4.0, 8.0, 16.0), 4.0, _slid, counts=True),
+    Flaw("hue", "hue shift", "degrees", (15.0, 45.0), 45.0, _hue, counts=True),
+    Flaw("slid", "texture slid", "px", (1.0, 2.0, 4.0, 8.0), 4.0, _slid, counts=True),
     Flaw("doubled", "doubled behind an edge", "", (1.0,), 1.0, _doubled),
-    Flaw("bled", "paint bled outside", "px", (2.0, 4.0, 8.0), 4.0, _bled),
-    Flaw("blur", "blur", "px", (1.0, 2.0, 4.0), 2.0, _blurred),
-    Flaw("noise", "noise", "of white", (0.01, 0.03, 0.1), 0.03, _noisy),
-    Flaw("moved", "moved aside", "px", (2.0,), 2.0, _moved),
+    Flaw("bled", "paint bled outside", "px", (4.0, 8.0), 4.0, _bled),
+    Flaw("blur", "blur", "px", (0.5, 1.0, 2.0, 4.0), 2.0, _blurred),
+    Flaw("flat", "texture removed", "of the contrast", (0.5, 1.0), 1.0, _flat),
+    Flaw("noise", "noise", "of white", (0.03, 0.1), 0.03, _noisy),
+    Flaw(
+        "moved", "picture shifted", "px", (2.0, 8.0), 2.0,
+        lambda e, size: _moved(e, (size, 0, 0, 0)),
+    ),
+    Flaw(
+        "zoomed", "picture zoomed", "%", (0.5, 1.0, 2.0), 2.0,
+        lambda e, size: _moved(e, (0, 0, size, 0)),
+    ),
+    Flaw(
+        "turned", "picture turned", "degrees", (0.5,), 0.5,
+        lambda e, size: _moved(e, (0, 0, 0, size)),
+    ),
     Flaw("elsewhere", "another scene", "", (1.0,), 1.0, lambda e, _: e.elsewhere),
     Flaw(
-        "weak_all", "all views: edit left out", "of the light", (0.25, 0.5, 1.0), 0.5,
+        "weak_all", "all views: edit left out", "of the light", (0.5, 1.0), 0.5,
         lambda e, size: _mixed(e.after, e.before, size), alike=True,
     ),
     Flaw("hue_all", "all views: hue shift", "degrees", (180.0,), 180.0, _hue, alike=True),
@@ -234,7 +255,11 @@ FLAWS = (
         "misdirected_all", "all views: another thing edited", "", (1.0,), 1.0,
         lambda e, _: e.misdirected, alike=True,
     ),
-    Flaw("blur_all", "all views: blur", "px", (2.0,), 2.0, _blurred, alike=True),
+    Flaw("blur_all", "all views: blur", "px", (0.5, 1.0, 2.0, 4.0), 2.0, _blurred, alike=True),
+    Flaw(
+        "flat_all", "all views: texture removed", "of the contrast", (0.5, 1.0), 1.0, _flat,
+        alike=True,
+    ),
     Flaw("noise_all", "all views: noise", "of white", (0.03,), 0.03, _noisy, alike=True),
 )  # fmt: skip
 """Every flaw: first of the target, the most important first, then of all views."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp_eval.colors import to_srgb
@@ -23,6 +24,8 @@ from attnwarp_eval.truth import appearance, two_view
 from attnwarp_eval.truth.edits import edit_mask, touched
 from attnwarp_eval.two_view import Hits
 from attnwarp_eval.world import World, changed, turned
+from attnwarp_lab.ideal.parts import part_labels
+from attnwarp_lab.ideal.thing import Thing
 from attnwarp_lab.probes.audit.flaws import Edited
 
 RIGHT = ("right", "right_other")
@@ -43,12 +46,19 @@ of fewer samples would look like disagreement."""
 COAT = 0.04
 """Share of light that a coat of refractive index 1.5 reflects at normal incidence."""
 
+PARTS = 12
+"""Number of the edited object's parts."""
+
 Pictures = Mapping[str, Mapping[str, Array]]
 """State of the scene -> view -> (H, W, 3) sRGB."""
 
 
-def two_answers(scene: Scene, edit: str) -> list[list[str]]:
-    """Names and contents of an edit's first two answers.
+MOST_ANSWERS = 4
+"""Number of an edit's answers whose true pictures are rendered."""
+
+
+def some_answers(scene: Scene, edit: str) -> list[list[str]]:
+    """Names and contents of an edit's first answers.
 
     Raises:
         StudyError: the scene has no such edit.
@@ -57,10 +67,11 @@ def two_answers(scene: Scene, edit: str) -> list[list[str]]:
     answers = answers_of(scene, edit) if edit in names else []
     if len(answers) < 2:
         raise StudyError(
-            f"audit.edit: scene {scene.name!r} has no edit {edit!r} with two answers; there are"
+            f"audit.edits: scene {scene.name!r} has no edit {edit!r} with two answers; there are"
             f" {', '.join(one.name for one in scene.edits if one.answers) or 'none'}"
         )
-    return [[name, scene.edited(edit, answer).content_hash] for name, answer in answers[:2]]
+    some = answers[:MOST_ANSWERS]
+    return [[name, scene.edited(edit, answer).content_hash] for name, answer in some]
 
 
 def edit_of_others(scene: Scene, edit: str) -> list[str] | None:
@@ -83,8 +94,9 @@ def true_pictures(work: Work) -> tuple[list[Camera], Pictures]:
 
     Returns:
         The cameras, and (H, W, 3) sRGB by state of the scene and name of the view, the source's
-        too. States are "before" the edit, those of :data:`PAIRS`, "misdirected", an edit of other
-        objects, and "elsewhere", another scene, where the cell's spec names them.
+        too. States are "before" the edit, those of :data:`PAIRS`, its further answers by number,
+        "misdirected", an edit of other objects, and "elsewhere", another scene, where the cell's
+        spec names them.
 
     Raises:
         InputError: a file has changed since the cell was planned.
@@ -100,7 +112,8 @@ def true_pictures(work: Work) -> tuple[list[Camera], Pictures]:
         if world.edited_hash(edit, answer) != content:
             raise changed(f"edit {edit!r} of scene {world.scene.name!r}")
     edited = [world.scene.edited(edit, answer) for edit, answer, _ in (*answers, *others)]
-    states = {"before": world.scene, **dict(zip((*RIGHT, "misdirected"), edited, strict=False))}
+    named = [*answer_states(spec), "misdirected"]
+    states = {"before": world.scene, **dict(zip(named, edited, strict=False))}
     states[METAL] = _metallic(edited[0], touched(world.scene, *answers[0][:2]))
     if spec["other"] is not None:
         neighbour = load_scene(work.cell.sources["other"])
@@ -133,6 +146,49 @@ def true_pictures(work: Work) -> tuple[list[Camera], Pictures]:
         state: {name: to_srgb(np.clip(one, 0, 1)) for name, one in pictures.items()}
         for state, pictures in light.items()
     }
+
+
+def answer_states(spec: Json) -> list[str]:
+    """States of the pictures of each answer, in the order of the spec."""
+    return [*RIGHT, *(f"answer {k}" for k in range(2, len(spec["answers"])))]
+
+
+def answered_thing(
+    world: World, spec: Json, pictures: Pictures, cameras: Sequence[Camera]
+) -> Thing:
+    """The edited object in parts, each in any of the edit's answers.
+
+    Args:
+        cameras: cameras of all views, the source first.
+    """
+    edit, answer = spec["edit"], spec["answers"][0][0]
+    points = {}
+    for camera in cameras:
+        hits = world.geometry.trace(camera)
+        mask = edit_mask(world.scene, edit, hits, answer)
+        points[camera.name] = np.where(mask[..., None], hits.point, np.nan)
+    states = answer_states(spec)
+
+    def shown(state: str, view: str) -> npt.NDArray[np.float32]:
+        return pictures[state][view].astype(np.float32)
+
+    return Thing(
+        part_labels(points, PARTS),
+        {camera.name: shown("before", camera.name) for camera in cameras},
+        {c.name: np.stack([shown(state, c.name) for state in states]) for c in cameras},
+        PARTS,
+    )
+
+
+def ideal_thing(
+    world: World, edit: str, spp: int, cameras: tuple[Camera, ...], parts: int, colors: int
+) -> Thing:
+    """The edited object in parts and colours that the ideal editor chooses equally often."""
+    answers = world.scene.edit(edit).answers
+    objects = [world.scene.object_names[one] for one in touched(world.scene, edit, answers[0].name)]
+    return Thing.of(
+        world.scene, world.geometry, cameras, objects, parts=parts, colors=colors, spp=spp
+    )
 
 
 def varnished(paint: Array, metal: Array, hits: Hits, mask: Mask) -> Array:

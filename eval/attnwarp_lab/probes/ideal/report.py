@@ -119,9 +119,9 @@ def _drift(results: Results, layout: Layout) -> Section:
             found: dict[str, dict[float, dict[str, list[float]]]] = {}
             for cell, record in results.finished(probe):
                 shift = record.spec.get("drift", {"shift": 0.0})["shift"]
-                of_scene = found.setdefault(cell.variant.partition(",")[0], {}).setdefault(shift, {})
+                by_shift = found.setdefault(cell.variant.partition(",")[0], {})
                 values = [view.metrics[key] for view in record.views]
-                of_scene.setdefault(cell.scene, []).extend(values)
+                by_shift.setdefault(shift, {}).setdefault(cell.scene, []).extend(values)
             means = {
                 name: {shift: interval(by[shift]) for shift in sorted(by)}
                 for name, by in found.items()
@@ -129,8 +129,9 @@ def _drift(results: Results, layout: Layout) -> Section:
             series = [charts.Line(name, list(by), list(by.values())) for name, by in means.items()]
             charts.lines(axes, series, x="planted shift, px", y=title, title=title.split(":")[0])
             shifts = sorted({shift for by in means.values() for shift in by})
+            count = len(results.study.scenes)
             rows = [
-                [name, *(spread(by[s], len(results.study.scenes)) if s in by else "" for s in shifts)]
+                [name, *(spread(by[s], count) if s in by else "" for s in shifts)]
                 for name, by in means.items()
             ]
             tables.append(Table(["method", *(f"{shift:g} px" for shift in shifts)], rows, title))
