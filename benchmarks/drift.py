@@ -60,7 +60,7 @@ class Try:
     Attributes:
         number: seed of the try.
         motion: right, down in px, scale in percent, turn in degrees.
-        errors, half_widths: of the four, in their units; None if the drift isn't told.
+        errors, half_widths: four errors and half widths; None if the drift isn't told.
     """
 
     number: int

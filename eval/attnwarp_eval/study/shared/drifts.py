@@ -72,7 +72,7 @@ def moved(
 
 
 def drifting(editor: Any, drift: DriftPart, seed: int) -> Any:
-    """The same editor, which edits every guide as if it lay elsewhere.
+    """Copy an editor, which then edits every guide as if it lay elsewhere.
 
     What it starts from stays in place, as with an editor that pulls a picture aside.
 

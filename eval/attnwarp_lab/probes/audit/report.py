@@ -68,7 +68,7 @@ class Pairs:
         return [yaw for yaw in self.yaws if abs(yaw) <= NEAR] or self.yaws
 
     def of_edit(self, edit: str) -> Pairs:
-        """The same of one edit."""
+        """Pairs of one edit."""
         return Pairs([(s, record) for s, record in self.records if record.spec["edit"] == edit])
 
     def plain(self, row: Figure, conditions: Sequence[str], yaw: float) -> Values:
