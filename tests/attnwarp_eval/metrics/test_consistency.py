@@ -286,5 +286,5 @@ def test_every_figure_is_registered():
     exact, flow = metrics.cross_view(source, target, pair), metrics.optical_flow(source, target)
     along = metrics.flow_consistency(source, target, flow)
     names = [*exact.figures(), *along.figures("flow_")]
-    assert len(names) == len(set(names)) == 2 * 7
+    assert len(names) == len(set(names)) == 2 * 8
     assert all(metric(name).name == name for name in names)
