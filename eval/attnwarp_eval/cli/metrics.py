@@ -68,6 +68,17 @@ def metrics(
         Path | None,
         typer.Option(help="Splats before the edit, for --consistency at rendered depth."),
     ] = None,
+    depth: Annotated[
+        Path | None,
+        typer.Option(help="Folder of NAME.npy, (H, W) depths, for it in place of rendered ones."),
+    ] = None,
+    scores: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV with first, second and columns such as 'MEt3R lower': scores of neighbours by"
+            " a network of yours."
+        ),
+    ] = None,
     colmap: Annotated[
         bool,
         typer.Option(
@@ -100,7 +111,7 @@ def metrics(
 
         inputs = measure.Inputs(
             renders, edited, originals, source_edit, prompt, source_prompt, mask, consistency, ply,
-            _color(background), colmap,
+            _color(background), colmap, depth, scores,
         )  # fmt: skip
         one_view = {
             "--edited": edited, "--source-edit": source_edit, "--prompt": prompt,
@@ -112,8 +123,9 @@ def metrics(
                 f"{unread[0]}: figures of single views do not go with --consistency; leave it out"
                 " here, or --consistency"
             )
-        for option, given in {"--ply": ply is not None, "--colmap": colmap}.items():
-            if consistency is None and given:
+        posed = {"--ply": ply, "--depth": depth, "--scores": scores, "--colmap": colmap or None}
+        for option, value in posed.items():
+            if consistency is None and value is not None:
                 raise InputError(f"{option}: needs --consistency DATA, cameras with pictures")
         if (out / "study.json").exists():
             raise InputError(

@@ -155,6 +155,7 @@ _SPECS = (
     Metric("embedding.clip_image", "cosine", "higher", 1e-3, 0, "CLIP: render against the edited source view"),
     Metric("embedding.dino_image", "cosine", "higher", 1e-3, 0, "DINO: render against the edited source view"),
     Metric("embedding.direction_consistency", "cosine", "higher", 2e-3, 0, "changes of neighbouring views against each other"),
+    Metric("embedding.clip_neighbours", "cosine", "higher", 1e-3, 0, "CLIP: neighbouring edited views against each other"),
     Metric("embedding.match_similarity", "cosine", "higher", 1e-3, 0, "patches after the edit that matched before it"),
     Metric("embedding.undefined", "views", "lower", 0, 0, "views whose embedding or change has no direction"),
     # A counter of a cell's cost, not of a view.

@@ -11,8 +11,8 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,7 @@ from attnwarp_eval.user_images.measure import (
 LONGEST = 256
 """Longest side in px of pictures, except for keypoints; smaller ones keep their size."""
 
-PROTOCOL = 2
+PROTOCOL = 3
 """Version; raised when the same pictures would give other figures."""
 
 _TSED = tuple(
@@ -59,13 +59,22 @@ _DIRECTION = Figure(
     "embedding.direction_consistency", "CLIP direction consistency", ("originals",), "clip"
 )
 _MATCHES = Figure("embedding.match_similarity", "DINO match similarity", ("originals",), "dino")
-_RENDERED = Figure("consistency.rendered_delta_e", "Colour at rendered depth", ("ply",))
-_EDIT = Figure(
-    "consistency.edit_delta_e", "Colour that the edit adds, rendered depth", ("ply", "originals")
+_NEIGHBOURS = Figure("embedding.clip_neighbours", "CLIP between neighbours", ("poses",), "clip")
+_REPROJECTION = Figure(
+    "consistency.rendered_mae_srgb", "Reprojection loss at rendered depth", ("geometry",)
 )
-_FEATURES = Figure("consistency.features", "Features at rendered depth", ("ply",), "dino")
+_RENDERED = Figure("consistency.rendered_delta_e", "Colour at rendered depth", ("geometry",))
+_EDIT = Figure(
+    "consistency.edit_delta_e", "Colour that the edit adds, rendered depth",
+    ("geometry", "originals"),
+)  # fmt: skip
+_FEATURES = Figure("consistency.features", "Features at rendered depth", ("geometry",), "dino")
 _PERCEPTUAL = Figure(
-    "consistency.perceptual", "Perceptual distance at rendered depth", ("ply",), "perceptual"
+    "consistency.perceptual", "Perceptual distance at rendered depth", ("geometry",), "perceptual"
+)
+_HELD = Figure("consistency.held_psnr", "Held-out PSNR, colours refitted", ("ply",))
+_HELD_DISTANCE = Figure(
+    "consistency.held_distance", "Held-out perceptual distance", ("ply",), "perceptual"
 )
 _COLMAP = tuple(
     Figure(f"consistency.colmap_{name}", f"COLMAP {title}", ("colmap",))
@@ -77,16 +86,20 @@ _COLMAP = tuple(
         ("failed", "failed"),
     )
 )
+"""Figures of COLMAP."""
+
+_TOGETHER = (_HELD, _HELD_DISTANCE, *_COLMAP)
 """Figures over all views together."""
 
 FIGURES = (
-    *_TSED, _DISTANCE, _FLOW, _DIRECTION, _MATCHES, _EDIT, _RENDERED, _FEATURES, _PERCEPTUAL,
-    *_COLMAP,
+    *_TSED, _DISTANCE, _FLOW, _DIRECTION, _MATCHES, _NEIGHBOURS, _EDIT, _RENDERED, _REPROJECTION,
+    _FEATURES, _PERCEPTUAL, *_TOGETHER,
 )  # fmt: skip
 
 _OPTIONS = {
     "poses": "--consistency",
     "ply": "--ply",
+    "geometry": "--ply or --depth",
     "originals": "--originals and --renders",
     "colmap": "--colmap",
 }
@@ -138,6 +151,7 @@ def measure_consistency(
     given = {
         "poses": True,
         "ply": inputs.ply is not None,
+        "geometry": inputs.ply is not None or inputs.depth is not None,
         "originals": bool(originals),
         "colmap": inputs.colmap,
     }
@@ -155,8 +169,8 @@ def measure_consistency(
             wanted.append(figure)
     loaded = load_encoders(wanted, encoders, device, done)
     wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
-    together = [figure for figure in wanted if figure in _COLMAP]
-    wanted = [figure for figure in wanted if figure not in _COLMAP]
+    together = [figure for figure in wanted if figure in _TOGETHER]
+    wanted = [figure for figure in wanted if figure not in _TOGETHER]
     pairs = _Pairs(inputs, cameras, posed, edited, originals, wanted, loaded)
     tasks = (_task(pairs, inputs, one, two, device) for one, two in itertools.pairwise(names))
     values: dict[Figure, dict[str, float]] = {figure: {} for figure in wanted}
@@ -178,11 +192,26 @@ def measure_consistency(
             " or one centre of projection: they have no epipolar distance, and those with too few"
             " matches count against TSED, whatever the edit did"
         )
-    if together:
-        (found,) = results(store, [_reconstruction(pairs, names)], 1, report)
-        every = f"all {len(names)}"
-        done.rows += [Row(f.key, f.title, found[f.key], {every: found[f.key]}) for f in together]
+    for kind, task in ((_COLMAP, _reconstruction), ((_HELD, _HELD_DISTANCE), _refit)):
+        if own := [figure for figure in together if figure in kind]:
+            (found,) = results(store, [task(pairs, names)], 1, report)
+            every = f"all {len(names)}"
+            done.rows += [
+                Row(f.key, f.title, found[f.key], {every: found[f.key]}, f.encoder) for f in own
+            ]
+    if inputs.scores is not None:
+        done.rows += _scores(inputs.scores, list(itertools.pairwise(names)))
     return done
+
+
+def _scores(path: Path, pairs: Sequence[tuple[str, str]]) -> list[Row]:
+    rows = []
+    for key, of_pair in metrics.read_scores(path, ("first", "second"), "--scores").items():
+        own = {f"{one} to {two}": of_pair.get((one, two), float("nan")) for one, two in pairs}
+        defined = [value for value in own.values() if not np.isnan(value)]
+        value = float(np.mean(defined)) if defined else float("nan")
+        rows.append(Row(key, key.split(".", 2)[2], value, own))
+    return rows
 
 
 def _over(figure: Figure, values: Mapping[str, float]) -> float:
@@ -271,7 +300,6 @@ class _Pairs:
         self._keypoints = lru_cache(maxsize=2)(self._found)
         self._surface = lru_cache(maxsize=2)(self._rendered)
         self._encoded = lru_cache(maxsize=16)(self._features)
-        self._splats: Any = None
 
     def figures(self, one: str, two: str) -> dict[str, float]:
         """Figures of a view and the next, by key; NaN where undefined."""
@@ -287,6 +315,9 @@ class _Pairs:
                 for old in (True, False)
             )
             values[_DIRECTION.key] = metrics.direction_consistency(before, after).mean
+        if _NEIGHBOURS in self.wanted:
+            first, second = (self._encoded("clip", name, False)[None] for name in (one, two))
+            values[_NEIGHBOURS.key] = metrics.image_similarity(first, second).mean
         if _MATCHES in self.wanted:
             tokens = [
                 self._encoded("dino", name, old).reshape(-1, self.loaded["dino"].about.dim)
@@ -294,7 +325,7 @@ class _Pairs:
                 for name in (one, two)
             ]
             values[_MATCHES.key] = metrics.match_similarity(*tokens).mean
-        if self.inputs.ply is not None:
+        if _RENDERED in self.wanted:
             values |= self._at_depth(one, two)
         return {figure.key: values[figure.key] for figure in self.wanted}
 
@@ -311,19 +342,18 @@ class _Pairs:
         }
 
     def _at_depth(self, one: str, two: str) -> dict[str, float]:
-        from attnwarp.warp import warp_surfaces
+        from attnwarp.warp import PRESETS, warp_surfaces
 
         a, b = self._small(one), self._small(two)
+        settings = PRESETS["corrected"]
+        if self.inputs.depth is not None:  # which has no normals
+            settings = replace(settings, normal_test="none")
         view = warp_surfaces(
-            a.camera, b.camera, self._surface(two), self._surface(one), warn_empty=False
+            a.camera, b.camera, self._surface(two), self._surface(one), settings, warn_empty=False
         )
         where = view.correspondence.xy.numpy(), view.mask.numpy()
         thinned = where[0][GRID], where[1][GRID]
-        values = {
-            _RENDERED.key: metrics.disagreement_at(a.edited, b.edited[GRID], *thinned).figures(
-                "rendered_"
-            )[_RENDERED.key]
-        }
+        values = metrics.disagreement_at(a.edited, b.edited[GRID], *thinned).figures("rendered_")
         if _EDIT in self.wanted:
             assert a.original is not None and b.original is not None
             before, after = (a.original, b.original[GRID]), (a.edited, b.edited[GRID])
@@ -382,15 +412,26 @@ class _Pairs:
         return metrics.sift_features(self._view(name).edited, str(self.edited[name]))
 
     def _rendered(self, name: str) -> Any:
-        from attnwarp.io import read_ply, read_splat
-        from attnwarp.warp import render_surface
+        from attnwarp.warp import Surface, render_surface, resize_depth
 
-        if self._splats is None:
-            path = self.inputs.ply
-            assert path is not None
-            read = read_splat if path.suffix.lower() == ".splat" else read_ply
-            self._splats = read(path)
-        return render_surface(self._splats, self._small(name).camera)
+        camera = self._small(name).camera
+        if self.inputs.depth is None:
+            return render_surface(self.splats, camera)
+        path = _depths(self.inputs.depth, name)[name]
+        try:
+            depth = np.load(path)
+            return Surface(resize_depth(depth, (camera.height, camera.width)))
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(f"--depth: {path}: expected (H, W) depths ({error})") from None
+
+    @cached_property
+    def splats(self) -> Any:
+        """Splats before the edit."""
+        from attnwarp.io import read_ply, read_splat
+
+        path = self.inputs.ply
+        assert path is not None
+        return (read_splat if path.suffix.lower() == ".splat" else read_ply)(path)
 
     def _features(self, kind: Kind, name: str, before: bool) -> npt.NDArray[np.float64]:
         view = self._small(name)
@@ -418,6 +459,36 @@ def _along_flow(one: _View, two: _View) -> float:
         one.edited, two.edited[GRID], flow.xy[GRID], flow.accepted[GRID]
     )
     return result.figures("flow_")[_FLOW.key]
+
+
+def _refit(pairs: _Pairs, names: Sequence[str]) -> Task[dict[str, float]]:
+    """Fit the splats' colours to two thirds of the edited views, and render the others."""
+    assert pairs.inputs.ply is not None
+    network = pairs.loaded.get("perceptual")
+    spec = {
+        "probe": "user refit",
+        "protocol": PROTOCOL,
+        "edited": [_sha256(pairs.edited[name]) for name in names],
+        "posed": [_sha256(pairs.posed[name]) for name in names if name in pairs.posed],
+        "cameras": [pairs.cameras[name].to_dict() for name in names],
+        "ply": _sha256(pairs.inputs.ply),
+        "background": list(pairs.inputs.background),
+        "encoder": None if network is None else network.about.to_dict(),
+    }
+
+    def compute(report: Reporter) -> Json:
+        views = [pairs._small(name) for name in names]
+        held = range(1, len(names), 3)
+        pictures = [view.edited for view in views]
+        (found,) = metrics.refit(pairs.splats, [v.camera for v in views], [pictures], held)
+        figures = {_HELD.key: found.held_out}
+        if network is not None:
+            shown = [found.renders[view] for view in held]
+            distances = network.distance([pictures[view] for view in held], shown)
+            figures[_HELD_DISTANCE.key] = float(np.mean(distances))
+        return {"figures": without_nan(figures)}
+
+    return Task("refit", spec, compute, lambda record: with_nan(record["figures"]))
 
 
 def _reconstruction(pairs: _Pairs, names: Sequence[str]) -> Task[dict[str, float]]:
@@ -451,6 +522,7 @@ def _task(pairs: _Pairs, inputs: Inputs, one: str, two: str, device: str) -> Tas
         "posed": hashed(pairs.posed),
         "cameras": [pairs.cameras[name].to_dict() for name in (one, two)],
         "ply": None if inputs.ply is None else _sha256(inputs.ply),
+        "depth": None if inputs.depth is None else hashed(_depths(inputs.depth, one, two)),
         "figures": [figure.key for figure in pairs.wanted],
         "encoders": {kind: pairs.loaded[kind].about.to_dict() for kind in sorted(pairs.loaded)},
         "background": list(inputs.background),
@@ -462,6 +534,10 @@ def _task(pairs: _Pairs, inputs: Inputs, one: str, two: str, device: str) -> Tas
         lambda tell: {"figures": without_nan(pairs.figures(one, two))},
         lambda record: with_nan(record["figures"]),
     )
+
+
+def _depths(folder: Path, *names: str) -> dict[str, Path]:
+    return {name: folder / f"{name}.npy" for name in names}
 
 
 @lru_cache(maxsize=512)

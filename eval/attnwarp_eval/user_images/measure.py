@@ -65,6 +65,7 @@ class Inputs:
             distance, black and transparent do not.
         poses, ply: cameras with pictures, and splats of the scene before the edit, for
             :func:`attnwarp_eval.user_images.consistency.measure_consistency`.
+        depth: folder of depth maps, for it; scores: its file of scores.
         background: sRGB in [0, 1] behind transparent pixels of pictures.
         colmap: whether COLMAP reconstructs the views.
     """
@@ -80,6 +81,8 @@ class Inputs:
     ply: Path | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     colmap: bool = False
+    depth: Path | None = None
+    scores: Path | None = None
 
 
 @dataclass(frozen=True)

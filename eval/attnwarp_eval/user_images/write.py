@@ -33,6 +33,8 @@ _INPUTS = (
     "source_prompt",
     "poses",
     "ply",
+    "depth",
+    "scores",
 )
 
 _READING = (

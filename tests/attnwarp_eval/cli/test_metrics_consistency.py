@@ -17,9 +17,10 @@ from PIL import Image
 from torch_threads import on_one_thread
 from typer.testing import CliRunner
 
+from attnwarp.encoders import load_encoder
 from attnwarp.io import read_dataset
 from attnwarp.render import render
-from attnwarp.warp import warp_view
+from attnwarp.warp import render_surface, warp_view
 from attnwarp_eval import metrics
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.user_images.measure import read_picture
@@ -69,7 +70,14 @@ def test_every_figure_is_that_of_its_function(capture, tmp_path):
     after = [read_picture(capture / "renders" / path.name) for path in dataset.image_paths]
     before = [read_picture(path) for path in dataset.image_paths]
     pairs = [f"{one} to {two}" for one, two in itertools.pairwise(names)]
+    held = [rows.pop(f"consistency.held_{name}")["value"] for name in ("psnr", "distance")]
     assert all(list(row["views"]) == pairs for row in rows.values())
+    kept = range(1, len(after), 3)
+    (found,) = metrics.refit(few_splats(), dataset.cameras, [after], kept)
+    distance = load_encoder("perceptual-small", "perceptual").distance(
+        [after[k] for k in kept], [found.renders[k] for k in kept]
+    )
+    assert held == pytest.approx([found.held_out, np.mean(distance)], rel=1e-4)
     exact = metrics.tsed_of_views(after, dataset.cameras)
     nan = lambda values: [np.nan if v is None else v for v in values]  # noqa: E731
     np.testing.assert_allclose(
@@ -86,6 +94,14 @@ def test_every_figure_is_that_of_its_function(capture, tmp_path):
     with torch.no_grad():
         view = warp_view(few_splats(), *dataset.cameras[:2])
     xy, mask = view.correspondence.xy[::2, ::2], view.mask[::2, ::2]
+    loss = np.abs(metrics.disagreement_at(after[0], after[1][::2, ::2], xy, mask).srgb)
+    assert rows["consistency.rendered_mae_srgb"]["views"][pairs[0]] == pytest.approx(
+        np.nanmean(loss), rel=1e-6
+    )
+    clip = load_encoder("clip-small", "clip").images(after[:2])
+    assert rows["embedding.clip_neighbours"]["views"][pairs[0]] == pytest.approx(
+        clip[0] @ clip[1] / np.prod(np.linalg.norm(clip, axis=1)), abs=1e-6
+    )
     second = slice(None, None, 2)
     edit = metrics.edit_agreement(
         (before[0], before[1][second, second]), (after[0], after[1][second, second]), xy, mask
@@ -93,6 +109,28 @@ def test_every_figure_is_that_of_its_function(capture, tmp_path):
     assert rows["consistency.edit_delta_e"]["views"][pairs[0]] == pytest.approx(
         edit["consistency.edit_delta_e"], rel=1e-6
     )
+
+
+def test_depth_from_a_folder_stands_for_rendered_depth_and_scores_are_read(capture, tmp_path):
+    dataset = read_dataset(capture)
+    folder, scores = tmp_path / "depth", tmp_path / "scores.csv"
+    folder.mkdir()
+    for camera, path in zip(dataset.cameras, dataset.image_paths, strict=True):
+        surface = render_surface(few_splats(), camera)
+        np.save(folder / f"{path.stem}.npy", surface.depth.numpy())
+    scores.write_text("first,second,MEt3R lower\n0,1,0.25\n1,2,\n2,3,0.75\n")
+    off = ("--dino=none", "--clip=none", "--perceptual=none")
+    given, _ = measured(capture, tmp_path / "a", "--depth", folder, "--scores", scores, *off)
+    rendered, _ = measured(capture, tmp_path / "b", "--ply", capture / "scene.ply", *off)
+    key = "consistency.rendered_mae_srgb"
+    own, other = (data["metrics"][key]["value"] for data in (given, rendered))
+    assert own == pytest.approx(other, abs=0.01)  # without the test of normals
+    assert "Held-out PSNR, colours refitted" in given["not_computed"]
+    row = given["metrics"]["consistency.score_lower.MEt3R"]
+    assert (row["value"], row["direction"]) == (0.5, "lower")
+    scores.write_text("first,second,MEt3R\n0,1,0.25\n")
+    done = call("--consistency", capture, "--scores", scores, "--out", tmp_path / "c", *off)
+    assert done.exit_code == 2 and "scores such as 'MEt3R lower'" in done.output
 
 
 def test_a_repainted_view_is_seen_and_a_second_call_computes_nothing(capture, tmp_path):
@@ -109,6 +147,8 @@ def test_a_repainted_view_is_seen_and_a_second_call_computes_nothing(capture, tm
         row, other = (data["metrics"][key]["views"] for data in (right, wrong))
         assert other["2 to 3"] > row["2 to 3"] + 0.01, key
         assert other["0 to 1"] == pytest.approx(row["0 to 1"], abs=1e-6), key
+    held = [data["metrics"]["consistency.held_psnr"]["value"] for data in (right, wrong)]
+    assert held[1] < held[0] - 1  # dB; one of the fitted views is inverted
     cells = {path: path.stat().st_mtime_ns for path in (tmp_path / "b").rglob("*.json")}
     assert call(*options, "--out", tmp_path / "b").exit_code == 0
     changed = [path.name for path, time in cells.items() if path.stat().st_mtime_ns != time]

@@ -325,7 +325,7 @@ FIGURES = (
     ),
     Figure("embedding.clip_similarity", "CLIP similarity", "prompt", _words, "clip"),
     Figure(
-        "embedding.clip_image", "CLIP between neighbours", "nothing", _similar("clip"), "clip"
+        "embedding.clip_neighbours", "CLIP between neighbours", "nothing", _similar("clip"), "clip"
     ),
     Figure(
         "embedding.dino_image", "DINO between neighbours", "nothing", _similar("dino"), "dino"

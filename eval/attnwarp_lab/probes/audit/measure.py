@@ -50,7 +50,7 @@ from attnwarp_lab.ideal.share import solve_share
 from attnwarp_lab.ideal.thing import Thing
 from attnwarp_lab.probes.audit.figures import Measure, Pair, Shown
 from attnwarp_lab.probes.audit.flaws import CONDITIONS, COUNTED, ELSEWHERE
-from attnwarp_lab.probes.audit.scores import digest_of, keep, read_scores
+from attnwarp_lab.probes.audit.scores import digest_of, keep, scores_of
 from attnwarp_lab.probes.audit.views import (
     PAIRS,
     Pictures,
@@ -214,7 +214,7 @@ class AuditProbe(MethodProbe[Seconds]):
         if spec["pictures"]:
             keep(work.root, work.cell, judged, [camera.name for camera in views])
         of_sets, seconds = self._of_sets(work, judged, views, models, encoders)
-        scores = read_scores(work.cell)
+        scores = scores_of(work.cell)
         shown = {
             state: {name: Shown(picture, encoders) for name, picture in of_views.items()}
             for state, of_views in pictures.items()

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import math
 from collections.abc import Mapping, Sequence
 from io import StringIO
 from pathlib import Path
@@ -22,14 +21,12 @@ import numpy as np
 
 from attnwarp_eval.files import write_atomic, write_picture
 from attnwarp_eval.metrics.arrays import Array
+from attnwarp_eval.metrics.scores import read_scores
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.schema import StudyError
 from attnwarp_eval.world import changed
 
 COLUMNS = ("scene", "edit", "condition", "source", "target")
-
-Scores = dict[str, dict[tuple[str, str, str], float]]
-"""Figure -> (condition, source, target) -> score."""
 
 
 def keep(
@@ -64,51 +61,19 @@ def digest_of(path: str) -> str:
         raise StudyError(f"audit.scores: {path} cannot be read ({error.strerror})") from None
 
 
-def read_scores(cell: Cell) -> Scores:
-    """Scores of a cell's pairs; none without a file.
+def scores_of(cell: Cell) -> dict[str, dict[tuple[str, ...], float]]:
+    """Scores of a cell by figure, then by (condition, source, target); none without a file.
 
     Raises:
-        StudyError: a column of no known meaning, or a score that is no number.
-        InputError: the file has changed since the cell was planned.
+        InputError: a file that cannot be used, or that has changed since the cell was planned.
     """
     path = cell.sources.get("scores")
     if path is None:
         return {}
     if digest_of(path) != cell.spec["scores"]:
         raise changed(f"file of scores {path}")
-    with Path(path).open(newline="") as file:
-        table = csv.DictReader(file)
-        titles = list(table.fieldnames or [])
-        own = [title for title in titles if title not in COLUMNS]
-        lacking = [name for name in COLUMNS if name not in titles]
-        bad = [t for t in own if t.rpartition(" ")[2] not in ("higher", "lower") or " " not in t]
-        if lacking or bad or not own:
-            raise StudyError(
-                f"audit.scores: {path} has the columns {', '.join(titles)}; expected"
-                f" {', '.join(COLUMNS)} and scores such as 'MEt3R lower'"
-            )
-        found: Scores = {key_of(title): {} for title in own}
-        for row in table:
-            if (row["scene"], row["edit"]) == (cell.scene, cell.spec["edit"]):
-                pair = row["condition"], row["source"], row["target"]
-                for title in own:
-                    found[key_of(title)][pair] = _number(row[title], f"{path}:{table.line_num}")
-    return found
-
-
-def key_of(title: str) -> str:
-    """Key of a column's figure.
-
-    Example:
-        >>> key_of("VGGT confidence higher")
-        'consistency.score_higher.VGGT confidence'
-    """
-    name, _, better = title.rpartition(" ")
-    return f"consistency.score_{better}.{name}"
-
-
-def _number(text: str, where: str) -> float:
-    try:
-        return float(text) if text else math.nan
-    except ValueError:
-        raise StudyError(f"audit.scores: {where}: got {text!r}, expected a number") from None
+    own = (cell.scene, cell.spec["edit"])
+    return {
+        key: {pair[2:]: value for pair, value in scores.items() if pair[:2] == own}
+        for key, scores in read_scores(Path(path), COLUMNS, "audit.scores").items()
+    }
