@@ -26,6 +26,10 @@ SEARCHED = 0.24, 0.105
 LONGEST = 512
 """Longest side in px at which tiles are aligned; larger pictures are reduced."""
 
+SHORTEST = 40
+"""Longest side in px from which on drift is searched for; of 32 px, 16 tiles, 3 known drifts of 40
+are told."""
+
 AGREEING = 0.35
 """Least share of textured tiles, weighted by their agreement, that must share one similarity.
 Unrelated pictures and neighbouring views of a capture reach 0.25 at most."""
@@ -85,7 +89,8 @@ def drift(
         left: (h, w) True where the edit should leave the picture as it is; None for everywhere.
 
     Returns:
-        The drift; None if too little is textured or left alone to tell.
+        The drift; None if too little is textured or left alone to tell, or both sides are below
+        :data:`SHORTEST`.
 
     Raises:
         ValueError: the pictures or the mask have other shapes.
@@ -99,6 +104,8 @@ def drift(
         (3.0, 0.0, 0.0)
         >>> drift(before, np.zeros_like(before)) is None
         True
+        >>> drift(before[:32, :32], before[:32, :32]) is None
+        True
     """
     size = before.shape[:2]
     mask = np.ones(size, bool) if left is None else np.asarray(left, bool)
@@ -106,8 +113,10 @@ def drift(
         raise ValueError(
             f"drift: got {before.shape}, {after.shape}, mask {mask.shape}; expected one size"
         )
-    pictures = _gray(before), _gray(after)
     longest = max(size)
+    if longest < SHORTEST:
+        return None
+    pictures = _gray(before), _gray(after)
     sides = [side for side in (64, 128, 256) if side < longest] + [min(longest, LONGEST)]
     levels = [_Level.of(pictures[0], pictures[1], mask, side) for side in sides]
     draw = np.random.default_rng(0)
