@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -86,17 +86,21 @@ class _Scenes(Spec, ABC):
 
     _number: ClassVar[str]
 
-    def files(self) -> list[Path]:
-        """Files of the scenes, drawn if missing; they may be deleted at any time."""
+    def paths(self) -> dict[str, Path]:
+        """Files of the scenes by name, some of which may not be drawn yet."""
         kept = self.model_dump(mode="json")
         if not self.stratify:
             kept.pop(self._number)  # a larger population has the scenes of a smaller one
         folder = cache_dir() / "drawn" / content_key(kept, self._decided_by())[:16]
-        paths = [folder / f"{name}.yaml" for name in self.names]
-        for k, path in enumerate(paths):
-            if not path.is_file():
-                write(self.scene(k), folder)
-        return paths
+        return {name: folder / f"{name}.yaml" for name in self.names}
+
+    def files(self, names: Container[str] | None = None) -> list[Path]:
+        """Files of the named or of all scenes, drawn if missing; they may be deleted at any time."""
+        paths = self.paths()
+        for k, (name, path) in enumerate(paths.items()):
+            if (names is None or name in names) and not path.is_file():
+                write(self.scene(k), path.parent)
+        return [path for name, path in paths.items() if names is None or name in names]
 
 
 class DrawnScenes(_Scenes):

@@ -216,13 +216,14 @@ def of_run(
     """
     from attnwarp_eval.study.probe import probe
     from attnwarp_eval.study.run import stored_study
+    from attnwarp_eval.study.study import scene_files
     from attnwarp_eval.world import world
 
     stored = stored_study(Store(folder))
     study = stored.study
     if not study.scenes:
         raise InputError(f"{folder}: the study {study.name!r} has no scenes; name a scene instead")
-    files = dict(zip(study.scene_names, study.scenes, strict=True))
+    files = dict(zip(study.scene_names, scene_files(study), strict=True))
     name = scene or study.scene_names[0]
     one_of(name, list(files), "scene")
     seed = study.seeds[0] if seed is None else seed

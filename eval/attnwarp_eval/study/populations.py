@@ -11,11 +11,11 @@ from attnwarp_eval.drawn.population import population
 
 
 def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
-    """A study's data with the files of its population under ``scenes``.
+    """A study's data with the files of its population under ``scenes``; none is drawn yet.
 
-    Data expanded before names files, perhaps in another machine's cache: they are found, or drawn,
-    again. An entry of ``editing.edits`` for the population's name, such as ``drawn``, becomes one
-    entry for each of its scenes.
+    Data expanded before names files, perhaps in another machine's cache: they become this one's. An
+    entry of ``editing.edits`` for the population's name, such as ``drawn``, becomes one entry for
+    each of its scenes.
 
     Args:
         data: data of a study; ``scenes`` is a mapping, or ``population`` names their population.
@@ -35,17 +35,17 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(scenes, Mapping):
         try:
             wanted = population(scenes)
-            result["scenes"] = [str(path) for path in wanted.files()]
+            result["scenes"] = [str(path) for path in wanted.paths().values()]
         except InputError as error:
             raise InputError(f"scenes: {error}") from None
         result["population"] = wanted.model_dump(mode="json")
     elif result.get("population") and isinstance(scenes, list):
         wanted = population(result["population"])
         try:
-            files = {path.stem: path for path in wanted.files()}
+            files, named = wanted.paths(), [Path(str(name)) for name in scenes]
+            wanted.files({p.stem for p in named if p != files.get(p.stem) and p.is_file()})
         except InputError:
             return result  # the folder of meshes is elsewhere, and only the figures are read
-        named = [Path(str(name)) for name in scenes]
         if not all(_is_one_of(path, files) for path in named):
             # With further scenes, the set is no sample of a population.
             result["population"] = None
@@ -67,4 +67,6 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
 def _is_one_of(path: Path, files: Mapping[str, Path]) -> bool:
     """Return True if a file is missing, or equals the population's scene of its name."""
     own = files.get(path.stem)
-    return own is not None and (not path.is_file() or path.read_bytes() == own.read_bytes())
+    if own is None or own == path or not path.is_file():
+        return own is not None
+    return path.read_bytes() == own.read_bytes()

@@ -27,7 +27,7 @@ from attnwarp_eval.study.record import Environment, Failure
 from attnwarp_eval.study.reporting import CellReporter
 from attnwarp_eval.study.schema import Study, StudyError, did_you_mean
 from attnwarp_eval.study.store import Problems, Store, StoreError
-from attnwarp_eval.study.study import cells_of, explain_errors, parse_study
+from attnwarp_eval.study.study import cells_of, explain_errors, parse_study, scene_files
 from attnwarp_eval.study.work import compute_and_write
 from attnwarp_eval.truth.plan import open_bounces
 
@@ -105,7 +105,7 @@ def plan(study: Study, store: Store) -> Plan:
 
 def _scenes(study: Study) -> dict[str, Scene]:
     scenes: dict[str, Scene] = {}
-    for name in study.scenes:
+    for name in scene_files(study):
         scenes[name] = load_scene(name)
         for other, scene in scenes.items():
             if other != name and scene.content_hash == scenes[name].content_hash:

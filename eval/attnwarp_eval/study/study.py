@@ -269,6 +269,17 @@ def shipped_studies() -> dict[str, Path]:
     return {p.stem: p for p in sorted(files, key=lambda p: p.stem)}
 
 
+def scene_files(study: Study) -> list[str]:
+    """Names or files of a study's scenes, after those that are missing are drawn.
+
+    Raises:
+        InputError: a scene of the population cannot be drawn.
+    """
+    if study.population is not None:
+        study.population.files(study.scene_names)
+    return study.scenes
+
+
 def load_study(name_or_path: str, **overrides: Any) -> Study:
     """Read a study by the name of a shipped one or by the path of a YAML file.
 

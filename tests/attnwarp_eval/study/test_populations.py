@@ -10,7 +10,7 @@ from attnwarp_eval.drawn.files import to_text
 from attnwarp_eval.drawn.scenes import draw
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import StudyError, load_study
-from attnwarp_eval.study.study import cells_of, parse_study
+from attnwarp_eval.study.study import cells_of, parse_study, scene_files
 
 STUDY = """\
 name: mine
@@ -33,7 +33,7 @@ def test_a_study_of_a_population_has_its_scenes_by_short_names(study_file):
     study = load_study(str(study_file))
     assert study.scene_names == ["drawn-0", "drawn-1", "drawn-2"]
     assert study.sampled == "3 scenes drawn by generator 1, seed 7, thin 0.2"
-    for k, name in enumerate(study.scenes):
+    for k, name in enumerate(scene_files(study)):
         assert Path(name).read_text() == to_text(draw(k, 7, axes={"thin": 0.2}).data)
 
 
@@ -41,13 +41,15 @@ def test_cells_of_a_population_are_those_of_the_same_scenes_named_as_files(study
     drawn = load_study(str(study_file))
     other = tmp_path / "files"
     other.mkdir()
-    for name in drawn.scenes:
+    for name in scene_files(drawn):
         (other / Path(name).name).write_bytes(Path(name).read_bytes())
     by_file = load_study(str(study_file), scenes=sorted(map(str, other.glob("*.yaml"))))
     assert by_file.population is not None and by_file.scenes == drawn.scenes
 
     def ids(study):
-        return [c.id for c in cells_of(study, {name: load_scene(name) for name in study.scenes})]
+        return [
+            c.id for c in cells_of(study, {name: load_scene(name) for name in scene_files(study)})
+        ]
 
     assert ids(drawn) == ids(by_file) and len(set(ids(drawn))) == 6
 
@@ -70,7 +72,7 @@ def test_a_stored_study_finds_its_scenes_on_a_machine_that_has_none_of_them(
     stored = load_study(str(study_file)).model_dump(mode="json")
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path / "elsewhere"))
     again = parse_study(stored)
-    assert all(str(tmp_path) in name and Path(name).is_file() for name in again.scenes)
+    assert all(str(tmp_path) in name and Path(name).is_file() for name in scene_files(again))
     assert again.scene_names == ["drawn-0", "drawn-1", "drawn-2"]
 
 
@@ -97,7 +99,7 @@ def test_meshes_of_a_folder_stand_upright_on_drawn_ground(tmp_path, monkeypatch)
     study = load_study(str(path))
     assert study.scene_names == ["mesh-0", "mesh-1", "mesh-2"]
     assert study.sampled == "3 scenes of meshes of models drawn by generator 1, seed 7, thin 0.2"
-    for name in study.scenes:
+    for name in scene_files(study):
         scene = load_scene(name)
         assert Path(name).with_name("meshes").is_dir() and len(scene.edits) == 7
         shapes = scene.shapes()
@@ -139,7 +141,7 @@ def test_each_drawn_scene_has_noise_of_its_own_and_methods_share_it():
     """The seeds in the cells themselves; a scene's are equal but for the control with another."""
     study = load_study("ablation", scenes=["drawn-2", "drawn-5"])
     seeds = defaultdict(set)
-    for cell in cells_of(study, {name: load_scene(name) for name in study.scenes}):
+    for cell in cells_of(study, {name: load_scene(name) for name in scene_files(study)}):
         if cell.probe == "editing":
             seeds[cell.scene, "another seed" in cell.labels].add(cell.spec["settings"]["seed"])
     assert all(len(own) == 1 for own in seeds.values())

@@ -13,7 +13,7 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.run import expected, plan, stored_study, verify
 from attnwarp_eval.study.shared import edits, encoders
-from attnwarp_eval.study.study import shipped_studies
+from attnwarp_eval.study.study import scene_files, shipped_studies
 
 SMALL = {
     "name": "small",
@@ -42,7 +42,7 @@ def write(folder, **changes):
 
 
 def cells(study):
-    return cells_of(study, {name: load_scene(name) for name in study.scenes})
+    return cells_of(study, {name: load_scene(name) for name in scene_files(study)})
 
 
 @pytest.mark.parametrize("name", list(shipped_studies()))
