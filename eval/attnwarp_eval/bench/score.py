@@ -1,23 +1,18 @@
-"""Scores of edited pictures of a bench.
-
-The order of methods is that of one number, fixed before any method was scored: ``error``, the mean
-CIEDE2000 over all pixels of all views to the right answer that the source's picture is nearest to.
-One answer for all views: another right answer in a view is an error there, and so is what leaks
-outside the mask. Unedited, tinted, blurred or copied pictures have large errors.
-"""
+"""Scores of edited pictures of a bench; :mod:`attnwarp_eval.bench.result` has their order."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import binary_erosion
 
 from attnwarp.colors import ciede2000, to_lab
 from attnwarp.errors import InputError
@@ -25,34 +20,27 @@ from attnwarp.io import read_image, read_ply
 from attnwarp.io.text import read_text
 from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.reporting import SILENT, Reporter
+from attnwarp_eval.bench.result import (
+    FIGURES,
+    ORDER,
+    OWN,
+    PROTOCOL,
+    Method,
+    Result,
+    Score,
+    table,
+)
 from attnwarp_eval.bench.suite import Suite, to_bytes, truth_file
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.document.model import Report, Section, Table
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.image import edit_drift
-from attnwarp_eval.statistics.intervals import interval
-from attnwarp_eval.study.record import with_nan
 from attnwarp_eval.study.shared.edit_figures import EditFigures
 from attnwarp_eval.study.shared.edit_truth import EditTruth
 from attnwarp_eval.world import World
 
-PROTOCOL = 1
-"""Version; raised when equal pictures would get other scores."""
-
 Image = npt.NDArray[np.float32]
-
-FIGURES = {
-    "error": "error, dE00",
-    "amount": "change of the source, dE00",
-    "done": "edits done",
-    "agreement": "disagreement above the floor, dE00",
-    "seen": "the source's answer where it sees",
-    "outside": "change outside, dE00",
-    "drift": "drift, px",
-    "render_error": "error of the splats, dE00",
-}
-"""Figures by key, with their heads; the first orders methods, less is better."""
 
 LITTLE = 3.0
 """dE00 inside the mask below which a source counts as unedited."""
@@ -60,24 +48,8 @@ LITTLE = 3.0
 SMOOTH = 0.5
 """Share of the true edit's gradient inside the mask below which pictures count as smoothed."""
 
-
-@dataclass(frozen=True)
-class Score:
-    """Score of one edit of one scene.
-
-    Attributes:
-        scene, edit: names.
-        figures: values of :data:`FIGURES`; NaN if undefined.
-        by_view: figures of each target in the names of studies, such as
-            ``fidelity.psnr.edit_inside``.
-        remarks: faults of the pictures, in words.
-    """
-
-    scene: str
-    edit: str
-    figures: dict[str, float]
-    by_view: dict[str, dict[str, float]]
-    remarks: list[str]
+EMPTY = (UNEDITED, COPIED, SMOOTHED) = "the source is unedited", "copies of the source", "smooth"
+"""Beginnings of remarks on pictures that agree without merit."""
 
 
 def score(
@@ -98,7 +70,7 @@ def score(
     """
     bench = Suite.read(suite)
     root = bench.open(suite, key)
-    told = json.loads(read_text(edited / "method.json")) if _has(edited, "method.json") else {}
+    told = Method.read(edited / "method.json")
     there = [
         (scene, edit["name"])
         for scene in bench.scenes
@@ -112,34 +84,39 @@ def score(
         report.step(number, len(given), f"{scene}, {edit}")
         folder = edited / scene / edit
         kept = out / "scores" / f"{scene}-{edit}.json"
-        digest = _digest(truth_file(root, scene), bench.spp, folder)
+        digest = _digest(truth_file(root, scene), bench.spp, folder, told.track)
         stored = json.loads(read_text(kept)) if kept.is_file() else {}
         if stored.get("key") != digest:
-            made = _score(bench, root, scene, edit, folder)
+            made = _score(bench, root, scene, edit, folder, told.track)
             stored = {"key": digest, "score": without_nan(asdict(made))}
             write_atomic(kept, json.dumps(stored).encode())
-        scores.append(Score(**_read(stored["score"])))
+        scores.append(Score(**stored["score"]))
     missing = [f"{scene}/{edit}" for scene, edit in there if (scene, edit) not in given]
-    _write(out, told, scores, missing)
+    result = Result(
+        protocol=PROTOCOL, bench=bench.identity(), method=told, scores=scores, missing=missing
+    )
+    _write(out, result)
     return scores
 
 
-def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path) -> Score:
+def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path, track: str) -> Score:
     of, truth = bench.truth(root, scene, edit)
     pictures, remarks = _pictures(bench, folder)
     source = bench.views[0]
     if source not in pictures:
         raise InputError(f"{folder}: has no {source}.png, which decides the answer; add it")
     judged = truth.judge({source: pictures[source]})
-    figures = EditFigures(of, truth, source, pictures, judged)
-    rows = {view: figures.row(view) for view in pictures if view != source}
     answer = judged.answer or next(iter(truth.answers))
-    remarks += _remarks(truth, pictures, source, answer)
-    inside = truth.union[source]
+    # An own editor has answers of its own, so that any source has an edit to agree with.
+    agreeing = replace(judged, done=True) if track == OWN else judged
+    figures = EditFigures(of, truth, source, pictures, agreeing)
+    rows = {view: figures.row(view) for view in pictures if view != source}
+    faults = _remarks(truth, pictures, source, answer)
     drifts = [edit_drift(truth.originals[view], image) for view, image in pictures.items()]
     values = {
         "error": _error(truth, pictures, answer),
-        "amount": _difference(truth.originals[source], pictures[source], inside),
+        "apart": math.nan,
+        "amount": _difference(truth.originals[source], pictures[source], truth.union[source]),
         "done": float(judged.done),
         "agreement": _mean(row["multiview.delta_e_above.edit_inside"] for row in rows.values()),
         "seen": _mean(row["multiview.same_answer.edit_seen"] for row in rows.values()),
@@ -153,7 +130,11 @@ def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path) -> Sco
     if (folder / "edited.ply").is_file():
         renders = _renders(of, bench, folder / "edited.ply")
         values["render_error"] = _error(truth, renders, answer)
-    return Score(scene, edit, values, rows, remarks)
+    if not any(fault.startswith(EMPTY) for fault in faults):
+        values["apart"] = values["agreement"] + values["outside"]
+    if track == OWN and truth.ambiguous:
+        values |= dict.fromkeys(("error", "done", "seen", "render_error"), math.nan)
+    return Score(scene, edit, values, rows, [*remarks, *faults])
 
 
 def _renders(of: World, bench: Suite, path: Path) -> dict[str, Image]:
@@ -189,11 +170,11 @@ def _remarks(
     remarks = []
     inside = truth.union[source]
     if _difference(truth.originals[source], pictures[source], inside) < LITTLE:
-        remarks.append("the source is unedited")
+        remarks.append(UNEDITED)
     others = {view: image for view, image in pictures.items() if view != source}
     copied = [view for view, image in others.items() if np.array_equal(image, pictures[source])]
     if copied:
-        remarks.append(f"copies of the source: {', '.join(copied)}")
+        remarks.append(f"{COPIED}: {', '.join(copied)}")
     for view, image in others.items():
         if view in copied:
             continue
@@ -204,19 +185,23 @@ def _remarks(
         nearest = min(errors, key=errors.__getitem__)
         if nearest != view and errors[nearest] < 0.5 * errors[view]:
             remarks.append(f"{view} looks like {nearest}: are their names swapped?")
+    # Without its border: a silhouette has a gradient, whatever fills it.
+    within = {view: binary_erosion(truth.union[view], np.ones((3, 3))) for view in pictures}
     slopes = [
-        _slope(image, truth.union[view]) / _slope(truth.answers[answer][view], truth.union[view])
+        _slope(image, within[view]) / _slope(truth.answers[answer][view], within[view])
         for view, image in pictures.items()
-        if truth.union[view].any()
+        if within[view].any()
     ]
     if slopes and float(np.median(slopes)) < SMOOTH:
-        remarks.append(f"smooth: {np.median(slopes):.0%} of the true edit's gradient")
+        remarks.append(f"{SMOOTHED}: {np.median(slopes):.0%} of the true edit's gradient")
     return remarks
 
 
 def _error(truth: EditTruth, pictures: Mapping[str, Image], answer: str) -> float:
+    """Mean over all views; a missing one counts as unedited."""
     true = truth.answers[answer]
-    return _mean(_difference(true[view], image, None) for view, image in pictures.items())
+    shown = {**truth.originals, **pictures}
+    return _mean(_difference(true[view], image, None) for view, image in shown.items())
 
 
 def _difference(one: Image, two: Image, where: npt.NDArray[np.bool_] | None) -> float:
@@ -236,66 +221,31 @@ def _mean(values: Any) -> float:
     return float(np.mean(finite)) if finite else math.nan
 
 
-def _digest(truth: Path, spp: int, folder: Path) -> str:
+def _digest(truth: Path, spp: int, folder: Path, track: str) -> str:
     files = sorted(path for path in folder.iterdir() if path.suffix in (".png", ".ply"))
-    parts = [str(PROTOCOL), read_text(truth), str(spp)]
+    parts = [str(PROTOCOL), track, read_text(truth), str(spp)]
     parts += [f"{path.name}:{hashlib.sha256(path.read_bytes()).hexdigest()}" for path in files]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
-def _read(data: Mapping[str, Any]) -> dict[str, Any]:
-    rows = {view: with_nan(row) for view, row in data["by_view"].items()}
-    return {**data, "figures": with_nan(data["figures"]), "by_view": rows}
-
-
-def _has(folder: Path, name: str) -> bool:
-    return (folder / name).is_file()
-
-
-def table(scores: Sequence[Score]) -> Table:
-    """The figures by edit: means over scenes with their 95 % interval."""
-    edits = list(dict.fromkeys(score.edit for score in scores))
-    rows = []
-    for edit in edits:
-        of_edit = [score for score in scores if score.edit == edit]
-        cells = []
-        for name in FIGURES:
-            value = interval({score.scene: [score.figures[name]] for score in of_edit})
-            bound = f" [{value.low:.2f}, {value.high:.2f}]" if value.bounded else ""
-            cells.append("" if math.isnan(value.mean) else f"{value.mean:.2f}{bound}")
-        rows.append([edit, str(len(of_edit)), *cells])
-    return Table(["edit", "scenes", *FIGURES.values()], rows)
-
-
-def _write(
-    out: Path, told: Mapping[str, Any], scores: Sequence[Score], missing: Sequence[str]
-) -> None:
+def _write(out: Path, result: Result) -> None:
+    result.write(out / "bench-score.json")
+    scores = result.scores
     remarks = [f"{s.scene}, {s.edit}: {text}" for s in scores for text in s.remarks]
-    remarks += [f"not handed in: {', '.join(missing)}"] if missing else []
-    data = {
-        "protocol": PROTOCOL,
-        "method": dict(told),
-        "scores": [without_nan(asdict(score)) for score in scores],
-        "missing": list(missing),
-    }
-    text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    write_atomic(out / "bench-score.json", text.encode())
-    each = Table(
-        ["scene", "edit", *FIGURES.values()],
+    remarks += [f"not handed in: {', '.join(result.missing)}"] if result.missing else []
+    rows = [
         [
-            [s.scene, s.edit, *("" if math.isnan(v) else f"{v:.2f}" for v in s.figures.values())]
-            for s in scores
-        ],
-        folded=True,
-    )
-    name = str(told.get("name", "the pictures"))
+            s.scene,
+            s.edit,
+            *("" if math.isnan(s.figures[k]) else f"{s.figures[k]:.2f}" for k in FIGURES),
+        ]
+        for s in scores
+    ]
+    each = Table(["scene", "edit", *FIGURES.values()], rows, folded=True)
+    told = result.method
     lead = [
-        "Methods are ordered by `error`: the mean CIEDE2000 over all pixels of all views to the"
-        " right answer that the source's picture is nearest to. Disagreement is read beside the"
-        " change of the source, since unedited pictures agree too."
+        f"Track: {told.track}, ordered by `{FIGURES[ORDER[told.track]]}`, less is better."
+        " Disagreement is read beside the change of the source, since unedited pictures agree too."
     ]
-    sections = [
-        Section("Scores", remarks, [table(scores)]),
-        Section("By scene", tables=[each]),
-    ]
-    write_files(Report(f"Scores of {name}", lead, sections), out, "bench-score")
+    sections = [Section("Scores", remarks, [table(scores)]), Section("By scene", tables=[each])]
+    write_files(Report(f"Scores of {told.name}", lead, sections), out, "bench-score")

@@ -28,6 +28,7 @@ from attnwarp.gaussians import Gaussians
 from attnwarp.io import Dataset, read_image, write_ply, write_transforms
 from attnwarp.io.text import read_text
 from attnwarp.reporting import SILENT, Part, Reporter
+from attnwarp_eval.drawn.draft import GENERATOR
 from attnwarp_eval.drawn.files import to_text
 from attnwarp_eval.drawn.scenes import draw
 from attnwarp_eval.files import write_atomic, write_picture
@@ -98,6 +99,13 @@ class Suite:
             if not (folder / name).is_file() or _sha256(folder / name) != digest:
                 raise InputError(f"{folder / name}: is missing or changed; export the bench again")
         return suite
+
+    def identity(self) -> dict[str, Any]:
+        """Entries that decide the scenes; results with equal ones can be compared."""
+        return {
+            "generator": GENERATOR, "seed": self.seed, "size": self.size, "spp": self.spp,
+            "views": list(self.views), "sealed": list(self.sealed),
+        }  # fmt: skip
 
     def truth(self, root: Path, scene: str, edit: str) -> tuple[World, EditTruth]:
         """Render the truth of an edit from the scene's file below the truth's folder."""

@@ -45,6 +45,33 @@ def export(
 
 
 @app.command()
+def run(
+    folder: Annotated[Path, typer.Argument(help="The exported bench.")],
+    out: Annotated[Path, typer.Argument(help="Folder to hand in; one begun is continued.")],
+    method: Annotated[str, typer.Option(help="Method of this package or of a plugin.")] = (
+        "attention_warping"
+    ),
+    editor: Annotated[
+        str, typer.Option(help="Bundled editor, a folder in diffusers' format, or ideal.")
+    ] = "small",
+    seed: Annotated[int, typer.Option(min=0, help="Of the first scene's noise.")] = 0,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Setting of the method.")
+    ] = None,
+    key: Annotated[Path | None, typer.Option(help="Folder of a sealed bench's truth.")] = None,
+) -> None:
+    """Edit the scenes by a method of ours, or of a plugin, with an editor of ours."""
+    with clear_errors(), reporter(title=out.name) as report:
+        from attnwarp.cli.shell import assignments
+        from attnwarp_eval.bench.run import run as edit
+
+        options = assignments(changes or [], {"seed": "--seed"})
+        with resumable(lambda: "finished edits are kept"):
+            edit(folder, out, method, editor, options=options, seed=seed, key=key, report=report)
+    typer.echo(out / "method.json")
+
+
+@app.command()
 def score(
     folder: Annotated[Path, typer.Argument(help="The exported bench.")],
     edited: Annotated[Path, typer.Argument(help="Folder with SCENE/EDIT/VIEW.png.")],
@@ -57,14 +84,32 @@ def score(
     from rich.console import Console
 
     with clear_errors(), reporter(title=edited.name) as report:
+        from attnwarp_eval.bench.result import table as of_scores
         from attnwarp_eval.bench.score import score as measure
-        from attnwarp_eval.bench.score import table
         from attnwarp_eval.document.write import terminal
 
         with resumable(lambda: "finished edits are kept"):
             scores = measure(folder, edited, out, report, key=key)
-    Console().print(terminal(table(scores)))
+    Console().print(terminal(of_scores(scores)))
     for one in scores:
         for remark in one.remarks:
             typer.echo(f"{one.scene}, {one.edit}: {remark}", err=True)
     typer.echo(out / "bench-score.html")
+
+
+@app.command()
+def table(
+    results: Annotated[
+        list[Path], typer.Argument(help="bench-score.json of each method; the first is paired.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for bench.md and its page.")] = Path(
+        "runs/bench"
+    ),
+) -> None:
+    """Compare the scores of methods on one bench, paired by scene."""
+    with clear_errors():
+        from attnwarp_eval.bench.result import Result, compare
+        from attnwarp_eval.document.write import write_files
+
+        report = compare([Result.read(path) for path in results])
+    typer.echo(write_files(report, out, "bench")[-1])

@@ -1,6 +1,7 @@
 """Oracles: the same pictures in a study, true pictures and pictures spoiled on purpose, COLMAP's own reader."""
 
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -15,7 +16,7 @@ from typer.testing import CliRunner
 
 from attnwarp.errors import InputError
 from attnwarp.io import read_dataset, read_image
-from attnwarp_eval.bench import score, suite
+from attnwarp_eval.bench import result, score, suite
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.files import write_picture
 from attnwarp_eval.scene.file import load_scene
@@ -52,10 +53,12 @@ def handed_in(folder, edits):
     return folder
 
 
-def scored(bench, tmp_path, pictures, edit="some_colour"):
+def scored(bench, tmp_path, pictures, edit="some_colour", track=result.SAME):
     if tmp_path.joinpath("in").exists():
         shutil.rmtree(tmp_path / "in")
-    (one,) = score.score(bench, handed_in(tmp_path / "in", {edit: pictures}), tmp_path / "out")
+    folder = handed_in(tmp_path / "in", {edit: pictures})
+    (folder / "method.json").write_text(json.dumps({"track": track}))
+    (one,) = score.score(bench, folder, tmp_path / "out")
     return one
 
 
@@ -122,31 +125,59 @@ def spoiled(bench):
     """Pictures that no method should be praised for, by what a remark says of them."""
     true = true_pictures(bench, "some_colour", ["blue"] * 3)
     views = list(true)
+    masks = {v: read_image(bench / SCENE / "masks" / "some_colour" / f"{v}.png") > 0 for v in views}
     originals = {v: read_image(bench / SCENE / "images" / f"{v}.png") for v in views}
-    blurred = {v: cv2.GaussianBlur(p, (0, 0), 4) for v, p in true.items()}
-    mixed = true_pictures(bench, "some_colour", ["blue", "red", "blue"])
+    inside = np.concatenate([p[masks[v][..., 0]] for v, p in true.items()]).mean(0)
+    tint = np.array([160, 170, 255]) / 255
     return true, {
         "unedited": originals,
-        "smooth": blurred,
+        "smooth: blurred": {v: cv2.GaussianBlur(p, (0, 0), 4) for v, p in true.items()},
+        "smooth: textureless": {
+            v: np.where(masks[v], inside, p).astype(np.uint8) for v, p in originals.items()
+        },
+        "smooth: flat": {v: np.full_like(p, (90, 100, 160)) for v, p in true.items()},
         "copies of the source": dict.fromkeys(views, true["source"]),
         "names swapped": {
             "source": true["source"], views[1]: true[views[2]], views[2]: true[views[1]],
         },
-        "flat": {v: np.full_like(p, (90, 100, 160)) for v, p in true.items()},
-        "": mixed,
+        "one tint": {v: (p * tint).astype(np.uint8) for v, p in originals.items()},
+        "two answers": true_pictures(bench, "some_colour", ["blue", "red", "blue"]),
     }  # fmt: skip
 
 
-def test_cheaters_are_named_and_ranked_behind_the_truth(bench, tmp_path):
+@pytest.mark.parametrize("track", result.ORDER)
+def test_cheaters_are_named_or_ranked_behind_the_truth(bench, tmp_path, track):
     true, cheats = spoiled(bench)
-    best = scored(bench, tmp_path, true).figures["error"]
-    for said, pictures in cheats.items():
-        one = scored(bench, tmp_path, pictures)
-        assert one.figures["error"] > best + 0.5, said
-        if said not in ("", "flat"):
-            assert any(said in remark for remark in one.remarks), said
-    other = scored(bench, tmp_path, cheats[""])
-    assert other.remarks == [] and other.figures["seen"] < 1
+    figure = result.ORDER[track]
+    best = scored(bench, tmp_path, true, track=track)
+    assert best.remarks == []
+    for content, pictures in cheats.items():
+        one = scored(bench, tmp_path, pictures, track=track)
+        said = content.partition(":")[0]
+        named = any(said in remark for remark in one.remarks)
+        assert named != (content in ("one tint", "two answers")), content
+        behind = one.figures[figure] > best.figures[figure] + 0.5
+        # Agreement of pictures without merit is undefined.
+        without = track == result.OWN and one.remarks and "swapped" not in content
+        assert math.isnan(one.figures[figure]) if without else behind, content
+
+
+def test_answers_of_an_own_editor_count_where_the_instruction_names_one(bench, tmp_path):
+    for edit, answer, one_right in (("colour", "edited", True), ("some_colour", "blue", False)):
+        true = true_pictures(bench, edit, [answer] * 3)
+        figures = scored(bench, tmp_path, true, edit, track=result.OWN).figures
+        for name in ("error", "done"):
+            assert math.isnan(figures[name]) != one_right
+        assert figures["apart"] == figures["agreement"] + figures["outside"]
+
+
+def test_leaving_the_worst_view_out_gains_nothing(bench, tmp_path):
+    true = true_pictures(bench, "some_colour", ["blue"] * 3)
+    last = list(true)[-1]
+    some = {view: picture for view, picture in true.items() if view != last}
+    original = read_image(bench / SCENE / "images" / f"{last}.png")
+    left_out = scored(bench, tmp_path, some).figures["error"]
+    assert left_out == scored(bench, tmp_path, some | {last: original}).figures["error"] > 0.5
 
 
 def test_a_missing_view_is_said_and_a_wrong_size_or_damage_refused(bench, tmp_path):

@@ -1,0 +1,99 @@
+"""Oracles: figures put in by hand, whose means and paired differences are known."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from attnwarp.errors import InputError
+from attnwarp.io import read_image
+from attnwarp_eval.bench import EDITORS, result, run, score, suite
+from attnwarp_eval.plugins import load_plugins
+
+REPORTS = Path(__file__).parents[3] / "reports" / "bench"
+BENCH = {"generator": 1, "seed": 31, "size": 64, "spp": 4, "views": ["source"], "sealed": []}
+
+
+def made(name, errors, track=result.SAME, apart=1.0, **other):
+    """A result whose scenes have these errors, and one figure undefined."""
+    figures = dict.fromkeys(result.FIGURES, 0.5) | {"drift": None}
+    aparts = apart if isinstance(apart, list) else [apart] * len(errors)
+    scores = [
+        {"scene": f"drawn-{k}", "edit": "colour", "by_view": {"yaw010": {"x": None}},
+         "figures": figures | {"error": error, "apart": aparts[k]}, "remarks": []}
+        for k, error in enumerate(errors)
+    ]  # fmt: skip
+    method = {"name": name, "editor": "small", "track": track}
+    return {
+        "protocol": 2,
+        "bench": BENCH,
+        "method": method,
+        "scores": scores,
+        "missing": [],
+    } | other
+
+
+def read(tmp_path, data):
+    path = tmp_path / "one.json"
+    path.write_text(json.dumps(data))
+    return result.Result.read(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"protocol": 1}, "protocol: Input should be 2"),
+        ({"rank": 1}, "rank: Extra inputs"),
+        ({"scores": []}, "scores: List should have at least 1"),
+        ({"method": {"track": "fastest"}}, "method.track"),
+    ],
+)
+def test_a_result_of_another_format_is_refused_by_name(tmp_path, change, message):
+    with pytest.raises(InputError, match=f"one.json: {message}"):
+        read(tmp_path, made("a", [1.0]) | change)
+
+
+def test_a_result_without_a_figure_is_refused(tmp_path):
+    data = made("a", [1.0])
+    del data["scores"][0]["figures"]["drift"]
+    with pytest.raises(InputError, match="lacks drift"):
+        read(tmp_path, data)
+
+
+def test_methods_are_ordered_by_their_track_and_paired_by_scene(tmp_path):
+    ours = read(tmp_path, made("ours", [2.0, 4.0, 3.0]))
+    best = read(tmp_path, made("best", [1.0, 2.5, 2.5]))  # 1, 1.5, 0.5 less
+    named = read(tmp_path, made("named", [0.1] * 3, result.OWN, [0.0, None, 0.0]))
+    own = read(tmp_path, made("own", [9.0] * 3, result.OWN, 5.0))
+    report = result.compare([ours, best, named, own])
+    same, other = (section.tables[0].rows for section in report.sections)
+    assert [row[0] for row in same] == ["best", "ours"]
+    # Student's t of three differences: 4.303 * 0.5 / sqrt(3) = 1.242.
+    assert same[0][-1] == "-1.00 [-2.24, +0.24]" and same[1][-1] == ""
+    # Undefined in one scene: behind, though its mean is less.
+    assert [row[0] for row in other] == ["own", "named"]
+    moved = read(tmp_path, made("b", [1.0], bench=BENCH | {"seed": 32}))
+    with pytest.raises(ValueError, match="another bench"):
+        result.compare([ours, moved])
+
+
+def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path):
+    load_plugins()
+    assert "ideal" in EDITORS
+    bench, out = tmp_path / "bench", tmp_path / "out"
+    suite.export(bench, count=1, seed=9, size=32, spp=1, targets=1)
+    options = {"steps": 4, "iterations": 0, "stages": 1}
+    told = run.run(bench, out, editor="ideal", options=options)
+    assert told.track == result.SAME and told.seconds > 0
+    (one,) = (s for s in score.score(bench, out, tmp_path / "score") if s.edit == "colour")
+    # The ideal editor knows the only answer; both sides are rounded to 8 bits, as its latents.
+    assert one.figures["error"] < 1 and one.remarks == []
+    place = out / "drawn-0" / "colour"
+    before = read_image(place / "source.png")
+    (place / "source.png").unlink()
+    again = run.run(bench, out, editor="ideal", options=options)
+    assert again.seconds > told.seconds
+    np.testing.assert_array_equal(read_image(place / "source.png"), before)
+    with pytest.raises(InputError, match="another method"):
+        run.run(bench, out, "by_view", editor="ideal", options={"steps": 4, "iterations": 0})
