@@ -256,7 +256,7 @@ def test_a_record_survives_json(records):
 
 
 def test_an_editor_that_drifts_moves_what_it_edits_and_a_cell_measures_it(tmp_path):
-    variants = {"full": {}, "drifts": {"drift": {"shift": 4}}}
+    variants = {"full, 0 px": {}, "full, 4 px": {"drift": {"shift": 4}}}
     study = load(tmp_path, variants=variants, probes={"ideal": list(variants)})
     full, drifts = (compute(probe("ideal"), cell, tmp_path) for cell in cells(study))
     assert full.id != drifts.id
@@ -264,3 +264,18 @@ def test_an_editor_that_drifts_moves_what_it_edits_and_a_cell_measures_it(tmp_pa
     assert moved[0] < 1 and moved[1] == pytest.approx(4, abs=0.5)  # 64 px, repainted in part
     seen = [np.mean([v.metrics["parts.delta_e.edit"] for v in r.views]) for r in (full, drifts)]
     assert seen[1] > seen[0] + 1
+    outcomes = [
+        written_runs.outcome("ideal", "spheres", [name], record.to_json(), name)
+        for name, record in zip(variants, (full, drifts), strict=True)
+    ]
+    said = {**STUDY, "variants": variants, "probes": {"ideal": list(variants)}}
+    made = written_runs.results(said, outcomes)
+    sections = [section for _, section in report_of("ideal").sections(made, Layout(tmp_path))]
+    (table,) = sections[-1].tables
+    assert table.columns == ["method", "0 px", "4 px"]
+    ((method, *shown),) = table.rows
+    right = [np.mean([v.metrics["parts.seen.edit"] for v in r.views]) for r in (full, drifts)]
+    assert method == "full" and [float(text.split()[0]) for text in shown] == pytest.approx(
+        right, abs=0.006
+    )
+    assert (tmp_path / "figures/drift.svg").is_file()

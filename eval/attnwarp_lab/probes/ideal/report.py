@@ -119,7 +119,7 @@ def _drift(results: Results, layout: Layout) -> Section:
             found: dict[str, dict[float, dict[str, list[float]]]] = {}
             for cell, record in results.finished(probe):
                 shift = record.spec.get("drift", {"shift": 0.0})["shift"]
-                by_shift = found.setdefault(cell.variant.partition(",")[0], {})
+                by_shift = found.setdefault(cell.variants[0].partition(",")[0], {})
                 values = [view.metrics[key] for view in record.views]
                 by_shift.setdefault(shift, {}).setdefault(cell.scene, []).extend(values)
             means = {
