@@ -217,7 +217,6 @@ def edit(
     noise: Tensor | None = None,
     latents: Tensor | None = None,
     on_step: Callable[[int, int, Tensor], None] | None = None,
-    estimate: Callable[[int, Tensor], Tensor] | None = None,
     regions: Sequence[npt.NDArray[Any]] | None = None,
 ) -> Edit:
     """Edit views together. Record or inject attention by running this inside
@@ -239,8 +238,6 @@ def edit(
         latents: (B, C, h, w) unchanged initial latents, such as those of an inversion; excludes
             ``start`` and ``noise``.
         on_step: callback with the step, the number of steps and the latents, after each step.
-        estimate: function of the step and the predicted (B, C, h, w) clean latents that returns
-            their replacement.
         regions: (H, W) edited region of each view in [0, 1]; a bundled editor averages its noise
             there to settle choices that the prompt leaves open. None is the full picture.
 
@@ -288,10 +285,7 @@ def edit(
         x = schedule.add_noise(before, noise, noised)
     with torch.no_grad():
         for number, (now, then) in enumerate(following(timesteps)):
-            output, clean = task.predict(x, now), None
-            if estimate is not None:
-                clean = estimate(number, schedule.estimate(output, x, now))
-            x = schedule.step(output, x, now, then, clean)
+            x = schedule.step(task.predict(x, now), x, now, then)
             if on_step is not None:
                 on_step(number, len(timesteps), x)
     return Edit(editor.decode(x), x, timesteps)

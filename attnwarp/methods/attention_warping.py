@@ -92,11 +92,14 @@ def attention_warping(
 
 
 def a_t(t: int, T: int, s: AttentionWarpingSettings = CORRECTED) -> float:
-    """Weight of the source's features at step t of T: a_t = a0 (T - t) / T.
+    """Weight of the source's features at step t of T: a_t = a0 (T - t) / T, or as ``decay`` says.
 
     Example:
         >>> [round(a_t(t, 4), 3) for t in range(4)]
         [0.9, 0.675, 0.45, 0.225]
+        >>> late = AttentionWarpingSettings(a0=1.0, decay="late")
+        >>> [a_t(t, 6, late) for t in range(6)]
+        [1.0, 1.0, 1.0, 1.0, 1.0, 0.5]
         >>> import numpy as np
         >>> from attnwarp.editing.editor import edit
         >>> from attnwarp.editing.recording import RecordingPlan, record
@@ -110,7 +113,8 @@ def a_t(t: int, T: int, s: AttentionWarpingSettings = CORRECTED) -> float:
         >>> bool((again.images[0] == source.images[0]).all())  # its own features change no bit
         True
     """
-    return s.a0 * (T - t) / T if s.decay == "linear" else s.a0
+    falling = s.a0 * (T - t) / T
+    return {"linear": falling, "late": min(s.a0, 3 * falling), "constant": s.a0}[s.decay]
 
 
 def blend(warp: TokenWarp, F_src: Tensor, F_new: Tensor, a: float) -> Tensor:
@@ -216,8 +220,8 @@ class AttentionWarping(Method):
                 # Record after the injection: the next source gets the features this source used.
                 plan = views.features.plan(view, views.latent_size(view), further=number > 0)
                 recording = stack.enter_context(record(work.editor, plan))
-            pictures, estimates = views.denoise(start, sights, step)
-        views.keep(number, RecordedSource(pictures[0], recording, estimates, sights[0], tokens))
+            pictures = views.denoise(start, sights, step)
+        views.keep(number, RecordedSource(pictures[0], recording, sights[0], tokens))
         return [views.result(view, pictures[0], sights[0], number)]
 
     def edit_targets(
@@ -233,7 +237,7 @@ class AttentionWarping(Method):
             start = views.referenced(start, sights, count)
             views.attend(stack, batch, sights)
             self._inject(stack, recorded, sights)
-            pictures, _ = views.denoise(start, sights, step)
+            pictures = views.denoise(start, sights, step)
         return [
             views.result(view, picture, sight, count)
             for view, picture, sight in zip(batch, pictures, sights, strict=True)

@@ -42,9 +42,8 @@ class Geometry:
         s = self.settings
         warps = [self.warp(source, view, model) for source in sources]
         scales = [self._edit_share(source) / self._edit_share(view) for source in sources]
-        margins = [self._margin(source) for source in sources] if s.estimate_margin > 0 else None
         zeros = not s.mask and s.outside == "zeros"
-        return Sight(warps, s.confidence, scales, margins, zeros)
+        return Sight(warps, scales, zeros)
 
     def warp(self, source: int, target: int, model: Gaussians) -> WarpedView:
         """Compute the warp from one view to another by depth of the original or current model."""
@@ -86,11 +85,6 @@ class Geometry:
         if model is self.work.frozen:
             self._frozen[view] = surface
         return surface
-
-    def _margin(self, source: int) -> int:
-        """Width in px of the unwarped band at depth edges of a source's depth map."""
-        camera = self.work.scene.cameras[source]
-        return round(self.settings.estimate_margin * min(camera.height, camera.width))
 
     def _edit_share(self, view: int) -> float:
         """Pixels of a view's edit per pixel of its picture."""

@@ -168,12 +168,10 @@ SOURCE_COLORS = (
 
 
 def sight_picture(sight: Sight) -> Bytes:
-    """Draw visibility, (H, W, 3) uint8: the colour of each pixel's source times the weight of its
-    features; black without a source.
-    """
+    """Draw visibility, (H, W, 3) uint8: the colour of each pixel's source, black without one."""
     choice = sight.choice((sight.mask.shape[0], sight.mask.shape[1]))
     colors = torch.tensor(SOURCE_COLORS, dtype=torch.float64)
-    pixels = colors[choice.clamp_min(0) % len(colors)] * sight.weight[..., None].double()
+    pixels = colors[choice.clamp_min(0) % len(colors)] * sight.mask[..., None]
     return np.asarray(pixels.round().to(torch.uint8).cpu().numpy())
 
 

@@ -154,27 +154,16 @@ class AttentionWarpingSettings(MethodSettings):
         sources: number of views whose features are recorded and warped. Those after the first are
             edited in a chain outward from it, each covered by the ones before; a target's pixel
             takes the source that sees it best (:mod:`attnwarp.methods.sight`).
-        confidence: True weighs the features by how well the source sees the surface (foreshortening
-            and the margin of depth agreement), False by the mask alone.
         unseen: editing of marked pixels that no warp reaches: "free", as the editor chooses, or
             "attend", with attention to the first source's edit (:mod:`attnwarp.methods.unseen`).
-        estimate: weight at the first step of the source's warped estimate of the clean latents in
-            the target's estimate. The weight falls to 0 at ``estimate_until``; 0 disables it.
-        estimate_until: share of the steps after which the source's estimate is unused.
-        estimate_in: space of the warp: "latents", whose cells keep the source's order of pixels
-            inside, or "picture", which is decoded, warped pixel by pixel and encoded again. The
-            editor then decodes the view and each source, and encodes twice, in each step of a
-            view.
-        estimate_margin: margin on either side of a source's depth edge excluded from the warped
-            estimate, since pixels there mix near and far; a share of the source's shorter side,
-            rounded to whole pixels.
         reference: the source's edit as a further picture that the editor sees beside the view's
             own, if it takes any: "plain" as it is, or "warped" to the view, whose own picture stays
             where the source sees nothing.
         depth_from: model of the depth: before the edit ("frozen") or as tuned so far ("current").
         a0: weight of the injected features at the first step. 0 records nothing and edits each view
             alone, with all else equal: the control.
-        decay: "linear", a_t = a0 (T - t) / T, or "constant".
+        decay: "linear", a_t = a0 (T - t) / T; "late", a0 until the last third of the steps, in
+            which it falls to 0; or "constant".
         kinds: kinds of features that are warped, such as ["self"]; None for all outputs of
             attention. ["key", "value"] warps a transformer's keys, before positions turn them, and
             its values.
@@ -231,16 +220,11 @@ class AttentionWarpingSettings(MethodSettings):
     mask: bool = True
     outside: Literal["border", "zeros"] = "border"
     sources: Count = 1
-    confidence: bool = False
     unseen: Literal["free", "attend"] = "free"
-    estimate: Share = 0.0
-    estimate_until: Weight = 0.5
-    estimate_in: Literal["latents", "picture"] = "latents"
-    estimate_margin: Share = 0.0
     reference: Literal["none", "plain", "warped"] = "none"
     depth_from: Literal["frozen", "current"] = "frozen"
     a0: Share = 0.9
-    decay: Literal["linear", "constant"] = "linear"
+    decay: Literal["linear", "late", "constant"] = "linear"
     kinds: tuple[Kind, ...] | None = None
     blocks: tuple[int | str, ...] | None = None
     feature_steps: tuple[float, float] = (0.0, 1.0)
@@ -649,12 +633,11 @@ PRESETS: Named[Named[MethodSettings]] = Named({
             negative_prompt=_STABLE_DIFFUSION["negative_prompt"],
         ),
         "extended": AttentionWarpingSettings(
-            sources=4,
             noise="surface",
-            estimate=1.0,
-            estimate_until=2.0,
-            estimate_in="picture",
-            estimate_margin=1 / 64,
+            warp=WARPS["tolerant"],
+            unseen="attend",
+            a0=1.0,
+            decay="late",
         ),
     }),
     "by_view": Named({"default": ByViewSettings()}),
@@ -708,9 +691,9 @@ negative prompt.
 ``corrected``: the default. Noise is shared, depth comes from the model before the edit, and a stage
 tunes on everything edited so far, with larger steps of the colours.
 
-``extended``: ``corrected`` with extensions beyond the paper: further sources, noise that sticks to
-the surface, and the sources' clean pictures except at depth edges, with a weight that falls from 1
-to a half. The study ``beyond`` measures each extension alone and all together.
+``extended``: ``corrected`` with extensions beyond the paper: noise that sticks to the surface, the
+source's features at full weight until the last third of the steps, tolerant masks, and attention to
+the source's edit where no warp reaches the marked thing.
 
 ``default`` of the other methods: the method with the editor's default guidance and prompts. Their
 other presets use the guidance, prompts and step grid published for Stable Diffusion.

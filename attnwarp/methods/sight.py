@@ -1,4 +1,4 @@
-"""Visibility of a target from its sources: the source and the weight of each target pixel."""
+"""Visibility of a target from its sources: the source of each target pixel."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from attnwarp.camera import Camera
-from attnwarp.warp import FeatureWarp, WarpedView, depth_tolerance, sample, sample_depth
-from attnwarp.warp.depth import Array, as_float64, valid_depth
+from attnwarp.warp import FeatureWarp, WarpedView
+from attnwarp.warp.depth import as_float64
 from attnwarp.warp.masks import axis_weights
 from attnwarp.warp.surface import needed
 
@@ -59,71 +59,15 @@ def _density(camera: Camera, normal: Tensor, points: Tensor) -> Tensor:
     return pixels * (turned * points).sum(dim=-1).abs() / points[..., 2].abs() ** 3
 
 
-def depth_margin(view: WarpedView) -> Tensor:
-    """Margin of depth agreement, (H, W) in [0, 1]: 1 - (abs(z - d) / tolerance)^2; 1 if the rule of
-    depth agreement is off.
-    """
-    s, both = view.settings, view.correspondence
-    if not s.depth_agreement or view.source is None:
-        return torch.ones(both.z.shape, dtype=torch.float64)
-    depth = as_float64(view.source.depth, "source_depth")
-    seen = sample_depth(depth, both, spread=s.depth_spread)
-    tolerance = depth_tolerance(both, depth, relative=s.depth_relative, slope=s.depth_slope)
-    share = (both.z - seen).abs() / tolerance
-    return torch.nan_to_num(1 - share**2, nan=0.0).clamp(0, 1)
-
-
-EDGE = 0.05
-"""Relative depth step that counts as an edge; equals the step at which taps are not blended
-(:attr:`attnwarp.warp.WarpSettings.depth_spread`)."""
-
-
-def near_edges(depth: Array, margin: int) -> Tensor:
-    """Mark the pixels within ``margin`` on either side of a depth edge, (H, W) bool.
-
-    A picture's pixels at an edge mix near and far. Inverse depth is affine in the pixel on a plane,
-    so an inverse-depth step larger than its neighbours' is an edge, and a plane at a grazing angle
-    has none. Undefined depth counts as infinite. Pixels of the outermost rows and columns have one
-    neighbour and get the margin from that side alone.
-
-    Args:
-        depth: (H, W), undefined where it is NaN, zero, negative or infinite.
-        margin: in px; 0 gives none.
-
-    Example:
-        >>> import torch
-        >>> near_edges(torch.tensor([[2.0, 2.0, 2.0, 3.0, 3.0, 3.0]]), 1)[0].int().tolist()
-        [0, 0, 1, 1, 0, 0]
-    """
-    z = valid_depth(depth, "depth")
-    inverse = torch.nan_to_num(1 / z, nan=0.0)
-    edge = torch.zeros(z.shape, dtype=torch.bool)
-    if margin == 0:
-        return edge
-    for axis in (0, 1):
-        if z.shape[axis] < 3:
-            continue
-        left, middle, right = (inverse.narrow(axis, k, z.shape[axis] - 2) for k in range(3))
-        bend = (left - 2 * middle + right).abs()
-        nearest = torch.maximum(torch.maximum(left, middle), right)
-        edge.narrow(axis, 1, z.shape[axis] - 2).logical_or_(bend > EDGE * nearest)
-    window = 2 * margin - 1
-    grown = torch.nn.functional.max_pool2d(edge[None].float(), window, 1, margin - 1)
-    return grown[0] > 0
-
-
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """Visibility of a target from its sources: the source of each pixel, and its weight.
+    """Visibility of a target from its sources: the source of each pixel.
 
     Args:
         views: the warp from each source, in the order of the sources.
-        soft: True weighs features by confidence, False by the mask alone.
         scales: (edit's pixels per photograph's pixel) of each source over the same of the target.
             Features have the edits' resolution, which may differ between photographs of several
             sizes. None if all are 1.
-        margins: margin of each source: px on either side of a depth edge whose picture is not
-            warped. None if all are 0.
         zeros: True pads features outside a source with zeros, False with the border's values.
 
     Example:
@@ -142,11 +86,9 @@ class Sight:
     """
 
     views: Sequence[WarpedView]
-    soft: bool = False
     scales: Sequence[float] | None = None
-    margins: Sequence[int] | None = None
     zeros: bool = False
-    _choices: dict[tuple[Size, bool], Tensor] = field(default_factory=dict, init=False, repr=False)
+    _choices: dict[Size, Tensor] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def quality(self) -> list[Tensor]:
@@ -159,72 +101,32 @@ class Sight:
             for view, scale in zip(self.views, scales, strict=True)
         ]
 
-    @cached_property
-    def confidence(self) -> list[Tensor]:
-        """Confidence of each source, (H, W) float64 in [0, 1]: quality by :func:`depth_margin`."""
-        pairs = zip(self.quality, self.views, strict=True)
-        return [quality * depth_margin(view) for quality, view in pairs]
-
     @property
     def mask(self) -> Tensor:
         """Mask of the pixels seen by some source, (H, W) bool."""
         return torch.stack([view.mask for view in self.views]).any(dim=0)
 
-    @property
-    def weight(self) -> Tensor:
-        """Weight of each pixel's source, (H, W): the source's confidence, or 1 in its mask."""
-        if not self.soft:
-            return self.mask.float()
-        choice = self.choice((self.mask.shape[0], self.mask.shape[1]))
-        weights = [weight * (choice == k) for k, weight in enumerate(self.confidence)]
-        return torch.stack(weights).sum(dim=0)
-
-    @cached_property
-    def clear(self) -> list[Tensor]:
-        """Mask of each source, (H, W) bool: True if the source pixel lies farther from depth edges
-        than the margin.
-        """
-        margins = [0] * len(self.views) if self.margins is None else self.margins
-        result = []
-        for view, margin in zip(self.views, margins, strict=True):
-            if margin == 0 or view.source is None:
-                result.append(torch.ones(view.mask.shape, dtype=torch.bool))
-                continue
-            near = near_edges(view.source.depth, margin).double()[None]
-            mixed, _ = sample(near, view.correspondence, mode="nearest")
-            result.append(torch.nan_to_num(mixed[0], nan=1.0) < 0.5)
-        return result
-
-    def mask_at(self, number: int, size: Size, *, picture: bool = False) -> Tensor:
-        """Resize a source's mask, (h, w) bool; for its picture, intersect with :attr:`clear`."""
+    def mask_at(self, number: int, size: Size) -> Tensor:
+        """Resize a source's mask, (h, w) bool."""
         # The mask does not depend on the size of the source's grid.
-        mask = self.views[number].at(size, source_size=size).mask
-        if not picture or self.margins is None:
-            return mask
-        return mask & (averaged(self.clear[number], size) >= 0.5)
+        return self.views[number].at(size, source_size=size).mask
 
-    def choice(self, size: Size, *, picture: bool = False) -> Tensor:
+    def choice(self, size: Size) -> Tensor:
         """Choose each pixel's source at a grid's size, (h, w) int64: the best quality among sources
         whose mask passes, the first of equals, -1 without a source.
-
-        Args:
-            size: size of the grid.
-            picture: True chooses for the sources' pictures, which :attr:`margins` keep away from
-                depth edges.
         """
-        key = size, picture and self.margins is not None
-        if key not in self._choices:
-            masks = [self.mask_at(k, size, picture=picture) for k in range(len(self.views))]
+        if size not in self._choices:
+            masks = [self.mask_at(k, size) for k in range(len(self.views))]
             if len(self.views) == 1:
-                self._choices[key] = torch.where(masks[0], 0, -1)
+                self._choices[size] = torch.where(masks[0], 0, -1)
             else:
                 qualities = torch.stack([averaged(quality, size) for quality in self.quality])
                 qualities = torch.where(torch.stack(masks), qualities, -1.0)
                 best, number = qualities.max(dim=0)
                 # Rounding of the means must not decide between equal qualities.
                 number = (qualities >= best - 1e-9).long().argmax(dim=0)
-                self._choices[key] = torch.where(best >= 0, number, -1)
-        return self._choices[key]
+                self._choices[size] = torch.where(best >= 0, number, -1)
+        return self._choices[size]
 
     def warp(self, number: int, *, picture: bool = False) -> SourceWarp:
         """Build the warp of a source's features, or of its picture, to its part of the target."""
@@ -252,15 +154,9 @@ class SourceWarp:
         key = (*size, *(source_size or ()))
         if key not in self._at:
             layer = self.sight.views[self.number].at(size, source_size=source_size)
-            choice = self.sight.choice(size, picture=self.picture)
-            mask = layer.mask & (choice == self.number)
+            mask = layer.mask & (self.sight.choice(size) == self.number)
             warp = FeatureWarp(layer.correspondence, mask, layer.backend)
-            weight = warp.weight
-            if self.sight.soft:
-                share = averaged(self.sight.confidence[self.number], size) * mask
-                weight = share.reshape(-1, 1).float()
-            zeros = self.sight.zeros and not self.picture
-            self._at[key] = LayerOfSource(warp, weight, zeros)
+            self._at[key] = LayerOfSource(warp, self.sight.zeros and not self.picture)
         return self._at[key]
 
 
@@ -270,15 +166,18 @@ class LayerOfSource:
 
     Args:
         warp: warp of the layer, with the mask.
-        weight: (h w, 1) float32 in [0, 1], 0 outside the mask.
         zeros: True surrounds the source's features with zeros, as zero padding does: a tap beyond
             the border counts 0, so the border's value returned by the warp is multiplied by the
             weight of the taps inside.
     """
 
     warp: FeatureWarp
-    weight: Tensor
     zeros: bool = False
+
+    @property
+    def weight(self) -> Tensor:
+        """Weight (h w, 1) float32: 1 inside the mask, 0 elsewhere."""
+        return self.warp.weight
 
     @property
     def mask(self) -> Tensor:

@@ -61,11 +61,7 @@ def kept_tokens(
         network: a diffusers UNet that denoises one view.
         layers: layers to keep; those of cross-attention are ignored.
         dtype: precision of the kept tokens.
-
-    Raises:
-        ValueError: the network has no self-attention of diffusers.
     """
-    check_network(network)
     names = {layer.name for layer in layers}
     kept = SourceTokens()
 
@@ -127,11 +123,7 @@ def attending(
         yield
 
 
-def check_network(network: Any) -> None:
-    """Raise ValueError unless a network has self-attention of diffusers."""
+def has_self_attention(network: Any) -> bool:
+    """Return True if a network has self-attention of diffusers."""
     names = getattr(network, "attn_processors", {})
-    if not any(name.endswith(".attn1.processor") for name in names):
-        raise ValueError(
-            "unseen: this editor has no self-attention that could attend to the source; set unseen"
-            " to 'free'"
-        )
+    return any(name.endswith(".attn1.processor") for name in names)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import Any
 
@@ -23,7 +23,7 @@ from attnwarp.editing.schedule import Time
 from attnwarp.gaussians import Gaussians
 from attnwarp.io.names import file_stems
 from attnwarp.methods.base import ViewEdit, edit_file
-from attnwarp.methods.carried import Estimates, Noise, carry
+from attnwarp.methods.carried import Noise, carry
 from attnwarp.methods.features import Features
 from attnwarp.methods.geometry import Geometry, Warps
 from attnwarp.methods.pictures import (
@@ -37,7 +37,13 @@ from attnwarp.methods.pictures import (
 from attnwarp.methods.scene import checked_image, to_float
 from attnwarp.methods.settings import AttentionWarpingSettings
 from attnwarp.methods.sight import Sight, Size
-from attnwarp.methods.unseen import SourceTokens, attending, check_network, kept_tokens, unseen_of
+from attnwarp.methods.unseen import (
+    SourceTokens,
+    attending,
+    has_self_attention,
+    kept_tokens,
+    unseen_of,
+)
 from attnwarp.methods.work import Guide, Work
 from attnwarp.workdir import MANIFEST
 
@@ -52,14 +58,12 @@ class RecordedSource:
     Attributes:
         picture: (h, w, 3) in [0, 1].
         recording: features of the source; None if their weight is 0.
-        estimates: (C, h, w) clean latents predicted at each step.
         sight: visibility of this source from the earlier ones; None for the first.
         tokens: inputs of the first source's self-attention, if unseen tokens attend to them.
     """
 
     picture: Image
     recording: Recording | None
-    estimates: list[Tensor] = field(default_factory=list)
     sight: Sight | None = None
     tokens: SourceTokens | None = None
 
@@ -159,18 +163,20 @@ class ViewEdits:
         self.folder = work.folder.path / RECORDING
         self.features = Features(work.editor, settings, self.folder if store == "disk" else store)
         self.geometry = Geometry(work, settings, warps)
-        self.estimates, self.noise = Estimates(work.editor, settings), Noise(settings)
+        self.noise = Noise(settings)
         self.sources = (source, *self._further_sources(source))
         self._recorded: list[RecordedSource] = []
         names = [self.names[view] for view in self.sources]
         self.about = {"source": names[0], "sources": names}
         self.inputs = {"source_picture": None if self.by_hand is None else digest(self.by_hand)}
-        if self.attends:
-            check_network(work.editor.network)
 
     @property
     def attends(self) -> bool:
         """True if marked tokens that no warp reaches attend to the first source."""
+        return self._wants_attention and has_self_attention(self.work.editor.network)
+
+    @property
+    def _wants_attention(self) -> bool:
         marked = self.work.scene.segments is not None
         return self.settings.unseen == "attend" and marked and bool(self.features.layers)
 
@@ -249,14 +255,17 @@ class ViewEdits:
                 f"stages: {stages}{on_sources} in place of {asked.stages}, as {views} views leave"
                 " no more to edit"
             )
+        if self._wants_attention and not self.attends:
+            lines.append(
+                "unseen: marked parts that no warp reaches are edited freely, as this editor has no"
+                " self-attention of a UNet that could attend to the source"
+            )
         if self.features.layers:
             plans = [
                 self.features.plan(view, self.latent_size(view), further=number > 0)
                 for number, view in enumerate(self.sources)
             ]
             lines.append(in_words(plans))
-            memory = self.estimates.memory([self.work.sizes[view] for view in self.sources])
-            lines += [] if memory is None else [memory]
         return lines
 
     # --- sources
@@ -276,16 +285,15 @@ class ViewEdits:
 
     def keep(self, number: int, source: RecordedSource) -> None:
         """Keep a source's edit for the views that take its features."""
-        del self._recorded[number:], self.estimates.sources[number:], self.noise.orders[number:]
+        del self._recorded[number:], self.noise.orders[number:]
         self._recorded.append(source)
-        self.estimates.sources.append(source.estimates)
         size = self.latent_size(self.sources[number])
         self.noise.orders.append(self.noise.order(source.sight, size))
 
     def sight(self, sources: int, view: int, model: Gaussians) -> Sight | None:
         """Compute the visibility of a view from the first sources; None if nothing is warped."""
         s = self.settings
-        warps = s.a0 > 0 or s.noise == "surface" or s.estimate > 0 or s.reference == "warped"
+        warps = s.a0 > 0 or s.noise == "surface" or s.reference == "warped"
         if not sources or not warps:
             return None
         return self.geometry.sight(self.sources[:sources], view, model)
@@ -345,26 +353,24 @@ class ViewEdits:
 
     def denoise(
         self, start: Start, sights: Sequence[Sight | None], step: Callable[[], None]
-    ) -> tuple[list[Image], list[Tensor]]:
+    ) -> list[Image]:
         """Edit views from their start.
 
         Args:
             start: initial state of the views.
-            sights: visibility of each view, for warped noise and estimates.
+            sights: visibility of each view, for warped noise.
             step: callback after each step.
 
         Returns:
-            (h, w, 3) pictures in [0, 1], and the estimates of a lone view if estimates are warped.
+            (h, w, 3) pictures in [0, 1].
         """
         work, s = self.work, self.settings
         if start.replayed is not None:
             picture, task, maps = start.replayed
             replay(work.editor.schedule, task.predict, maps, on_step=lambda *_: step())
-            return [picture], [work.editor.encode([picture])[0]] * s.steps
-        kept: list[Tensor] = []
+            return [picture]
         shape = work.editor.noise_shape(work.sizes[start.views[0]])
-        sources = 0 if sights[0] is None else len(sights[0].views)
-        result = edit(
+        return edit(
             work.editor,
             start.guides,
             work.prompt,
@@ -376,9 +382,7 @@ class ViewEdits:
             latents=start.latents,
             on_step=lambda *_: step(),
             regions=work.regions(start.views),
-            estimate=self.estimates.change(sights, sources, kept if len(sights) == 1 else None),
-        )
-        return result.images, kept
+        ).images
 
     def _timesteps(self) -> Sequence[Time]:
         """Timesteps of the source's edit."""
@@ -425,7 +429,7 @@ class ViewEdits:
         recordings = [s.recording for s in self._recorded[:sources] if s.recording is not None]
         shape = self.work.scene.images[view].shape[:2]
         if sight is not None and recordings:
-            about["injected"] = float(sight.weight.mean())
+            about["injected"] = float(sight.mask.float().mean())
             rules = sight.views[0].rules
             about["rules"] = {k: float(rule.float().mean()) for k, rule in rules.items()}
             if sources > 1:

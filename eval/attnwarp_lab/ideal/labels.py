@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp import check
-from attnwarp.methods.sight import near_edges
 from attnwarp_eval.metrics.arrays import share
 
 Labels = npt.NDArray[np.int16]
@@ -24,6 +23,10 @@ NONE = -2
 
 OUTSIDE = -1
 """Label of a token that does not show the thing."""
+
+
+EDGE = 0.05
+"""Relative depth step that counts as an edge."""
 
 
 class Layer(Protocol):
@@ -128,11 +131,33 @@ def label_tokens(
     }
 
 
+def depth_edges(depth: npt.NDArray[Any]) -> Mask:
+    """Mark the pixels on either side of a depth edge, (H, W) bool.
+
+    Inverse depth is affine in the pixel on a plane, so an inverse-depth step larger than its
+    neighbours' is an edge, and a plane at a grazing angle has none. Pixels of the outermost rows
+    and columns have one neighbour and are marked from that side alone.
+
+    Args:
+        depth: (H, W); NaN without a surface, which counts as infinite.
+
+    Example:
+        >>> depth_edges(np.array([[2.0, 2.0, 2.0, 3.0, 3.0, 3.0]]))[0].astype(int).tolist()
+        [0, 0, 1, 1, 0, 0]
+    """
+    inverse = np.nan_to_num(1 / depth, nan=0.0)
+    edge = np.zeros(depth.shape, dtype=bool)
+    for values, marks in ((inverse, edge), (inverse.T, edge.T)):
+        left, middle, right = values[:-2], values[1:-1], values[2:]
+        nearest = np.maximum(np.maximum(left, middle), right)
+        marks[1:-1] |= np.abs(left - 2 * middle + right) > EDGE * nearest
+    return edge
+
+
 def edge_distance(depth: npt.NDArray[Any], size: tuple[int, int]) -> npt.NDArray[np.float64]:
     """(h, w) distance of each token to the nearest depth edge, in tokens; infinite without one.
 
-    A pixel at an edge, see :func:`attnwarp.methods.sight.near_edges`, has distance 0; a token has
-    the distance of its nearest pixel.
+    A pixel of :func:`depth_edges` has distance 0; a token has the distance of its nearest pixel.
 
     Args:
         depth: (H, W) true depth of the target; NaN without a surface.
@@ -145,7 +170,7 @@ def edge_distance(depth: npt.NDArray[Any], size: tuple[int, int]) -> npt.NDArray
         [[0.0, 0.0, 1.0, 2.0]]
     """
     (H, W), (h, w) = depth.shape, size
-    away = (~near_edges(depth, 1).numpy()).astype(np.uint8)
+    away = (~depth_edges(depth)).astype(np.uint8)
     if away.all():
         return np.full(size, np.inf)
     px = cv2.distanceTransform(away, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

@@ -28,12 +28,11 @@ from attnwarp import Camera, Gaussians
 from attnwarp.digest import digest
 from attnwarp.editing.editor import edit, shared_noise
 from attnwarp.editing.schedule import DDIM
-from attnwarp.editing.small import load_editor
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.fit import FitSettings
 from attnwarp.io import read_image, read_ply
 from attnwarp.io.images import encode_png
-from attnwarp.methods import attention_warping, geometry, preset, tuning
+from attnwarp.methods import attention_warping, preset, tuning
 from attnwarp.methods.pictures import to_bytes
 from attnwarp.methods.tuning import Tuning
 from attnwarp.warp import Surface, warp_surfaces
@@ -42,8 +41,6 @@ QUICK = preset("attention_warping", stages=2, views_per_stage=2, steps=2, iterat
 IDEAS = {
     "sources": {"sources": 3},
     "surface noise": {"noise": "surface"},
-    "confidence": {"confidence": True},
-    "estimate": {"estimate": 0.9},
 }
 ALL_IDEAS = {name: value for idea in IDEAS.values() for name, value in idea.items()}
 
@@ -1119,23 +1116,6 @@ def test_each_idea_alone_changes_the_views(idea, finished, scene, editor, tmp_pa
     assert any(after.get(name) != before[name] for name in first)
 
 
-def test_confidence_counts_pixels_of_edits_and_not_of_photographs(scene, editor, tmp_path):
-    """Oracle: one place photographed at two sizes and edited at one is an identity warp."""
-    model, view = scene[0], scene[1][0]
-    settings = replace(QUICK, stages=1, iterations=0, steps=1, size=32, confidence=True)
-    for factor in (1, 3):
-        views = [view, view.resize(32 * factor, 32 * factor)]
-        folder = tmp_path / str(factor)
-        attention_warping(
-            model, views, pictures(model, views), editor, "red", settings, folder=folder
-        )
-    one, other = (
-        json.loads(sorted((tmp_path / f / "rounds/1").glob("*.json"))[-1].read_text()) for f in "13"
-    )
-    assert one["injected"] > 0.8
-    assert other["injected"] == pytest.approx(one["injected"], abs=0.05)
-
-
 @pytest.fixture(scope="module")
 def extended(scene, editor, tmp_path_factory):
     folder = tmp_path_factory.mktemp("extended")
@@ -1183,33 +1163,6 @@ def test_further_sources_are_edited_first_and_counted(extended, scene):
     assert result.counters["feature_bytes"] == 3 * (4 * 256 * 16 + 4 * 64 * 32) * 2 * 2 * 4
 
 
-def test_an_estimate_of_a_source_is_decoded_once_for_all_that_take_it(scene, editor, monkeypatch):
-    decoded = 0
-    decode = editor.vae.decode
-
-    def count(latents, **more):
-        nonlocal decoded
-        decoded += len(latents)
-        return decode(latents, **more)
-
-    monkeypatch.setattr(editor.vae, "decode", count)
-    told = []
-    settings = replace(
-        QUICK, stages=1, views_per_stage=4, iterations=0, **ALL_IDEAS, estimate_in="picture"
-    )
-    assert (settings.steps, settings.sources, len(scene[1])) == (2, 3, 5)
-    run(scene, editor, settings=settings, report=Watched(log=told.append))
-    steps = sum(1 - k / (settings.estimate_until * settings.steps) > 0 for k in range(2))
-    # Each of three sources once a step, each view but the first once a step, and five pictures.
-    assert decoded == steps * (3 + 4) + 5
-    # Three sources of 32 x 32 px, three channels in float32.
-    amount = 3 * steps * 32 * 32 * 3 * 4 / 2**20
-    (line,) = [text for text in told if text.startswith("estimates")]
-    assert line == (
-        f"estimates of 3 sources, as pictures of {steps} steps: up to {amount:.1f} MiB in main memory"
-    )
-
-
 @pytest.mark.door
 def test_a_source_prompt_that_is_too_long_is_refused_before_any_work(
     scene, depth_editor, monkeypatch
@@ -1247,78 +1200,3 @@ def test_a_view_at_a_further_sources_place_gets_that_sources_edit(scene, editor)
     assert plan(result).chain == (first,)
     assert np.array_equal(result.edited[first], result.edited[5])
     assert not np.array_equal(result.edited[0], result.edited[5])
-
-
-def test_the_estimate_of_a_twin_is_the_sources(scene, editor):
-    """At weight 1 in every step the clean latents of a view at the source's place are the source's."""
-    _, views, images = scene
-    twin = Camera(views[0].K, views[0].world_to_camera, 32, 32, "twin")
-    other = 1 - images[0]  # guided by another picture, it would become another
-    settings = replace(QUICK, a0=0.0, stages=1, iterations=0, estimate=1.0, estimate_until=1e9)
-
-    def difference(settings):
-        pair = [views[0], twin], [images[0], other]
-        result = attention_warping(wall(), *pair, editor, "a bear", settings)
-        return np.abs(result.edited[0].astype(int) - result.edited[1]).max()
-
-    assert difference(settings) <= 1
-    assert difference(replace(settings, estimate=0.0)) > 50
-
-
-def test_an_estimate_warped_as_a_picture_lands_on_its_pixel_within_a_cell():
-    """Two views of a wall are 3 px apart, and a cell of the latents is 4 px wide."""
-    shift, size = 3, 32
-    K = np.array([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]])
-    poses = [np.diag([1.0, -1, -1, 1]) for _ in range(2)]
-    for pose, x in zip(poses, (0, shift * 4 / size), strict=True):
-        pose[:3, 3] = (x, 0, 4)  # the wall lies at depth 4
-    views = [Camera(K, pose, size, size, name) for name, pose in zip("ab", poses, strict=True)]
-    images = [np.random.default_rng(k).random((size, size, 3), np.float32) for k in range(2)]
-    settings = replace(QUICK, a0=0.0, stages=1, iterations=0, estimate=1.0, estimate_until=1e9)
-
-    def difference(**changes):
-        result = attention_warping(
-            wall(), views, images, load_editor("small-plain"), "make it red",
-            replace(settings, **changes),
-        )  # fmt: skip
-        source, target = (result.edited[k].astype(int) for k in range(2))
-        # The border's pixels have taps outside the source.
-        inside = slice(4, -4)
-        return np.abs(np.roll(source, shift, axis=1) - target)[inside, inside].max()
-
-    assert difference(estimate_in="picture") <= 2
-    assert difference() > 50
-
-
-def test_an_estimate_warped_as_a_picture_changes_nothing_that_no_source_sees(scene, editor):
-    """Though this autoencoder does not give back the picture that it is given."""
-    _, views, images = scene
-    away = Camera.look_at((0, 0, 8), (0, 0, 9), width=32, height=32, fov_y=40, up=(0, 1, 0))
-    settings = replace(QUICK, a0=0.0, stages=1, iterations=0)
-    pair = [views[0], replace(away, name="away")], images[:2]
-
-    def edited(weight):
-        changed = replace(settings, estimate=weight, estimate_in="picture")
-        return attention_warping(wall(), *pair, editor, "a bear", changed).edited[1]
-
-    assert np.array_equal(edited(0.0), edited(1.0))
-
-
-@pytest.mark.parametrize("size", further(32, 64))
-def test_the_estimates_margin_is_a_share_of_the_photograph_whatever_the_size_of_the_edit(
-    editor, monkeypatch, size
-):
-    """Depth has the photographs' 64 px, of which 3/64 are 3."""
-    model, views = splats(), cameras(size=64)
-    margins, sight = [], geometry.Sight
-
-    def watched(*arguments):
-        margins.append(arguments[3])
-        return sight(*arguments)
-
-    monkeypatch.setattr(geometry, "Sight", watched)
-    settings = replace(
-        QUICK, stages=1, steps=1, iterations=0, size=size, estimate=1.0, estimate_margin=3 / 64
-    )
-    attention_warping(model, views[:2], pictures(model, views)[:2], editor, "a bear", settings)
-    assert margins == [[3]]

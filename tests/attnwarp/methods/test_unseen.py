@@ -12,7 +12,7 @@ from attnwarp.editing.small import load_editor
 from attnwarp.methods import attention_warping, preset
 from attnwarp.methods.attention import aligned, self_attention
 from attnwarp.methods.sight import Sight
-from attnwarp.methods.unseen import attending, check_network, kept_tokens, unseen_of
+from attnwarp.methods.unseen import attending, has_self_attention, kept_tokens, unseen_of
 from attnwarp.warp import Surface, warp_surfaces
 
 STEPS = 2
@@ -106,6 +106,6 @@ def test_an_edit_attends_only_if_something_is_marked(scene, editor):
     assert all(np.array_equal(unmarked[0][k], unmarked[1][k]) for k in free)
 
 
-def test_a_network_without_self_attention_of_its_own_is_refused():
-    with pytest.raises(ValueError, match="unseen: this editor has no self-attention"):
-        check_network(torch.nn.Identity())
+def test_a_network_without_self_attention_of_its_own_leaves_unseen_parts_free(editor):
+    assert has_self_attention(editor.network)
+    assert not has_self_attention(torch.nn.Identity())

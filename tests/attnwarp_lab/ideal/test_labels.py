@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 import torch
 
+from attnwarp import Camera
 from attnwarp.warp import preset
 from attnwarp_eval.study.shared.warps import warp_truth
 from attnwarp_eval.world import world
-from attnwarp_lab.ideal.labels import NONE, carried_labels, edge_distance, label_transport
+from attnwarp_lab.ideal.labels import (
+    NONE,
+    carried_labels,
+    depth_edges,
+    edge_distance,
+    label_transport,
+)
 from attnwarp_lab.ideal.parts import token_parts
 from attnwarp_lab.ideal.thing import labels_of
 
@@ -148,3 +155,34 @@ def test_counts_by_distance_add_up_to_all(labels):
         counts = [s * f[f"labels.{total}"] for s, f in zip(shares, (whole, one, two), strict=True)]
         assert counts[0] == pytest.approx(counts[1] + counts[2])
     assert one["labels.wrong"] > two["labels.wrong"]  # without a mask, edges go wrong
+
+
+def test_a_depth_edge_is_a_share_of_the_nearest_depth():
+    """Closed form: of three inverse depths 1, 1, 1 + x the bend is x and the nearest is 1 + x, so
+    an edge of 5 % begins at x = 1 / 19 = 0.0526.
+    """
+    for x, edge in ((0.0520, False), (0.0533, True)):
+        assert depth_edges(1 / np.array([[1.0, 1.0, 1.0, 1 + x, 1 + x, 1 + x]])).any() == edge
+
+
+def test_depth_edges_are_both_sides_of_the_outline_of_a_box_before_a_wall():
+    """Oracle: a loop over neighbours."""
+    depth = np.full((20, 24), 4.0)
+    depth[6:13, 9:17] = 3.0
+    depth[:3] = np.nan  # the sky behind the wall's upper edge
+    expected = np.zeros((20, 24), dtype=bool)
+    filled = np.nan_to_num(depth, nan=9.0)
+    for y in range(20):
+        for x in range(24):
+            for v, u in ((y, x + 1), (y, x - 1), (y + 1, x), (y - 1, x)):
+                if 0 <= v < 20 and 0 <= u < 24 and filled[y, x] != filled[v, u]:
+                    expected[y, x] = True
+    np.testing.assert_array_equal(depth_edges(depth), expected)
+
+
+def test_a_plane_at_a_grazing_angle_has_no_depth_edge_though_its_depth_leaps():
+    grazing = Camera.look_at((0, -2.0, 0.1), (0, 0, 0), width=32, height=32, fov_y=40)
+    rays = grazing.directions() @ grazing.rotation
+    below = (-grazing.position[2] / rays[..., 2])[16:]  # the horizon lies above
+    assert (below[0] / below[1] > 1.2).all()
+    assert not depth_edges(below).any()

@@ -391,10 +391,9 @@ def test_a_variant_is_the_same_cell_with_or_without_another_ones_budget(folder):
     assert len({cell.id for cell in cells.values()}) == 3
 
 
-@pytest.mark.parametrize("name", ["comparison", "beyond"])
-def test_studies_that_compare_methods_tune_attention_warping_alike(name):
+def test_the_study_that_compares_methods_tunes_attention_warping_alike():
     """Further sources leave fewer views, so fewer stages. Oracle: stages counted by hand."""
-    study = load_study(name)
+    study = load_study("comparison")
     totals = {}
     for label in study.probes["editing"]:
         variant = study.variants[label]

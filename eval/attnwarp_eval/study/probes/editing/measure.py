@@ -121,10 +121,10 @@ class EditingProbe(MethodProbe[EditResult]):
                 f"control: {OTHER_SCENE!r} needs an editor that takes pictures, and"
                 f" {editor.name!r} takes depth; choose another editor or control"
             )
-        if settings.get("sources", 1) > 1 or settings.get("estimate", 0) > 0:
+        if settings.get("sources", 1) > 1:
             raise ValueError(
                 f"control: {OTHER_SCENE!r} replaces the features of one source and nothing else;"
-                " set options.sources to 1 and options.estimate to 0, or choose another control"
+                " set options.sources to 1, or choose another control"
             )
 
     def measured(self, study: Study) -> Set[str]:
