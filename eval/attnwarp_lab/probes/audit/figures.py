@@ -194,10 +194,12 @@ def _nearest(shown: Shown, truth: PartTruth) -> npt.NDArray[np.intp]:
 
 
 def _labels(pair: Pair, source: Shown, target: Shown) -> float:
-    """Share of the object's pixels, exactly seen by both, whose nearest answers agree."""
-    xy, seen = pair.exact
+    """Share of the object's pixels, seen by both, whose nearest answers agree.
+
+    Edges count: at small sizes little else of a thing is left.
+    """
     there, here = map(_nearest, (source, target), pair.labels)
-    seen = seen & pair.mask
+    seen, xy = pair.truth.visible & pair.mask, pair.truth.xy
     column, row = np.floor(xy[seen]).astype(np.int64).T
     h, w = there.shape
     return mean((there[row.clip(0, h - 1), column.clip(0, w - 1)] == here[seen]).astype(float))
@@ -209,7 +211,7 @@ def _parts(pair: Pair, source: Shown, target: Shown) -> float:
     there, here = (
         part_answers(one.picture.astype(np.float32), truth, count, among)
         for one, truth, among in zip(
-            (source, target), pair.labels, (None, pair.exact[1]), strict=True
+            (source, target), pair.labels, (None, pair.truth.visible), strict=True
         )
     )
     known = (there != UNKNOWN) & (here != UNKNOWN)
