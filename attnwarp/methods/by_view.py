@@ -75,13 +75,18 @@ class ByView(Method):
         """Edit all views, batch by batch, then tune."""
         work, s = self.work, self.settings
         views = range(len(work.sizes))
-        # Edits with separately drawn timesteps go through the network one at a time.
-        alone = s.start is not None and s.noise == "fresh"
-        for _, same in groupby(views, key=lambda view: work.sizes[view]):
-            for batch in chunks(list(same), 1 if alone else s.batch):
-                rows = len(batch) * s.steps * work.branches()
-                loop.edit(0, batch, partial(self.edit, batch), rows=rows)
+        for batch in self.batches(views):
+            rows = len(batch) * s.steps * work.branches()
+            loop.edit(0, batch, partial(self.edit, batch), rows=rows)
         loop.tune(0, views, s.iterations)
+
+    def batches(self, views: Sequence[int]) -> list[tuple[int, ...]]:
+        """Group views that go through the network together: neighbours of one size."""
+        s = self.settings
+        # Edits with separately drawn timesteps go through the network one at a time.
+        most = 1 if s.start is not None and s.noise == "fresh" else s.batch
+        same = groupby(views, key=lambda view: self.work.sizes[view])
+        return [batch for _, group in same for batch in chunks([*group], most)]
 
     def edit(
         self, batch: Sequence[int], model: Gaussians, step: Callable[[], None]

@@ -52,12 +52,13 @@ def edited_alone(
     work = Work(gaussians, scene, editor, instruction, settings, "auto", folder, report)
     method = ByView(work, settings)
     (folder.path / CONTROL).mkdir(parents=True, exist_ok=True)
-    for place, view in enumerate(views):
-        file = f"{CONTROL}/{names[view]}.png"
-        report.step(place, len(views), "control: each view of the page edited alone")
-        if not folder.has(file):
-            (edit,) = method.edit((view,), work.frozen, lambda: None)
-            folder.write_picture(file, to_bytes(work.composite(view, edit.picture)))
+    files = {view: f"{CONTROL}/{names[view]}.png" for view in views}
+    left = [view for view in views if not folder.has(files[view])]
+    for batch in method.batches(left):
+        report.step(left.index(batch[0]), len(left), "control: each view of the page edited alone")
+        edits = method.edit(batch, work.frozen, lambda: None)
+        for view, edit in zip(batch, edits, strict=True):
+            folder.write_picture(files[view], to_bytes(work.composite(view, edit.picture)))
 
 
 def disagreement(

