@@ -32,6 +32,7 @@ def enter(name: str, module: str) -> None:
     # Read when torch loads OpenMP, whose idle threads else spin: on a busy machine the perceptual
     # distance took 15 times the CPU time on two threads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    process.keep_freed_memory()
     before = signal.getsignal(signal.SIGINT)
     heeds = before is signal.default_int_handler  # a shell's background job ignores Ctrl-C
     # A command has nothing to save before its import ends.
