@@ -139,10 +139,10 @@ class Model:
         )
 
     def _clamp_scales(self) -> None:
-        sky = self.tensors["means"].norm(dim=1, keepdim=True) > self.far
-        largest = torch.where(
-            sky, math.log(LARGEST_SKY * self.far), math.log(LARGEST * self.extent)
-        )
+        largest = torch.tensor(math.log(LARGEST * self.extent), device=self.device)
+        if math.isfinite(self.far):
+            sky = self.tensors["means"].norm(dim=1, keepdim=True) > self.far
+            largest = torch.where(sky, math.log(LARGEST_SKY * self.far), largest)
         self.tensors["scales"].clamp_(math.log(SMALLEST * self.extent)).clamp_(max=largest)
 
     def step(self, progress: float) -> None:

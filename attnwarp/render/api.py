@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -298,9 +298,9 @@ def _before_sky(gaussians: Gaussians, camera: Camera, given: dict[str, Any]) -> 
     moved = _checked_pose(given["pose"], camera).detach().numpy()
     eye = torch.as_tensor(-moved[:3, :3].T @ moved[:3, 3] - gaussians.origin)
     sky = (gaussians.means.detach() - eye.to(gaussians.means)).norm(dim=1) > gaussians.far
-    plain, index = replace(gaussians, far=math.inf), torch.nonzero(sky)[:, 0]
+    plain, index = gaussians.unchecked(far=math.inf), torch.nonzero(sky)[:, 0]
     # Without opacity rather than left out, which would copy the scene.
-    scene = replace(plain, opacities=torch.where(sky, 0.0, plain.opacities))
+    scene = plain.unchecked(opacities=torch.where(sky, 0.0, plain.opacities))
     if given["features"] is not None:
         return render(scene, camera, **given)
     behind = render(plain.select(index), camera, **given)

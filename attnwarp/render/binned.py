@@ -10,7 +10,7 @@ import torch
 
 from attnwarp.render import _pool, order
 from attnwarp.render._kernels import binning, layout, ordering, projection
-from attnwarp.render.dispatch import call
+from attnwarp.render.dispatch import call, typed
 from attnwarp.render.interface import Inputs
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 
@@ -129,6 +129,7 @@ class BinnedSplats:
         nothing = np.zeros(self.tile_count, np.int64)
         self.lists = layout.Lists(nothing, nothing, np.empty(0, np.int64))
         self._run_counts = _pool.empty(m, np.int32)
+        self._project, self._find_runs = typed(projection.project), typed(binning.find_runs)
         self._runs_per_splat = RUNS_PER_SPLAT
         self._groups: list[tuple[int, int]] = []
         self._runs: list[np.ndarray] = []
@@ -195,8 +196,7 @@ class BinnedSplats:
     ) -> np.ndarray:
         """Project a group of splats and return their runs."""
         outlines = _pool.empty((last - first, layout.OUTLINE_SIZE), np.float32)
-        call(
-            projection.project,
+        self._project(
             first,
             last,
             self.view,
@@ -220,8 +220,7 @@ class BinnedSplats:
             target = layout.Runs(
                 _pool.empty((room, layout.RUN_SIZE), np.int32), self._run_counts, changes
             )
-            used = call(
-                binning.find_runs,
+            used = self._find_runs(
                 first, last, self.view, self.tiles, self.table, outlines, before, target, pieces,
             )  # fmt: skip
             if used <= room:

@@ -42,7 +42,7 @@ from attnwarp.render.binned import (
     as_array,
     join,
 )
-from attnwarp.render.dispatch import call
+from attnwarp.render.dispatch import call, typed
 from attnwarp.render.exact import outputs_of
 from attnwarp.render.interface import OUTPUTS, Inputs, Outputs
 from attnwarp.render.threads import ranges, run_jobs, thread_count
@@ -120,11 +120,11 @@ def _exact_distortion(drawn: _Drawn) -> torch.Tensor:
     binned, state = drawn.binned, drawn.pictures.state
     target = _pool.empty(state.shape[1:], np.float32)
     rooms = _rooms(binned.lists)[binned.tiles.order]
+    distort = typed(distortion.distort)
 
     def work(first: int, last: int) -> None:
         space = _pairs_workspace(int(rooms[first:last].max()))
-        call(
-            distortion.distort,
+        distort(
             first, last, binned.view, binned.tiles, binned.lists, binned.table, state, target,
             space,
         )  # fmt: skip
@@ -328,7 +328,7 @@ def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:
     rooms = _rooms(binned.lists)[order] if exact else np.zeros(tile_count, np.int64)
     before = np.concatenate([[0], np.cumsum(counts[order])])
     buffer = np.empty((0, columns), np.float32)
-    first = 0
+    first, rasterize_backward = 0, typed(backward.rasterize_backward)
     while first < tile_count:
         end = before[first] + GRADIENT_ROWS
         last = max(first + 1, int(np.searchsorted(before, end, side="right")) - 1)
@@ -351,8 +351,7 @@ def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:
                 aligned_doubles(evaluation.MOMENTS),
                 _pairs_workspace(int(rooms[begin:end].max())),
             )
-            call(
-                backward.rasterize_backward,
+            rasterize_backward(
                 begin, end, binned.view, binned.tiles, binned.lists, binned.table,
                 binned.background, drawn.ndc_scale, drawn.pictures, upstream, rows, space,
             )  # fmt: skip

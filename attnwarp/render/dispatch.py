@@ -55,3 +55,15 @@ def machine_code(kernel: Callable[..., Any], arguments: tuple[Any, ...]) -> Call
 def call(kernel: Callable[..., Any], *arguments: Any) -> Any:
     """Call ``kernel(*arguments)``."""
     return machine_code(kernel, arguments)(*arguments)
+
+
+def typed(kernel: Callable[..., Any]) -> Callable[..., Any]:
+    """Return ``kernel`` for calls that have the types of the first, found once, as jobs have."""
+    found: list[Callable[..., Any]] = []
+
+    def called(*arguments: Any) -> Any:
+        if not found:
+            found.append(machine_code(kernel, arguments))
+        return found[0](*arguments)
+
+    return called
