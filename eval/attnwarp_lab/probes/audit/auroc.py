@@ -28,10 +28,6 @@ class Auroc:
         value: 1 for perfect separation, 0.5 for none; NaN if nothing is defined.
         low, high: 95 % interval over scenes, by percentiles of a bootstrap; NaN with fewer than
             six scenes.
-        scenes: number of scenes with both kinds of results.
-        undefined: share of the values that were NaN, which are left out.
-        paired: share of the flawed results with a value above the mean of the right ones of
-            the same scene; ties are half.
 
     Example:
         >>> auroc([({"bear": [3.0], "fence": [4.0]}, {"bear": [1.0], "fence": [3.0]})]).value
@@ -41,9 +37,6 @@ class Auroc:
     value: float
     low: float
     high: float
-    scenes: int
-    undefined: float
-    paired: float
 
 
 def auroc(groups: Sequence[tuple[Values, Values]], *, seed: int = 0) -> Auroc:
@@ -58,33 +51,25 @@ def auroc(groups: Sequence[tuple[Values, Values]], *, seed: int = 0) -> Auroc:
 
     Example:
         >>> flawed, right = {"bear": [2.0, float("nan")]}, {"bear": [1.0]}
-        >>> auroc([(flawed, right)]).undefined
-        0.3333333333333333
+        >>> auroc([(flawed, right)]).value
+        1.0
     """
     scenes = sorted({scene for pair in groups for values in pair for scene in values})
     rng = np.random.default_rng(seed)
     draws = rng.multinomial(len(scenes), np.full(len(scenes), 1 / max(1, len(scenes))), RESAMPLES)
     weights = np.vstack([np.ones(len(scenes)), draws])
-    areas, within, total, missing, used = [], [], 0, 0, set()
-    for flawed, right in groups:
-        rows = [_split(values, scenes) for values in (flawed, right)]
-        for defined, undefined in rows:
-            total += sum(map(len, defined)) + undefined
-            missing += undefined
-        (positive, _), (negative, _) = rows
-        wins = _wins(positive, negative)
+    areas, used = [], set()
+    for pair in groups:
+        positive, negative = (_defined(values, scenes) for values in pair)
         counts = np.outer(list(map(len, positive)), list(map(len, negative))).astype(float)
         if not counts.sum():
             continue
-        won = np.einsum("ki,ij,kj->k", weights, wins, weights)
+        won = np.einsum("ki,ij,kj->k", weights, _wins(positive, negative), weights)
         of = np.einsum("ki,ij,kj->k", weights, counts, weights)
         areas.append(np.divide(won, of, out=np.full_like(won, np.nan), where=of > 0))
-        for scene, p, n in zip(scenes, positive, negative, strict=True):
-            if len(p) and len(n):
-                used.add(scene)
-                within.append(float(_above(p, n.mean()).mean()))
+        used |= set(np.flatnonzero(np.diag(counts)))
     if not areas:
-        return Auroc(np.nan, np.nan, np.nan, 0, missing / total if total else np.nan, np.nan)
+        return Auroc(np.nan, np.nan, np.nan)
     table = np.stack(areas)
     known = np.isfinite(table)
     means = np.divide(
@@ -94,17 +79,13 @@ def auroc(groups: Sequence[tuple[Values, Values]], *, seed: int = 0) -> Auroc:
         where=known.any(axis=0),
     )
     low, high = np.nanquantile(means[1:], [0.025, 0.975]) if len(used) >= 6 else (np.nan, np.nan)
-    return Auroc(
-        float(means[0]), float(low), float(high), len(used), missing / total,
-        float(np.mean(within)) if within else np.nan,
-    )  # fmt: skip
+    return Auroc(float(means[0]), float(low), float(high))
 
 
-def _split(values: Values, scenes: Sequence[str]) -> tuple[list[FloatArray], int]:
-    """Defined values by scene, and the number of undefined ones."""
+def _defined(values: Values, scenes: Sequence[str]) -> list[FloatArray]:
+    """Defined values by scene."""
     rows = [np.asarray(values.get(scene, ()), dtype=np.float64) for scene in scenes]
-    defined = [row[np.isfinite(row)] for row in rows]
-    return defined, sum(map(len, rows)) - sum(map(len, defined))
+    return [row[np.isfinite(row)] for row in rows]
 
 
 def _wins(positive: Sequence[FloatArray], negative: Sequence[FloatArray]) -> FloatArray:

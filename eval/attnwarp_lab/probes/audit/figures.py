@@ -332,10 +332,6 @@ FIGURES = (
     Figure(
         "embedding.dino_image", "DINO between neighbours", "nothing", _similar("dino"), "dino"
     ),
-    Figure("consistency.colmap_registered", "COLMAP, registered views", "set of views"),
-    Figure("consistency.colmap_points", "COLMAP, points", "set of views"),
-    Figure("consistency.colmap_track_length", "COLMAP, track length", "set of views"),
-    Figure("consistency.colmap_error", "COLMAP, reprojection error", "set of views"),
     *(
         Figure(f"consistency.{key}{end}", f"{title}{said}", "splats, set of views", splats=splats)
         for splats, end, said in (("sampled", "", ""), ("fitted", ".fitted", ", fitted splats"))

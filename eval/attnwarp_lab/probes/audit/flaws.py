@@ -264,9 +264,6 @@ FLAWS = (
 )  # fmt: skip
 """Every flaw: first of the target, the most important first, then of all views."""
 
-ELSEWHERE = next(flaw for flaw in FLAWS if flaw.name == "elsewhere")
-"""Flaw that shows another scene, which every figure should detect."""
-
 COUNTED = tuple(flaw for flaw in FLAWS if flaw.counts)
 """The most important flaws."""
 

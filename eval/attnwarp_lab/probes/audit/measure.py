@@ -23,7 +23,6 @@ from pydantic import Field, model_validator
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
 from attnwarp.warp import Surface, WarpedView, render_surface, warp_view
-from attnwarp_eval import metrics
 from attnwarp_eval.cost import Meter, in_turn
 from attnwarp_eval.metrics.arrays import Array
 from attnwarp_eval.metrics.refit import refit
@@ -49,7 +48,7 @@ from attnwarp_lab.ideal.figures import PartTruth
 from attnwarp_lab.ideal.share import solve_share
 from attnwarp_lab.ideal.thing import Thing
 from attnwarp_lab.probes.audit.figures import Measure, Pair, Shown
-from attnwarp_lab.probes.audit.flaws import CONDITIONS, COUNTED, ELSEWHERE
+from attnwarp_lab.probes.audit.flaws import CONDITIONS
 from attnwarp_lab.probes.audit.scores import digest_of, keep, scores_of
 from attnwarp_lab.probes.audit.views import (
     PAIRS,
@@ -68,18 +67,14 @@ ARM = "arm="
 REFIT_SIZE = 128
 """Side in px of the pictures to which splats' colours are fitted."""
 
-IN_SETS = {flaw.key(flaw.reference): flaw for flaw in (*COUNTED, ELSEWHERE)}
-"""Flaws of sets of views: a reconstruction takes too long for all of them."""
-
 
 class Audit(Part):
     """Edits and views.
 
     ``edits``: edits with at least two answers. ``yaws``: degrees of the targets from the source.
     ``splats``: the scene before the edit, with rendered depth; with ``fitted``, splats fitted to
-    its true pictures stand beside it. ``colmap``: whether COLMAP reconstructs all views, too;
-    needs pycolmap. ``scores``: file of scores, and ``pictures``: whether the run keeps the
-    pictures that they are of (:mod:`attnwarp_lab.probes.audit.scores`).
+    its true pictures stand beside it. ``scores``: file of scores, and ``pictures``: whether the run
+    keeps the pictures that they are of (:mod:`attnwarp_lab.probes.audit.scores`).
     """
 
     edits: Annotated[list[str], Field(min_length=1)] = Field(default_factory=lambda: ["parts"])
@@ -88,7 +83,6 @@ class Audit(Part):
     )
     splats: Splats = Splats(kind="2d", count=16_000, position_noise=0.1, normal_noise=3.0)
     fitted: bool = False
-    colmap: bool = False
     scores: str | None = None
     pictures: bool = False
 
@@ -293,11 +287,6 @@ class AuditProbe(MethodProbe[Seconds]):
                 found, taken = _refitted(model, views, sets, encoders)
                 figures |= {f"{key}{end}.{name}": value for (key, name), value in found.items()}
                 seconds |= {f"{key}{end}": [taken] for key in {key for key, _ in found}}
-            if work.spec["colmap"]:
-                few = {n: of for n, of in sets.items() if not is_alone(n) or n in IN_SETS}
-                found, taken = _reconstructed(views, few)
-                figures |= {f"{key}.{name}": value for (key, name), value in found.items()}
-                seconds |= {key: [taken] for key in {key for key, _ in found}}
         return figures, seconds
 
 
@@ -380,19 +369,6 @@ def _refitted(
                 [of[view].astype(np.float32) for view in held], [found.renders[v] for v in held]
             )
             figures["consistency.held_distance", name] = float(np.mean(distances))
-    return figures, (perf_counter() - start) / len(sets)
-
-
-def _reconstructed(
-    cameras: Sequence[Camera], sets: Mapping[str, Sequence[Array]]
-) -> tuple[dict[tuple[str, str], float], float]:
-    """COLMAP's figures of sets of views, and seconds of a set."""
-    start = perf_counter()
-    figures = {
-        (key, name): value
-        for name, images in sets.items()
-        for key, value in metrics.reconstruct(images, cameras).figures().items()
-    }
     return figures, (perf_counter() - start) / len(sets)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -67,9 +68,16 @@ class Pairs:
         """Yaws up to :data:`NEAR`; all if there are none."""
         return [yaw for yaw in self.yaws if abs(yaw) <= NEAR] or self.yaws
 
-    def of_edit(self, edit: str) -> Pairs:
-        """Pairs of one edit."""
-        return Pairs([(s, record) for s, record in self.records if record.spec["edit"] == edit])
+    @cached_property
+    def kinds(self) -> dict[str, Pairs]:
+        """Pairs of each edit, which are never pooled."""
+        edits = dict.fromkeys(record.spec["edit"] for _, record in self.records)
+        if len(edits) == 1:
+            return dict.fromkeys(edits, self)
+        return {
+            edit: Pairs([(s, record) for s, record in self.records if record.spec["edit"] == edit])
+            for edit in edits
+        }
 
     def plain(self, row: Figure, conditions: Sequence[str], yaw: float) -> Values:
         """Scene -> unsigned values of conditions at a yaw."""
@@ -96,21 +104,18 @@ class Pairs:
         yaws: Sequence[float],
         right: Sequence[str] = RIGHT,
     ) -> Auroc:
-        """Mean AUROC of conditions at yaws, against right pairs of the same yaw."""
+        """Mean AUROC of conditions at yaws, against right pairs of the same edit and yaw."""
         key = (row.key, tuple(conditions), tuple(yaws), tuple(right))
         if key not in self._kept:
             self._kept[key] = auroc(
                 [
-                    (self.values(row, [one], yaw), self.values(row, right, yaw))
+                    (kind.values(row, [one], yaw), kind.values(row, right, yaw))
+                    for kind in self.kinds.values()
                     for one in conditions
                     for yaw in yaws
                 ]
             )
         return self._kept[key]
-
-    def shown(self, row: Figure, flaw: Flaw) -> Auroc:
-        """AUROC of a flaw at its reference size, up to :data:`NEAR` degrees."""
-        return self.area(row, [flaw.key(flaw.reference)], self.near)
 
     def counted(self, row: Figure, yaws: Sequence[float], right: Sequence[str] = RIGHT) -> Auroc:
         """Mean AUROC of the most important flaws, against right pairs."""
@@ -118,12 +123,12 @@ class Pairs:
 
     def alarms(self, row: Figure, trap: str = VARNISHED) -> float:
         """Share of a trap's right pairs above the threshold that :data:`ALARM` of the other right
-        pairs pass, mean over the near yaws.
+        pairs of the edit pass, mean over edits and near yaws.
         """
         shares = []
-        for yaw in self.near:
+        for kind, yaw in product(self.kinds.values(), self.near):
             right, shiny = (
-                np.array([v for numbers in self.values(row, names, yaw).values() for v in numbers])
+                np.array([v for numbers in kind.values(row, names, yaw).values() for v in numbers])
                 for names in (RIGHT, [trap])
             )
             right, shiny = right[np.isfinite(right)], shiny[np.isfinite(shiny)]
@@ -220,8 +225,7 @@ class AuditReport(ProbeReport):
         yield Place.ANSWER, _answer(results, pairs)
         if pairs.arms:
             yield Place.INSTRUMENT, _real(pairs)
-        edits = list(dict.fromkeys(record.spec["edit"] for _, record in records))
-        yield Place.INSTRUMENT, _settings(pairs, edits)
+        yield Place.INSTRUMENT, _settings(pairs)
         yield Place.INSTRUMENT, _sizes(pairs)
         yield Place.APPENDIX, _everything(pairs)
 
@@ -230,7 +234,7 @@ def area_text(value: Auroc, intervals: bool = True) -> str:
     """AUROC with its interval, if any; a dash if undefined.
 
     Example:
-        >>> area_text(Auroc(0.951, 0.9, 1.0, 24, 0.0, 0.9))
+        >>> area_text(Auroc(0.951, 0.9, 1.0))
         '0.95 [0.90, 1.00]'
     """
     if not math.isfinite(value.value):
@@ -322,7 +326,7 @@ def _answer(results: Results, pairs: Pairs) -> Section:
         "false alarms: varnish / metal", *taus, "seconds",
     ]  # fmt: skip
     yaws = ", ".join(f"{yaw:g}" for yaw in pairs.yaws)
-    edits = ", ".join(dict.fromkeys(f"`{record.spec['edit']}`" for _, record in pairs.records))
+    edits = ", ".join(f"`{edit}`" for edit in pairs.kinds)
     text = [
         (
             f"Every pair is the source view and one turned by {yaws} degrees, of"
@@ -374,9 +378,9 @@ def _real(pairs: Pairs) -> Section:
     )
 
 
-def _settings(pairs: Pairs, edits: Sequence[str]) -> Section:
+def _settings(pairs: Pairs) -> Section:
     """AUROC of the five flaws by kind of edit and by yaw."""
-    kinds = {edit: pairs.of_edit(edit) for edit in edits}
+    kinds = pairs.kinds
     rows = [
         [
             row.title,

@@ -112,7 +112,7 @@ def test_every_metric_has_every_condition_and_its_seconds(record):
     view, other = record.views
     assert (view.name, view.yaw) == ("turned10", pytest.approx(10))
     assert other.name == "turned-20"
-    keys = [f.key for f in FIGURES if f.splats != "fitted" and "colmap" not in f.key]
+    keys = [f.key for f in FIGURES if f.splats != "fitted"]
     expected = {f"{key}.{name}" for key in keys for name in (*PAIRS, *CONDITIONS, f"{ARM}carried")}
     assert set(view.metrics) == expected
     assert set(record.extra.seconds) == set(keys)
@@ -186,25 +186,6 @@ def test_another_thing_is_none_that_the_edit_changes(scenes):
     assert edit_of_others(scene, "box")[0] == "any"
 
 
-@pytest.mark.door
-def test_figures_of_a_set_are_those_of_colmap_on_the_true_pictures(tmp_path):
-    pytest.importorskip("pycolmap")
-    path = write(tmp_path / "one.yaml")
-    audit = {"edits": ["any"], "yaws": [8, -8], "splats": {"count": 500}, "colmap": True}
-    (cell,) = cells(
-        [path], tmp_path, encoders={}, size=128, audit=audit, probes={"audit": []}, variants={}
-    )
-    record = compute(probe("audit"), cell, tmp_path, threads=1)
-    scene = load_scene(str(path)).with_size(128, 128)
-    cameras = [scene.source, turned(scene, 8), turned(scene, -8)]
-    right = [shown(scene.edited("any", "red"), camera) for camera in cameras]
-    flawed = [right[0], shown(scene, cameras[1]), right[2]]
-    for name, images in (("right", right), ("unedited=1", flawed)):
-        for key, value in metrics.reconstruct(images, cameras).figures().items():
-            for view in record.views:
-                assert view.metrics[f"{key}.{name}"] == pytest.approx(value, nan_ok=True)
-
-
 @pytest.mark.parametrize(
     ("audit", "message"),
     [
@@ -252,7 +233,7 @@ ARMS = ["a", "b", "c", "d"]
 def by_hand(scenes, value, seeds=1):
     """A run whose metric ``value(key, condition, yaw, scene)`` gives, the same for every seed."""
     spec = {"size": 64, "rounds": 3, "edit": "any", "yaws": [10.0, 120.0], "encoders": {}}
-    spec |= {"colmap": True, "arms": {arm: {} for arm in ARMS}}
+    spec |= {"arms": {arm: {} for arm in ARMS}}
     keys = [f.key for f in FIGURES if f.key.startswith(("consistency.", "multiview."))]
     names = (*PAIRS, *CONDITIONS, *(ARM + arm for arm in ARMS))
     records = {}
@@ -344,16 +325,16 @@ def test_a_figure_is_ranked_by_the_true_disagreement_of_real_edits_of_a_scene():
 def test_a_metric_is_ranked_with_the_size_of_a_flaw_and_seeds_are_of_one_scene():
     def value(key, name, yaw, scene):
         _, size = CONDITIONS.get(name, (None, 0.0))
-        if key == "consistency.colmap_points":  # higher is better: falls as the flaw grows
+        if key == "consistency.held_psnr":  # higher is better: falls as the flaw grows
             return 9.0 - size
-        if key == "consistency.colmap_error":  # 0, 2, 1, 3 and 4 for sizes that rise
+        if key == "consistency.held_distance":  # 0, 2, 1, 3 and 4 for sizes that rise
             return {0.5: 2.0, 1.0: 1.0, 2.0: 3.0, 4.0: 4.0}.get(size, 0.0)
         return 1.0
 
     pairs = pairs_of(by_hand(2, value, seeds=2))
     assert pairs.scenes == 2
     rows = {row.key: row for row in pairs.rows}
-    points, error = (rows[f"consistency.colmap_{name}"] for name in ("points", "error"))
+    points, error = (rows[f"consistency.held_{name}"] for name in ("psnr", "distance"))
     assert pairs.follows(points, FLAW["slid"]).mean == pytest.approx(1)
     assert pairs.follows(error, FLAW["blur"]).mean == pytest.approx(0.9)  # 1 - 6 * 2 / (5 * 24)
     assert pairs.follows(rows["consistency.delta_e"], FLAW["noise"]).mean == 0
@@ -390,7 +371,7 @@ def test_a_file_of_scores_is_judged_as_any_figure_and_a_bad_one_says_why(scenes,
     assert Pairs([("one", record)]).rows[0].key == key
     path.write_text("scene,edit,condition,source,target,MEt3R\n")
     (cell,) = cells([scenes[0]], tmp_path, audit=audit, **small)
-    with pytest.raises(StudyError, match="scores such as 'MEt3R lower'"):
+    with pytest.raises(InputError, match="scores such as 'MEt3R lower'"):
         compute(probe("audit"), cell, tmp_path, threads=1)
 
 

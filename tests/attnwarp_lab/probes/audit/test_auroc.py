@@ -22,22 +22,19 @@ def test_it_is_torchmetrics_area_and_mann_whitneys_u_with_ties():
     assert result.value == pytest.approx(float(area), abs=1e-6)
     assert result.value == pytest.approx(mannwhitneyu(flawed, right).statistic / 2400)
     assert result.low < result.value < result.high
-    assert (result.scenes, result.undefined) == (8, 0)
 
 
 def test_groups_are_averaged_and_never_compared_with_one_another():
     low, high = {"a": [1.0], "b": [1.0]}, {"a": [9.0], "b": [9.0]}
     seen = auroc([(high, low), ({"a": [90.0], "b": [90.0]}, high)])
-    assert (seen.value, seen.paired) == (1.0, 1.0)
+    assert seen.value == 1.0
     assert auroc([(high, low), (low, high)]).value == 0.5
 
 
-def test_undefined_values_are_left_out_and_counted():
+def test_undefined_values_are_left_out():
     result = auroc([({"a": [2.0, np.nan]}, {"a": [1.0, np.nan, 0.0]})])
-    assert (result.value, result.undefined) == (1.0, 0.4)
-    nothing = auroc([({"a": [np.nan]}, {"a": [1.0]})])
-    assert np.isnan(nothing.value)
-    assert nothing.undefined == 0.5
+    assert result.value == 1.0
+    assert np.isnan(auroc([({"a": [np.nan]}, {"a": [1.0]})]).value)
     assert np.isnan(result.low)  # one scene says nothing about others
 
 
