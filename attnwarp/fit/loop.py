@@ -420,7 +420,8 @@ class _Run:
             if k == 1:  # the first loads and warms up
                 begin = time.perf_counter()
             index = k % len(self.views)
-            view = self.render(self.model.gaussians(), self.views.cameras[index], background)
+            gaussians = self.model.gaussians(sh_degree=self.sh_degree)
+            view = self.render(gaussians, self.views.cameras[index], background)
             self.loss_of(view.color.float(), view, self.views.target(index, background)).backward()
             self.model.clear()
         pace = (time.perf_counter() - begin) / 3
@@ -506,7 +507,7 @@ class _Run:
         background = self.background(fitting=True)
         target = self.views.target(index, background)
         try:
-            gaussians = self.model.gaussians()
+            gaussians = self.model.gaussians(sh_degree=self.sh_degree)
         except ValueError as error:
             raise RuntimeError(
                 f"after {self.iteration} iterations: {error}; lower the learning rates"
@@ -543,15 +544,19 @@ class _Run:
             else SMOOTHING * self.error + (1 - SMOOTHING) * squared
         )
 
-    def render(self, gaussians: Gaussians, camera: Any, background: Tensor) -> Render:
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the harmonics in use, which grows during the fit."""
         more = self.iteration // self.settings.sh_every
-        degree = min(self.settings.sh_degree, self.first_degree + more)
+        return min(self.settings.sh_degree, self.first_degree + more)
+
+    def render(self, gaussians: Gaussians, camera: Any, background: Tensor) -> Render:
         return render(
             gaussians,
             camera,
             backend=self.backend,
             background=background,
-            sh_degree=degree,
+            sh_degree=self.sh_degree,
             near=self.settings.near * self.extent,
         )
 

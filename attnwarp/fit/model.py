@@ -122,16 +122,24 @@ class Model:
         """Device of the splats and of Adam's moments."""
         return self.tensors["means"].device
 
-    def gaussians(self, tensors: dict[str, Tensor] | None = None) -> Gaussians:
-        """Build the splats, differentiable in the leaves, or from ``tensors`` in their place."""
+    def gaussians(
+        self, tensors: dict[str, Tensor] | None = None, sh_degree: int | None = None
+    ) -> Gaussians:
+        """Build the splats, differentiable in the leaves, or from ``tensors`` in their place.
+
+        Args:
+            tensors: tensors by name, as in :attr:`tensors`.
+            sh_degree: degree of the harmonics; all by default. Others cost a gradient of zeros.
+        """
         t = self.tensors if tensors is None else tensors
+        rest = t["rest"] if sh_degree is None else t["rest"][:, : (sh_degree + 1) ** 2 - 1]
         return Gaussians(
             self.settings.kind,
             t["means"],
             t["quats"],
             t["scales"].exp(),
             t["opacity"].sigmoid(),
-            torch.cat([t["dc"], t["rest"]], dim=1),
+            torch.cat([t["dc"], rest], dim=1) if rest.shape[1] else t["dc"],
             origin=self.origin,
             antialiased=self.antialiased,
             screen_filter=self.screen_filter,

@@ -390,7 +390,8 @@ def _prepare(
                     f"sh_degree: got {sh_degree}, expected 0 to {gaussians.sh_degree}, the splats'"
                     " degree"
                 )
-            values = values[:, : (sh_degree + 1) ** 2]
+            if sh_degree < gaussians.sh_degree:  # a slice's gradient is another tensor of zeros
+                values = values[:, : (sh_degree + 1) ** 2]
     channels = 3 if features is None else features.shape[1]
     if background is None:
         behind = torch.zeros(channels, dtype=torch.float32, device=device)

@@ -15,6 +15,7 @@ from attnwarp import Camera, Gaussians
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.fit import FitSettings, Views, fit, from_points
 from attnwarp.fit.loop import CHECKPOINT, SPLATS
+from attnwarp.fit.model import Model
 from attnwarp.io import read_ply
 from attnwarp.render import render
 from attnwarp.workdir import Workdir
@@ -661,3 +662,14 @@ def test_defaults_that_depend_on_the_kind_follow_it():
     solid = dataclasses.replace(flat, kind="3d")
     assert (flat.normal_weight, flat.opacity_floor) == (0.05, 0.05)
     assert (solid.normal_weight, solid.distortion_weight, solid.opacity_floor) == (0.0, 0.0, 0.005)
+
+
+def test_harmonics_above_the_degree_in_use_take_no_part():
+    """By the closed form of the layout: (degree + 1)^2 coefficients come first."""
+    start = from_points(np.eye(3), kind="2d", sh_degree=3)
+    start.sh += torch.arange(16.0)[:, None]
+    model = Model(start, FitSettings(kind="2d"), 1.0)
+    for degree, count in enumerate((1, 4, 9, 16)):
+        assert torch.equal(model.gaussians(sh_degree=degree).sh, start.sh[:, :count])
+    model.gaussians(sh_degree=0).sh.sum().backward()
+    assert model.tensors["rest"].grad is None
