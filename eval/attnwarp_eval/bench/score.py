@@ -46,7 +46,8 @@ LITTLE = 3.0
 """dE00 inside the mask below which a source counts as unedited."""
 
 SMOOTH = 0.5
-"""Share of the true edit's gradient inside the mask below which pictures count as smoothed."""
+"""Share of a gradient inside the mask, the original's or the true edit's if less, below which
+pictures count as smoothed: an editor may keep either."""
 
 EMPTY = (UNEDITED, COPIED, SMOOTHED) = "the source is unedited", "copies of the source", "smooth"
 """Beginnings of remarks on pictures that agree without merit."""
@@ -185,15 +186,15 @@ def _remarks(
         nearest = min(errors, key=errors.__getitem__)
         if nearest != view and errors[nearest] < 0.5 * errors[view]:
             remarks.append(f"{view} looks like {nearest}: are their names swapped?")
-    # Without its border: a silhouette has a gradient, whatever fills it.
-    within = {view: binary_erosion(truth.union[view], np.ones((3, 3))) for view in pictures}
-    slopes = [
-        _slope(image, within[view]) / _slope(truth.answers[answer][view], within[view])
-        for view, image in pictures.items()
-        if within[view].any()
-    ]
+    slopes = []
+    for view, image in pictures.items():
+        # Without its border: a silhouette has a gradient, whatever fills it.
+        within = binary_erosion(truth.union[view], np.ones((3, 3)))
+        if within.any():
+            least = (truth.originals[view], truth.answers[answer][view])
+            slopes.append(_slope(image, within) / min(_slope(one, within) for one in least))
     if slopes and float(np.median(slopes)) < SMOOTH:
-        remarks.append(f"{SMOOTHED}: {np.median(slopes):.0%} of the true edit's gradient")
+        remarks.append(f"{SMOOTHED}: {np.median(slopes):.0%} of the gradient before or after")
     return remarks
 
 

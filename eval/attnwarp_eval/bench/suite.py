@@ -27,7 +27,9 @@ from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import Dataset, read_image, write_ply, write_transforms
 from attnwarp.io.text import read_text
-from attnwarp.reporting import SILENT, Part, Reporter
+from attnwarp.process import core_count
+from attnwarp.reporting import SILENT, Part, Reporter, duration
+from attnwarp_eval.drawn.asked import BRIGHT
 from attnwarp_eval.drawn.draft import GENERATOR
 from attnwarp_eval.drawn.files import to_text
 from attnwarp_eval.drawn.scenes import draw
@@ -52,6 +54,9 @@ SPLATS = {"kind": "2d", "count": 16_000, "position_noise": 0.1, "normal_noise": 
 
 FIT = {"iterations": 1000, "max_splats": 12_000, "sh_degree": 1, "evaluate_every": 1000}
 """Settings of a sealed bench's splats, fitted to the pictures from random points."""
+
+SECONDS = {"scene": 10.0, "sample": 1.4e-6, "fit": 90.0}
+"""CPU seconds of an export: a scene's shapes and splats, a path of its pictures, a sealed fit."""
 
 KEY = "key.json"
 TIME = 946_684_800
@@ -177,6 +182,10 @@ def export(
     asked = {"seed": seed, "size": size, "spp": spp, "targets": targets}
     files: dict[str, str] = {}
     views: tuple[str, ...] = ()
+    left = sum(not (root / name / "files.json").is_file() for name in scenes)
+    cost = _cost(size, spp, targets + 1, sealed is not None)
+    time = duration(left * cost / core_count())
+    report.log(f"{left} scenes to write: {time}, if {core_count()} cores are free")
     for number, name in enumerate(scenes):
         report.step(number, count, name)
         listing = root / name / "files.json"
@@ -202,6 +211,12 @@ def export(
         for path in (*folder.rglob("*"), folder):
             os.utime(path, (TIME, TIME))
     return suite
+
+
+def _cost(size: int, spp: int, views: int, sealed: bool) -> float:
+    """CPU seconds of a scene: a picture before the edits, and one for each right answer."""
+    samples = size**2 * spp * views * (1 + 1 + len(BRIGHT))
+    return SECONDS["scene"] + SECONDS["sample"] * samples + SECONDS["fit"] * sealed
 
 
 def truth_file(root: Path, scene: str) -> Path:

@@ -4,8 +4,10 @@ import json
 import math
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -80,6 +82,43 @@ def test_pycolmap_opens_the_export(bench):
     for camera in read_dataset(bench / SCENE / "transforms.json").cameras:
         pose = by_name[camera.name.removeprefix("images/")].cam_from_world().matrix()
         np.testing.assert_allclose(pose, camera.world_to_camera[:3], atol=1e-9)
+
+
+def test_nerfstudios_rules_read_the_export(bench):
+    """Rules of its NerfstudioDataParser: intrinsics at the top or in every frame, paths below the
+    folder, masks and depths of all frames or none, rays (x - cx) / fl_x, -(y - cy) / fl_y, -1 in
+    ``transform_matrix``, points by Open3D. Rays and depth must meet the truth's source pixels.
+    """
+    o3d = pytest.importorskip("open3d")
+    place = bench / SCENE
+    meta = json.loads((place / "transforms.json").read_text())
+    frames = meta["frames"]
+    for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+        assert name in meta or all(name in frame for frame in frames)
+    assert meta["camera_model"] == "OPENCV" and not {"k1", "k2", "k3", "p1", "p2"} & set(meta)
+    assert not any({"mask_path", "depth_file_path"} & set(frame) for frame in frames)
+    assert not any(f"{split}_filenames" in meta for split in ("train", "val", "test"))
+    paths = [place / frame["file_path"] for frame in frames]
+    assert len(set(paths)) == len(frames) and all(path.is_file() for path in paths)
+    points = o3d.io.read_point_cloud(str(place / meta["ply_file_path"]))
+    assert len(points.points) == len(points.colors) == suite.POINTS
+
+    poses = {Path(f["file_path"]).stem: np.array(f["transform_matrix"]) for f in frames}
+    grid = np.stack(np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5), -1)
+    x, y = ((grid - [meta["cx"], meta["cy"]]) / [meta["fl_x"], meta["fl_y"]]).transpose(2, 0, 1)
+    depth = np.load(place / "depth" / "yaw010.npy")
+    rays = np.stack([x, -y, -np.ones_like(x)], -1) @ poses["yaw010"][:3, :3].T
+    surface = poses["yaw010"][:3, 3] + rays * depth[..., None]
+    seen = (surface - poses["source"][:3, 3]) @ poses["source"][:3, :3]
+    mine = np.stack([
+        meta["cx"] + meta["fl_x"] * seen[..., 0] / -seen[..., 2],
+        meta["cy"] - meta["fl_y"] * seen[..., 1] / -seen[..., 2],
+    ], -1)  # fmt: skip
+    true = np.load(place / "truth" / "source_pixel" / "yaw010.npy")
+    visible = read_image(place / "truth" / "visible" / "yaw010.png")[..., 0] == 255
+    assert visible.mean() > 0.2
+    # Depth and pixels are stored in float32.
+    np.testing.assert_allclose(mine[visible], true[visible], atol=1e-3)
 
 
 def test_scores_equal_those_of_a_study_to_the_last_digit(bench, tmp_path):
@@ -206,6 +245,28 @@ def test_an_export_goes_on_where_it_was_and_keeps_other_settings_out(bench, tmp_
         suite.export(copy, count=1, seed=10, size=SIZE, spp=SPP, targets=2)
 
 
+@pytest.mark.slow
+def test_a_killed_export_goes_on_to_the_same_files(tmp_path):
+    asked = {"count": 2, "seed": 9, "size": 16, "spp": 1, "targets": 1}
+    call = (
+        f"from attnwarp_eval.bench import suite; suite.export({str(tmp_path / 'a')!r}, **{asked})"
+    )
+    process = subprocess.Popen([sys.executable, "-c", call])
+    second = tmp_path / "a" / "drawn-1" / "images" / "source.png"
+    while not second.is_file() and process.poll() is None:
+        time.sleep(0.01)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    first = tmp_path / "a" / "drawn-0" / "images" / "source.png"
+    kept = first.stat().st_mtime_ns
+    again, whole = (suite.export(tmp_path / name, **asked) for name in ("a", "b"))
+    assert again == whole and first.stat().st_mtime_ns == kept
+    files = {path for path in (tmp_path / "a").rglob("*") if path.is_file()}
+    assert {path.relative_to(tmp_path / "a") for path in files} == {
+        path.relative_to(tmp_path / "b") for path in (tmp_path / "b").rglob("*") if path.is_file()
+    }
+
+
 def test_the_commands_score_a_folder_and_print_its_page(bench, tmp_path):
     folder = handed_in(tmp_path, {"colour": true_pictures(bench, "colour", ["edited"] * 3)})
     (folder / "method.json").write_text(json.dumps({"name": "truth"}))
@@ -217,16 +278,57 @@ def test_the_commands_score_a_folder_and_print_its_page(bench, tmp_path):
     assert "Scores of truth" in page and "not handed in: drawn-0/some_colour" in page
 
 
-def test_the_documented_loop_hands_in_pictures_without_this_package(bench, tmp_path):
+MADE_UP = """
+import hashlib
+def my_editor(picture, words):
+    values = np.array(picture).astype(float)
+    hue = np.array([hash_of(values.tobytes(), words, k) for k in range(3)])
+    return Image.fromarray((0.75 * values + 0.25 * hue).astype(np.uint8))
+def hash_of(*parts):
+    return hashlib.sha256(repr(parts).encode()).digest()[0]
+def alone(scene, out, view, picture, edit):
+    return my_editor(picture, edit["instruction"])
+edit_all("bench", "alone", alone)
+"""
+"""A method whose tint follows from the picture: views alone get different ones."""
+
+
+def walk(python, bench, folder, before=""):
+    """Walk the page's way from an export to two scored folders in an environment's Python."""
     page = (Path(__file__).parents[3] / "docs" / "measuring" / "bench.md").read_text()
-    (block,) = re.findall(r"```python\n(.*?)```", page, re.S)
-    (tmp_path / "bench").symlink_to(bench)
+    loop, carry = re.findall(r"```python\n(.*?)```", page, re.S)
+    (folder / "bench").symlink_to(bench)
+    script = before + loop + "import numpy as np\n" + MADE_UP + carry
+    subprocess.run([python, "-c", script], cwd=folder, check=True, timeout=120)
+    by_name = {}
+    for name in ("alone", "edited"):
+        made = score.score(bench, folder / name, folder / f"out-{name}")
+        assert [one.edit for one in made] == list(suite.EDITS)
+        by_name[name] = made
+    for alone, carried in zip(*by_name.values(), strict=True):
+        assert carried.remarks == []
+        # One tint of the source's for all that it sees, in place of a tint for each view.
+        assert carried.figures["agreement"] < alone.figures["agreement"] - 3
+    files = [folder / f"out-{name}" / "bench-score.json" for name in by_name]
+    report = result.compare([result.Result.read(path) for path in files])
+    assert [section.title for section in report.sections[:2]] == [
+        f"Own editor: {edit}" for edit in suite.EDITS
+    ]
+
+
+def test_the_page_hands_in_pictures_without_this_package(bench, tmp_path):
     without = "import sys\nsys.modules |= dict.fromkeys(['attnwarp', 'attnwarp_eval', 'torch'])\n"
-    editor = "def my_editor(picture, words):\n    return picture.point(lambda value: 255 - value)\n"
-    script = without + editor + block
-    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True, timeout=120)
-    scores = score.score(bench, tmp_path / "edited", tmp_path / "out")
-    assert [one.edit for one in scores] == list(suite.EDITS)
-    original = read_image(bench / SCENE / "images" / "source.png")
-    edited = read_image(tmp_path / "edited" / SCENE / "colour" / "source.png")
-    assert np.array_equal(edited, 255 - original)
+    walk(sys.executable, bench, tmp_path, without)
+
+
+@pytest.mark.slow
+def test_a_stranger_walks_the_page_in_an_environment_of_numpy_and_pillow(bench, tmp_path):
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "env"], check=True)
+    python = tmp_path / "env" / "bin" / "python"
+    install = [python, "-m", "pip", "install", "-q", "--only-binary=:all:", "numpy", "pillow"]
+    if subprocess.run(install, timeout=300).returncode:
+        pytest.skip("the package index can't be reached")
+    call = [python, "-c", "import attnwarp"]
+    missing = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True)
+    assert "No module named 'attnwarp'" in missing.stderr
+    walk(python, bench, tmp_path)
