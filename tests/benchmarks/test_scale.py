@@ -38,6 +38,7 @@ def test_every_step_of_the_documents_command_is_measured(monkeypatch, tmp_path, 
     assert "Traceback" not in capfd.readouterr().err
 
 
+@pytest.mark.door
 def test_a_step_that_fails_leaves_the_others_their_figures(monkeypatch, tmp_path):
     # No process of its own knows this step, so it ends with an error there.
     steps = {"plan": scale.STEPS["plan"], "unknown": scale.STEPS["plan"]}

@@ -10,6 +10,7 @@ from diffusers import (
     UNet2DConditionModel,
 )
 from diffusers.models.attention_processor import AttnProcessor2_0
+from further import further
 from tiny_editors import controlnet, pix2pix, unet
 
 from attnwarp.camera import Camera
@@ -152,11 +153,11 @@ def test_recording_changes_no_bit_of_diffusers_own_pipelines(pipeline):
 
 @pytest.mark.parametrize(
     ("scheduler", "options", "steps"),
-    [
-        (PNDMScheduler, {"skip_prk_steps": True}, 4),
+    further(
         (HeunDiscreteScheduler, {}, 3),
+        (PNDMScheduler, {"skip_prk_steps": True}, 4),
         (KDPM2DiscreteScheduler, {}, 3),
-    ],
+    ),
 )
 def test_of_a_scheduler_with_more_passes_than_steps_each_pass_has_its_own_features(
     scheduler, options, steps

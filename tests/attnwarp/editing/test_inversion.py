@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from diffusers import DDIMInverseScheduler, DDIMScheduler, LEditsPPPipelineStableDiffusion
+from further import further
 from PIL import Image
 from tiny_editors import parts, unet
 
@@ -143,12 +144,12 @@ def test_edit_friendly_inversion_is_that_of_diffusers(skip):
 
 @pytest.mark.parametrize(
     "changes",
-    [
-        {},
-        {"set_alpha_to_one": True},
+    further(
         {"prediction_type": "sample", "rescale_betas_zero_snr": True, "timestep_spacing": "trailing", "set_alpha_to_one": True},
-    ],
-    ids=["epsilon", "a last step without noise", "zero SNR, predicts the picture"],
+        {"set_alpha_to_one": True},
+        {},
+    ),
+    ids=["zero SNR, predicts the picture", "a last step without noise", "epsilon"],
 )  # fmt: skip
 def test_replaying_the_maps_gives_the_picture_back_to_float_error(changes):
     scheduler = DDIMScheduler.from_config(parts()["scheduler"].config, **changes)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from further import further
 
 from attnwarp.encoders import load_encoder
 from attnwarp.encoders.base import (
@@ -186,7 +187,7 @@ def test_places_of_the_mirror_image_are_mirrored_and_follow_the_picture(parts):
         parts.shown(picture[0], words)
 
 
-@pytest.mark.parametrize(("kind", "part"), [("mushroom", "cap"), ("house", "roof")])
+@pytest.mark.parametrize(("kind", "part"), further(("mushroom", "cap"), ("house", "roof")))
 def test_places_of_a_part_are_told_from_the_others(parts, kind, part):
     """Oracle: the pixels that rays of a world hit, whose shape no recipe has seen."""
     row = render_part_world(KINDS.index(kind), PartSplit(92_000_000, 17, test=True))

@@ -32,7 +32,7 @@ ANSWERS = ("red", "blue")
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory):
+def bench(tmp_path_factory, coarse_textures):
     folder = tmp_path_factory.mktemp("bench")
     suite.export(folder, count=1, seed=9, size=SIZE, spp=SPP, targets=2)
     return folder

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tiny_models
 from edit_folders import Watched
+from further import further
 from PIL import Image, ImageOps
 from torch_threads import on_one_thread
 from typer.testing import CliRunner
@@ -192,7 +193,7 @@ def test_json_goes_to_stdout_alone(data, models):
 
 @pytest.mark.parametrize(
     "left_out, reasons",
-    [
+    further(
         (
             "edited",
             {
@@ -220,7 +221,7 @@ def test_json_goes_to_stdout_alone(data, models):
             "prompt",
             {"CLIP similarity": "needs --prompt", "CLIP directional similarity": "needs --prompt"},
         ),
-    ],
+    ),
 )
 def test_what_is_left_out_costs_its_figures_and_the_reason_is_said(data, models, left_out, reasons):
     folder, _ = data

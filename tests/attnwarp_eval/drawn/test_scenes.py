@@ -43,6 +43,7 @@ def test_generator_1_draws_what_it_always_drew():
     assert _digest(texts).startswith(OF_GENERATOR_1)
 
 
+@pytest.mark.door  # the digest above was made by another process
 def test_another_process_with_other_locale_threads_and_hash_seed_draws_the_same_files(tmp_path):
     program = (
         "import sys\nfrom pathlib import Path\nfrom attnwarp_eval.drawn.files import write\n"

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import skimage.metrics
 import torch
+from further import further
 from imported_modules import modules_after
 from torchmetrics.functional.image import (
     multiscale_structural_similarity_index_measure,
@@ -96,7 +97,7 @@ def oracle_ms_ssim(image, target):
 
 
 @pytest.mark.parametrize(
-    ("size", "noise"), [((176, 176), 0.05), ((177, 191), 0.4), ((224, 180), 0.15)]
+    ("size", "noise"), further(((177, 191), 0.4), ((176, 176), 0.05), ((224, 180), 0.15))
 )
 def test_ms_ssim_is_that_of_torchmetrics(size, noise):
     image, target = pictures(*size, noise=noise)

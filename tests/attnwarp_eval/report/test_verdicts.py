@@ -20,7 +20,7 @@ from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import read_results
 from attnwarp_eval.report.claims import load_claims
 from attnwarp_eval.report.judging import decided, found
-from attnwarp_eval.report.raw import PARTS, read_parts, read_raw, together, write_raw
+from attnwarp_eval.report.raw import PARTS, read_parts, read_raw, together
 from attnwarp_eval.report.results import lines
 from attnwarp_eval.report.verdicts import filled, headlines, table, verdicts
 from attnwarp_eval.statistics.contrasts import contrast
@@ -34,6 +34,15 @@ SLIP = "warp.epe_median_layer.64"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return written_runs.unpack_stored(tmp_path_factory.mktemp("stored"))
+
+
+@pytest.fixture(scope="module")
+def reported(folder, tmp_path_factory):
+    """A stored run that is reported with its raw results, and their folder."""
+    store, raw = Store(folder / "variants"), tmp_path_factory.mktemp("raw")
+    done = invoke("report", store.root, "--no-pictures", "--raw", raw)
+    assert done.exit_code == 0 and str(raw / "results.jsonl.xz") in done.output
+    return store, raw
 
 
 def invoke(*arguments):
@@ -89,8 +98,8 @@ def defined(value):
     return np.nan if value is None else value
 
 
-def test_raw_results_outlive_the_keys_of_their_study(folder, tmp_path):
-    path = write_raw(Store(folder / "variants"), tmp_path)
+def test_raw_results_outlive_the_keys_of_their_study(reported, tmp_path):
+    path = reported[1] / "results.jsonl.xz"
     head, *cells = lzma.decompress(path.read_bytes()).decode().splitlines()
     older = json.loads(head)
     variant = next(iter(older["study"]["variants"].values()))
@@ -100,11 +109,9 @@ def test_raw_results_outlive_the_keys_of_their_study(folder, tmp_path):
     assert read_raw(tmp_path / "older.jsonl.xz").study == read_raw(path).study
 
 
-def test_raw_results_hold_every_figure_of_the_run_and_no_path_of_this_machine(folder, tmp_path):
-    store = Store(folder / "variants")
-    done = invoke("report", store.root, "--no-pictures", "--raw", tmp_path / "reports")
-    path = tmp_path / "reports" / "results.jsonl.xz"
-    assert done.exit_code == 0 and str(path) in done.output
+def test_raw_results_hold_every_figure_of_the_run_and_no_path_of_this_machine(reported):
+    store, raw = reported
+    path = raw / "results.jsonl.xz"
     kept, whole = (lines(results, False) for results in (read_raw(path), read_results(store)))
     assert len(kept) == len(whole)
     for one, other in zip(map(json.loads, kept), map(json.loads, whole), strict=True):
@@ -121,9 +128,8 @@ def test_raw_results_hold_every_figure_of_the_run_and_no_path_of_this_machine(fo
         assert "0 worse, 0 can't tell, 0 better" in same.output
 
 
-def test_a_folder_of_raw_results_gives_the_report_of_its_run(folder, tmp_path):
-    store, raw = Store(folder / "variants"), tmp_path / "reports"
-    assert invoke("report", store.root, "--no-pictures", "--raw", raw).exit_code == 0
+def test_a_folder_of_raw_results_gives_the_report_of_its_run(reported):
+    store, raw = reported
     done = invoke("report", raw)
     assert done.exit_code == 0 and str(raw / "report.html") in done.output
     assert (raw / "report.md").read_text() == (store.root / "report.md").read_text()
@@ -260,9 +266,8 @@ def test_halves_of_the_committed_populations_contradict_each_other_in_no_verdict
     assert len(agreeing) > 10  # the halves do tell
 
 
-def test_raw_results_are_lines_of_json(folder, tmp_path):
-    invoke("report", folder / "variants", "--no-pictures", "--raw", tmp_path / "own.jsonl.xz")
-    text = lzma.decompress((tmp_path / "own.jsonl.xz").read_bytes()).decode()
+def test_raw_results_are_lines_of_json(reported):
+    text = lzma.decompress((reported[1] / "results.jsonl.xz").read_bytes()).decode()
     head, *cells = map(json.loads, text.splitlines())
     assert head["study"]["name"] == "stored" and len(cells) == 16
     probes = {cell["record"]["spec"]["probe"] for cell in cells}

@@ -14,7 +14,6 @@ from tiny_models import save_clip, save_dino
 from typer.testing import CliRunner
 
 from attnwarp.editing.small import load_editor
-from attnwarp.errors import InputError
 from attnwarp.io import read_ply, write_ply
 from attnwarp_eval.cli.main import app
 from attnwarp_lab.captures.check import check, pattern
@@ -34,6 +33,11 @@ def copied(made, tmp_path):
     return folder, copy.deepcopy(made[1])
 
 
+@pytest.fixture(scope="module")
+def right(made):
+    return told(*made)
+
+
 def told(folder, manifest):
     return check(load_manifest(str(save(folder, manifest))), folder / "run", "cpu")
 
@@ -42,10 +46,9 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values.double().numpy()))))
 
 
-def test_a_right_manifest_has_no_problem_and_its_probe_values_are_the_models_own(made):
+def test_a_right_manifest_has_no_problem_and_its_probe_values_are_the_models_own(made, right):
     """Oracle: diffusers' and transformers' own classes on the same input, without this package's loading."""
-    folder, manifest = made
-    done = told(folder, manifest)
+    folder, done = made[0], right
     assert done.problems == []
     assert {name: len(views) for name, views in done.views.items()} == {"one": 3, "two": 3}
     pipe, editor = pix2pix(), load_editor(str(folder / "weights/pix2pix"))
@@ -97,7 +100,6 @@ def empty_prompt(folder, manifest):
 
 
 def other_checkpoint(folder, manifest):
-    manifest["editors"]["pix2pix"]["probe"] = told(folder, manifest).weights["editors.pix2pix"][1]
     unet(8, seed=5).save_pretrained(folder / "weights/pix2pix/unet")
 
 
@@ -166,8 +168,9 @@ MISTAKES = {
         for m in MISTAKES
     ],
 )
-def test_a_planted_mistake_is_refused_by_name_before_anything_runs(copied, mistake):
+def test_a_planted_mistake_is_refused_by_name_before_anything_runs(copied, right, mistake):
     folder, manifest = copied
+    manifest["editors"]["pix2pix"]["probe"] = right.weights["editors.pix2pix"][1]
     mistake(folder, manifest)
     path = folder / "manifest.yaml"
     if mistake is not two_names:
@@ -177,8 +180,6 @@ def test_a_planted_mistake_is_refused_by_name_before_anything_runs(copied, mista
     assert done.exit_code == 2, done.output
     assert MISTAKES[mistake] in done.stderr
     assert not (run / "cells").exists()
-    with pytest.raises(InputError):
-        check(load_manifest(str(path)), run, "cpu").refuse()
 
 
 def test_the_shipped_manifest_has_the_published_numbers():

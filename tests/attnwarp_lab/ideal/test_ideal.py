@@ -144,7 +144,7 @@ def test_an_editor_that_collapses_is_not_ideal():
 
 
 @pytest.fixture(scope="module")
-def thing():
+def thing(coarse_textures):
     of = world("spheres", 64)
     cameras = [of.camera(name) for name in VIEWS]
     return Thing.of(of.scene, of.geometry, cameras, SPHERES, parts=PARTS, colors=4, spp=1)
@@ -275,7 +275,7 @@ def warp_of_the_text(source, target, drop=False):
 
 
 @pytest.fixture(scope="module")
-def wide():
+def wide(coarse_textures):
     """The thing from the front and from the side, where many normals are more than 60 degrees apart."""
     of = world("spheres", 64)
     cameras = [of.camera(name) for name in ("source", "yaw090")]

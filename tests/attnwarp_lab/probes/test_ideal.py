@@ -56,7 +56,7 @@ def cells(study):
 
 
 @pytest.fixture(scope="module")
-def records(tmp_path_factory):
+def records(tmp_path_factory, coarse_textures):
     folder = tmp_path_factory.mktemp("ideal")
     study = load(folder)
     return {cell.variant: compute(probe("ideal"), cell, folder) for cell in cells(study)}

@@ -99,7 +99,7 @@ def cells(scenes, folder, **changes):
 
 
 @pytest.fixture(scope="module")
-def record(scenes, tmp_path_factory):
+def record(scenes, tmp_path_factory, coarse_textures):
     folder = tmp_path_factory.mktemp("run")
     return compute(probe("audit"), cells(scenes, folder)[0], folder, threads=1)
 
