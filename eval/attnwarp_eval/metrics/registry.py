@@ -265,6 +265,7 @@ _SPECS = (
     Metric("masks.marked", "pixels", "none", 0, 0, "pixels of a lifted mask"),
     Metric("masks.thing", "pixels", "none", 0, 0, "pixels of the thing"),
     Metric("parts.seen", "share", "higher", 1e-4, 0, "parts truly seen by the source that show its answer"),
+    Metric("parts.right", "share", "higher", 1e-4, 0, "pixels truly seen by the source that show its answer"),
     Metric("parts.through", "share", "lower", 1e-4, 0, "hidden pixels that show the answer of the surface before them"),
     Metric("parts.bleed", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 to the picture before, outside the thing"),
     Metric("parts.delta_e", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 to the source's answers, at pixels truly seen"),

@@ -46,11 +46,12 @@ def carried_labels(layer: Layer, source: Labels) -> Labels:
     """(h, w) label that each token of a target takes: that of the heaviest tap.
 
     Args:
-        source: (h', w') part of each token of the source, -1 outside the thing.
+        source: (h', w') part of each token of the source, -1 outside the thing; or labels that it
+            took itself.
 
     Returns:
-        A part, :data:`OUTSIDE`, or :data:`NONE` where the mask is False. Of equal weights the
-        smallest label.
+        A part, :data:`OUTSIDE`, or :data:`NONE` where the mask is False or nothing is taken. Of
+        equal weights the smallest label.
 
     Example:
         >>> import numpy as np, torch
@@ -64,7 +65,7 @@ def carried_labels(layer: Layer, source: Labels) -> Labels:
         [[0, 1], [-1, -2]]
     """
     check.shape(source, ("h", "w"), "source")
-    codes = np.arange(OUTSIDE, int(source.max()) + 1)
+    codes = np.arange(min(OUTSIDE, int(source.min())), int(source.max()) + 1)
     one_hot = (source == codes[:, None, None]).astype(np.float32)
     weights = np.nan_to_num(np.asarray(layer.warp(one_hot)))
     labels = codes[weights.argmax(axis=0)]

@@ -33,10 +33,12 @@ from attnwarp_eval.study.shared.splats import splats_of
 from attnwarp_eval.study.shared.things import thing_of
 from attnwarp_eval.two_view import HIDDEN
 from attnwarp_eval.world import World
+from attnwarp_lab.ideal.editor import FACTOR
 from attnwarp_lab.ideal.figures import part_answers, part_figures
 from attnwarp_lab.ideal.paint import EDIT
 from attnwarp_lab.ideal.share import alone, solve_share
 from attnwarp_lab.ideal.thing import Thing, in_front
+from attnwarp_lab.probes.edges import EdgesPart, among, edges_of
 
 Image = npt.NDArray[np.float32]
 
@@ -83,11 +85,13 @@ class IdealProbe(MethodProbe[IdealResult]):
     """One edit of a thing in parts by one method and the ideal editor."""
 
     name = "ideal"
+    study_part = EdgesPart
     whole = True
     metrics = metrics_of("parts.", "edit.drift")
 
     def check(self, study: Study) -> None:
         """Require the ideal editor for every variant, and a method that it supports."""
+        edges_of(study, self.name)
         for name in study.probes.get(self.name, []):
             variant = study.variants[name]
             own = variant.part(VariantPart)
@@ -106,6 +110,7 @@ class IdealProbe(MethodProbe[IdealResult]):
         self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
     ) -> Iterator[Cell]:
         """Cells: one for each scene, variant and seed."""
+        edges = edges_of(study, self.name)
         for name, scene in scenes.items():
             thing = thing_of(study, scene)
             for label in names:
@@ -116,6 +121,7 @@ class IdealProbe(MethodProbe[IdealResult]):
                         **self.variant_spec(study, study.variants[label], seed),
                         **other,
                         "thing": thing,
+                        **({"edges": True} if edges and label in edges.named else {}),
                     }
                     yield Cell(spec, name, label, self.name, seed, (label,), sources=files)
 
@@ -158,8 +164,12 @@ class IdealProbe(MethodProbe[IdealResult]):
             if spec["settings"]["iterations"]:  # else the scene is unchanged
                 pictures["render"] = _renders(world, names, before, result.gaussians)
             answers = part_answers(edited[names[0]], thing.truth(names[0]), thing.parts)
+            stages = {names[v]: n for n, part in enumerate(result.rounds, 1) for v in part.views}
             for name in names[1:]:
-                row = self._figures(world, thing, name, pictures, answers)
+                row = self._figures(world, thing, name, pictures, answers, "edges" in spec)
+                if "parts.right.all.edit" in row:
+                    stage = stages.get(name, 1)
+                    row[f"parts.right.stage{stage}.edit"] = row["parts.right.all.edit"]
                 work.add(f"parts/{name}", row | {"edit.drift": result.drift})
         inside = [labels[labels >= 0] for labels in thing.labels.values()]
         counts = [np.unique(own, return_counts=True)[1] for own in inside]
@@ -194,15 +204,18 @@ class IdealProbe(MethodProbe[IdealResult]):
         name: str,
         pictures: Mapping[str, Mapping[str, Image]],
         answers: npt.NDArray[np.int64],
+        edges: bool,
     ) -> dict[str, float]:
         pair = world.pair(name, world.source.width)
         front = in_front(pair, thing.labels[world.source.name])
+        h, w = (side // FACTOR for side in pair.visible.shape)
+        places = among(pair.hits.depth, (h, w)) if edges else None
         row: dict[str, float] = {}
         for kind, images in pictures.items():
             if name in images:
                 figures = part_figures(
                     images[name], thing.truth(name), answers, pair.visible, pair.label == HIDDEN,
-                    front,
+                    front, places,
                 )  # fmt: skip
                 row |= {f"{key}.{kind}": value for key, value in figures.items()}
         return row

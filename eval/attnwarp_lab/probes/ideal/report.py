@@ -11,6 +11,10 @@ from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
 from attnwarp_eval.study.results import Results
+from attnwarp_lab.probes.edges import edge_section, edges_of
+
+MOST_STAGES = 3
+"""Stages of an edit that the figure on depth edges shows."""
 
 DRIFTING = {
     "ideal": ("ideal editor: parts with the source's answer", "parts.seen.edit"),
@@ -60,8 +64,22 @@ class IdealReport(ProbeReport):
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """The editor by scene: share of signal, settling of answers, statistics alone; figures by
-        planted drift.
+        planted drift; errors at depth edges.
         """
+        edges = edges_of(results.study, self.name)
+        if edges is not None:
+            own = "parts.right.{}.edit", "", "parts.through.{}.edit"
+            metrics = {name: (name, *own) for name in edges.named}
+            stages = {
+                name: [
+                    (stage, results.views(self.name, name, f"parts.right.stage{stage}.edit"))
+                    for stage in range(1, MOST_STAGES + 1)
+                ]
+                for name in edges.named
+            }
+            section = edge_section(results, layout, self.name, metrics, stages, "stage of the edit")
+            if section is not None:
+                yield Place.RESULT, section
         found: dict[tuple[object, ...], list[str]] = {}
         for cell, record in results.finished(self.name):
             ideal, extra = record.spec["editor"]["ideal"], record.extra

@@ -4,30 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated
+from itertools import pairwise
+from typing import Annotated, Any
 
-import numpy as np
 from pydantic import Field
 
-from attnwarp.warp import WarpedView
+from attnwarp.warp import WarpedView, WarpSettings, warp_view
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probe import Work, metrics_of, register
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.schema import Part, Study, Variant, Whole
+from attnwarp_eval.study.shared.controls import MovedView
+from attnwarp_eval.study.shared.edits import VariantPart
+from attnwarp_eval.study.shared.splats import splats_of
 from attnwarp_eval.study.shared.things import thing_of
-from attnwarp_eval.study.shared.warps import WarpProbe, warped_views
+from attnwarp_eval.study.shared.warps import WarpProbe, warp_truth, warped_views
 from attnwarp_eval.two_view import TwoView
 from attnwarp_eval.world import World
 from attnwarp_lab.ideal.editor import FACTOR
 from attnwarp_lab.ideal.labels import Labels as LabelMap
-from attnwarp_lab.ideal.labels import carried_labels, edge_distance, label_transport
+from attnwarp_lab.ideal.labels import Mask, carried_labels, label_transport
 from attnwarp_lab.ideal.parts import token_parts
 from attnwarp_lab.ideal.thing import labels_of
+from attnwarp_lab.probes.edges import PLACES, among, edges_of
 from attnwarp_lab.probes.labels.inspected import Parts
-
-FAR = 4
-"""Distance to a depth edge, in tokens, from which tokens are counted together."""
 
 GRIDS = (8, 16, 32, 64)
 """Default sides of the token grids."""
@@ -72,7 +73,8 @@ class LabelTransport(WarpProbe):
     metrics = metrics_of("labels.")
 
     def check(self, study: Study) -> None:
-        """Require grids that divide the pictures."""
+        """Require grids that divide the pictures, and known variants."""
+        edges_of(study, self.name)
         for grid in study.part(StudyPart).labels.grids:
             if study.size % grid:
                 raise ValueError(
@@ -88,12 +90,25 @@ class LabelTransport(WarpProbe):
             yield replace(cell, spec={**cell.spec, "thing": things[cell.scene]}, pictures=())
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """Depth, rules, grids and parts."""
+        """Depth, rules, grids and parts; a control, and what the judgement of edges needs."""
+        edges, control = edges_of(study, self.name), variant.part(VariantPart).control
+        parts, further = study.part(StudyPart).labels.parts, dict[str, Any]()
+        if control is not None:
+            further["control"] = control
+        if edges is not None and any(study.variants[name] == variant for name in edges.named):
+            own = {"parts": edges.parts or parts[0]}
+            own["chained"] = any(study.variants[name] == variant for name in edges.methods)
+            further["edges"] = own
         return {
             **super().variant_spec(study, variant, seed),
             "grids": grids_of(study, study.size),
-            "parts": study.part(StudyPart).labels.parts,
+            "parts": parts,
+            **further,
         }
+
+    def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
+        """Key of the depth, the rules and the control."""
+        return *super().meaning(study, variant), variant.part(VariantPart).control
 
     def token_labels(self, study: Study, world: World, targets: Sequence[str]) -> Parts:
         """Labels for the first number of parts."""
@@ -110,53 +125,83 @@ class LabelTransport(WarpProbe):
         """Warp, carry and count, view by view."""
         spec, world, meter = work.spec, work.world, work.meter
         names = [world.source.name, *spec["views"]]
+        edges = spec.get("edges", {"parts": spec["parts"][0], "chained": False})
         with meter.stage("truth"):
             cameras = [world.camera(name) for name in names]
             labels = {
                 count: labels_of(world.scene, world.geometry, cameras, spec["thing"], count)
-                for count in spec["parts"]
+                for count in {*spec["parts"], edges["parts"]}
             }
         grids: list[int] = spec["grids"]
         near = min(grids, key=lambda grid: abs(grid - spec["size"] / FACTOR))
-        for name, truth, view in warped_views(work, grids):
-            figures: dict[str, float] = {}
+        links = _linked(work) if edges["chained"] else {}
+        fine = labels[edges["parts"]]
+        source = chained = token_parts(fine[names[0]], (near, near))
+        for link, (name, truth, view) in enumerate(warped_views(work, grids), 1):
+            if "control" in spec:
+                view = MovedView.of(view, spec["control"])
+            layer, figures = view.at((near, near)), dict[str, float]()
             for count in spec["parts"]:
+                pair = labels[count][names[0]], labels[count][name]
                 for grid in grids:
-                    pair = labels[count][names[0]], labels[count][name]
-                    first = (count, grid) == (spec["parts"][0], near)
-                    one, by_distance = _figures(work, truth, view, pair, grid, first)
-                    if first:
-                        figures |= one | by_distance
+                    one = _figures(work, truth, view, pair, grid)
+                    if (count, grid) == (spec["parts"][0], near):
+                        figures |= one
                     figures |= {f"{key}.{grid}.{count}": value for key, value in one.items()}
+            places = among(truth.hits.depth, (near, near))
+            if "edges" not in spec:
+                places = {place: places[place] for place in PLACES}
+            figures |= _by_place(carried_labels(layer, source), truth, fine[name], places)
+            if edges["chained"]:
+                chained = carried_labels(links.get(name, view).at((near, near)), chained)
+                chain = _by_place(chained, truth, fine[name], places)
+                figures |= {f"{key}.chain": value for key, value in chain.items()}
+                for end in ("", ".chain"):
+                    figures[f"labels.right.link{link}{end}"] = figures[f"labels.right.all{end}"]
             work.add(name, figures)
         return NoExtra()
 
 
+def _linked(work: Work) -> dict[str, WarpedView]:
+    """Warps into each target but the first, from the target before it."""
+    spec, world = work.spec, work.world
+    settings = WarpSettings.from_dict(spec["settings"])
+    pairs = {name: world.between(before, name) for before, name in pairwise(spec["views"])}
+    if spec.get("geometry") == "truth":
+        return {name: warp_truth(world, pair, settings) for name, pair in pairs.items()}
+    model = splats_of(work)
+    return {
+        name: warp_view(model, pair.source, pair.target, settings, warn_empty=False)
+        for name, pair in pairs.items()
+    }
+
+
 def _figures(
-    work: Work,
-    truth: TwoView,
-    view: WarpedView,
-    labels: tuple[LabelMap, LabelMap],
-    grid: int,
-    distances: bool,
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Figures of the part labels carried by a warp, of all tokens and by distance to depth edges.
+    work: Work, truth: TwoView, view: WarpedView, labels: tuple[LabelMap, LabelMap], grid: int
+) -> dict[str, float]:
+    """Figures of the part labels carried by a warp.
 
     Args:
         truth: truth of the pair, (H, W).
         labels: (H, W) part of each pixel of the source and of the target.
         grid: side of the token grid, a divisor of the image's.
-        distances: False leaves the figures by distance out.
     """
     source, target = (token_parts(of, (grid, grid)) for of in labels)
     with work.meter.stage("carry"):
         carried = carried_labels(view.at((grid, grid)), source)
     with work.meter.stage("checks"):
-        of = carried, target, labels[1], truth.visible, truth.unseen
-        by_distance: dict[str, float] = {}
-        if distances:
-            far = np.minimum(edge_distance(truth.hits.depth, (grid, grid)), FAR).astype(int)
-            for tokens in range(FAR + 1):
-                one = label_transport(*of, among=far == tokens)
-                by_distance |= {f"{key}.edge{tokens}": value for key, value in one.items()}
-        return label_transport(*of), by_distance
+        return label_transport(carried, target, labels[1], truth.visible, truth.unseen)
+
+
+def _by_place(
+    carried: LabelMap, truth: TwoView, pixels: LabelMap, places: Mapping[str, Mask]
+) -> dict[str, float]:
+    """Figures of carried labels by the end of their names."""
+    tokens = token_parts(pixels, (carried.shape[0], carried.shape[1]))
+    return {
+        f"{key}.{place}": value
+        for place, counted in places.items()
+        for key, value in label_transport(
+            carried, tokens, pixels, truth.visible, truth.unseen, counted
+        ).items()
+    }

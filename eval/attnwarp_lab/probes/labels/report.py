@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import ClassVar
 
-from attnwarp_eval.document.model import Table
-from attnwarp_eval.study.probe_report import ProbeReport, mean_values, register_report
+from attnwarp_eval.document.model import Section, Table
+from attnwarp_eval.study.probe_report import (
+    Layout,
+    Place,
+    ProbeReport,
+    mean_values,
+    register_report,
+)
 from attnwarp_eval.study.results import Results
-from attnwarp_lab.probes.labels.measure import FAR
+from attnwarp_lab.probes.edges import FAR, edge_section, edges_of
+
+RIGHT, WRONG, HIDDEN = (f"labels.{name}.{{}}" for name in ("right", "wrong", "painted_hidden"))
+"""Figures of a row on depth edges."""
 
 
 @register_report
@@ -26,6 +35,26 @@ class LabelReport(ProbeReport):
     }
     contrasts = ("labels.right", "labels.painted_hidden")
     stage = "pair"
+
+    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+        """Errors at depth edges, from the source and from view to view."""
+        edges = edges_of(results.study, self.name)
+        if edges is None:
+            return
+        metrics = {name: (name, RIGHT, WRONG, HIDDEN) for name in edges.named}
+        most = max((len(r.views) for _, r in results.finished(self.name)), default=0)
+        links, beside = range(1, most + 1), {}
+        for name in edges.methods:
+            chain = f"{name}, from view to view"
+            metrics[chain] = name, f"{RIGHT}.chain", f"{WRONG}.chain", f"{HIDDEN}.chain"
+            for title, metric in ((name, "link{}"), (chain, "link{}.chain")):
+                beside[title] = [
+                    (link, results.views(self.name, name, f"labels.right.{metric.format(link)}"))
+                    for link in links
+                ]
+        section = edge_section(results, layout, self.name, metrics, beside, "links of a chain")
+        if section is not None:
+            yield Place.RESULT, section
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
         """Labels by distance to depth edges, and right labels by grid and number of parts."""
