@@ -42,7 +42,7 @@ def train(
     stage: str, data: Data = CACHE / "data", out: Out = CACHE, threads: Threads = 1,
     device: Annotated[str, typer.Option(help="Of torch: cpu or cuda.")] = "cpu",
 ) -> None:  # fmt: skip
-    """Train a stage: plain, drawn, features, control, depth. On a GPU each takes minutes, on a CPU days."""
+    """Train a stage: plain, drawn, features, control, depth, joint. On a GPU each takes minutes, on a CPU days."""
     import torch
 
     if device not in ("cpu", "cuda"):
@@ -50,8 +50,12 @@ def train(
     if device == "cuda" and not torch.cuda.is_available():
         raise typer.BadParameter("torch finds no GPU here; use cpu", param_hint="--device")
     from training.editors.depth import DEPTH_STAGES, train_depth_stage
+    from training.editors.joint import JOINT_STAGES
     from training.editors.recipe import train_stage
 
+    if stage in JOINT_STAGES:
+        train_stage(stage, data, out, stage=JOINT_STAGES[stage], threads=threads, device=device)
+        return
     trainer = train_depth_stage if checked(stage) in DEPTH_STAGES else train_stage
     trainer(stage, data, out, threads=threads, device=device)
 

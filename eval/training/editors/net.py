@@ -36,13 +36,24 @@ SHIFT = 16.0
 """
 
 
+def text_encoder(vocabulary: int) -> Any:
+    """The text encoder of every editor, before its training."""
+    from transformers import CLIPTextConfig, CLIPTextModel
+
+    return CLIPTextModel(
+        CLIPTextConfig(
+            vocab_size=vocabulary, hidden_size=TEXT_WIDTH, intermediate_size=2 * TEXT_WIDTH,
+            num_hidden_layers=TEXT_LAYERS, num_attention_heads=4, max_position_embeddings=TOKENS,
+            pad_token_id=0, bos_token_id=1, eos_token_id=1,
+        )
+    )  # fmt: skip
+
+
 class EditorNet(torch.nn.Module):
     """The UNet and the text encoder, trained together."""
 
     def __init__(self, vocabulary: int, size: int, *, draws: bool = True) -> None:
         super().__init__()
-        from transformers import CLIPTextConfig, CLIPTextModel
-
         self.unet = EditUNet(
             sample_size=size // BLOCK, in_channels=2 * CHANNELS, out_channels=CHANNELS,
             down_block_types=("DownBlock2D",) * len(WIDTHS), mid_block_type="UNetMidBlock2D",
@@ -51,13 +62,7 @@ class EditorNet(torch.nn.Module):
         )  # fmt: skip
         if not draws:
             self.unet.draw = None
-        self.text = CLIPTextModel(
-            CLIPTextConfig(
-                vocab_size=vocabulary, hidden_size=TEXT_WIDTH, intermediate_size=2 * TEXT_WIDTH,
-                num_hidden_layers=TEXT_LAYERS, num_attention_heads=4, max_position_embeddings=TOKENS,
-                pad_token_id=0, bos_token_id=1, eos_token_id=1,
-            )
-        )  # fmt: skip
+        self.text = text_encoder(vocabulary)
         # The first prediction is the picture before the edit.
         torch.nn.init.zeros_(self.unet.conv_out.weight)
         torch.nn.init.zeros_(self.unet.conv_out.bias)

@@ -108,6 +108,14 @@ class Stage:
     composed: float = 0.0
     large: float = 0.0
 
+    def network(self, vocabulary: int) -> torch.nn.Module:
+        """The network before its training."""
+        return EditorNet(vocabulary, self.size, draws=self.draws)
+
+    def constants(self) -> dict[str, Any]:
+        """Constants that the network alone depends on, by name."""
+        return {}
+
 
 STAGES = {
     "plain": Stage(64, 11_500, 1.5e-3, 1800, parts=1190, draws=False, large=0.2, seed=11),
@@ -162,7 +170,7 @@ def constants() -> dict[str, Any]:
 
 def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
     """Everything that a stage's result depends on; a checkpoint of another recipe is not gone on with."""
-    of_stages = constants() | steps.constants()
+    of_stages = constants() | steps.constants() | stage.constants()
     names = ("SENTENCES", "POINTS", "THING_WEIGHT", "MOST_THING_WEIGHT", "HALF_PLANES")
     of_stages |= {key: getattr(editor_pool, key) for key in names}
     if stage.draws:
@@ -214,7 +222,7 @@ def train_stage(
     torch.manual_seed(stage.seed)
     tokenizer = tokenizer_of(out)
     pool = pool_of(stage, data, tokenizer, device) if pool is None else pool
-    net = EditorNet(tokenizer.get_vocab_size(), stage.size, draws=stage.draws)
+    net: Any = stage.network(tokenizer.get_vocab_size())
     spent = 0.0
     if stage.start is not None:
         weights = weights_of(out, stage.start)
