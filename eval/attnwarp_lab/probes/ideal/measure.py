@@ -33,12 +33,12 @@ from attnwarp_eval.study.shared.splats import splats_of
 from attnwarp_eval.study.shared.things import thing_of
 from attnwarp_eval.two_view import HIDDEN
 from attnwarp_eval.world import World
+from attnwarp_lab.ideal.edges import EdgesPart, among, edges_of
 from attnwarp_lab.ideal.editor import FACTOR
 from attnwarp_lab.ideal.figures import part_answers, part_figures
 from attnwarp_lab.ideal.paint import EDIT
 from attnwarp_lab.ideal.share import alone, solve_share
 from attnwarp_lab.ideal.thing import Thing, in_front
-from attnwarp_lab.probes.edges import EdgesPart, among, edges_of
 
 Image = npt.NDArray[np.float32]
 

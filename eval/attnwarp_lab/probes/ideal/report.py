@@ -11,8 +11,8 @@ from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
 from attnwarp_eval.study.results import Results
-from attnwarp_lab.probes.edge_report import edge_section
-from attnwarp_lab.probes.edges import edges_of
+from attnwarp_lab.ideal.edge_report import edge_section
+from attnwarp_lab.ideal.edges import edges_of
 
 MOST_STAGES = 3
 """Stages of an edit that the figure on depth edges shows."""

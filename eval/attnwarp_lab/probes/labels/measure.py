@@ -22,12 +22,12 @@ from attnwarp_eval.study.shared.things import thing_of
 from attnwarp_eval.study.shared.warps import WarpProbe, warp_truth, warped_views
 from attnwarp_eval.two_view import TwoView
 from attnwarp_eval.world import World
+from attnwarp_lab.ideal.edges import PLACES, among, edges_of
 from attnwarp_lab.ideal.editor import FACTOR
 from attnwarp_lab.ideal.labels import Labels as LabelMap
 from attnwarp_lab.ideal.labels import Mask, carried_labels, label_transport
 from attnwarp_lab.ideal.parts import token_parts
 from attnwarp_lab.ideal.thing import labels_of
-from attnwarp_lab.probes.edges import PLACES, among, edges_of
 from attnwarp_lab.probes.labels.inspected import Parts
 
 GRIDS = (8, 16, 32, 64)

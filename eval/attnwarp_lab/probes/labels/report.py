@@ -14,8 +14,8 @@ from attnwarp_eval.study.probe_report import (
     register_report,
 )
 from attnwarp_eval.study.results import Results
-from attnwarp_lab.probes.edge_report import edge_section
-from attnwarp_lab.probes.edges import FAR, edges_of
+from attnwarp_lab.ideal.edge_report import edge_section
+from attnwarp_lab.ideal.edges import FAR, edges_of
 
 RIGHT, WRONG, HIDDEN = (f"labels.{name}.{{}}" for name in ("right", "wrong", "painted_hidden"))
 """Figures of a row on depth edges."""

@@ -21,11 +21,11 @@ from attnwarp_eval.study.shared.controls import MovedView
 from attnwarp_eval.study.shared.warps import warp_truth
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.world import world
+from attnwarp_lab.ideal.edge_report import EdgeTable
+from attnwarp_lab.ideal.edges import PLACES, edges_of
 from attnwarp_lab.ideal.labels import carried_labels, label_transport
 from attnwarp_lab.ideal.parts import token_parts
 from attnwarp_lab.ideal.thing import labels_of
-from attnwarp_lab.probes.edge_report import EdgeTable
-from attnwarp_lab.probes.edges import PLACES, edges_of
 
 SCENES = [f"s{k}" for k in range(8)]
 WRONG = {"exact": (0.1, 0.1), "good": (0.1, 0.1), "edgy": (0.4, 0.1), "far": (0.1, 0.3)}

@@ -21,7 +21,7 @@ from attnwarp_eval.statistics.contrasts import Contrast, contrast
 from attnwarp_eval.statistics.intervals import ByView, benjamini_hochberg, common, over_scenes
 from attnwarp_eval.study.probe_report import Layout
 from attnwarp_eval.study.results import Results
-from attnwarp_lab.probes.edges import AT, AWAY, FAR, OFF, PLACES, Edges, edges_of
+from attnwarp_lab.ideal.edges import AT, AWAY, FAR, OFF, PLACES, Edges, edges_of
 
 EQUAL_WITHIN = 0.05
 """Difference of shares up to which a method errs equally at an edge and away from it."""

@@ -1,4 +1,4 @@
-"""The key ``edges`` of a study, and the tokens that it counts together by distance to a depth edge."""
+"""The key ``edges`` of a study, and the tokens counted together by distance to a depth edge."""
 
 from __future__ import annotations
 
