@@ -64,7 +64,6 @@ from attnwarp_eval.metrics.reconstruction import Reconstruction, reconstruct
 from attnwarp_eval.metrics.refit import Refit, refit
 from attnwarp_eval.metrics.registry import METRICS, at_size, metric
 from attnwarp_eval.metrics.scores import read_scores
-from attnwarp_eval.metrics.surface import surface_error
 from attnwarp_eval.metrics.warp import endpoint_error, feature_error
 
 __all__ = [
@@ -121,7 +120,6 @@ __all__ = [
     "sift_matches",
     "ssim",
     "ssim_map",
-    "surface_error",
     "tsed",
     "tsed_of_views",
     "view_dependent",
