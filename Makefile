@@ -19,7 +19,7 @@ GATE := build/gate
 # Where LLVM is installed, each process of the tests would compile Mitsuba's integrators. The tests of LLVM choose their own variant.
 test test-all: export ATTNWARP_MITSUBA ?= scalar_rgb
 
-.PHONY: demo test test-all gate baseline bench docs lint checks kernels kernels-float64 collected measured venv clean
+.PHONY: demo test test-all gate baseline bench docs lint checks kernels kernels-float64 measured venv clean
 
 ## an edit carried, what the mask is for, accuracy against time: runs/demo/report.html
 demo:
@@ -71,7 +71,7 @@ lint: venv
 # uses them. Lint ends first, so that what else would be done by each worker follows it: other kernels, and modules compiled
 # by collecting the tests once. Output comes a target at a time, so that it does not mix.
 checks: venv
-	@$(MAKE) --no-print-directory -j2 --output-sync=target collected gate
+	@$(MAKE) --no-print-directory -j2 --output-sync=target build/collected.txt gate
 
 kernels: venv
 	@$(BIN)/python -m scripts.compile_kernels
@@ -79,9 +79,11 @@ kernels: venv
 kernels-float64: lint
 	@$(BIN)/python -m scripts.compile_kernels float64
 
-collected: kernels-float64
+# Once an installation: later changes of a few modules are compiled by the workers.
+.venv/.installed-dev: venv ;
+build/collected.txt: .venv/.installed-dev | kernels-float64
 	@mkdir -p build
-	@$(BIN)/python -m pytest --collect-only -qq > build/collected.txt || { tail -60 build/collected.txt; exit 1; }
+	@$(BIN)/python -m pytest --collect-only -qq > $@ || { tail -60 $@; rm $@; exit 1; }
 
 venv:
 	@scripts/venv.sh
