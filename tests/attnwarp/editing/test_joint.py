@@ -10,6 +10,7 @@ import pytest
 import tiny_joint as tiny
 import torch
 import written_out_joint as written_out
+from further import further
 from PIL import Image
 
 from attnwarp.editing.editor import drawn, edit
@@ -92,7 +93,7 @@ def pipeline_edit(name, monkeypatch, editor, pictures, noise, dtype):
     return image, last["latents"]
 
 
-@pytest.mark.parametrize("guidance", [PLAIN, GUIDED], ids=["plain", "guided"])
+@pytest.mark.parametrize("guidance", further(GUIDED, PLAIN), ids=["guided", "plain"])
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=() if n in FAST else pytest.mark.slow) for n in tiny.NAMES]
 )
@@ -142,7 +143,7 @@ def plan_of(editor, size, keep=None, steps=STEPS, views=1, kinds=None, blocks=No
 
 
 @pytest.mark.parametrize("kinds", [None, ("key", "value")], ids=["outputs", "keys"])
-@pytest.mark.parametrize("guidance", [PLAIN, GUIDED], ids=["plain", "guided"])
+@pytest.mark.parametrize("guidance", further(GUIDED, PLAIN), ids=["guided", "plain"])
 @pytest.mark.parametrize("name", tiny.NAMES)
 def test_recording_changes_no_bit_and_a_views_own_features_change_none(name, guidance, kinds):
     editor = tiny.editor(name, **guidance[name])

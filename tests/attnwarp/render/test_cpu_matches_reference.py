@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from backends import GPU
+from further import further
 from rounding import MODES, excess, mixed_scales, prepared
 
 from attnwarp import Camera, Gaussians
@@ -22,7 +23,7 @@ from attnwarp.render.interface import OUTPUTS
 
 @pytest.mark.parametrize("backend", ["cpu", GPU])
 @pytest.mark.usefixtures("one_thread")
-@pytest.mark.parametrize("block", range(8))
+@pytest.mark.parametrize("block", further(*range(8)))
 def test_two_hundred_random_scenes_agree_to_1e_5(
     backend: str, block: int, make_camera, make_splats
 ) -> None:

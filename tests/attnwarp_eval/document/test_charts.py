@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+from further import further
 from matplotlib.text import Text
 from scipy import stats
 
@@ -19,8 +20,8 @@ def around(value: float) -> Interval:
     )
 
 
-@pytest.mark.parametrize("spread", [0.02, 0.0])
-@pytest.mark.parametrize("log", [True, False])
+@pytest.mark.parametrize("spread", further(0.0, 0.02))
+@pytest.mark.parametrize("log", further(True, False))
 def test_names_at_a_front_cover_no_other_and_stay_inside(tmp_path, log, spread) -> None:
     random = np.random.default_rng(0)
     points = {
