@@ -61,9 +61,8 @@ from attnwarp_eval.metrics.multiview import (
 )
 from attnwarp_eval.metrics.occlusion import COUNTS, YawBin, by_yaw, confusion, mask_error, scores
 from attnwarp_eval.metrics.reconstruction import Reconstruction, reconstruct
-from attnwarp_eval.metrics.refit import Refit, refit
+from attnwarp_eval.metrics.refit import refit
 from attnwarp_eval.metrics.registry import METRICS, at_size, metric
-from attnwarp_eval.metrics.scores import read_scores
 from attnwarp_eval.metrics.warp import endpoint_error, feature_error
 
 __all__ = [
@@ -74,7 +73,6 @@ __all__ = [
     "Flow",
     "Keypoints",
     "Reconstruction",
-    "Refit",
     "Similarity",
     "Tsed",
     "YawBin",
@@ -112,7 +110,6 @@ __all__ = [
     "perceptual",
     "perceptual_consistency",
     "psnr",
-    "read_scores",
     "reconstruct",
     "refit",
     "scores",

@@ -28,6 +28,7 @@ from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.metrics.epipolar import LEAST_MATCHES, LIMITS
 from attnwarp_eval.metrics.known_geometry import GRID
+from attnwarp_eval.metrics.score_table import read_scores
 from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.task import Task, results
@@ -206,7 +207,7 @@ def measure_consistency(
 
 def _scores(path: Path, pairs: Sequence[tuple[str, str]]) -> list[Row]:
     rows = []
-    for key, of_pair in metrics.read_scores(path, ("first", "second"), "--scores").items():
+    for key, of_pair in read_scores(path, ("first", "second"), "--scores").items():
         own = {f"{one} to {two}": of_pair.get((one, two), float("nan")) for one, two in pairs}
         defined = [value for value in own.values() if not np.isnan(value)]
         value = float(np.mean(defined)) if defined else float("nan")

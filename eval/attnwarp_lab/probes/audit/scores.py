@@ -21,7 +21,7 @@ import numpy as np
 
 from attnwarp_eval.files import write_atomic, write_picture
 from attnwarp_eval.metrics.arrays import Array
-from attnwarp_eval.metrics.scores import read_scores
+from attnwarp_eval.metrics.score_table import read_scores
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.schema import StudyError
 from attnwarp_eval.world import changed
