@@ -24,8 +24,8 @@ SIZE = 128
 
 def draw(out: Path, scene: str, thing: str, instruction: str, seed: int) -> None:
     """Rows: before the edit, each view edited alone, attention warped, and the preset `extended`.
-    Columns: the source view and targets. Every view has noise of its own; nothing changes outside
-    the thing's exact mask.
+    Columns: the source view and targets. Every view has noise of its own, except in the last row,
+    whose preset ties it to the surface; nothing changes outside the thing's exact mask.
     """
     truth = world(scene, SIZE)
     cameras = [truth.source, *(truth.targets[view] for view in VIEWS)]
@@ -35,15 +35,17 @@ def draw(out: Path, scene: str, thing: str, instruction: str, seed: int) -> None
     model = splats(scene, SIZE, 0, kind="2d", count=20_000, position_noise=0.1, normal_noise=3.0)
     given = (model, cameras, before, load_editor("small-plain"), instruction)
     # The row shows edited views, so the splats need no tuning.
-    few: dict[str, Any] = {"iterations": 1, "seed": seed, "noise": "fresh"}
-    alone = by_view(*given, ByViewSettings(**few), segments=segments)
+    few: dict[str, Any] = {"iterations": 1, "seed": seed}
+    alone = by_view(*given, ByViewSettings(**few, noise="fresh"), segments=segments)
     rows: dict[str, Mapping[int, Any]] = {
         "before": dict(enumerate(before)),
         "each view alone": alone.edited,
     }
     few |= {"stages": 1, "views_per_stage": len(VIEWS)}
-    for title, name in (("attention warped", "corrected"), ("extended", "extended")):
-        settings = preset("attention_warping", name, **few)
+    for title, settings in (
+        ("attention warped", preset("attention_warping", "corrected", noise="fresh", **few)),
+        ("extended", preset("attention_warping", "extended", **few)),
+    ):
         rows[title] = attention_warping(*given, settings, segments=segments).edited
     figure, axes = pyplot.subplots(len(rows), len(cameras), figsize=(11, 9), dpi=80)
     for axis, title in zip(axes[0], ("source view", *VIEWS), strict=True):
