@@ -82,8 +82,8 @@ def edit(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Its choices: corrected, extended, paper, released, released-controlnet; see"
-            " docs/method/algorithm.md.",
+            help="Its choices (default: extended): corrected, extended, paper, released,"
+            " released-controlnet; see docs/method/algorithm.md.",
             rich_help_panel=METHOD,
         ),
     ] = None,
@@ -248,6 +248,8 @@ def edit(
             name = used[0].replace("_", "-")
             raise ValueError(f"--{name}: is of attention_warping, not of {method}; leave it out")
         changes.setdefault("steps", own_steps_of(editor))
+        if method == "attention_warping" and preset is None:
+            preset = "extended"  # carries most; the library's default is the method as corrected
         settings = methods.preset(method, preset, **changes)
         budget = methods.Budget(seconds, network_rows)
         use_threads(editing.threads)

@@ -45,29 +45,33 @@ class SourceTokens:
     """Inputs of self-attention during a source's edit.
 
     Attributes:
-        by_pass: (branches, L, C) tokens by the layer's name, one entry for each pass.
+        by_pass: (branches, L, C) tokens by the layer's name, then by the number of the pass.
     """
 
-    by_pass: dict[str, list[Tensor]] = field(default_factory=dict)
+    by_pass: dict[str, dict[int, Tensor]] = field(default_factory=dict)
 
 
 @contextmanager
 def kept_tokens(
-    network: Any, layers: Sequence[Layer], dtype: torch.dtype
+    network: Any, layers: Sequence[Layer], dtype: torch.dtype, passes: range
 ) -> Iterator[SourceTokens]:
     """Keep the inputs of a network's self-attention while the block runs; outputs are unchanged.
 
     Args:
         network: a diffusers UNet that denoises one view.
         layers: layers to keep; those of cross-attention are ignored.
-        dtype: precision of the kept tokens.
+        dtype: precision of the kept tokens, which are in main memory.
+        passes: numbers of the passes to keep, from 0.
     """
     names = {layer.name for layer in layers}
-    kept = SourceTokens()
+    kept, done = SourceTokens(), dict.fromkeys(names, 0)
 
     def rule(name: str, tokens: Tensor, attend: Attend) -> Tensor:
         if name in names:
-            kept.by_pass.setdefault(name, []).append(tokens.detach().to(dtype))
+            if done[name] in passes:
+                own = kept.by_pass.setdefault(name, {})
+                own[done[name]] = tokens.detach().to("cpu", dtype, copy=True)
+            done[name] += 1
         return attend(tokens, None)
 
     with self_attention(network, rule):

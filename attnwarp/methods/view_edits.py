@@ -18,7 +18,8 @@ from attnwarp import check
 from attnwarp.digest import digest
 from attnwarp.editing.editor import Editor, edit
 from attnwarp.editing.inversion import NoiseMaps, inversion_rows, invert_view, noise_maps, replay
-from attnwarp.editing.recording import Recording, in_words
+from attnwarp.editing.layers import Layer
+from attnwarp.editing.recording import Recording, RecordingPlan, in_words
 from attnwarp.editing.schedule import Time
 from attnwarp.gaussians import Gaussians
 from attnwarp.io.names import file_stems
@@ -178,15 +179,23 @@ class ViewEdits:
     @property
     def _wants_attention(self) -> bool:
         marked = self.work.scene.segments is not None
-        return self.settings.unseen == "attend" and marked and bool(self.features.layers)
+        return self.settings.unseen == "attend" and marked and bool(self._attending_layers)
+
+    @property
+    def _attending_layers(self) -> tuple[Layer, ...]:
+        return tuple(layer for layer in self.features.layers if layer.kind == "self")
 
     def keeping(self, stack: ExitStack, number: int) -> SourceTokens | None:
         """Keep the first source's tokens for views to attend to, until the stack is left."""
         if number or not self.attends:
             return None
-        dtype = self.features.stored
-        kept = kept_tokens(self.work.editor.network, self.features.layers, dtype)
-        return stack.enter_context(kept)
+        passes = self.settings.feature_range()
+        network, layers = self.work.editor.network, self._attending_layers
+        return stack.enter_context(kept_tokens(network, layers, self.features.stored, passes))
+
+    def _tokens_plan(self, features: RecordingPlan) -> RecordingPlan:
+        branches = self.features.branches(self.features.source_guidance(further=False))
+        return replace(features, layers=self._attending_layers, keep=branches, store="cpu")
 
     def attend(
         self, stack: ExitStack, views: Sequence[int], sights: Sequence[Sight | None]
@@ -201,11 +210,9 @@ class ViewEdits:
             for view, sight in zip(views, sights, strict=True)
             if sight is not None
         ]
-        layers, size = self.features.layers, self.latent_size(views[0])
-        passes = self.settings.feature_range()
-        stack.enter_context(
-            attending(self.work.editor.network, layers, size, tokens, unseen, passes)
-        )
+        network, layers = self.work.editor.network, self._attending_layers
+        size, passes = self.latent_size(views[0]), self.settings.feature_range()
+        stack.enter_context(attending(network, layers, size, tokens, unseen, passes))
 
     def _checked_by_hand(self, picture: npt.NDArray[Any], source: int) -> Image:
         """Check an edit made elsewhere and resize it to the source's edit."""
@@ -266,6 +273,8 @@ class ViewEdits:
                 for number, view in enumerate(self.sources)
             ]
             lines.append(in_words(plans))
+            if self.attends:
+                lines.append(f"for what no warp reaches, {in_words([self._tokens_plan(plans[0])])}")
         return lines
 
     # --- sources

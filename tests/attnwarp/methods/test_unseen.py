@@ -35,7 +35,7 @@ def of_source(scene, editor):
     pictures = [scene[2][k] for k in range(3)]
     layers = choose_layers(editor.layers(), kinds=("self",))
     (kept,), latents = edited(
-        editor, pictures[:1], kept_tokens(editor.network, layers, torch.float32)
+        editor, pictures[:1], kept_tokens(editor.network, layers, torch.float32, range(STEPS))
     )
     assert torch.equal(latents, edited(editor, pictures[:1])[1])  # keeping changes no bit
     return pictures, layers, kept
