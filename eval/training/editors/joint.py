@@ -30,6 +30,8 @@ class JointNet(torch.nn.Module):
         shift: shift of the noise schedule.
     """
 
+    alphas: Tensor
+
     def __init__(self, vocabulary: int, shift: float = SHIFT) -> None:
         super().__init__()
         from diffusers import FluxTransformer2DModel
