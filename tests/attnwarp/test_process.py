@@ -3,6 +3,7 @@ KeyboardInterrupt.
 """
 
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -25,6 +26,20 @@ def test_nothing_is_left_to_search_as_the_process_ends():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["0", "False", "True", "True"]
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="of glibc's allocator")
+def test_memory_freed_by_one_step_serves_the_next():
+    """The system counts the pages that it cleared: 3,064 a step of 63 MB without."""
+    code = (
+        "import resource, numpy; from attnwarp.process import keep_freed_memory;"
+        "step = lambda: [numpy.ones(10 << 17) for _ in range(6)] and None;"
+        "faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt;"
+        "keep_freed_memory(); [step() for _ in range(4)];"
+        "before = faults(); [step() for _ in range(4)]; print(faults() - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 100
 
 
 @pytest.mark.skipif(
