@@ -213,11 +213,10 @@ def variant_like(
     if name not in study.probes:
         return None
     wanted = parse_variant(dict(data))
+    meaning = None if own else asked.meaning(study, wanted)
     for label, variant in study.variants.items():
-        if own:
-            same = asked.alike(study, variant, wanted)
-        else:
-            same = asked.meaning(study, variant) == asked.meaning(study, wanted)
-        if same and results.records(name, label):
+        if results.records(name, label) and (
+            asked.alike(study, variant, wanted) if own else asked.meaning(study, variant) == meaning
+        ):
             return label
     return None
