@@ -69,8 +69,11 @@ def control_share(method: ByView, control: ByView, alone: ByView) -> tuple[float
         gain = of[0] - of[2]
         return np.where(gain > 0, of[1] - of[2], np.nan) / np.where(gain > 0, gain, 1)
 
-    bounds = np.nanquantile(share(means[:, drawn].mean(axis=-1)), [0.025, 0.975])
-    return float(share(means.mean(axis=-1))), float(bounds[0]), float(bounds[1])
+    mean, shares = float(share(means.mean(axis=-1))), share(means[:, drawn].mean(axis=-1))
+    shares = shares[np.isfinite(shares)]
+    if not len(shares):
+        return mean, np.nan, np.nan
+    return mean, *np.quantile(shares, [0.025, 0.975]).tolist()
 
 
 Figures = tuple[str, str, str, str]
@@ -137,7 +140,7 @@ class EdgeTable:
         found, share = self.judged[title], self.share_of_control(title)
         if found.scenes < FEWEST_SCENES:
             return no_verdict(found) if found.scenes else "not measured"
-        if share is not None and not share[0] <= BLIND:
+        if share is not None and share[0] > BLIND:
             return "blind"
         told = found.verdict("lower", adjusted_p=self.p[title], bound=EQUAL_WITHIN)
         words = {"worse": "holds", "better": "the opposite holds", "equal": "does not hold: equal"}
@@ -168,7 +171,9 @@ class EdgeTable:
 
 
 def _percent(share: Sequence[float]) -> str:
-    mean, low, high = (f"{number(100 * value, 2)}" for value in share)
+    if not np.isfinite(share[0]):
+        return "no gain"
+    mean, low, high = (number(100 * value, 2) for value in share)
     return f"{mean} % ({low} to {high} %)"
 
 

@@ -33,8 +33,8 @@ WRONG = {"exact": (0.1, 0.1), "good": (0.1, 0.1), "edgy": (0.4, 0.1), "far": (0.
 METHODS = ["good", "edgy", "far"]
 
 
-def planted(control=0.9):
-    wrong = {**WRONG, "moved": (control, control)}
+def planted(control=0.9, **changes):
+    wrong = {**WRONG, "moved": (control, control), **changes}
     study = {
         "name": "edges", "size": 64, "scenes": SCENES, "variants": {name: {} for name in wrong},
         "probes": {"labels": list(wrong)},
@@ -76,6 +76,10 @@ def test_a_control_that_brings_more_than_half_makes_a_method_blind():
     assert found.share_of_control("good") == pytest.approx((0.6 / 0.9,) * 3)
     assert found.verdict("good") == "blind"
     assert table_of(planted()).share_of_control("good")[0] == pytest.approx(0.1 / 0.9)
+    # A method that brings nothing is judged all the same.
+    found = table_of(planted(good=(1.0, 1.0)))
+    assert np.isnan(found.share_of_control("good")).all()
+    assert found.verdict("good") == "does not hold: equal"
 
 
 def test_a_label_that_is_none_stays_none_along_a_chain():
