@@ -2,10 +2,9 @@
 
 A track has one order, fixed before any method was scored:
 
-- same editor (one of ours, so that all right answers are known): ``error``, the mean CIEDE2000 over
-  all pixels of all views to the right answer that the source's picture is nearest to. Another right
-  answer in a view is an error there, so is what leaks outside the mask, and a missing view counts
-  as unedited.
+- same editor (one of ours, so that all right answers are known): ``error``, the mean CIEDE2000 of
+  all views to the right answer that the source's picture is nearest to, inside the mask plus
+  outside. Another right answer in a view is an error there, and a missing view counts as unedited.
 - own editor: ``apart``, disagreement above the floor plus change outside the mask. Pictures that
   are unedited, copied or smoothed agree without any merit: a remark names them, and ``apart`` is
   undefined. A method with such a scene stands behind those without.
@@ -20,7 +19,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
 from pydantic.dataclasses import dataclass
@@ -29,13 +28,15 @@ from attnwarp.errors import InputError
 from attnwarp.io.text import read_text
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.document.model import Report, Section, Table
+from attnwarp_eval.document.numbers import FEWEST_SCENES
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.statistics.intervals import Interval, interval, paired
 
-PROTOCOL = 2
+PROTOCOL: Final = 2
 """Version; raised when equal pictures would get other scores."""
 
-SAME, OWN = "same editor", "own editor"
+SAME: Final = "same editor"
+OWN: Final = "own editor"
 
 FIGURES = {
     "error": "error, dE00",
@@ -49,6 +50,8 @@ FIGURES = {
     "render_error": "error of the splats, dE00",
 }
 """Figures by key, with their heads."""
+
+SHARES = ("done", "seen")
 
 ORDER = {SAME: "error", OWN: "apart"}
 """Figure that orders the methods of each track."""
@@ -160,26 +163,35 @@ def _validated(kind: Any, path: Path) -> Any:
         raise InputError(f"{path}: {place}: {first['msg']}; see docs/measuring/bench.md") from None
 
 
-def bounded(value: Interval, sign: str = "") -> str:
-    """A mean with its interval, if it has one; empty if undefined."""
+def bounded(value: Interval, figure: str, sign: str = "") -> str:
+    """A mean with its interval, if it has one, and the number of undefined scenes.
+
+    Shares and fewer than :data:`FEWEST_SCENES` scenes have no interval.
+    """
     if math.isnan(value.mean):
         return ""
-    low, high = (format(v, f"{sign}.2f") for v in (value.low, value.high))
-    return format(value.mean, f"{sign}.2f") + (f" [{low}, {high}]" if value.bounded else "")
+    text = format(value.mean, f"{sign}.2f")
+    if value.bounded and value.scenes >= FEWEST_SCENES and figure not in SHARES:
+        text += f" [{value.low:{sign}.2f}, {value.high:{sign}.2f}]"
+    return text + (f" ({value.undefined} undefined)" if value.undefined else "")
 
 
 def table(scores: Sequence[Score]) -> Table:
-    """The figures by edit: means over scenes with their 95 % interval."""
+    """The figures by edit: means over scenes, see :func:`bounded`."""
     rows = []
     for edit in dict.fromkeys(score.edit for score in scores):
         own = [score for score in scores if score.edit == edit]
-        cells = [bounded(interval({s.scene: [s.figures[name]] for s in own})) for name in FIGURES]
+        over = {name: interval({s.scene: [s.figures[name]] for s in own}) for name in FIGURES}
+        cells = [bounded(value, name) for name, value in over.items()]
         rows.append([edit, str(len(own)), *cells])
     return Table(["edit", "scenes", *FIGURES.values()], rows)
 
 
 def compare(results: Sequence[Result]) -> Report:
-    """Compare methods on one bench, in each track and edit; the first is paired with the others.
+    """Compare methods on one bench, by track and edit.
+
+    The own editor's tables have every method; differences are paired by scene with the first one
+    of the same editor, else with the first of all.
 
     Raises:
         ValueError: results of two benches.
@@ -191,11 +203,12 @@ def compare(results: Sequence[Result]) -> Report:
                 f"{result.method.name}: was scored on another bench than {first.method.name};"
                 " score both on one"
             )
+    tracks = {track: [r for r in results if track in (r.method.track, OWN)] for track in ORDER}
     sections = [
-        Section(f"{track.capitalize()}: {edit}", tables=[_compared(results, first, track, edit)])
-        for track in ORDER
+        Section(f"{track.capitalize()}: {edit}", tables=[_compared(those, track, edit)])
+        for track, those in tracks.items()
+        if any(result.method.track == track for result in those)
         for edit in first.edits
-        if any(result.method.track == track for result in results)
     ]
     remarks = [
         f"- {r.method.name}, {r.method.editor}: {s.scene}, {s.edit}: {text}"
@@ -203,13 +216,10 @@ def compare(results: Sequence[Result]) -> Report:
         for s in r.scores
         for text in s.remarks
     ]
-    of = first.bench
     lead = [
-        f"Drawn scenes of generator {of['generator']}, "
-        + (f"seed {of['seed']}" if of["seed"] is not None else "sealed")
-        + f", {len(of['views'])} views of {of['size']} px. Means over scenes with their 95 %"
-        f" intervals; the last column is the method minus {first.method.name} with"
-        f" {first.method.editor}, paired by scene. Less is better; disagreement is read beside the"
+        f"{_bench(first.bench)} Means over scenes; from six scenes on with their 95 % intervals."
+        " The last column is the difference, paired by scene, from the first method with the same"
+        " editor, else from the first of all. Less is better; disagreement is read beside the"
         " change of the source."
     ]
     if remarks:
@@ -217,20 +227,32 @@ def compare(results: Sequence[Result]) -> Report:
     return Report("Methods on a bench", lead, sections)
 
 
-def _compared(results: Sequence[Result], first: Result, track: str, edit: str) -> Table:
+def _bench(of: Mapping[str, Any]) -> str:
+    drawn = f"Drawn scenes of generator {of['generator']}, {len(of['views'])} views"
+    if of["seed"] is None:
+        return f"{drawn} of {of['size']} px, sealed."
+    asked = {"size": of["size"], "spp": of["spp"], "targets": len(of["views"]) - 1}
+    options = " ".join(
+        f"--{name} {value}" for name, value in (asked | {"seed": of["seed"]}).items()
+    )
+    return f"{drawn}: `attnwarp-eval bench export bench {options}`."
+
+
+def _compared(results: Sequence[Result], track: str, edit: str) -> Table:
     figure = ORDER[track]
-    keys = [figure, *(key for key in FIGURES if key not in ORDER.values())]
+    keys = [figure, *(key for key in FIGURES if key != figure)]
     ranked = []
     for result in results:
-        if result.method.track != track or edit not in result.edits:
+        if edit not in result.edits:
             continue
-        values = result.values(edit, figure)
-        means = [bounded(_over(result.values(edit, key))) for key in keys]
-        gain = "" if result is first else bounded(
-            paired(_by_scene(first.values(edit, figure)), _by_scene(values)), "+"
-        )  # fmt: skip
-        seconds = "" if result.method.seconds is None else f"{result.method.seconds:.0f}"
-        row = [result.method.name, result.method.editor, str(len(values)), *means, seconds, gain]
+        told, values = result.method, result.values(edit, figure)
+        first = next((r for r in results if r.method.editor == told.editor), results[0])
+        first = results[0] if first is result else first
+        means = [bounded(_over(result.values(edit, key)), key) for key in keys]
+        gain = paired(_by_scene(first.values(edit, figure)), _by_scene(values))
+        seconds = "" if told.seconds is None else f"{told.seconds:.0f}"
+        row = [told.name, told.editor, str(len(values)), *means, seconds]
+        row.append("" if first is result else bounded(gain, figure, "+"))
         undefined = any(math.isnan(value) for value in values.values())
         ranked.append((undefined, _over(values).mean, row))
     ranked.sort(key=lambda one: (one[0], math.isnan(one[1]), one[1]))

@@ -37,7 +37,7 @@ from attnwarp_eval.document.write import write_files
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.image import edit_drift
 from attnwarp_eval.study.shared.edit_figures import EditFigures
-from attnwarp_eval.study.shared.edit_truth import EditTruth
+from attnwarp_eval.study.shared.edit_truth import EditTruth, Judgement
 from attnwarp_eval.world import World
 
 Image = npt.NDArray[np.float32]
@@ -48,6 +48,8 @@ LITTLE = 3.0
 SMOOTH = 0.5
 """Share of a gradient inside the mask, the original's or the true edit's if less, below which
 pictures count as smoothed: an editor may keep either."""
+
+DISAGREEMENT = "multiview.delta_e_above.edit_inside"
 
 EMPTY = (UNEDITED, COPIED, SMOOTHED) = "the source is unedited", "copies of the source", "smooth"
 """Beginnings of remarks on pictures that agree without merit."""
@@ -108,10 +110,15 @@ def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path, track:
         raise InputError(f"{folder}: has no {source}.png, which decides the answer; add it")
     judged = truth.judge({source: pictures[source]})
     answer = judged.answer or next(iter(truth.answers))
+
+    def rows_of(judged: Judgement) -> dict[str, dict[str, float]]:
+        figures = EditFigures(of, truth, source, pictures, judged)
+        return {view: figures.row(view) for view in pictures if view != source}
+
+    rows = rows_of(judged)
     # An own editor has answers of its own, so that any source has an edit to agree with.
-    agreeing = replace(judged, done=True) if track == OWN else judged
-    figures = EditFigures(of, truth, source, pictures, agreeing)
-    rows = {view: figures.row(view) for view in pictures if view != source}
+    free = rows if judged.done else rows_of(replace(judged, done=True))
+    rows = free if track == OWN else rows
     faults = _remarks(truth, pictures, source, answer)
     drifts = [edit_drift(truth.originals[view], image) for view, image in pictures.items()]
     values = {
@@ -119,7 +126,7 @@ def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path, track:
         "apart": math.nan,
         "amount": _difference(truth.originals[source], pictures[source], truth.union[source]),
         "done": float(judged.done),
-        "agreement": _mean(row["multiview.delta_e_above.edit_inside"] for row in rows.values()),
+        "agreement": _mean(row[DISAGREEMENT] for row in rows.values()),
         "seen": _mean(row["multiview.same_answer.edit_seen"] for row in rows.values()),
         "outside": _mean(
             _difference(truth.originals[view], image, ~truth.union[view])
@@ -132,7 +139,7 @@ def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path, track:
         renders = _renders(of, bench, folder / "edited.ply")
         values["render_error"] = _error(truth, renders, answer)
     if not any(fault.startswith(EMPTY) for fault in faults):
-        values["apart"] = values["agreement"] + values["outside"]
+        values["apart"] = _mean(row[DISAGREEMENT] for row in free.values()) + values["outside"]
     if track == OWN and truth.ambiguous:
         values |= dict.fromkeys(("error", "done", "seen", "render_error"), math.nan)
     return Score(scene, edit, values, rows, [*remarks, *faults])
@@ -199,16 +206,24 @@ def _remarks(
 
 
 def _error(truth: EditTruth, pictures: Mapping[str, Image], answer: str) -> float:
-    """Mean over all views; a missing one counts as unedited."""
-    true = truth.answers[answer]
+    """Mean over views inside the mask, plus that outside; a missing view counts as unedited.
+
+    Over all pixels alike, unedited pictures of a small thing would have next to no error.
+    """
     shown = {**truth.originals, **pictures}
-    return _mean(_difference(true[view], image, None) for view, image in shown.items())
+    errors = {
+        view: [
+            _difference(true, shown[view], where)
+            for where in (truth.union[view], ~truth.union[view])
+        ]
+        for view, true in truth.answers[answer].items()
+    }
+    return sum(_mean(error[k] for error in errors.values()) for k in (0, 1))
 
 
-def _difference(one: Image, two: Image, where: npt.NDArray[np.bool_] | None) -> float:
+def _difference(one: Image, two: Image, where: npt.NDArray[np.bool_]) -> float:
     a, b = (to_lab(to_bytes(image)) for image in (one, two))
-    values = ciede2000(a, b)
-    values = values if where is None else values[where]
+    values = ciede2000(a, b)[where]
     return float(values.mean()) if values.size else math.nan
 
 

@@ -201,6 +201,14 @@ def test_cheaters_are_named_or_ranked_behind_the_truth(bench, tmp_path, track):
         assert math.isnan(one.figures[figure]) if without else behind, content
 
 
+def test_an_editor_that_disturbs_the_background_stands_before_unedited_pictures(bench, tmp_path):
+    true, cheats = spoiled(bench)
+    masks = {v: read_image(bench / SCENE / "masks" / "some_colour" / f"{v}.png") > 0 for v in true}
+    disturbed = {v: np.where(masks[v], p, 0.8 * p + 20).astype(np.uint8) for v, p in true.items()}
+    one, unedited = (scored(bench, tmp_path, p).figures for p in (disturbed, cheats["unedited"]))
+    assert one["outside"] > 3 and 3 < one["error"] < unedited["error"] - 3
+
+
 def test_answers_of_an_own_editor_count_where_the_instruction_names_one(bench, tmp_path):
     for edit, answer, one_right in (("colour", "edited", True), ("some_colour", "blue", False)):
         true = true_pictures(bench, edit, [answer] * 3)

@@ -40,6 +40,28 @@ def read(tmp_path, data):
     return result.Result.read(path)
 
 
+@pytest.mark.parametrize("path", sorted(REPORTS.glob("*.json")), ids=lambda path: path.stem)
+def test_every_result_of_the_table_has_the_format_and_one_bench(path):
+    one, first = (result.Result.read(p) for p in (path, min(REPORTS.glob("*.json"))))
+    assert one.bench == first.bench and one.method.name
+    assert path.read_text() == written(one, path.parent / "never.json")
+
+
+def written(one, path):
+    texts = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(result, "write_atomic", lambda _, data: texts.append(data.decode()))
+        one.write(path)
+    return texts[0]
+
+
+def test_the_table_is_made_of_the_results_beside_it():
+    results = [result.Result.read(path) for path in sorted(REPORTS.glob("*.json"))]
+    from attnwarp_eval.document.write import markdown
+
+    assert (REPORTS / "bench.md").read_text() == markdown(result.compare(results))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -62,17 +84,21 @@ def test_a_result_without_a_figure_is_refused(tmp_path):
 
 
 def test_methods_are_ordered_by_their_track_and_paired_by_scene(tmp_path):
-    ours = read(tmp_path, made("ours", [2.0, 4.0, 3.0]))
-    best = read(tmp_path, made("best", [1.0, 2.5, 2.5]))  # 1, 1.5, 0.5 less
-    named = read(tmp_path, made("named", [0.1] * 3, result.OWN, [0.0, None, 0.0]))
-    own = read(tmp_path, made("own", [9.0] * 3, result.OWN, 5.0))
+    ours = read(tmp_path, made("ours", [2.0, 4.0, 3.0] * 2))
+    best = read(tmp_path, made("best", [1.0, 2.5, 2.5] * 2))  # 1, 1.5, 0.5 less, twice
+    named = read(tmp_path, made("named", [0.1] * 6, result.OWN, [0.0, None] + [0.0] * 4))
+    own = read(tmp_path, made("own", [9.0] * 6, result.OWN, 5.0))
     report = result.compare([ours, best, named, own])
     same, other = (section.tables[0].rows for section in report.sections)
     assert [row[0] for row in same] == ["best", "ours"]
-    # Student's t of three differences: 4.303 * 0.5 / sqrt(3) = 1.242.
-    assert same[0][-1] == "-1.00 [-2.24, +0.24]" and same[1][-1] == ""
+    # Student's t of six differences: 2.571 * sqrt(1 / 5) / sqrt(6) = 0.469.
+    assert same[0][-1] == "-1.00 [-1.47, -0.53]" and same[1][-1] == ""
+    few = [read(tmp_path, made(name, errors)) for name, errors in (("a", [1.0]), ("b", [2.0]))]
+    assert result.compare(few).sections[0].tables[0].rows[1][-1] == "+1.00"
+    assert same[0][3:7] == ["2.00 [1.19, 2.81]", "1.00 [1.00, 1.00]", "0.50 [0.50, 0.50]", "0.50"]
+    assert other[-1][3] == "0.00 (1 undefined)"  # five scenes have no interval
     # Undefined in one scene: behind, though its mean is less.
-    assert [row[0] for row in other] == ["own", "named"]
+    assert [row[0] for row in other] == ["ours", "best", "own", "named"]
     moved = read(tmp_path, made("b", [1.0], bench=BENCH | {"seed": 32}))
     with pytest.raises(ValueError, match="another bench"):
         result.compare([ours, moved])
@@ -87,8 +113,8 @@ def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path):
     told = run.run(bench, out, editor="ideal", options=options)
     assert told.track == result.SAME and told.seconds > 0
     (one,) = (s for s in score.score(bench, out, tmp_path / "score") if s.edit == "colour")
-    # The ideal editor knows the only answer; both sides are rounded to 8 bits, as its latents.
-    assert one.figures["error"] < 1 and one.remarks == []
+    # The ideal editor knows the only answer, and leaves the rest alone to the width of a token.
+    assert one.figures["done"] == 1 and one.figures["outside"] < 1 and one.remarks == []
     place = out / "drawn-0" / "colour"
     before = read_image(place / "source.png")
     (place / "source.png").unlink()
