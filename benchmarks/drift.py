@@ -159,7 +159,7 @@ def of_scenes(count: int, seed: int) -> Iterator[Try]:
 def row(name: str, tries: Sequence[Try]) -> list[str]:
     """Cells of a table: tries, told, median and largest errors, misses of the intervals."""
     told = [one for one in tries if one.errors is not None]
-    errors = np.abs([one.errors for one in told]).reshape(-1, 4)
+    errors = np.abs(np.array([one.errors for one in told], float)).reshape(-1, 4)
     half = np.array([one.half_widths for one in told]).reshape(-1, 4)
     middle = np.median(errors, axis=0)
     missed = errors > half
