@@ -23,8 +23,7 @@ the ground, the time of day; whether an edit went in the direction of the words;
 outside its words. It knows {objects} things, {colors} colours, {finishes} surfaces, {grounds} grounds and {times} times of day (`attnwarp_eval/drawn/worlds.py`). A word
 that it does not know is read in pieces and mostly passed over: "a robot dinosaur" is a dinosaur to it. Its figures do not
 compare with those of OpenAI's CLIP, whose name stands beside a figure when it was used (`--clip clip:FOLDER`).
-On edits whose truth is known similarity to the prompt prefers blurred results and is blind to small shifts; docs/measuring/metrics.md
-and reports/metrics have the figures.
+On edits whose truth is known similarity to the prompt prefers blurred results and is blind to small shifts (docs/measuring/metrics.md).
 
 **Recipe**: `training/encoders/naming.py`, then `training/encoders/clip.py`. First {warm_epochs} epochs in which linear heads name each attribute from the image
 tower's features; three in ten pictures have their colours scrambled, and of these the thing alone is asked. Then contrast over batches of 128 pictures and 256
