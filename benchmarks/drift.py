@@ -203,7 +203,7 @@ def report(sets: dict[str, list[Try]]) -> str:
             if some:
                 lines.append("| " + " | ".join(row(f"{size:g} {kind}", some)[:7]) + " |")
     lines += [
-        "", "The raw results are `results.jsonl.xz`, one try a line. Made by `python -m"
+        "", "The raw results are `tries.jsonl.xz`, one try a line. Made by `python -m"
         " benchmarks.drift --out reports/drift`.",
     ]  # fmt: skip
     return "\n".join(lines)
@@ -234,7 +234,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "rendered, 256 px": list(of_scenes(few, scenes)),
     }
     given.out.mkdir(parents=True, exist_ok=True)
-    with lzma.open(given.out / "results.jsonl.xz", "wt") as file:
+    with lzma.open(given.out / "tries.jsonl.xz", "wt") as file:
         for name, tries in sets.items():
             for one in tries:
                 file.write(json.dumps({"of": name, **asdict(one)}, sort_keys=True) + "\n")

@@ -35,7 +35,7 @@ def test_known_drifts_are_found_under_changes_of_colour_blur_noise_and_repaint(t
 
 def test_the_page_of_drifts_says_what_its_raw_results_say() -> None:
     folder = ROOT / "reports/drift"
-    sets = read(folder / "results.jsonl.xz")
+    sets = read(folder / "tries.jsonl.xz")
     page = (folder / "report.md").read_text()
     assert len(page.splitlines()) <= 150
     for name, tries in sets.items():
