@@ -121,7 +121,14 @@ def attending(
                 f" {len(tokens) / views:g}; give both one text guidance"
             )
         others = source[:, None].expand(-1, views, -1, -1).flatten(0, 1)
-        return torch.lerp(own, attend(tokens, others), share.repeat(branches, 1, 1))
+        # Tokens attend one by one, so those that are seen in every view are left out.
+        asked = share.any(dim=0)[:, 0].nonzero()[:, 0]
+        attended = attend(tokens[:, asked], others)
+        result = own.clone()
+        result[:, asked] = torch.lerp(
+            own[:, asked], attended, share[:, asked].repeat(branches, 1, 1)
+        )
+        return result
 
     with self_attention(network, rule):
         yield
