@@ -174,12 +174,13 @@ class ViewEdits:
     @property
     def attends(self) -> bool:
         """True if marked tokens that no warp reaches attend to the first source."""
-        return self._wants_attention and has_self_attention(self.work.editor.network)
+        able = has_self_attention(self.work.editor.network) and bool(self._attending_layers)
+        return self._wants_attention and able
 
     @property
     def _wants_attention(self) -> bool:
         marked = self.work.scene.segments is not None
-        return self.settings.unseen == "attend" and marked and bool(self._attending_layers)
+        return self.settings.unseen == "attend" and marked and bool(self.features.layers)
 
     @property
     def _attending_layers(self) -> tuple[Layer, ...]:
@@ -264,8 +265,8 @@ class ViewEdits:
             )
         if self._wants_attention and not self.attends:
             lines.append(
-                "unseen: marked parts that no warp reaches are edited freely, as this editor has no"
-                " self-attention of a UNet that could attend to the source"
+                "unseen: marked parts that no warp reaches are edited freely, as no self-attention"
+                " of a UNet is recorded that could attend to the source"
             )
         if self.features.layers:
             plans = [

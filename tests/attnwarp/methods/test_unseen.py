@@ -5,6 +5,7 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 import torch
+from edit_folders import Watched
 
 from attnwarp.editing.editor import edit
 from attnwarp.editing.layers import choose_layers
@@ -12,7 +13,7 @@ from attnwarp.editing.small import load_editor
 from attnwarp.methods import attention_warping, preset
 from attnwarp.methods.attention import aligned, self_attention
 from attnwarp.methods.sight import Sight
-from attnwarp.methods.unseen import attending, has_self_attention, kept_tokens, unseen_of
+from attnwarp.methods.unseen import attending, kept_tokens, unseen_of
 from attnwarp.warp import Surface, warp_surfaces
 
 STEPS = 2
@@ -106,6 +107,19 @@ def test_an_edit_attends_only_if_something_is_marked(scene, editor):
     assert all(np.array_equal(unmarked[0][k], unmarked[1][k]) for k in free)
 
 
-def test_a_network_without_self_attention_of_its_own_leaves_unseen_parts_free(editor):
-    assert has_self_attention(editor.network)
-    assert not has_self_attention(torch.nn.Identity())
+def test_without_self_attention_unseen_parts_stay_free_and_that_is_said(scene, editor):
+    model, cameras, pictures = scene
+    told, edits = [], []
+    marks = [np.ones(picture.shape[:2], bool) for picture in pictures]
+    for unseen in ("free", "attend"):
+        settings = preset(
+            "attention_warping", stages=1, steps=1, iterations=0, kinds=("cross",), unseen=unseen
+        )
+        edits.append(
+            attention_warping(
+                model, cameras, pictures, editor, "a bear", settings, segments=marks,
+                report=Watched(log=told.append),
+            ).edited
+        )  # fmt: skip
+    assert all(np.array_equal(edits[0][k], edits[1][k]) for k in edits[0])
+    assert sum(line.startswith("unseen: marked parts") for line in told) == 1
