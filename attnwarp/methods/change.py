@@ -92,26 +92,26 @@ def drift_of(work: Work, view: int, picture: Image) -> dict[str, Any] | None:
     return None if found is None else asdict(found)
 
 
-def say_drift(of: Mapping[str, Any]) -> tuple[str, bool]:
+def say_drift(edit: Mapping[str, Any]) -> tuple[str, bool]:
     """Write a line about the drift of an edit, and whether it warns.
 
     Args:
-        of: "view", and its "drift" as of :func:`drift_of`.
+        edit: "view", and its "drift" as of :func:`drift_of`.
 
     Example:
         >>> say_drift({"view": "bear", "drift": None})
         ("whether the edit of bear moved the picture can't be told", False)
     """
-    if not of["view"]:
+    if not edit["view"]:
         return "no view was edited", False
-    if of["drift"] is None:
-        return f"whether the edit of {of['view']} moved the picture can't be told", False
-    moved = Drift(**of["drift"])
+    if edit["drift"] is None:
+        return f"whether the edit of {edit['view']} moved the picture can't be told", False
+    moved = Drift(**edit["drift"])
     if not moved.seen:
-        return f"the edit of {of['view']} left the picture in place ({moved})", False
+        return f"the edit of {edit['view']} left the picture in place ({moved})", False
     return (
-        f"the edit of {of['view']} moved the picture, corners by {moved.largest:.1f} px ({moved});"
-        " warps assume that it stays: try another seed or editor"
+        f"the edit of {edit['view']} moved the picture, corners by {moved.largest:.1f} px"
+        f" ({moved}); warps assume that it stays: try another seed or editor"
     ), True
 
 
