@@ -347,7 +347,10 @@ def _on_sphere(z_phi: Array) -> Array:
 
 def _eliminate(points: Array, normals: Array, spacing: Array, count: int) -> npt.NDArray[np.int64]:
     """Indices of the ``count`` points that are left when the most crowded one is removed again and
-    again.
+    again; of equally crowded ones the first.
+
+    Crowds are counted in integers: what is added and taken away again leaves no residue, whose
+    rounding, other on every processor, would choose among points that nothing crowds.
     """
     from scipy.sparse import csr_matrix
     from scipy.spatial import cKDTree
@@ -358,7 +361,7 @@ def _eliminate(points: Array, normals: Array, spacing: Array, count: int) -> npt
     k = min(n, 6 * CANDIDATES)
     distance, near = cKDTree(points).query(points, k=k, workers=-1)
     start, other, closeness = _crowds(distance.reshape(n, k), near.reshape(n, k), radius, normals)
-    crowd = csr_matrix((closeness**8, other, start), shape=(n, n))
+    crowd = csr_matrix(((closeness**8 * 2**40).astype(np.int64), other, start), shape=(n, n))
     crowd.sort_indices()
     crowd = crowd.maximum(crowd.T).tocsr()
     alive = _remove(
@@ -394,14 +397,19 @@ def _crowds(distance, near, radius, normals):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=CACHE)
+def _before(weight, a, b):  # type: ignore[no-untyped-def]
+    return weight[a] > weight[b] or (weight[a] == weight[b] and a < b)
+
+
+@numba.njit(cache=CACHE)
 def _sink(heap, place, weight, k, size):  # type: ignore[no-untyped-def]
     while True:
         child = 2 * k + 1
         if child >= size:
             return
-        if child + 1 < size and weight[heap[child + 1]] > weight[heap[child]]:
+        if child + 1 < size and _before(weight, heap[child + 1], heap[child]):
             child += 1
-        if weight[heap[child]] <= weight[heap[k]]:
+        if not _before(weight, heap[child], heap[k]):
             return
         heap[k], heap[child] = heap[child], heap[k]
         place[heap[k]], place[heap[child]] = k, child
@@ -414,7 +422,7 @@ def _remove(start, other, closeness, removals):  # type: ignore[no-untyped-def]
     heap with places.
     """
     n = len(start) - 1
-    weight = np.zeros(n)
+    weight = np.zeros(n, np.int64)
     for i in range(n):
         for e in range(start[i], start[i + 1]):
             weight[i] += closeness[e]

@@ -8,7 +8,12 @@ from attnwarp.errors import InputError
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.shapes import Box, Rectangle, Sphere
-from attnwarp_eval.splats.surface import quaternions_from_normals, sample_surface, surface_splats
+from attnwarp_eval.splats.surface import (
+    _eliminate,
+    quaternions_from_normals,
+    sample_surface,
+    surface_splats,
+)
 from attnwarp_eval.truth import Geometry, appearance, edge_band
 from attnwarp_eval.truth.shading import buried, frames
 
@@ -51,6 +56,16 @@ def test_blue_noise_keeps_its_distance_and_covers():
     grid = np.stack(np.meshgrid(*[np.linspace(-0.95, 0.95, 200)] * 2), -1).reshape(-1, 2)
     hole = cKDTree(s.point[:, :2]).query(grid)[0].max() / s.spacing[0]
     assert hole < 1.2  # random points leave holes of 1.7
+
+
+def test_rounding_does_not_choose_which_samples_are_kept():
+    random = np.random.default_rng(0)
+    points = random.uniform(0, 1, (4000, 3)) * (1, 1, 0)
+    normals, spacing = np.tile([0.0, 0, 1], (4000, 1)), np.full(4000, 0.03)
+    # Other processors add in another order, and so differ in the last digits.
+    other = points * (1 + random.uniform(-4e-16, 4e-16, points.shape))
+    kept = _eliminate(points, normals, spacing, 400)
+    np.testing.assert_array_equal(_eliminate(other, normals, spacing, 400), kept)
 
 
 def test_the_density_falls_from_the_middle_outward_as_documented():
