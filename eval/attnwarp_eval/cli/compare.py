@@ -31,7 +31,8 @@ def compare(
     baseline: Annotated[
         Path,
         typer.Argument(
-            help="A baseline's file (.jsonl), raw results (.jsonl.xz), or another run's folder."
+            help="A baseline's file (.jsonl), raw results (.jsonl.xz), a report's folder of"
+            " them, or another run's folder."
         ),
     ],
     run: Annotated[Path, typer.Argument(help="The run's folder.")],
@@ -204,7 +205,7 @@ def _baseline(path: Path, run: Snapshot, common: bool) -> tuple[Snapshot, Pictur
     from attnwarp_eval.compare import read_baseline
     from attnwarp_eval.compare.pictures import pictures_of_baseline
     from attnwarp_eval.compare.snapshot import snapshot
-    from attnwarp_eval.report.raw import read_raw
+    from attnwarp_eval.report.raw import PARTS, read_parts, read_raw
 
     if path.name == "results.jsonl" and (path.parent / "study.json").is_file():
         path = path.parent  # a run's table of figures: the run has them all
@@ -213,6 +214,8 @@ def _baseline(path: Path, run: Snapshot, common: bool) -> tuple[Snapshot, Pictur
     if raw or path.is_dir():
         if raw:
             trusted = snapshot(read_raw(path))
+        elif any(path.glob(PARTS)):
+            trusted = snapshot(read_parts(path))
         else:
             trusted, pictures, _ = _run(path)
         if trusted.missing and not common:

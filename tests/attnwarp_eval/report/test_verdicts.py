@@ -98,6 +98,13 @@ def defined(value):
     return np.nan if value is None else value
 
 
+def test_a_run_is_compared_with_the_raw_results_of_a_report(reported):
+    store, raw = reported
+    done = invoke("compare", raw, store.root)
+    assert done.exit_code == 0, done.output
+    assert done.stdout.startswith("pass: 0 worse, 0 can't tell, 0 better, ")
+
+
 def test_raw_results_outlive_the_keys_of_their_study(reported, tmp_path):
     path = reported[1] / "results.jsonl.xz"
     head, *cells = lzma.decompress(path.read_bytes()).decode().splitlines()
