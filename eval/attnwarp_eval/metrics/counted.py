@@ -30,6 +30,7 @@ COUNTED: Mapping[str, tuple[str, ...]] = {
     "masks.recall": ("masks.thing",),
     "parts.seen": ("parts.seen_parts",),
     "parts.through": ("parts.hidden_pixels",),
+    "parts.fill": ("parts.fill_pairs",),
     "warp.below_half_px": ("warp.visible",),
     "warp.below_1px": ("warp.visible",),
     "warp.below_2px": ("warp.visible",),

@@ -257,6 +257,8 @@ _SPECS = (
     Metric("parts.seen", "share", "higher", 1e-4, 0, "parts truly seen by the source that show its answer"),
     Metric("parts.right", "share", "higher", 1e-4, 0, "pixels truly seen by the source that show its answer"),
     Metric("parts.through", "share", "lower", 1e-4, 0, "hidden pixels that show the answer of the surface before them"),
+    Metric("parts.fill", "share", "higher", 1e-4, 0, "parts that the source does not show, with one answer in two targets"),
+    Metric("parts.fill_pairs", "pixels", "none", 0, 0, "pairs of such a part with itself in another target"),
     Metric("parts.bleed", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 to the picture before, outside the thing"),
     Metric("parts.delta_e", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 to the source's answers, at pixels truly seen"),
     Metric("parts.seen_parts", "pixels", "none", 0, 0, "parts truly seen by the source"),

@@ -104,6 +104,37 @@ def answered(truth: PartTruth, answers: npt.NDArray[np.int64]) -> Image:
     return picture
 
 
+def fill_figures(
+    shown: Mapping[str, npt.NDArray[np.int64]], answers: npt.NDArray[np.int64]
+) -> dict[str, dict[str, float]]:
+    """Agreement of each view with the other ones on the parts that the source does not show.
+
+    Args:
+        shown: (P,) answers of the edited targets, from :func:`part_answers`, by view.
+        answers: (P,) of the source.
+
+    Returns:
+        By view, ``parts.fill``: of the pairs of its unseen parts with the same part in another
+        view, the share with one answer, by chance 1/K; and their number, ``parts.fill_pairs``.
+
+    Example:
+        >>> import numpy as np
+        >>> shown = {"a": np.array([0, 1, 2]), "b": np.array([1, 1, 0])}
+        >>> fill_figures(shown, np.array([3, -1, -1]))["a"]  # the source shows the first part
+        {'parts.fill': 0.5, 'parts.fill_pairs': 2}
+    """
+    table = np.stack([np.where(answers == UNKNOWN, own, UNKNOWN) for own in shown.values()])
+    known = table != UNKNOWN
+    figures = {}
+    for k, name in enumerate(shown):
+        pairs = known & known[k]
+        pairs[k] = False
+        same = int((table == table[k])[pairs].sum())
+        count = int(pairs.sum())
+        figures[name] = {"parts.fill": share(same, count), "parts.fill_pairs": count}
+    return figures
+
+
 def part_figures(
     picture: Image,
     truth: PartTruth,

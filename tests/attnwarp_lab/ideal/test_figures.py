@@ -5,7 +5,7 @@ import math
 import numpy as np
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from attnwarp_lab.ideal.figures import PartTruth, part_answers, part_figures
+from attnwarp_lab.ideal.figures import PartTruth, fill_figures, part_answers, part_figures
 
 RANDOM = np.random.default_rng(0)
 
@@ -80,3 +80,21 @@ def test_where_nothing_is_seen_or_hidden_figures_are_undefined():
         and math.isnan(got["parts.delta_e"])
     )
     assert got["parts.bleed"] == 0.0
+
+
+def test_targets_are_held_against_each_other_on_what_the_source_does_not_show():
+    """Oracle: pairs counted one by one."""
+    random = np.random.default_rng(0)
+    answers = np.repeat([-1, 1], 6)
+    shown = {name: random.integers(-1, 3, 12) for name in "abcd"}
+    got = fill_figures(shown, answers)
+    for name, mine in shown.items():
+        pairs = [
+            (mine[part], other[part])
+            for key, other in shown.items()
+            for part in range(12)
+            if key != name and answers[part] == -1 and mine[part] >= 0 and other[part] >= 0
+        ]
+        assert got[name]["parts.fill_pairs"] == len(pairs) > 0
+        assert got[name]["parts.fill"] == np.mean([a == b for a, b in pairs])
+    assert np.isnan(fill_figures(shown, np.zeros(12, int))["a"]["parts.fill"])

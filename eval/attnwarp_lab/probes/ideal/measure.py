@@ -35,7 +35,7 @@ from attnwarp_eval.two_view import HIDDEN
 from attnwarp_eval.world import World
 from attnwarp_lab.ideal.edges import EdgesPart, among, edges_of
 from attnwarp_lab.ideal.editor import FACTOR
-from attnwarp_lab.ideal.figures import part_answers, part_figures
+from attnwarp_lab.ideal.figures import fill_figures, part_answers, part_figures
 from attnwarp_lab.ideal.paint import EDIT
 from attnwarp_lab.ideal.share import alone, solve_share
 from attnwarp_lab.ideal.thing import Thing, in_front
@@ -165,8 +165,11 @@ class IdealProbe(MethodProbe[IdealResult]):
                 pictures["render"] = _renders(world, names, before, result.gaussians)
             answers = part_answers(edited[names[0]], thing.truth(names[0]), thing.parts)
             stages = {names[v]: n for n, part in enumerate(result.rounds, 1) for v in part.views}
+            shown = {v: part_answers(edited[v], thing.truth(v), thing.parts) for v in names[1:]}
+            fill = fill_figures(shown, answers)
             for name in names[1:]:
                 row = self._figures(world, thing, name, pictures, answers, "edges" in spec)
+                row |= {f"{key}.edit": value for key, value in fill[name].items()}
                 if "parts.right.all.edit" in row:
                     stage = stages.get(name, 1)
                     row[f"parts.right.stage{stage}.edit"] = row["parts.right.all.edit"]

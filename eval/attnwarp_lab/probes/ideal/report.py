@@ -34,6 +34,7 @@ class IdealReport(ProbeReport):
     columns: ClassVar[Mapping[str, str]] = {
         "seen": "parts.seen.edit",
         "through": "parts.through.edit",
+        "unseen, between targets": "parts.fill.edit",
         "bleed, dE00": "parts.bleed.edit",
         "dE00 where seen": "parts.delta_e.edit",
         "seen, renders": "parts.seen.render",
@@ -43,6 +44,7 @@ class IdealReport(ProbeReport):
     contrasts = (
         "parts.seen.edit",
         "parts.through.edit",
+        "parts.fill.edit",
         "parts.bleed.edit",
         "parts.delta_e.edit",
         "parts.seen.render",
