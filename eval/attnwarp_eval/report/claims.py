@@ -15,7 +15,10 @@ from attnwarp_eval.statistics.contrasts import Contrast, contrast
 from attnwarp_eval.statistics.intervals import ByView, Interval, common, over_scenes
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Study
 from attnwarp_eval.study.study import parse_variant
+
+DECLARED = resources.files("attnwarp_eval.report") / "claims.yaml"
 
 Seen = Literal["", "seen", "not seen", "not measured"]
 """Outcome of a claim's control; empty without a control."""
@@ -33,6 +36,7 @@ class Claim:
     expect: Literal["higher", "lower"]
     b: Mapping[str, Any] | None = None
     study: str = ""
+    scenes: Mapping[str, int] | None = None
     or_b: Mapping[str, Any] | None = None
     against: float = 0.0
     than: str = ""
@@ -91,6 +95,13 @@ class Claim:
         share = float(self.equal_within.removesuffix("%")) / 100
         ratio = probe(self.probe).metric(self.metric).scale == "ratio"
         return math.log1p(share) if ratio else share
+
+    def judged_by(self, study: Study) -> bool:
+        """Return True for the study that judges the claim, with the scenes planned for it."""
+        drawn = study.population
+        return study.name == self.study and (
+            drawn is not None and self.scenes in (None, {"drawn": drawn.count, "seed": drawn.seed})
+        )
 
     def measure(self, results: Results) -> Measured | None:
         """Measure the sides of the claim; None if the run lacks a variant of that content."""
@@ -166,9 +177,11 @@ class Measured:
 @cache
 def load_claims() -> tuple[Claim, ...]:
     """Load the bundled claims."""
-    text = (resources.files("attnwarp_eval.report") / "claims.yaml").read_text()
+    family = read_yaml(DECLARED.read_text())[1]
     return tuple(
-        Claim(**_tuples(one)) for entry in read_yaml(text)[1] for one in _of_each_metric(entry)
+        Claim(**_tuples(one), scenes=family["scenes"][one["study"]])
+        for entry in family["claims"]
+        for one in _of_each_metric(entry)
     )
 
 

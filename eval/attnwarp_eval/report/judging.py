@@ -150,7 +150,7 @@ def found(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
                 agreement(measured.a, measured.b, claim.sign),
                 _here(claim, measured, len(results.study.scenes)),
                 _below_floor(measured),
-                bool(results.study.sampled) and results.study.name == claim.study,
+                claim.judged_by(results.study),
                 measured.contrast.flips.p,
             )
         )

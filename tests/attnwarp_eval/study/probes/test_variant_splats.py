@@ -122,8 +122,9 @@ def test_the_claims_about_fitted_warps_are_about_fitted_splats():
     study = parse_study({**STUDY, "scenes": ["spheres"], "probes": {"depth": ["sampled"]}})
     claims = {claim.id: claim for claim in load_claims()}
     two, three = (
-        parse_variant(side) for side in (claims["fitted-2dgs-warp"].b, claims["fitted-2dgs-warp"].a)
+        parse_variant(side)
+        for side in (claims["fitted-2dgs-labels"].b, claims["fitted-2dgs-labels"].a)
     )
-    meaning = probe("warp").meaning
+    meaning = probe("labels").meaning
     assert meaning(study, two) == meaning(study, study.variants["2D"])
     assert meaning(study, three) == meaning(study, study.variants["3D"])
