@@ -164,7 +164,7 @@ class Pairs:
                 taken.setdefault(scene, []).append(float(np.median(rounds)))
         return interval(taken) if taken else None
 
-    def within(self, row: Figure, flaw: Flaw) -> Interval:
+    def within(self, row: Figure, flaw: Flaw, level: float = 0.95) -> Interval:
         """Share of a flaw's pairs, at its reference size and up to :data:`NEAR` degrees, that rank
         below the mean of the right pairs of their own scene, edit and yaw; ties are half.
         """
@@ -181,7 +181,7 @@ class Pairs:
                     mean = float(np.mean(right))
                     won = float(flawed[0] > mean) + 0.5 * float(flawed[0] == mean)
                     shares.setdefault(scene, []).append(won)
-        return interval(shares)
+        return interval(shares, level=level)
 
     def tau(self, row: Figure, truth: Figure) -> Interval:
         """Kendall's rank correlation of a figure with the true disagreement of a scene's real
@@ -282,13 +282,14 @@ def kendall(values: Any, truth: Any) -> float:
 
 def judged(pairs: Pairs, row: Figure) -> tuple[list[str], list[str], list[str]]:
     """Titles of the flaws of one view that a figure sees, and is blind to, and of those that it
-    rates above a right edit.
+    rates above a right edit, at 5 % over all figures and flaws (Bonferroni).
 
     A flaw of all views alike leaves them in agreement, so only what it is rewarded for counts.
     """
+    level = 1 - 0.05 / (len(pairs.rows) * len(FLAWS))
     sees, blind, games = [], [], []
     for flaw in FLAWS:
-        share = pairs.within(row, flaw)
+        share = pairs.within(row, flaw, level)
         if not flaw.alike and share.mean >= SEES:
             sees.append(flaw.title)
         elif not flaw.alike and share.mean < BLIND:
@@ -335,7 +336,8 @@ def _answer(results: Results, pairs: Pairs) -> Section:
             f" it alike. **Sees**: at least {percent(SEES)} of the flawed pairs up to {NEAR:g}"
             " degrees rank below the mean of the right pairs of their own scene, edit and yaw;"
             f" **blind**: fewer than {percent(BLIND)}. **Gamed by**: flaws, of one view or of all"
-            " alike, that rank above the right pairs, the 95 % interval over scenes wholly so."
+            " alike, that rank above the right pairs, the interval over scenes wholly so, at 5 %"
+            " over all figures and flaws (Bonferroni)."
             f" False alarms: right pairs of a varnished or a metal object above the threshold that"
             f" {percent(ALARM)} of the matt right pairs pass."
         ),
