@@ -46,7 +46,7 @@ def bundled() -> list[str]:
 
     Example:
         >>> bundled()
-        ['small', 'small-depth', 'small-plain']
+        ['small-depth', 'small-plain']
     """
     return sorted(path.parent.name for path in WEIGHTS.glob("*/model_index.json"))
 

@@ -39,7 +39,7 @@ def run(
     suite: Path,
     out: Path,
     method: str = "attention_warping",
-    editor: str = "small",
+    editor: str = "small-plain",
     *,
     options: Mapping[str, Any] | None = None,
     seed: int = 0,

@@ -53,7 +53,7 @@ def run(
     ),
     editor: Annotated[
         str, typer.Option(help="Bundled editor, a folder in diffusers' format, or ideal.")
-    ] = "small",
+    ] = "small-plain",
     seed: Annotated[int, typer.Option(min=0, help="Of the first scene's noise.")] = 0,
     changes: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Setting of the method.")

@@ -168,7 +168,6 @@ def editor_card(
         f" {facts['device']}. {facts['state']}",
         "", "**Knows**: 11 colours, 6 materials, stripes and checks, 7 grounds, 4 times of day, on the things of"
         f" `attnwarp_eval/drawn/worlds.py`{learned}. **Does not know**: {missing}other words, photographs of the world.", "",
-        f"**Injection**: {facts['injection']}", "",
         f"**Data**: {facts['worlds'] + facts['parts']} random worlds by ray casting, two views and up to 30 looks each"
         " (`training/worlds/editing_pairs.py`); no scene of the package, none of its instructions. **Recipe**: `training/editors/recipe.py`.", "",
         "## Figures on what it has never seen", "",

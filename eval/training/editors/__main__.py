@@ -42,7 +42,7 @@ def train(
     stage: str, data: Data = CACHE / "data", out: Out = CACHE, threads: Threads = 1,
     device: Annotated[str, typer.Option(help="Of torch: cpu or cuda.")] = "cpu",
 ) -> None:  # fmt: skip
-    """Train a stage: plain, drawn, features, control, depth, joint. On a GPU each takes minutes, on a CPU days."""
+    """Train a stage: plain, drawn, depth, joint. On a GPU each takes minutes, on a CPU days."""
     import torch
 
     if device not in ("cpu", "cuda"):

@@ -100,12 +100,6 @@ def facts_of(stage: str, out: Path) -> dict[str, object]:
         "minutes": sum(facts["minutes"] for facts in [own, *before]),
         "parts": plan.parts,
         "large": plan.size * 2 if plan.large else 0,
-        "injection": {
-            "none": "none; what its attention features carry, it learned from editing alone.",
-            "features": "trained with injected features, so that its features would carry the answer; the figures of swapped"
-            " features say how far they do. No claim about an editor's own working may rest on it alone.",
-            "control": "the same steps as the injection stage without the injection.",
-        }[plan.inject],
     }
 
 

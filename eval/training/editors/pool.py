@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -30,7 +30,6 @@ from training.worlds.editing_pairs import (
     ambiguous_instruction,
     instruction,
 )
-from training.worlds.view_warps import view_moves
 
 SENTENCES = 48
 """Instructions made ahead for each thing and result."""
@@ -72,15 +71,6 @@ class Rows:
 
     def __len__(self) -> int:
         return len(self.world)
-
-    def where(self, mask: Tensor, other: Rows) -> Rows:
-        """These rows where the mask is, the other's elsewhere."""
-        return Rows(
-            **{
-                f.name: torch.where(mask, getattr(self, f.name), getattr(other, f.name))
-                for f in fields(self)
-            }
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,14 +198,6 @@ class PairPool(PicturePool):
         tables = tables_of(worlds, tokenizer, sentences)
         self.tables = {key: value.to(self.device) for key, value in tables.items()}
         self.open_kinds = torch.tensor([k in AMBIGUOUS for k in KIND_NAMES], device=self.device)
-        self._moves: dict[int, tuple[Tensor, Tensor]] = {}
-
-    def moves(self, size: int) -> tuple[Tensor, Tensor]:
-        """:func:`training.worlds.view_warps.view_moves` on the device, made once for a size."""
-        if size not in self._moves:
-            index, mask = view_moves(self.worlds, size)
-            self._moves[size] = index.to(self.device), mask.to(self.device)
-        return self._moves[size]
 
     def rows(
         self, count: int, generator: torch.Generator, *, size: int, kinds: Mapping[str, float], unclear: float

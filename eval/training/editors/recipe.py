@@ -22,7 +22,6 @@ from attnwarp_eval.drawn import assemblies
 from attnwarp_eval.drawn.worlds import OBJECTS
 from training import steps
 from training.editors import draws as editor_draws
-from training.editors import injection as editor_injection
 from training.editors import net as editor_net
 from training.editors import pool as editor_pool
 from training.editors.net import (
@@ -57,8 +56,6 @@ DROP = 0.05
 UNCLEAR = 0.35
 """Share of pairs whose instruction leaves the answer to the noise."""
 KINDS = {"color": 0.45, "material": 0.15, "pattern": 0.05, "ground": 0.2, "time": 0.15}
-INJECTED_SHARE = 0.7
-"""Share of injected steps in a stage with injection; the others are plain."""
 
 NET_CONSTANTS = (
     "WIDTHS", "LAYERS", "HEADS", "TEXT_WIDTH", "TEXT_LAYERS", "VOCABULARY", "TOKENS", "T_STEPS", "NOISY_SHARE",
@@ -78,9 +75,7 @@ class Stage:
         worlds: how many of the training worlds of one thing each are used.
         parts: how many of those of things with parts (:mod:`attnwarp_eval.drawn.assemblies`).
         start: the stage whose networks this one starts from.
-        inject: "none", "features" (recorded features of another run are mixed in, the target composed to match) or
-            "control" (the same pairs and steps without the injection).
-        batch: pictures of ``size`` in a step; an injected pair is two of them, and there are a quarter as many large ones.
+        batch: pictures of ``size`` in a step; there are a quarter as many large ones.
         seed: seed of everything random.
         unclear: share of pairs whose instruction leaves the answer to the noise.
         draws: whether the noise's mean adds to the text (:class:`attnwarp.editing.small_unet.EditUNet`).
@@ -97,7 +92,6 @@ class Stage:
     peak: float
     worlds: int
     start: str | None = None
-    inject: str = "none"
     batch: int = 256
     seed: int = 0
     parts: int = 0
@@ -120,14 +114,8 @@ class Stage:
 STAGES = {
     "plain": Stage(64, 11_500, 1.5e-3, 1800, parts=1190, draws=False, large=0.2, seed=11),
     "drawn": Stage(64, 12_000, 1.2e-3, 1800, parts=1190, start="plain", composed=0.7, large=0.25, seed=12),
-    "features": Stage(
-        64, 7_800, 8e-4, 1800, parts=1190, start="drawn", inject="features", composed=0.7, large=0.25, seed=13
-    ),
-    "control": Stage(
-        64, 7_800, 8e-4, 1800, parts=1190, start="drawn", inject="control", composed=0.7, large=0.25, seed=13
-    ),
 }  # fmt: skip
-"""``small-plain`` is "drawn" and ``small`` "features"."""
+"""``small-plain`` is "drawn"."""
 
 
 def make_tokenizer(count: int = 80_000, worlds: int = 200) -> Tokenizer:
@@ -176,13 +164,6 @@ def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
     if stage.draws:
         of_stages |= {key: getattr(editor_draws, key) for key in ("DRAW_STEPS", "DRAW_GAIN")}
         of_stages["SETTLED"], of_stages["OPEN"] = SETTLED, OPEN
-    if stage.inject != "none":
-        of_injection = (
-            "FIRST_WEIGHT", "WEIGHT_SPREAD", "LEAST_WEIGHT", "MOST_ALPHA", "CARRIED", "MOST_OWN", "NO_TEXT", "WAYS",
-            "INJECTED_KINDS",
-        )  # fmt: skip
-        of_stages |= {key: getattr(editor_injection, key) for key in of_injection}
-        of_stages["INJECTED_SHARE"] = INJECTED_SHARE
     return {"stage": name, **asdict(stage), "constants": of_stages, "pairs": PAIRS_PROTOCOL}
 
 
@@ -260,23 +241,14 @@ def weights_of(out: Path, stage: str) -> dict[str, Tensor]:
 def tasks_of(
     stage: Stage, pool: PairPool, net: EditorNet, alphas: Tensor, empty: Tensor
 ) -> list[Task]:
-    """Tasks of a stage's steps: plain pairs or injected ones, small pictures or large ones."""
+    """Tasks of a stage's steps: small pictures or large ones."""
     tasks = []
     for size, share in ((stage.size, 1 - stage.large), (2 * stage.size, stage.large)):
         if share == 0:
             continue
         count = max(2, stage.batch // (size // stage.size) ** 2)
-        injected = 0.0 if stage.inject == "none" else INJECTED_SHARE
         draw = functools.partial(plain_inputs, pool, stage, alphas, empty, size)
-        # Some plain steps among those with injection, so that clear instructions are not forgotten.
-        tasks.append(Task(share * (1 - injected), count, draw, functools.partial(plain_loss, net)))
-        if injected:
-            inject = stage.inject == "features"
-            drawn = functools.partial(
-                editor_injection.inputs, pool, alphas, empty, size, inject=inject, noisy_from=stage.noisy_from
-            )  # fmt: skip
-            loss = functools.partial(editor_injection.injected_loss, net, inject=inject)
-            tasks.append(Task(share * injected, count // 2, drawn, loss))
+        tasks.append(Task(share, count, draw, functools.partial(plain_loss, net)))
     return tasks
 
 

@@ -138,11 +138,8 @@ def test_an_instruction_that_names_no_look_is_refused_and_none_of_the_training_i
 @pytest.mark.parametrize(
     ("name", "dtype"),
     [
-        *((name, torch.bfloat16) for name in ("small", "small-plain")),
-        *(
-            pytest.param(name, torch.float16, marks=pytest.mark.slow)
-            for name in ("small", "small-plain")
-        ),
+        ("small-plain", torch.bfloat16),
+        pytest.param("small-plain", torch.float16, marks=pytest.mark.slow),
     ],
 )
 def test_half_precision_changes_an_edit_by_less_than_40_db(name, dtype):

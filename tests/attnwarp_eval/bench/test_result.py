@@ -24,7 +24,7 @@ def made(name, errors, track=result.SAME, apart=1.0, **other):
          "figures": figures | {"error": error, "apart": aparts[k]}, "remarks": []}
         for k, error in enumerate(errors)
     ]  # fmt: skip
-    method = {"name": name, "editor": "small", "track": track}
+    method = {"name": name, "editor": "small-plain", "track": track}
     return {
         "protocol": 2,
         "bench": BENCH,

@@ -7,11 +7,8 @@ import pytest
 import torch
 from picked_answers import picked
 
-from attnwarp.editing.layers import Layer
-from attnwarp.methods.attention_warping import a_t
 from training.assess.pictures import Pictures, Row
 from training.editors.answers import KIND_NAMES, codes, settled
-from training.editors.injection import WAYS, Moves, draw_moves, falling_weight
 from training.editors.pool import PairPool, cut_regions
 from training.editors.recipe import make_tokenizer
 from training.worlds import editing_pairs
@@ -178,69 +175,3 @@ def test_regions_cut_the_thing_and_take_half_of_it_on_average(pool):
     # A half-plane and its complement are as likely; boxes are smaller than their complements.
     assert 0.3 < shares.mean() < 0.5
     assert ((shares > 0) & (shares < 1)).mean() > 0.95
-
-
-@pytest.mark.parametrize("size", [64, 128])
-def test_moved_cells_of_the_recorded_picture_show_what_the_targets_cells_show(pool, size):
-    rows = pool.rows(60, generator(1), size=size, kinds={"color": 1.0}, unclear=1.0)
-    targets, sources, way, index, mask = draw_moves(pool, rows, size, generator(2))
-    errors: dict[str, list[float]] = {}
-    a = pool.latents(pool.pictures(sources, targets.source, size))[:, :3].flatten(2)
-    b = pool.latents(pool.pictures(targets, targets.source, size))[:, :3].flatten(2)
-    for k, name in enumerate([list(WAYS)[w] for w in way.tolist()]):
-        if name != "unrelated" and mask[k].any():
-            difference = (a[k][:, index[k]] - b[k])[:, mask[k]].abs().mean()
-            errors.setdefault(name, []).append(float(difference))
-    assert set(errors) == {"same", "mirrored", "shifted", "other view"}
-    for name, values in errors.items():
-        # Means of cells are exact but for another view, where a cell is the nearest one and light differs with the side.
-        assert np.mean(values) < (0.35 if name == "other view" else 1e-5), name
-    shares = mask.float().mean(dim=1)
-    assert (shares == 1).any() and ((shares > 0) & (shares < 1)).any()
-    moved = [k for k, w in enumerate(way.tolist()) if list(WAYS)[w] == "shifted"]
-    assert any((index[k] != torch.arange(index.shape[1])).any() for k in moved) == (size == 64)
-
-
-def test_an_unrelated_picture_is_of_its_own_row_and_asks_for_the_same_kind(pool):
-    rows = pool.rows(400, generator(3), size=64, kinds={"color": 0.5, "ground": 0.5}, unclear=1.0)
-    targets, sources, way, _, _ = draw_moves(pool, rows, 64, generator(4))
-    answered = pool.answered(sources, generator(5))
-    strange = way == list(WAYS).index("unrelated")
-    assert torch.equal(answered.kind, targets.kind)
-    for row in one_by_one(answered):
-        assert row.target in GROUPS[row.kind]
-        assert pool.worlds.valid[row.world, row.source] and pool.worlds.valid[row.world, row.target]
-    assert torch.equal(sources.world[~strange], targets.world[~strange])
-    assert (sources.world[strange] != targets.world[strange]).any()
-
-
-def test_the_weight_of_features_falls_as_the_papers_does():
-    t = torch.arange(999, -1, -50).repeat_interleave(500)
-    weight = falling_weight(t, generator()).reshape(20, 500)
-    for step, drawn in enumerate(weight):
-        # Uniform by 0.15: 500 draws have a standard error of 0.004; the least weight moves the last ones.
-        paper = a_t(step, 20)
-        assert float(drawn.mean()) == pytest.approx(max(paper, 0.1), abs=0.05), step
-        assert float((drawn - paper).abs().max()) < 0.2
-
-
-def test_the_blend_moves_masks_and_mixes_tokens():
-    generator = torch.Generator().manual_seed(0)
-    new, recorded = (torch.randn((2, 16, 3), generator=generator) for _ in range(2))
-    index = torch.stack([torch.arange(15, -1, -1), torch.arange(16)])
-    mask = torch.zeros((2, 16), dtype=torch.bool)
-    mask[0, :8] = mask[1, 5] = True
-    moves = Moves(4, index, mask, torch.tensor([0.25, 1.0]))
-    out = moves.blend(Layer("layer", "self", 0, 3), recorded, new)
-    for row in range(2):
-        for cell in range(16):
-            a = (0.25, 1.0)[row]
-            expected = new[row, cell]
-            if mask[row, cell]:
-                expected = a * recorded[row, index[row, cell]] + (1 - a) * new[row, cell]
-            assert torch.allclose(out[row, cell], expected, rtol=0, atol=1e-6)
-    coarse, share = Moves(
-        4, torch.arange(16)[None], torch.ones((1, 16), dtype=torch.bool), torch.ones(1)
-    ).level(1)
-    assert coarse.tolist() == [[0, 1, 2, 3]]
-    assert share.all()

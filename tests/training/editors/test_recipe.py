@@ -21,7 +21,6 @@ from attnwarp_eval.scene.yaml import read_yaml
 from training import steps
 from training.assess.pictures import Pictures, Row
 from training.editors import draws as editor_draws
-from training.editors import injection as editor_injection
 from training.editors import net as editor_net
 from training.editors import recipe as editor
 from training.editors.__main__ import app
@@ -29,7 +28,6 @@ from training.editors.answers import codes
 from training.editors.export import export_editor, facts_of
 from training.editors.pool import PairPool
 from training.editors.recipe import Stage, make_tokenizer, train_stage
-from training.encoders.byte_pairs import tokens_of
 from training.worlds import editing_pairs
 from training.worlds.data import SPLITS
 from training.worlds.editing_pairs import (
@@ -195,30 +193,29 @@ def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(
     folder = export_editor("drawn", tmp_path / "whole", tmp_path / "exported")
     check_export(folder)
 
-    for inject in ("features", "control"):
-        stage = dataclasses.replace(TINY, start="drawn", inject=inject)
-        train_stage(inject, data, tmp_path / "whole", stage=stage)
-        after = torch.load(tmp_path / "whole" / f"{inject}.pt", weights_only=True)["net"]
-        assert all(torch.isfinite(v).all() for v in after.values())
-        assert not torch.equal(
-            after["unet.conv_out.weight"], one["average"]["module.unet.conv_out.weight"]
-        )
+    stage = dataclasses.replace(TINY, start="drawn")
+    train_stage("further", data, tmp_path / "whole", stage=stage)
+    after = torch.load(tmp_path / "whole/further.pt", weights_only=True)["net"]
+    assert all(torch.isfinite(v).all() for v in after.values())
+    assert not torch.equal(
+        after["unet.conv_out.weight"], one["average"]["module.unet.conv_out.weight"]
+    )
     monkeypatch.setitem(editor.STAGES, "drawn", TINY)
-    monkeypatch.setitem(editor.STAGES, "control", stage)
-    facts = facts_of("control", tmp_path / "whole")
+    monkeypatch.setitem(editor.STAGES, "further", stage)
+    facts = facts_of("further", tmp_path / "whole")
     assert (facts["steps"], facts["before"], facts["large"]) == (4, 4, 0)
     assert "CPU core" in str(facts["device"])
     with pytest.raises(InputError, match="nothing.pt: no such file; train the stage nothing first"):
-        train_stage("features", data, tmp_path, stage=dataclasses.replace(TINY, start="nothing"))
+        train_stage("further", data, tmp_path, stage=dataclasses.replace(TINY, start="nothing"))
 
 
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
         (["train", "plain", "--device", "tpu"], "expected cpu or cuda"),
-        (["train", "drawn-64"], "expected one of plain, drawn, features, control, depth"),
-        (["export", "drawn-64", "small"], "expected one of plain, drawn, features, control, depth"),
-        (["assess", "drawn-64", "small"], "expected one of plain, drawn, features, control, depth"),
+        (["train", "drawn-64"], "expected one of plain, drawn, depth"),
+        (["export", "drawn-64", "small-plain"], "expected one of plain, drawn, depth"),
+        (["assess", "drawn-64", "small-plain"], "expected one of plain, drawn, depth"),
     ],
 )
 def test_an_unknown_stage_or_device_is_refused_by_name(words, reason):
@@ -252,56 +249,6 @@ def check_export(folder):
     assert np.abs(mine - theirs).max() < 1e-6
     assert np.abs(mine - picture).max() > 0.01
     assert sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) < 20e6
-
-
-def test_the_control_differs_from_the_injection_in_what_goes_over_alone(pool, tokenizer):
-    torch.manual_seed(0)
-    net = editor_net.EditorNet(tokenizer.get_vocab_size(), 64)
-    torch.nn.init.normal_(net.unet.conv_out.weight, std=0.05)
-    alphas = editor_net.scheduler().alphas_cumprod
-    empty = tokens_of(tokenizer, [""])[0]
-    inputs = [
-        editor_injection.inputs(
-            pool, alphas, empty, 64, 3, torch.Generator().manual_seed(2), inject=inject
-        )
-        for inject in (True, False)
-    ]
-    # Everything of run A, and all that decides what could go over, is the same.
-    for key in ("noisy A", "before A", "target A", "weight A", "t", "tokens", "index", "mask"):
-        assert torch.equal(inputs[0][key], inputs[1][key]), key
-    parts = [
-        editor_injection.injected_loss(net, x, inject=inject)[1]
-        for x, inject in zip(inputs, (True, False), strict=True)
-    ]
-    assert parts[0]["recorded"] == parts[1]["recorded"]
-    assert parts[0]["injected"] != parts[1]["injected"]
-
-
-@pytest.mark.parametrize("way", ["same", "mirrored", "unrelated"])
-def test_the_target_is_the_recorded_answer_where_features_went_and_ones_own_elsewhere(
-    pool, tokenizer, monkeypatch, way
-):
-    ways = dict.fromkeys(editor_injection.WAYS, 0.0) | {way: 1.0}
-    monkeypatch.setattr(editor_injection, "WAYS", ways)
-    alphas, empty = editor_net.scheduler().alphas_cumprod, torch.zeros(24, dtype=torch.int64)
-    x, control = (
-        editor_injection.inputs(
-            pool, alphas, empty, 64, 12, torch.Generator().manual_seed(5), inject=inject
-        )
-        for inject in (True, False)
-    )
-    own, target = control["target B"], x["target B"]
-    mask = x["mask"].view(12, 1, 16, 16).expand_as(own)
-    assert torch.equal(target[~mask], own[~mask])
-    if way == "unrelated":  # features of another picture are to change nothing
-        assert torch.equal(target, own)
-        return
-    answer = x["target A"].flip(3) if way == "mirrored" else x["target A"]
-    # A mirrored cell's details are mirrored too; its mean and its middle bands are not.
-    channels = 3 if way == "mirrored" else 48
-    inside = mask[:, :channels]
-    assert torch.allclose(target[:, :channels][inside], answer[:, :channels][inside], atol=1e-5)
-    assert (target != own).any()
 
 
 def test_layers_of_the_noise_learn_what_the_answer_it_picks_adds_to_an_open_sentence(
