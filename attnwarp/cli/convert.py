@@ -15,6 +15,7 @@ from attnwarp.cli.options import (
     Reading,
     ScreenFilterOption,
     SplatKindOption,
+    option,
     options_of,
 )
 from attnwarp.cli.shell import check_out, clear_errors
@@ -30,16 +31,15 @@ def convert(
     antialiased: AntialiasedOption = None,
     screen_filter: ScreenFilterOption = None,
     third_scale: Annotated[
-        float | None,
-        typer.Option(help="Write 2DGS as thin 3DGS with this third scale (1e-6)."),
+        float | None, option("Write 2DGS as thin 3DGS with this third scale (1e-6).")
     ] = None,
     sh_degree: Annotated[
-        int | None, typer.Option(min=0, max=3, help="Cut harmonics beyond this degree.")
+        int | None, option("Cut harmonics beyond this degree.", min=0, max=3)
     ] = None,
     coordinates: Annotated[
         Coordinates,
-        typer.Option(
-            help="world, relative to the origin comment that attnwarp alone reads, or auto: world"
+        option(
+            "world, relative to the origin comment that attnwarp alone reads, or auto: world"
             " unless float32 would lose too much."
         ),
     ] = Coordinates.auto,

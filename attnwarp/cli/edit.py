@@ -20,10 +20,7 @@ from attnwarp.cli.files import (
     warn_of_misfit,
 )
 from attnwarp.cli.options import (
-    MACHINE,
-    METHOD,
     MOST_PIXELS,
-    SPLATS,
     AntialiasedOption,
     AnywayOption,
     DataArgument,
@@ -35,6 +32,10 @@ from attnwarp.cli.options import (
     Reading,
     ScreenFilterOption,
     Store,
+    of_machine,
+    of_method,
+    of_splats,
+    option,
     options_of,
 )
 from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
@@ -58,134 +59,77 @@ def edit(
     instruction: InstructionOption,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Of the result, resumed if it is there; in runs/edits if left out.",
-        ),
+        option("Of the result, resumed if it is there; in runs/edits if left out.", "FOLDER"),
     ] = None,
     ply: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Splats of the scene; fitted first if left out."),
+        Path | None, option("Splats of the scene; fitted first if left out.", "FILE")
     ] = None,
     editor: EditorOption = "small-plain",
     method: Annotated[
         str,
-        typer.Option(
-            metavar="NAME",
-            help="attention_warping, or by_view, igs2gs, dge, gaussctrl, corresponding, fused,"
+        of_method(
+            "attention_warping, or by_view, igs2gs, dge, gaussctrl, corresponding, fused,"
             " guided, warped_reference; see docs/method/baselines.md.",
+            "NAME",
             show_default=False,
-            rich_help_panel=METHOD,
         ),
     ] = "attention_warping",
     preset: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Its choices (default: extended): corrected, extended, paper, released,"
+        of_method(
+            "Its choices (default: extended): corrected, extended, paper, released,"
             " released-controlnet; see docs/method/algorithm.md.",
-            rich_help_panel=METHOD,
+            "NAME",
         ),
     ] = None,
     source_picture: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="The source view, edited elsewhere.", rich_help_panel=METHOD
-        ),
+        Path | None, of_method("The source view, edited elsewhere.", "FILE")
     ] = None,
-    stages: Annotated[
-        int | None,
-        typer.Option(min=1, metavar="N", help="Of editing and tuning (3).", rich_help_panel=METHOD),
-    ] = None,
+    stages: Annotated[int | None, of_method("Of editing and tuning (3).", "N", min=1)] = None,
     views_per_stage: Annotated[
-        int | None,
-        typer.Option(
-            min=1, metavar="N", help="New views that a stage edits.", rich_help_panel=METHOD
-        ),
+        int | None, of_method("New views that a stage edits.", "N", min=1)
     ] = None,
     steps: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            help="Of denoising; the editor's own if left out.",
-            rich_help_panel=METHOD,
-        ),
+        int | None, of_method("Of denoising; the editor's own if left out.", "N", min=1)
     ] = None,
     iterations: Annotated[
-        int | None,
-        typer.Option(
-            min=0, metavar="N", help="Of tuning, in each stage (300).", rich_help_panel=METHOD
-        ),
+        int | None, of_method("Of tuning, in each stage (300).", "N", min=0)
     ] = None,
     size: Annotated[
         int | None,
-        typer.Option(
+        option(
+            "Longest side in px to edit at; the editor's own if left out.",
+            "N",
             min=16,
             max=MOST_PIXELS,
-            metavar="N",
-            help="Longest side in px to edit at; the editor's own if left out.",
         ),
     ] = None,
     alone: Annotated[
-        bool,
-        typer.Option(
-            "--each-view-alone", help="Carry nothing, for comparison.", rich_help_panel=METHOD
-        ),
+        bool, of_method("Carry nothing, for comparison.", None, "--each-view-alone")
     ] = False,
-    seed: Annotated[
-        int | None, typer.Option(min=0, metavar="N", help="Of everything random (0).")
-    ] = None,
+    seed: Annotated[int | None, option("Of everything random (0).", "N", min=0)] = None,
     change: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help="Any other setting of the preset.",
-            rich_help_panel=METHOD,
-        ),
+        list[str] | None, of_method("Any other setting of the preset.", "NAME=VALUE", "--set")
     ] = None,
     fit_iterations: Annotated[
-        int | None,
-        typer.Option(
-            min=1, metavar="N", help="Of the fit, without --ply (3000).", rich_help_panel=SPLATS
-        ),
+        int | None, of_splats("Of the fit, without --ply (3000).", "N", min=1)
     ] = None,
     max_splats: Annotated[
-        int | None,
-        typer.Option(
-            min=1, metavar="N", help="Most that a fit grows (30000).", rich_help_panel=SPLATS
-        ),
+        int | None, of_splats("Most that a fit grows (30000).", "N", min=1)
     ] = None,
     kind: Annotated[
-        Kind | None,
-        typer.Option(
-            metavar="KIND",
-            help="Of the fit, 2dgs or 3dgs, or of the PLY, whatever it says.",
-            rich_help_panel=SPLATS,
-        ),
+        Kind | None, of_splats("Of the fit, 2dgs or 3dgs, or of the PLY, whatever it says.", "KIND")
     ] = None,
     antialiased: AntialiasedOption = None,
     screen_filter: ScreenFilterOption = None,
     store: Annotated[
-        Store | None,
-        typer.Option(
-            metavar="WHERE",
-            help="Recorded features: cpu (main memory), device or disk.",
-            rich_help_panel=MACHINE,
-        ),
+        Store | None, of_machine("Recorded features: cpu (main memory), device or disk.", "WHERE")
     ] = None,
     seconds: Annotated[
-        float | None,
-        typer.Option(
-            min=0, metavar="S", help="Begin no edit and no iteration after.", rich_help_panel=METHOD
-        ),
+        float | None, of_method("Begin no edit and no iteration after.", "S", min=0)
     ] = None,
     network_rows: Annotated[
-        int | None,
-        typer.Option(
-            min=0, metavar="N", help="At most, through the network.", rich_help_panel=METHOD
-        ),
+        int | None, of_method("At most, through the network.", "N", min=0)
     ] = None,
     anyway: AnywayOption = False,
     *,

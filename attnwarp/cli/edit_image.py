@@ -25,6 +25,7 @@ from attnwarp.cli.options import (
     ThreadsOption,
     WhereOption,
     check_segmenter,
+    option,
 )
 from attnwarp.editing.small import bundled, check_words, guide_of, say_foreign
 from attnwarp.errors import InputWarning
@@ -41,9 +42,8 @@ MOST_STRETCH = 0.03
 
 PictureEditorOption = Annotated[
     str,
-    typer.Option(
-        metavar="NAME|FOLDER",
-        help="A bundled editor that takes pictures, or a folder in diffusers' format.",
+    option(
+        "A bundled editor that takes pictures, or a folder in diffusers' format.", "NAME|FOLDER"
     ),
 ]
 
@@ -51,39 +51,34 @@ PictureEditorOption = Annotated[
 def edit_image(
     picture: Annotated[Path, typer.Argument(help="A PNG or JPEG file.")],
     instruction: InstructionOption,
-    out: Annotated[Path, typer.Option(help="PNG file for the result.")],
+    out: Annotated[Path, option("PNG file for the result.")],
     editor: PictureEditorOption = "small-plain",
-    seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 0,
+    seed: Annotated[int, option("Of the noise.", min=0)] = 0,
     steps: Annotated[
-        int | None,
-        typer.Option(min=1, max=1000, help="Of denoising; the editor's own if left out."),
+        int | None, option("Of denoising; the editor's own if left out.", min=1, max=1000)
     ] = None,
     size: Annotated[
         int | None,
-        typer.Option(
-            min=16,
-            max=MOST_PIXELS,
-            help="Longest side to work at in px; the editor's own if left out.",
+        option(
+            "Longest side to work at in px; the editor's own if left out.", min=16, max=MOST_PIXELS
         ),
     ] = None,
     text_guidance: Annotated[
-        float | None, typer.Option(help="How much the words count; the editor's if left out.")
+        float | None, option("How much the words count; the editor's if left out.")
     ] = None,
     image_guidance: Annotated[
-        float | None, typer.Option(help="How much the picture counts; the editor's if left out.")
+        float | None, option("How much the picture counts; the editor's if left out.")
     ] = None,
     sheet: Annotated[
-        Path | None, typer.Option(help="PNG file for a sheet of the picture after every step.")
+        Path | None, option("PNG file for a sheet of the picture after every step.")
     ] = None,
-    mask: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Mask of the picture; white is edited.")
-    ] = None,
+    mask: Annotated[Path | None, option("Mask of the picture; white is edited.", "FILE")] = None,
     box: BoxOption = None,
     at: AtOption = None,
     words: WhereOption = None,
     segmenter: SegmenterOption = None,
     mask_out: Annotated[
-        Path | None, typer.Option(help="PNG file for the mask that --box, --at or --where gives.")
+        Path | None, option("PNG file for the mask that --box, --at or --where gives.")
     ] = None,
     device: DeviceOption = "auto",
     dtype: DtypeOption = "auto",

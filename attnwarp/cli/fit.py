@@ -24,6 +24,7 @@ from attnwarp.cli.options import (
     MaxSizeOption,
     Reading,
     ThreadsOption,
+    option,
     options_of,
 )
 from attnwarp.cli.shell import STOPPED, assignments, check_out, clear_errors, use_threads, warn
@@ -62,62 +63,51 @@ RESULTS = ("splats.ply", "checkpoint.pt", "history.jsonl", "settings.json")
 @options_of(Reading)
 def fit(
     data: DataArgument,
-    out: Annotated[Path, typer.Option(help="Folder for the result; a fit in it is resumed.")],
+    out: Annotated[Path, option("Folder for the result; a fit in it is resumed.")],
     kind: Annotated[
-        Kind | None,
-        typer.Option(help="Flat discs or ellipsoids (default 2dgs, or that of --start)."),
+        Kind | None, option("Flat discs or ellipsoids (default 2dgs, or that of --start).")
     ] = None,
     start: Annotated[
         Path | None,
-        typer.Option(
-            metavar="SPLATS", help="Go on from fitted splats (PLY or .splat) in place of points."
-        ),
+        option("Go on from fitted splats (PLY or .splat) in place of points.", "SPLATS"),
     ] = None,
-    iterations: Annotated[
-        int | None, typer.Option(min=1, help="Steps, one view each (default 7000).")
-    ] = None,
+    iterations: Annotated[int | None, option("Steps, one view each (default 7000).", min=1)] = None,
     max_seconds: Annotated[
-        float | None, typer.Option(min=0, help="Stop after so many seconds of fitting.")
+        float | None, option("Stop after so many seconds of fitting.", min=0)
     ] = None,
     max_size: MaxSizeOption = None,
     max_splats: Annotated[
         int | None,
-        typer.Option(
-            min=1,
-            help="Do not grow the model beyond (default: half of a picture's pixels, or twice the"
+        option(
+            "Do not grow the model beyond (default: half of a picture's pixels, or twice the"
             " first splats if more).",
+            min=1,
         ),
     ] = None,
     points: Annotated[
-        int | None,
-        typer.Option(min=1, help="Random first points, where DATA has none (default 10000)."),
+        int | None, option("Random first points, where DATA has none (default 10000).", min=1)
     ] = None,
     hold_out: Annotated[
         str,
-        typer.Option(
-            metavar="N|NAMES",
-            help="Hold out one view of so many, 0 none, where DATA names no splits; or these views,"
+        option(
+            "Hold out one view of so many, 0 none, where DATA names no splits; or these views,"
             " with commas between.",
+            "N|NAMES",
         ),
     ] = "8",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    seed: Annotated[int, option("Seed of everything random.", min=0)] = 0,
     change: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set", metavar="NAME=VALUE", help="Any other setting; see docs/method/fitting.md."
-        ),
+        option("Any other setting; see docs/method/fitting.md.", "NAME=VALUE", "--set"),
     ] = None,
-    checkpoint_seconds: Annotated[
-        float, typer.Option(min=0, help="Seconds between two checkpoints.")
-    ] = 30.0,
+    checkpoint_seconds: Annotated[float, option("Seconds between two checkpoints.", min=0)] = 30.0,
     device: DeviceOption = "auto",
     threads: ThreadsOption = None,
     restart: Annotated[
-        bool, typer.Option("--restart", help="Begin again, over the fit in --out.")
+        bool, option("Begin again, over the fit in --out.", None, "--restart")
     ] = False,
     third_scale: Annotated[
-        float | None,
-        typer.Option(help="2dgs: third scale in the PLY, for viewers of 3DGS (1e-6)."),
+        float | None, option("2dgs: third scale in the PLY, for viewers of 3DGS (1e-6).")
     ] = None,
     *,
     reading: Reading,

@@ -57,7 +57,7 @@ class Coordinates(StrEnum):
     relative = "relative"
 
 
-PANELS = (MARKING, METHOD, SPLATS, PAGE, MACHINE, READING) = (
+PANELS = (
     "What is edited", "The method", "Splats", "The page", "The machine", "Reading DATA",
 )  # fmt: skip
 """Panels of the help in order, below the panel of common options."""
@@ -68,94 +68,71 @@ MOST_PIXELS = 4096
 SEGMENTER = "clip-parts"
 """Segmenter of ``--where`` if ``--segmenter`` is omitted."""
 
-InstructionOption = Annotated[str, typer.Option(help='What to change, such as "make it red".')]
+
+def option(
+    text: str, metavar: str | None = None, *names: str, panel: str | None = None, **more: Any
+) -> Any:
+    """Describe an option of a command.
+
+    Args:
+        text: help.
+        metavar: name of the value in the help.
+        names: spellings, such as "--set"; that of the argument if omitted.
+        panel: panel of the help.
+        more: further keywords of :func:`typer.Option`.
+    """
+    return typer.Option(*names, help=text, metavar=metavar, rich_help_panel=panel, **more)
+
+
+of_marking, of_method, of_splats, of_page, of_machine, of_reading = (
+    functools.partial(option, panel=panel) for panel in PANELS
+)
+
+InstructionOption = Annotated[str, option('What to change, such as "make it red".')]
 
 AnywayOption = Annotated[
     bool,
-    typer.Option(
-        "--anyway", help="Take words of which a bundled editor knows none that tells a look."
-    ),
+    option("Take words of which a bundled editor knows none that tells a look.", None, "--anyway"),
 ]
 
 EditorOption = Annotated[
     str,
-    typer.Option(
-        metavar="NAME",
-        help="A bundled editor, or a folder in diffusers' format; two, BASE,CONTROLNET, for depth.",
+    option(
+        "A bundled editor, or a folder in diffusers' format; two, BASE,CONTROLNET, for depth.",
+        "NAME",
     ),
 ]
 
 WhereOption = Annotated[
-    str | None,
-    typer.Option(
-        "--where",
-        metavar="WORDS",
-        help='Names of it, such as "bear"; the rest stays.',
-        rich_help_panel=MARKING,
-    ),
+    str | None, of_marking('Names of it, such as "bear"; the rest stays.', "WORDS", "--where")
 ]
 
 BoxOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="X0,Y0,X1,Y1",
-        help="Box around it, px of the (source) picture.",
-        rich_help_panel=MARKING,
-    ),
+    str | None, of_marking("Box around it, px of the (source) picture.", "X0,Y0,X1,Y1")
 ]
 
-AtOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="X,Y",
-        help="Point on it, px of the (source) picture.",
-        rich_help_panel=MARKING,
-    ),
-]
+AtOption = Annotated[str | None, of_marking("Point on it, px of the (source) picture.", "X,Y")]
 
 SegmenterOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="NAME",
-        help="What --where asks: clip-parts, or folders DINO,SAM.",
-        rich_help_panel=MARKING,
-    ),
+    str | None, of_marking("What --where asks: clip-parts, or folders DINO,SAM.", "NAME")
 ]
 
-ThreadsOption = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        metavar="N",
-        help="CPU threads; all cores if left out.",
-        rich_help_panel=MACHINE,
-    ),
-]
+ThreadsOption = Annotated[int | None, of_machine("CPU threads; all cores if left out.", "N", min=1)]
 
-DeviceOption = Annotated[
-    str,
-    typer.Option(
-        metavar="NAME", help="cpu, cuda, or auto: a GPU if there is one.", rich_help_panel=MACHINE
-    ),
-]
+DeviceOption = Annotated[str, of_machine("cpu, cuda, or auto: a GPU if there is one.", "NAME")]
 
 DtypeOption = Annotated[
     str,
-    typer.Option(
-        metavar="TYPE",
-        help="Of the editor: float32, float16, auto (float16 on a GPU), or bfloat16, which"
+    of_machine(
+        "Of the editor: float32, float16, auto (float16 on a GPU), or bfloat16, which"
         " moves pictures ten times as far.",
-        rich_help_panel=MACHINE,
+        "TYPE",
     ),
 ]
 
 LowMemoryOption = Annotated[
     bool,
-    typer.Option(
-        "--low-memory",
-        help="Weights wait in main memory; pictures are decoded in tiles.",
-        rich_help_panel=MACHINE,
-    ),
+    of_machine("Weights wait in main memory; pictures are decoded in tiles.", None, "--low-memory"),
 ]
 
 DataArgument = Annotated[
@@ -164,39 +141,21 @@ DataArgument = Annotated[
 
 
 MaxSizeOption = Annotated[
-    int | None,
-    typer.Option(
-        min=16,
-        metavar="N",
-        help="Shrink larger images to this many px.",
-        rich_help_panel=READING,
-    ),
+    int | None, of_reading("Shrink larger images to this many px.", "N", min=16)
 ]
 
 
-SplatKindOption = Annotated[
-    Kind | None,
-    typer.Option(help="Read the file as this kind, whatever it says.", rich_help_panel=SPLATS),
-]
+SplatKindOption = Annotated[Kind | None, of_splats("Read the file as this kind, whatever it says.")]
 
 
 ScreenFilterOption = Annotated[
     float | None,
-    typer.Option(
-        metavar="PX2",
-        help="What the screen adds to 3D splats: 0.3 of 3DGS, 0.1 of Mip-Splatting.",
-        rich_help_panel=SPLATS,
-    ),
+    of_splats("What the screen adds to 3D splats: 0.3 of 3DGS, 0.1 of Mip-Splatting.", "PX2"),
 ]
 
 
 AntialiasedOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--antialiased/--no-antialiased",
-        help="How the splats were fitted.",
-        rich_help_panel=SPLATS,
-    ),
+    bool | None, of_splats("How the splats were fitted.", None, "--antialiased/--no-antialiased")
 ]
 
 
@@ -205,49 +164,22 @@ class Reading:
     """Options of reading a dataset: one per keyword of `attnwarp.io.read_dataset`."""
 
     format: Annotated[
-        Format | None,
-        typer.Option(
-            metavar="NAME",
-            help="transforms or colmap, where DATA holds both.",
-            rich_help_panel=READING,
-        ),
+        Format | None, of_reading("transforms or colmap, where DATA holds both.", "NAME")
     ] = None
-    images: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Images of a COLMAP model.", rich_help_panel=READING),
-    ] = None
+    images: Annotated[Path | None, of_reading("Images of a COLMAP model.", "FOLDER")] = None
     scale: Annotated[
-        int,
-        typer.Option(
-            metavar="N",
-            help="2, 4 or 8: images_N in place of images; cameras are resized.",
-            rich_help_panel=READING,
-        ),
+        int, of_reading("2, 4 or 8: images_N in place of images; cameras are resized.", "N")
     ] = 1
     missing_images: Annotated[
         MissingImages,
-        typer.Option(
-            metavar="WHAT",
-            help="error, or none: leave out cameras whose image is missing.",
-            rich_help_panel=READING,
-        ),
+        of_reading("error, or none: leave out cameras whose image is missing.", "WHAT"),
     ] = MissingImages.error
     resize_cameras: Annotated[
-        bool,
-        typer.Option(
-            "--resize-cameras",
-            help="Fit cameras to images of another size.",
-            rich_help_panel=READING,
-        ),
+        bool, of_reading("Fit cameras to images of another size.", None, "--resize-cameras")
     ] = False
     ignore_keys: Annotated[
         list[str] | None,
-        typer.Option(
-            "--ignore-key",
-            metavar="KEY",
-            help="Pass over this key of a transforms.json.",
-            rich_help_panel=READING,
-        ),
+        of_reading("Pass over this key of a transforms.json.", "KEY", "--ignore-key"),
     ] = None
 
 
@@ -263,11 +195,7 @@ class Marking:
 
     source: Annotated[
         str | None,
-        typer.Option(
-            metavar="VIEW",
-            help="Name or number of the view that is marked and edited first.",
-            rich_help_panel=MARKING,
-        ),
+        of_marking("Name or number of the view that is marked and edited first.", "VIEW"),
     ] = None
     box: BoxOption = None
     at: AtOption = None
@@ -275,19 +203,10 @@ class Marking:
     segmenter: SegmenterOption = None
     mask: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Mask of the source view, lifted into all; white is edited.",
-            rich_help_panel=MARKING,
-        ),
+        of_marking("Mask of the source view, lifted into all; white is edited.", "FILE"),
     ] = None
     masks: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Masks of all views, NAME.png; white is edited.",
-            rich_help_panel=MARKING,
-        ),
+        Path | None, of_marking("Masks of all views, NAME.png; white is edited.", "FOLDER")
     ] = None
 
     def marks(self) -> Marks:
@@ -310,12 +229,7 @@ class Editing(Marking):
     """Options of editing a scene by any method."""
 
     tune_outside: Annotated[
-        bool,
-        typer.Option(
-            "--tune-outside",
-            help="Tune splats that no mask marks, too.",
-            rich_help_panel=MARKING,
-        ),
+        bool, of_marking("Tune splats that no mask marks, too.", None, "--tune-outside")
     ] = False
     max_size: MaxSizeOption = None
     device: DeviceOption = "auto"
@@ -324,19 +238,14 @@ class Editing(Marking):
     threads: ThreadsOption = None
     control: Annotated[
         bool | None,
-        typer.Option(
+        of_page(
+            "Edit its views each alone too; on with a bundled editor.",
+            None,
             "--control/--no-control",
-            help="Edit its views each alone too; on with a bundled editor.",
-            rich_help_panel=PAGE,
         ),
     ] = None
     turntable: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Film of the scene's turn, before and after: .gif, .mp4.",
-            rich_help_panel=PAGE,
-        ),
+        Path | None, of_page("Film of the scene's turn, before and after: .gif, .mp4.", "FILE")
     ] = None
 
     def checked(self) -> EditOptions:
@@ -408,8 +317,8 @@ def program_options(
     context: typer.Context,
     version: Annotated[
         bool,
-        typer.Option(
-            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+        option(
+            "Show the version and exit.", None, "--version", callback=_print_version, is_eager=True
         ),
     ] = False,
 ) -> None:

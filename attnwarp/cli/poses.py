@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from attnwarp.cli.options import option
 from attnwarp.cli.shell import check_out, clear_errors, warn
 from attnwarp.errors import InputError
 from attnwarp.reporting import Reporter, reporter
@@ -19,12 +20,11 @@ LEAST = 3
 
 def poses(
     pictures: Annotated[Path, typer.Argument(help="Folder of photographs of one scene at rest.")],
-    out: Annotated[
-        Path, typer.Option(metavar="CAPTURE", help="Folder for the capture, which fit reads.")
-    ] = Path("capture"),
+    out: Annotated[Path, option("Folder for the capture, which fit reads.", "CAPTURE")] = Path(
+        "capture"
+    ),
     each_camera: Annotated[
-        bool,
-        typer.Option(help="Photographs differ in camera, zoom or size: a lens for each."),
+        bool, option("Photographs differ in camera, zoom or size: a lens for each.")
     ] = False,
 ) -> None:
     """Find the pose and lens of each photograph by COLMAP, and undistort them for attnwarp fit.

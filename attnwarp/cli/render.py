@@ -17,6 +17,7 @@ from attnwarp.cli.options import (
     ScreenFilterOption,
     SplatKindOption,
     ThreadsOption,
+    option,
     options_of,
 )
 from attnwarp.cli.shell import check_out, clear_errors, use_threads
@@ -30,23 +31,22 @@ def render(
     cameras: Annotated[
         Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
+    out: Annotated[Path, option("Folder for the pictures.")],
     background: Annotated[
-        str, typer.Option(help="black, white, or three numbers in [0, 1]: r,g,b.")
+        str, option("black, white, or three numbers in [0, 1]: r,g,b.")
     ] = "black",
     size: Annotated[
-        int | None, typer.Option(min=1, help="Longest side in px; the cameras' own if left out.")
+        int | None, option("Longest side in px; the cameras' own if left out.", min=1)
     ] = None,
     near: Annotated[
-        float | None,
-        typer.Option(help="Nothing nearer is drawn, scene units; as in a fit if left out."),
+        float | None, option("Nothing nearer is drawn, scene units; as in a fit if left out.")
     ] = None,
     depth: Annotated[
-        bool, typer.Option("--depth", help="Also NAME.depth.npy: median depth, NaN where none.")
+        bool, option("Also NAME.depth.npy: median depth, NaN where none.", None, "--depth")
     ] = False,
     threads: ThreadsOption = None,
     normal: Annotated[
-        bool, typer.Option("--normal", help="Also NAME.normal.png: (n + 1) / 2 in world axes.")
+        bool, option("Also NAME.normal.png: (n + 1) / 2 in world axes.", None, "--normal")
     ] = False,
     kind: SplatKindOption = None,
     antialiased: AntialiasedOption = None,
