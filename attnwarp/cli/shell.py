@@ -21,7 +21,6 @@ from attnwarp.cli.entry import STOPPED
 from attnwarp.errors import InputError, InputWarning, missing_extra
 from attnwarp.process import (
     core_count,
-    resend_lost_interrupts,
     skip_last_collection,
     stops_interrupt,
 )
@@ -217,7 +216,6 @@ def run(app: typer.Typer, name: str) -> None:
         name: name of the program, the prefix of its messages.
     """
     skip_last_collection()
-    resend_lost_interrupts()
     begin(name)
     try:
         try:

@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import torch
 
-from attnwarp.render import _pool, order
+from attnwarp.render import order
 from attnwarp.render._kernels import binning, layout, ordering, projection
 from attnwarp.render.dispatch import call, typed
 from attnwarp.render.interface import Inputs
@@ -122,13 +122,13 @@ class BinnedSplats:
         self.tile_count = across * down
         self._set_order()
         m = len(self.order)
-        singles = _pool.empty((m, 2 * layout.ROW_DOUBLES), np.float32)
-        features = _pool.empty((m if self.channels > 3 else 0, self.channels), np.float32)
+        singles = np.empty((m, 2 * layout.ROW_DOUBLES), np.float32)
+        features = np.empty((m if self.channels > 3 else 0, self.channels), np.float32)
         self.table = layout.Table(singles.view(np.float64), singles, features)
         self.projected = 0
         nothing = np.zeros(self.tile_count, np.int64)
         self.lists = layout.Lists(nothing, nothing, np.empty(0, np.int64))
-        self._run_counts = _pool.empty(m, np.int32)
+        self._run_counts = np.empty(m, np.int32)
         self._project, self._find_runs = typed(projection.project), typed(binning.find_runs)
         self._runs_per_splat = RUNS_PER_SPLAT
         self._groups: list[tuple[int, int]] = []
@@ -138,7 +138,7 @@ class BinnedSplats:
     def _set_order(self) -> None:
         """Sort the potentially visible splats by depth, ties by their parameters."""
         n = len(self.splats.means)
-        depth = _pool.empty(n, np.float32)
+        depth = np.empty(n, np.float32)
         pieces = ranges(n, PIECE)
         listed = np.zeros((len(pieces), 1))
         run_jobs(
@@ -147,7 +147,7 @@ class BinnedSplats:
         )
         self._listed = float(listed.sum())
         self.order, ties = ordering.radix_order(
-            depth, *(_pool.empty(n, kind) for kind in [np.int32] * 2 + [np.uint32] * 2)
+            depth, *(np.empty(n, kind) for kind in [np.int32] * 2 + [np.uint32] * 2)
         )
         if len(ties):
             s = self.splats
@@ -175,7 +175,7 @@ class BinnedSplats:
             for first, last in ranges(more, max(GROUP, -(-more // GROUPS)))
         ]
         runs: list[np.ndarray] = [np.empty((0, layout.RUN_SIZE), np.int32)] * len(groups)
-        changes = _pool.zeros((len(groups), self.tile_count + 1), np.int32)
+        changes = np.zeros((len(groups), self.tile_count + 1), np.int32)
 
         def work(index: int) -> None:
             runs[index] = self._project_group(*groups[index], wanted, before, changes[index])
@@ -195,7 +195,7 @@ class BinnedSplats:
         changes: np.ndarray,  # (tiles + 1,)
     ) -> np.ndarray:
         """Project a group of splats and return their runs."""
-        outlines = _pool.empty((last - first, layout.OUTLINE_SIZE), np.float32)
+        outlines = np.empty((last - first, layout.OUTLINE_SIZE), np.float32)
         self._project(
             first,
             last,
@@ -218,7 +218,7 @@ class BinnedSplats:
         room = int(self._runs_per_splat * (last - first)) + 256
         while True:
             target = layout.Runs(
-                _pool.empty((room, layout.RUN_SIZE), np.int32), self._run_counts, changes
+                np.empty((room, layout.RUN_SIZE), np.int32), self._run_counts, changes
             )
             used = self._find_runs(
                 first, last, self.view, self.tiles, self.table, outlines, before, target, pieces,
@@ -254,9 +254,9 @@ class BinnedSplats:
         starts, counts = np.zeros((2, self.tile_count), np.int64)
         no_changes = np.zeros((0, self.tile_count + 1), np.int32)
         changes = join(self._changes) if self._changes else no_changes
-        cursors = _pool.empty(changes.shape, np.int64)
+        cursors = np.empty(changes.shape, np.int64)
         call(binning.place_cursors, changes, live, cursors, starts, counts)
-        entries = _pool.empty(int(counts.sum()), np.int64)
+        entries = np.empty(int(counts.sum()), np.int64)
         before = np.concatenate([[0], np.cumsum(live)])
         run_jobs(
             binning.scatter,

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from attnwarp.camera import Camera
-from attnwarp.render import _pool
 from attnwarp.render._kernels import depth_normals
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 
@@ -64,8 +63,8 @@ class _NormalConsistency(torch.autograd.Function):
         maps = _maps(*ctx.saved_tensors)
         pixels = max(1, maps.depth.size)
         share = np.float32(float(upstream) / pixels)
-        d_depth, d_alpha, d_normal = (_pool.empty(part.shape, np.float32) for part in maps)
-        to_neighbors = _pool.empty((4, *maps.depth.shape), np.float32)
+        d_depth, d_alpha, d_normal = (np.empty(part.shape, np.float32) for part in maps)
+        to_neighbors = np.empty((4, *maps.depth.shape), np.float32)
         rows = _rows(ctx.saved_tensors[0])
         run_jobs(
             depth_normals.disagreement_backward,

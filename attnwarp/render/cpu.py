@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from attnwarp.render import _pool
+from attnwarp.process import keep_freed_memory
 from attnwarp.render._kernels import (
     backward,
     distortion,
@@ -46,6 +46,9 @@ from attnwarp.render.dispatch import call, typed
 from attnwarp.render.exact import outputs_of
 from attnwarp.render.interface import OUTPUTS, Inputs, Outputs
 from attnwarp.render.threads import ranges, run_jobs, thread_count
+
+# Fresh pages would cost a tenth of a picture's time.
+keep_freed_memory()
 
 MAP_READERS = {
     "alpha": ("depth", "distortion_ordered", "distortion_l2_ndc", "distortion_l1", "background"),
@@ -78,10 +81,10 @@ class _Drawn:
 
 def _pictures(inputs: Inputs, *, with_state: bool) -> layout.Pictures:
     h, w = inputs.height, inputs.width
-    color = _pool.empty((h, w, inputs.channels), np.float32)
-    normal = _pool.empty((h, w, 3), np.float32)
-    alpha, depth, median, ordered, l2 = (_pool.empty((h, w), np.float32) for _ in range(5))
-    state = _pool.empty((len(layout.STATE), h if with_state else 0, w), np.float32)
+    color = np.empty((h, w, inputs.channels), np.float32)
+    normal = np.empty((h, w, 3), np.float32)
+    alpha, depth, median, ordered, l2 = (np.empty((h, w), np.float32) for _ in range(5))
+    state = np.empty((len(layout.STATE), h if with_state else 0, w), np.float32)
     return layout.Pictures(color, alpha, depth, median, normal, ordered, l2, state)
 
 
@@ -102,8 +105,8 @@ def _pairs_workspace(room: int) -> distortion.Workspace:
         aligned(distortion.BUFFER_FLOATS),
         aligned(distortion.WORK_FLOATS),
         aligned_doubles(evaluation.MOMENTS),
-        _pool.empty(room * distortion.PAST, np.float32),
-        _pool.empty(room, np.int64),
+        np.empty(room * distortion.PAST, np.float32),
+        np.empty(room, np.int64),
         np.empty(layout.SQUARES, np.int64),
     )
 
@@ -118,7 +121,7 @@ def _rooms(lists: layout.Lists) -> np.ndarray:
 def _exact_distortion(drawn: _Drawn) -> torch.Tensor:
     """Compute ``distortion_l1``, (H, W), from a drawn picture with its state."""
     binned, state = drawn.binned, drawn.pictures.state
-    target = _pool.empty(state.shape[1:], np.float32)
+    target = np.empty(state.shape[1:], np.float32)
     rooms = _rooms(binned.lists)[binned.tiles.order]
     distort = typed(distortion.distort)
 
@@ -145,7 +148,7 @@ def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
     starts = np.zeros(tile_count, np.int64)
     totals = np.zeros(3, np.int64)
     cached: list[np.ndarray] = []
-    sums = _pool.zeros(len(binned.order), np.int64)
+    sums = np.zeros(len(binned.order), np.int64)
     count = binned.front()
     # In deep scenes most tiles are opaque long before the last splat; the other tiles start
     # again with all splats.
@@ -154,7 +157,7 @@ def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
         is_last = count == len(binned.order)
         for band in binned.bands(live):
             lists = binned.bin(band)
-            weights = _pool.empty(len(lists.entries), np.float32)
+            weights = np.empty(len(lists.entries), np.float32)
             progress = layout.Progress(processed, tested, composited, contributing, opaque, weights)
             run_jobs(
                 rasterization.rasterize,
@@ -177,7 +180,7 @@ def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
             )
             totals += [part[band].sum() for part in (processed, tested, composited)]
             ended = band if is_last else band & opaque
-            used = _pool.empty(int(processed[ended].sum()) if with_state else 0, np.int64)
+            used = np.empty(int(processed[ended].sum()) if with_state else 0, np.int64)
             offset = sum(map(len, cached))
             call(rasterization.settle, ended, lists, progress, sums, offset, starts, used)
             cached.append(used)
@@ -186,7 +189,7 @@ def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
             break
         count = len(binned.order)
     binned.lists = layout.Lists(starts, processed, join(cached))
-    weight = _pool.zeros(len(binned.splats.means), np.float32)
+    weight = np.zeros(len(binned.splats.means), np.float32)
     call(rasterization.splat_weights, binned.order, sums, weight)
     counters = {
         "splats": len(binned.splats.means),
@@ -238,13 +241,13 @@ class _Composite(torch.autograd.Function):
         shapes = [*(picture.shape for picture in drawn.pictures[:-1]), exact, drawn.weight.shape]
         given = layout.Upstream(
             *(
-                _pool.zeros(shape, np.float32) if grad is None else as_array(grad, np.float32)
+                np.zeros(shape, np.float32) if grad is None else as_array(grad, np.float32)
                 for grad, shape in zip(upstream, shapes, strict=True)
             )
         )
         binned = drawn.binned
         total = _table_gradients(drawn, given._replace(weight=given.weight[binned.order]))
-        gradients = layout.Splats(*(_pool.zeros(part.shape, part.dtype) for part in binned.splats))
+        gradients = layout.Splats(*(np.zeros(part.shape, part.dtype) for part in binned.splats))
         pieces = ranges(binned.projected, PIECE)
         view = projection_backward.view_row(binned.view)
         d_view = np.zeros((len(pieces), 12))
@@ -322,7 +325,7 @@ def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:
     binned = drawn.binned
     n, tile_count = binned.projected, binned.tile_count
     columns = layout.GRADIENTS + 3 + max(3, binned.channels)
-    total = _pool.zeros((n, columns), np.float64)
+    total = np.zeros((n, columns), np.float64)
     order, counts = binned.tiles.order, binned.lists.counts
     exact = len(upstream.exact) > 0
     rooms = _rooms(binned.lists)[order] if exact else np.zeros(tile_count, np.int64)
@@ -336,8 +339,8 @@ def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:
         count = int(before[last] - before[first])
         if len(buffer) < count:
             size = max(count, min(GRADIENT_ROWS, int(before[-1])))
-            buffer = _pool.empty((size, columns), np.float32)
-        starts = _pool.empty(tile_count, np.int64)
+            buffer = np.empty((size, columns), np.float32)
+        starts = np.empty(tile_count, np.int64)
         starts[order] = before[:-1] - before[first]
         rows = layout.Rows(starts, buffer[:count])
         pieces = 8 * thread_count()

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.render import _pool
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 from attnwarp.warp._kernels import pair, sampling
 from attnwarp.warp.correspondence import Correspondence, check_proportions
@@ -64,7 +63,7 @@ def correspond_and_mask(
     read = {"target_depth", *(part for rule in asked for part in rule.parts)}
     seen, other = _views(source, {k: part for k, part in parts.items() if k in read}, size)
     positions = _positions(size)
-    passes, mask = _pool.empty((len(row), *size), np.bool_), _pool.empty(size, np.bool_)
+    passes, mask = np.empty((len(row), *size), np.bool_), np.empty(size, np.bool_)
     views = _pair(source, target, settings)
     run_jobs(
         pair.rules_of_pair,
@@ -107,7 +106,7 @@ def correspond_layer(
 def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize, defined: Tensor) -> Tensor:
     """Compute :func:`attnwarp.warp.resize_mask` by kernels and intersect ``defined``, (h, w)."""
     rows, columns = _axis(size[0], mask.shape[0], mode), _axis(size[1], mask.shape[1], mode)
-    result = _pool.empty(size, np.bool_)
+    result = np.empty(size, np.bool_)
     run_jobs(
         pair.resize_mask,
         [
@@ -124,8 +123,8 @@ def taps_at(
     """Compute :func:`attnwarp.warp.sampling.taps_at` by kernels; ``device`` must be the CPU."""
     xy = correspondence.xy.contiguous().numpy()
     shape = (4, *xy.shape[:2])
-    index = _pool.empty(shape, np.int32)
-    weight = _pool.empty(shape, np.float32 if dtype == torch.float32 else np.float64)
+    index = np.empty(shape, np.int32)
+    weight = np.empty(shape, np.float32 if dtype == torch.float32 else np.float64)
     source, integer = _lens(correspondence.source), correspondence.pixel_centers == "integer"
     run_jobs(
         pair.taps_of,
@@ -151,7 +150,7 @@ class _SampleMaps(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, planes: Tensor, taps: Taps) -> Tensor:
         source, (index, weight) = _values(planes), taps.arrays
-        result = _pool.empty((len(source), index.shape[1]), source.dtype)
+        result = np.empty((len(source), index.shape[1]), source.dtype)
         size = max(sampling.PLANES, PIECE // max(1, index.shape[1]))
         run_jobs(
             sampling.sample_maps,
@@ -165,7 +164,7 @@ class _SampleMaps(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         index, weight = ctx.taps.arrays
         gradient = _values(upstream.to(ctx.taps.weight.dtype))
-        result = _pool.zeros(tuple(ctx.shape), weight.dtype)
+        result = np.zeros(tuple(ctx.shape), weight.dtype)
         run_jobs(
             sampling.scatter_maps,
             [
@@ -180,7 +179,7 @@ class _SampleTokens(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, tokens: Tensor, taps: Taps) -> Tensor:
         source, (index, weight) = _values(tokens), taps.arrays
-        result = _pool.empty((len(source), index.shape[1], source.shape[2]), source.dtype)
+        result = np.empty((len(source), index.shape[1], source.shape[2]), source.dtype)
         run_jobs(
             sampling.sample_rows,
             [(*piece, source, index, weight, result) for piece in _pieces(result)],
@@ -193,7 +192,7 @@ class _SampleTokens(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         index, weight = ctx.taps.arrays
         gradient = _values(upstream.to(ctx.taps.weight.dtype))
-        result = _pool.zeros(tuple(ctx.shape), weight.dtype)
+        result = np.zeros(tuple(ctx.shape), weight.dtype)
         pieces = ranges(result.shape[2], CHANNELS)
         run_jobs(
             sampling.scatter_rows, [(*piece, gradient, index, weight, result) for piece in pieces]
@@ -265,9 +264,9 @@ def _pair(source: Camera, target: Camera, settings: WarpSettings) -> pair.Pair:
 
 def _positions(size: tuple[int, int]) -> pair.Positions:
     return pair.Positions(
-        _pool.empty((*size, 2), np.float64),
-        _pool.empty((*size, 3), np.float64),
-        _pool.empty(size, np.float64),
+        np.empty((*size, 2), np.float64),
+        np.empty((*size, 3), np.float64),
+        np.empty(size, np.float64),
     )
 
 

@@ -59,37 +59,6 @@ def test_cores_are_those_that_this_process_may_use(monkeypatch):
     assert core_count() == os.cpu_count()
 
 
-def test_an_interrupt_that_a_destructor_swallows_still_ends_the_program():
-    code = (
-        "import signal, sys, time\n"
-        "from attnwarp.process import interrupt, resend_lost_interrupts\n"
-        "number = signal.SIGINT\n"
-        "if sys.argv[1] != 'alone': resend_lost_interrupts()\n"
-        "if sys.argv[1] == 'in the background':\n"
-        "    signal.signal(number, signal.SIG_IGN); number = signal.SIGTERM\n"
-        "    signal.signal(number, interrupt)\n"
-        "class Freed:\n"
-        "    def __del__(self): signal.raise_signal(number)\n"
-        "class Faulty:\n"
-        "    def __del__(self): raise OSError('another fault')\n"
-        "Faulty()\n"
-        "try:\n"
-        "    Freed(); time.sleep(0 if sys.argv[1] == 'alone' else 5); print('went on')\n"
-        "except KeyboardInterrupt: print('stopped')\n"
-    )
-
-    def outcome(how):
-        return subprocess.run(
-            [sys.executable, "-c", code, how], capture_output=True, text=True, check=True
-        )
-
-    alone, resent = outcome("alone"), outcome("resent")
-    assert (alone.stdout, resent.stdout) == ("went on\n", "stopped\n")
-    assert "KeyboardInterrupt" in alone.stderr and "KeyboardInterrupt" not in resent.stderr
-    assert "another fault" in resent.stderr
-    assert outcome("in the background").stdout == "stopped\n"  # of a shell: Ctrl-C is ignored
-
-
 def test_the_command_tells_its_version():
     """Oracle: the project's own file."""
     root = Path(__file__).parents[2]
