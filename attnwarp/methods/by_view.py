@@ -10,7 +10,7 @@ from typing import Any, Unpack
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor, edit
+from attnwarp.editing.editor import Editor
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
 from attnwarp.methods.settings import ByViewSettings
@@ -94,18 +94,7 @@ class ByView(Method):
         """Edit views from their guides alone."""
         work, s = self.work, self.settings
         start = None if s.start is None else work.timestep(0, batch[0], s.start)
-        with work.guided(s.text_guidance):
-            result = edit(
-                work.editor,
-                [work.guide(view, work.frozen) for view in batch],
-                work.instruction,
-                steps=s.steps,
-                start=start,
-                pictures=None if start is None else [work.picture(view) for view in batch],
-                noise=work.noise(0, batch),
-                on_step=lambda *_: step(),
-                regions=work.regions(batch),
-            )
+        result = work.edit(batch, step, start=start)
         about: dict[str, Any] = {"start": start}
         if start is not None:
             about["timesteps"] = result.timesteps

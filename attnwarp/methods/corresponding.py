@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor, Latent, edit
+from attnwarp.editing.editor import Editor, Latent
 from attnwarp.editing.layers import Call, Layer, Network, all_layers, check_rows, hooked
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.attention import aligned, self_attention
@@ -133,17 +133,7 @@ class Corresponding(ByWarps):
                 return self.warp(views[source], views[target])
 
             stack.enter_context(mixing(editor, layers, len(views), latent_size, warp))
-            result = edit(
-                editor,
-                [work.guide(view, work.frozen) for view in views],
-                work.instruction,
-                steps=s.steps,
-                start=start,
-                pictures=None if start is None else [work.picture(view) for view in views],
-                noise=work.noise(0, views),
-                on_step=lambda *_: step(),
-                regions=work.regions(views),
-            )
+            result = work.edit(views, step, start=start)
         edits = dict(zip(views, result.images, strict=True))
         return [ViewEdit(edits[view], {"start": start}) for view in batch]
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor, edit, tensor_of
+from attnwarp.editing.editor import Editor, tensor_of
 from attnwarp.editing.editors.pix2pix import InstructPix2Pix, Pix2PixTask
 from attnwarp.editing.schedule import following
 from attnwarp.gaussians import Gaussians
@@ -103,14 +103,8 @@ class Fused(ByWarps):
 
     def edit_alone(self, view: int, model: Gaussians, step: Callable[[], None]) -> list[ViewEdit]:
         """Edit a view from its noised picture."""
-        work, s = self.work, self.settings
         start = self._start(0, view)
-        with work.guided(s.text_guidance):
-            result = edit(
-                work.editor, [work.picture(view)], work.instruction, steps=s.steps, start=start,
-                grid=s.grid, noise=work.noise(0, (view,)), on_step=lambda *_: step(),
-                regions=work.regions([view]),
-            )  # fmt: skip
+        result = self.work.edit([view], step, start=start)
         return [ViewEdit(result.images[0], {"start": start})]
 
     def edit_again(self, view: int, model: Gaussians, step: Callable[[], None]) -> list[ViewEdit]:

@@ -11,7 +11,7 @@ from typing import Any, Unpack
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor, edit
+from attnwarp.editing.editor import Editor
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
 from attnwarp.methods.settings import IGS2GSSettings
@@ -84,19 +84,7 @@ class IGS2GS(Method):
         self, number: int, view: int, model: Gaussians, step: Callable[[], None]
     ) -> list[ViewEdit]:
         """Edit a view from its noised render, guided by its original picture."""
-        work, s = self.work, self.settings
-        start = work.timestep(number, view, s.start)
-        with work.guided(s.text_guidance):
-            result = edit(
-                work.editor,
-                [work.picture(view)],
-                work.instruction,
-                steps=s.steps,
-                start=start,
-                grid=s.grid,
-                pictures=[work.render(view, model)],
-                noise=work.noise(number, (view,)),
-                on_step=lambda *_: step(),
-                regions=work.regions([view]),
-            )
+        work, start = self.work, self.work.timestep(number, view, self.settings.start)
+        pictures = [work.render(view, model)]
+        result = work.edit([view], step, number=number, start=start, pictures=pictures)
         return [ViewEdit(result.images[0], {"start": start, "timesteps": result.timesteps})]

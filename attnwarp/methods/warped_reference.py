@@ -14,7 +14,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor, edit
+from attnwarp.editing.editor import Editor
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Options, Result, ViewEdit, run
 from attnwarp.methods.by_warps import ByWarps, checked_source
@@ -108,18 +108,7 @@ class WarpedReference(ByWarps):
             assert s.start is not None
             start = work.timestep(0, self.source, s.start)
             pictures, shares = map(list, zip(*map(self.starts, batch), strict=True))
-        with work.guided(s.text_guidance):
-            result = edit(
-                work.editor,
-                [work.guide(view, work.frozen) for view in batch],
-                work.instruction,
-                steps=s.steps,
-                start=start,
-                pictures=pictures,
-                noise=work.noise(0, batch),
-                on_step=lambda *_: step(),
-                regions=work.regions(batch),
-            )
+        result = work.edit(batch, step, start=start, pictures=pictures)
         return [
             ViewEdit(picture, {"start": start, "warped": share})
             for picture, share in zip(result.images, shares, strict=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from attnwarp.editing.editor import Editor, guided, shared_noise
+from attnwarp.editing.editor import Edit, Editor, edit, guided, shared_noise
 from attnwarp.editing.schedule import Grid
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.noise import FRESH, own_seed
@@ -92,6 +92,40 @@ class Work:
         if self.editor.guide == "picture":
             return self.picture(view)
         return self.depth(view, model, warp)
+
+    def edit(
+        self,
+        views: Sequence[int],
+        step: Callable[[], None],
+        *,
+        number: int = 0,
+        start: int | None = None,
+        pictures: Sequence[Image] | None = None,
+    ) -> Edit:
+        """Edit views together, from their guides before the edit and their noise of a round.
+
+        Args:
+            views: numbers of the views.
+            step: callback after each step.
+            number: number of the round.
+            start: Stable Diffusion's timestep to start from; None starts as the editor begins.
+            pictures: pictures noised to ``start``; those before the edit if omitted.
+        """
+        if start is not None and pictures is None:
+            pictures = [self.picture(view) for view in views]
+        with self.guided(self.settings.text_guidance):
+            return edit(
+                self.editor,
+                [self.guide(view, self.frozen) for view in views],
+                self.instruction,
+                steps=self.settings.steps,
+                start=start,
+                grid=self.grid,
+                pictures=pictures,
+                noise=self.noise(number, views),
+                on_step=lambda *_: step(),
+                regions=self.regions(views),
+            )
 
     def composite(self, view: int, picture: Image) -> Image:
         """Compose the edit inside the view's segment with the settings' choice outside."""
