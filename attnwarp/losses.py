@@ -294,14 +294,9 @@ def normal_consistency(view: Render) -> Tensor:
         view: rendered view.
 
     Example:
-        >>> import torch
-        >>> from attnwarp import Camera, Gaussians
         >>> from attnwarp.render import render
-        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> view = dict(width=16, height=16, fov_y=40, up=(0, 1, 0))
-        >>> camera = Camera.look_at((0, 0, 3), (0, 0, 0), **view)
-        >>> normal_consistency(render(disc, camera)).item() < 1e-5  # a disc is flat
+        >>> from attnwarp.trial import disc, view
+        >>> normal_consistency(render(disc(), view())).item() < 1e-5  # a disc is flat
         True
     """
     if view.backend == "cpu" and not view._pose.requires_grad:
@@ -334,14 +329,9 @@ def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.
         ValueError: the form is unknown.
 
     Example:
-        >>> import torch
-        >>> from attnwarp import Camera, Gaussians
         >>> from attnwarp.render import render
-        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> view = dict(width=16, height=16, fov_y=40, up=(0, 1, 0))
-        >>> camera = Camera.look_at((0, 0, 3), (0, 0, 0), **view)
-        >>> depth_distortion(render(disc, camera)).item()  # one splat has no spread
+        >>> from attnwarp.trial import disc, view
+        >>> depth_distortion(render(disc(), view())).item()  # one splat has no spread
         0.0
     """
     check.one_of(form, get_args(Distortion), "form")

@@ -67,17 +67,12 @@ def attention_warping(
         ValueError, InputError, RuntimeError: see :func:`by_view`.
 
     Example:
-        >>> import torch
-        >>> from attnwarp import Camera, Gaussians
         >>> from attnwarp.editing.small import load_editor
         >>> from attnwarp.methods import attention_warping, preset
-        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> view = dict(width=32, height=32, fov_y=40, up=(0, 1, 0))
-        >>> cameras = [Camera.look_at((x, 0, 3), (0, 0, 0), **view) for x in (0, 1)]
+        >>> from attnwarp.trial import disc, view
         >>> quick = preset("attention_warping", stages=1, steps=1, iterations=1)
         >>> editor = load_editor("small-plain")
-        >>> result = attention_warping(disc, cameras, None, editor, "red", quick)
+        >>> result = attention_warping(disc(), [view(0), view(1)], None, editor, "red", quick)
         >>> result.rounds[0].views, result.edited[1].shape  # the source, then the target
         ((0, 1), (32, 32, 3))
     """
@@ -127,15 +122,11 @@ def blend(warp: TokenWarp, F_src: Tensor, F_new: Tensor, a: float) -> Tensor:
         a: a_t, in [0, 1].
 
     Example:
-        >>> import numpy as np, torch
-        >>> from attnwarp import Camera
-        >>> from attnwarp.warp import Surface, warp_surfaces
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
-        >>> layer = warp_surfaces(source, target, wall, wall).at((4, 4))
+        >>> import torch
+        >>> from attnwarp.trial import wall
+        >>> from attnwarp.warp import warp_surfaces
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> layer = warp_surfaces(source, target, seen, seen).at((4, 4))
         >>> column = torch.arange(4.0).repeat(4).reshape(1, 16, 1)
         >>> blend(layer, column, torch.zeros(1, 16, 1), 0.5)[0, :4, 0].tolist()
         [0.5, 1.0, 1.5, 0.0]

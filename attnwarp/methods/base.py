@@ -157,13 +157,11 @@ class Result:
             shifts, scales and turns the picture, see :class:`attnwarp.drift.Drift`.
 
     Example:
-        >>> import numpy as np, torch
-        >>> from attnwarp import Gaussians
+        >>> import numpy as np
         >>> from attnwarp.methods import Result
-        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> from attnwarp.trial import disc
         >>> edited = {0: np.zeros((8, 8, 3), np.uint8)}
-        >>> Result("dge", disc, edited, (), {}, {"views": 1}, {"edit": 2.5}).cut is None
+        >>> Result("dge", disc(), edited, (), {}, {"views": 1}, {"edit": 2.5}).cut is None
         True
     """
 

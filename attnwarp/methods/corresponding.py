@@ -63,16 +63,12 @@ def corresponding(
         ValueError, InputError, RuntimeError: see :func:`by_view`.
 
     Example:
-        >>> import torch
-        >>> from attnwarp import Camera, Gaussians
-        >>> from attnwarp.methods import CorrespondingSettings, corresponding
         >>> from attnwarp.editing.small import load_editor
-        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> view = dict(width=32, height=32, fov_y=40, up=(0, 1, 0))
-        >>> cameras = [Camera.look_at((x, 0, 3), (0, 0, 0), **view) for x in (0, 1)]
+        >>> from attnwarp.methods import CorrespondingSettings, corresponding
+        >>> from attnwarp.trial import disc, view
         >>> quick = CorrespondingSettings(steps=1, iterations=1)
-        >>> result = corresponding(disc, cameras, None, load_editor("small-plain"), "red", quick)
+        >>> views, editor = [view(0), view(1)], load_editor("small-plain")
+        >>> result = corresponding(disc(), views, None, editor, "red", quick)
         >>> result.counters["network_rows"]  # two views, two branches each
         4
     """

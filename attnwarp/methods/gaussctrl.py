@@ -53,16 +53,10 @@ def gaussctrl(
         ValueError, InputError, RuntimeError: see :func:`by_view`.
 
     Example:
-        >>> from attnwarp.methods import gaussctrl
         >>> from attnwarp.editing.small import load_editor
-        >>> from attnwarp import Camera
-        >>> camera = Camera.look_at((0, 0, 3), (0, 0, 0), width=32, height=32, fov_y=40,
-        ...                         up=(0, 1, 0))
-        >>> import torch
-        >>> from attnwarp import Gaussians
-        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> gaussctrl(disc, [camera], None, load_editor("small-plain"), "red")
+        >>> from attnwarp.methods import gaussctrl
+        >>> from attnwarp.trial import disc, view
+        >>> gaussctrl(disc(), [view()], None, load_editor("small-plain"), "red")
         Traceback (most recent call last):
         ValueError: editor: gaussctrl is made for a depth ControlNet, got InstructPix2Pix, which
         takes pictures; choose another editor or method

@@ -32,16 +32,12 @@ def pixel_ratio(view: WarpedView) -> Tensor:
         ValueError: the target has no normals.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import Surface, warp_surfaces
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> far = np.eye(4)
-        >>> far[2, 3] = 2.0  # twice as far from the wall
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, far, 8, 8)
-        >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
-        >>> back = Surface(np.full((8, 8), 4.0), wall.normal)
-        >>> pixel_ratio(warp_surfaces(source, target, wall, back))[4, 4].item()
+        >>> _, target, seen = wall()
+        >>> source = target.moved((0, 0, -2))  # twice as far from the wall
+        >>> behind = Surface(2 * seen.depth, seen.normal)
+        >>> pixel_ratio(warp_surfaces(source, target, seen, behind))[4, 4].item()
         0.25
     """
     normal = as_float64(needed(view.target.normal, "target.normal", "pixel_ratio"), "normal")
@@ -71,18 +67,14 @@ class Sight:
         zeros: True pads features outside a source with zeros, False with the border's values.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import Surface, warp_surfaces
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> far, near = (np.eye(4) for _ in range(2))
-        >>> far[2, 3], near[0, 3] = 2.0, 1.0
-        >>> target, *sources = (Camera(K, pose, 8, 8) for pose in (np.eye(4), far, near))
-        >>> normal = np.broadcast_to([0.0, 0, -1], (8, 8, 3))
-        >>> wall, back = (Surface(np.full((8, 8), z), normal) for z in (2.0, 4.0))
-        >>> views = [warp_surfaces(s, target, wall, w) for s, w in zip(sources, (back, wall))]
+        >>> near, target, seen = wall()
+        >>> far, behind = target.moved((0, 0, -2)), Surface(2 * seen.depth, seen.normal)
+        >>> pairs = ((far, behind), (near, seen))
+        >>> views = [warp_surfaces(source, target, seen, own) for source, own in pairs]
         >>> Sight(views).choice((8, 8))[0].tolist()  # the near source, where it sees the wall
-        [1, 1, 1, 1, 0, 0, 0, 0]
+        [1, 1, 1, 1, 1, 1, 0, 0]
     """
 
     views: Sequence[WarpedView]

@@ -144,10 +144,10 @@ def normal_from_depth(
         pose: (4, 4) world-to-camera transform that replaces the camera's.
 
     Example:
-        >>> import numpy as np, torch
-        >>> from attnwarp import Camera
+        >>> import torch
         >>> from attnwarp.render import normal_from_depth
-        >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
+        >>> from attnwarp.trial import wall
+        >>> _, camera, seen = wall()
         >>> normal = normal_from_depth(torch.full((8, 8), 2.0), camera)  # a wall that faces it
         >>> (normal[4, 4] + 0.0).tolist(), bool(normal[0, 0].isnan().all())
         ([0.0, 0.0, -1.0], True)

@@ -39,9 +39,9 @@ class Correspondence:
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import correspond
-        >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
+        >>> _, camera, seen = wall()
         >>> depth = np.full((8, 8), 2.0)
         >>> depth[0, 0] = np.nan  # no surface
         >>> c = correspond(camera, camera, depth)
@@ -128,14 +128,10 @@ def correspond(
         ValueError: the depth's size differs from ``target``, or its type is not floating.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import correspond
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> c = correspond(source, target, seen.depth)
         >>> c.xy[0, 0].tolist()
         [2.5, 0.5]
     """
@@ -188,14 +184,10 @@ def correspond_at(
             positive integers.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import correspond_at
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> c = correspond_at(source, target, np.full((8, 8), 2.0), (4, 4))
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> c = correspond_at(source, target, seen.depth, (4, 4))
         >>> c.xy[0, 0].tolist()  # half as many pixels
         [1.5, 0.5]
     """
@@ -247,14 +239,10 @@ def in_bounds(correspondence: Correspondence, size: tuple[int, int] | None = Non
     position, so the test is 0 <= u < W on the index.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import correspond, in_bounds
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> c = correspond(source, target, seen.depth)
         >>> in_bounds(c)[0].tolist()
         [True, True, True, True, True, True, False, False]
     """

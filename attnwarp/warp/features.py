@@ -34,11 +34,11 @@ class FeatureWarp:
         backend: "auto" or "reference"; both give the same bits.
 
     Example:
-        >>> import numpy as np, torch
-        >>> from attnwarp import Camera
+        >>> import torch
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import FeatureWarp, correspond
-        >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
-        >>> c = correspond(camera, camera, np.full((8, 8), 2.0))  # a view onto itself
+        >>> _, camera, seen = wall()
+        >>> c = correspond(camera, camera, seen.depth)  # a view onto itself
         >>> warp, features = FeatureWarp(c, c.defined), torch.rand(4, 8, 8)
         >>> torch.equal(warp.warp(features), features)
         True
@@ -94,15 +94,11 @@ class FeatureWarp:
             ValueError: the shape differs from the source grid, or the dtype cannot be blended.
 
         Example:
-            >>> import numpy as np, torch
-            >>> from attnwarp import Camera
-            >>> from attnwarp.warp import Surface, warp_surfaces
-            >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-            >>> shift = np.eye(4)
-            >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-            >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-            >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
-            >>> layer = warp_surfaces(source, target, wall, wall).at((4, 4))
+            >>> import torch
+            >>> from attnwarp.trial import wall
+            >>> from attnwarp.warp import warp_surfaces
+            >>> source, target, seen = wall()  # 2 px apart
+            >>> layer = warp_surfaces(source, target, seen, seen).at((4, 4))
             >>> column = torch.arange(4.0).repeat(4).reshape(1, 16, 1)
             >>> layer.warp_tokens(column)[0, :4, 0].tolist()
             [1.0, 2.0, 3.0, 3.0]

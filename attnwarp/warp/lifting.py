@@ -56,14 +56,11 @@ class LiftedMask:
             both are empty.
 
     Example:
-        >>> import numpy as np, torch
-        >>> from attnwarp import Camera, Gaussians
+        >>> import numpy as np
+        >>> from attnwarp.trial import disc, view
         >>> from attnwarp.warp import lift_masks
-        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                  torch.full((1, 2), 0.3), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> view = dict(width=8, height=8, fov_y=40, up=(0, 1, 0))
-        >>> front, back = (Camera.look_at((0, 0, z), (0, 0, 0), **view) for z in (3, -3))
-        >>> lifted = lift_masks(disc, [front], [np.ones((8, 8), dtype=bool)])
+        >>> front, back = (view(z=z, side=8) for z in (3, -3))
+        >>> lifted = lift_masks(disc(0.3), [front], [np.ones((8, 8), dtype=bool)])
         >>> lifted.seen.tolist(), bool(lifted.render(back)[4, 4] > 0.5)
         ([True], True)
     """
@@ -256,15 +253,10 @@ def footprints(splats: Gaussians, camera: Camera) -> npt.NDArray[np.float64]:
     Zwicker et al. 2001) plus the screen filter. A splat behind the camera gets 1.
 
     Example:
-        >>> import torch
-        >>> from attnwarp import Camera, Gaussians
-        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                  torch.full((1, 2), 0.1), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> view = dict(width=64, height=64, fov_y=40, up=(0, 1, 0))
-        >>> camera = Camera.look_at((0, 0, 3), (0, 0, 0), **view)
         >>> from attnwarp.render import render
-        >>> drawn = float(render(disc, camera).weight[0])
-        >>> bool(abs(footprints(disc, camera)[0] / drawn - 1) < 0.1)
+        >>> from attnwarp.trial import disc, view
+        >>> drawn = float(render(disc(0.2), view()).weight[0])
+        >>> bool(abs(footprints(disc(0.2), view())[0] / drawn - 1) < 0.1)
         True
     """
     place = (splats.world_means() - camera.position) @ camera.rotation.T

@@ -47,12 +47,8 @@ def piece_around(
             distance.
 
     Example:
-        >>> import torch
-        >>> from attnwarp import Camera, Gaussians
-        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                  torch.full((1, 2), 0.3), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> front = Camera.look_at((0, 0, 3), (0, 0, 0), width=8, height=8, fov_y=40, up=(0, 1, 0))
-        >>> bool(piece_around(disc, front, (0, 0)).all())  # nothing there
+        >>> from attnwarp.trial import disc, view
+        >>> bool(piece_around(disc(0.3), view(), (0, 0)).all())  # nothing there
         True
     """
     from scipy.sparse import coo_array

@@ -35,14 +35,10 @@ def in_front(correspondence: Correspondence) -> Tensor:
         correspondence: correspondence of the target's pixels, by :func:`attnwarp.warp.correspond`.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import correspond, in_front
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> c = correspond(source, target, seen.depth)
         >>> bool(in_front(c).all())
         True
     """
@@ -70,13 +66,10 @@ def opaque(
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import correspond, opaque
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> c = correspond(source, target, seen.depth)
         >>> opaque(c, 0.5, target_alpha=np.eye(8))[0].tolist()
         [True, False, False, False, False, False, False, False]
     """
@@ -108,13 +101,10 @@ def depth_agrees(
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import correspond, depth_agrees
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> c = correspond(source, target, seen.depth)
         >>> depth_agrees(c, np.full((8, 8), 1.5)).any().item()  # something stands before it
         False
     """
@@ -129,13 +119,11 @@ def depth_tolerance(
     """Compute the depth difference allowed by :func:`depth_agrees`, (H, W), from its arguments.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import correspond, depth_tolerance
-        >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
-        >>> flat = np.full((8, 8), 2.0)
-        >>> c = correspond(camera, camera, flat)
-        >>> depth_tolerance(c, flat, relative=0.01, slope=0.5)[4, 4].item()
+        >>> source, target, seen = wall()
+        >>> c = correspond(source, target, seen.depth)
+        >>> depth_tolerance(c, seen.depth, relative=0.01, slope=0.5)[4, 4].item()
         0.02
     """
     depth = as_float64(source_depth, "source_depth")
@@ -163,13 +151,10 @@ def photometric(
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import correspond, photometric
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> c = correspond(source, target, seen.depth)
         >>> black, grey = np.zeros((8, 8, 3)), np.full((8, 8, 3), 0.15)
         >>> [photometric(c, black, grey, limit).all().item() for limit in (0.2, 0.1)]
         [True, False]
@@ -192,16 +177,11 @@ def facing(correspondence: Correspondence, target_normal: Array) -> Tensor:
         ValueError: the normals have a wrong shape or type.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import correspond, facing
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> c = correspond(source, target, np.full((8, 8), 2.0))
-        >>> normal = np.broadcast_to([0.0, 0, -1], (8, 8, 3))
-        >>> facing(c, normal).all().item()
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> c = correspond(source, target, seen.depth)
+        >>> facing(c, seen.normal).all().item()
         True
     """
     normal, defined = _normals(correspondence, target_normal)
@@ -223,16 +203,11 @@ def source_incidence(
         ValueError: the normals have a wrong shape or type.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import correspond, source_incidence
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> c = correspond(source, target, np.full((8, 8), 2.0))
-        >>> normal = np.broadcast_to([0.0, 0, -1], (8, 8, 3))
-        >>> source_incidence(c, normal, 20.0)[4].tolist()  # within 20 degrees of the source's axis
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> c = correspond(source, target, seen.depth)
+        >>> source_incidence(c, seen.normal, 20.0)[4].tolist()  # of the source's axis
         [True, True, True, True, True, False, False, False]
     """
     normal, defined = _normals(correspondence, target_normal)
@@ -260,16 +235,11 @@ def camera_frame(
         ValueError: the normals have a wrong shape or type.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import camera_frame, correspond
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> c = correspond(source, target, np.full((8, 8), 2.0))
-        >>> normal = np.broadcast_to([0.0, 0, -1], (8, 8, 3))
-        >>> camera_frame(c, normal).all().item()
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> c = correspond(source, target, seen.depth)
+        >>> camera_frame(c, seen.normal).all().item()
         True
     """
     return _frame_angle(correspondence, target_normal) < angle
@@ -294,14 +264,10 @@ def gaussian_filter(
         (N,) bool.
 
     Example:
-        >>> import torch
-        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.trial import disc, view
         >>> from attnwarp.warp import gaussian_filter
-        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                  torch.full((1, 2), 0.2), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> view = dict(width=8, height=8, fov_y=40, up=[0, 1, 0])
-        >>> above, below = (Camera.look_at([0, 0, z], [0, 0, 0], **view) for z in (3, -3))
-        >>> gaussian_filter(disc, above, below, "facing").tolist()
+        >>> above, below = (view(z=z, side=8) for z in (3, -3))
+        >>> gaussian_filter(disc(0.2), above, below, "facing").tolist()
         [False]
     """
     check.one_of(rule, get_args(GaussianFilter), "rule")
@@ -448,15 +414,13 @@ class Rule:
         unit: unit of the margin.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
-        >>> from attnwarp.warp import RULES, Rule, Surface, warp_surfaces
+        >>> from attnwarp.trial import wall
+        >>> from attnwarp.warp import RULES, Rule, warp_surfaces
         >>> def near(correspondence, target_depth):
-        ...     return target_depth < 3
+        ...     return target_depth < 1
         >>> RULES.append(Rule("near", near, reads=("target_depth",)))
-        >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
-        >>> wall = Surface(np.full((8, 8), 4.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
-        >>> warp_surfaces(camera, camera, wall, wall).mask.any().item()
+        >>> source, target, seen = wall()
+        >>> warp_surfaces(source, target, seen, seen).mask.any().item()
         False
         >>> RULES.pop().name
         'near'

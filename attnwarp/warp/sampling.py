@@ -49,15 +49,11 @@ def sample(
             unknown mode.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
-        >>> from attnwarp.warp import correspond, sample
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> c = correspond(source, target, np.full((8, 8), 2.0))
         >>> import torch
+        >>> from attnwarp.trial import wall
+        >>> from attnwarp.warp import correspond, sample
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> c = correspond(source, target, seen.depth)
         >>> warped, mask = sample(torch.arange(8.0).expand(1, 8, 8), c)
         >>> warped[0, 0].tolist()  # beyond the border its value is taken
         [2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 7.0, 7.0]
@@ -198,15 +194,11 @@ def sample_depth(
         ValueError: the depth has a wrong shape, aspect ratio or type.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
+        >>> from attnwarp.trial import wall
         >>> from attnwarp.warp import correspond, sample_depth
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> c = correspond(source, target, np.full((8, 8), 2.0))
-        >>> sample_depth(np.full((8, 8), 2.0), c)[0, 4:].tolist()
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> c = correspond(source, target, seen.depth)
+        >>> sample_depth(seen.depth, c)[0, 4:].tolist()
         [2.0, 2.0, nan, nan]
     """
     depth = valid_depth(source_depth, "source_depth")

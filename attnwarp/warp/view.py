@@ -50,12 +50,10 @@ class WarpedView:
         backend: backend of the feature grids, see :func:`warp_surfaces`.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
-        >>> from attnwarp.warp import Surface, warp_surfaces
-        >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
-        >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
-        >>> view = warp_surfaces(camera, camera, wall, wall)
+        >>> from attnwarp.trial import wall
+        >>> from attnwarp.warp import warp_surfaces
+        >>> _, camera, seen = wall()
+        >>> view = warp_surfaces(camera, camera, seen, seen)
         >>> view.mask.all().item(), view.at((4, 4)).mask.shape
         (True, torch.Size([4, 4]))
     """
@@ -82,12 +80,10 @@ class WarpedView:
             mask: (H, W) bool; pixels without a source position are removed from it.
 
         Example:
-            >>> import numpy as np
-            >>> from attnwarp import Camera
-            >>> from attnwarp.warp import Surface, warp_surfaces
-            >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
-            >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
-            >>> view = warp_surfaces(camera, camera, wall, wall)
+            >>> from attnwarp.trial import wall
+            >>> from attnwarp.warp import warp_surfaces
+            >>> _, camera, seen = wall()
+            >>> view = warp_surfaces(camera, camera, seen, seen)
             >>> view.with_mask(torch.zeros(8, 8, dtype=torch.bool)).at((4, 4)).mask.any().item()
             False
         """
@@ -189,15 +185,10 @@ def warp_surfaces(
         TypeError: an argument has a wrong type.
 
     Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
-        >>> from attnwarp.warp import Surface, warp_surfaces
-        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
-        >>> shift = np.eye(4)
-        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
-        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
-        >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
-        >>> view = warp_surfaces(source, target, wall, wall)
+        >>> from attnwarp.trial import wall
+        >>> from attnwarp.warp import warp_surfaces
+        >>> source, target, seen = wall()  # 2 px apart
+        >>> view = warp_surfaces(source, target, seen, seen)
         >>> view.mask[0].tolist()
         [True, True, True, True, True, True, False, False]
         >>> list(view.rules)
@@ -287,15 +278,10 @@ def warp_view(
         ValueError, TypeError: as in :func:`warp_surfaces`.
 
     Example:
-        >>> import torch
-        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.trial import disc, view
         >>> from attnwarp.warp import warp_view
-        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> view = dict(width=16, height=16, fov_y=40, up=[0, 1, 0])
-        >>> camera = Camera.look_at([0, 0, 3], [0, 0, 0], **view)
-        >>> view = warp_view(disc, camera, camera)
-        >>> view.mask[8, 8].item(), view.at((4, 4)).mask.shape
+        >>> warp = warp_view(disc(), view(0), view(1))
+        >>> warp.mask[16, 16].item(), warp.at((4, 4)).mask.shape
         (True, torch.Size([4, 4]))
     """
     check.instance(gaussians, Gaussians, "gaussians", "attnwarp.Gaussians")
@@ -357,16 +343,11 @@ def render_surface(
         Surface of (H, W) tensors without gradients, on the CPU.
 
     Example:
-        >>> import torch
-        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.trial import disc, view
         >>> from attnwarp.warp import render_surface
-        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> view = dict(width=16, height=16, fov_y=40, up=[0, 1, 0])
-        >>> camera = Camera.look_at([0, 0, 3], [0, 0, 0], **view)
-        >>> surface = render_surface(disc, camera)
-        >>> surface.depth.shape, round(float(surface.depth[8, 8]), 4)
-        (torch.Size([16, 16]), 3.0)
+        >>> surface = render_surface(disc(), view())
+        >>> surface.depth.shape, round(float(surface.depth[16, 16]), 4)
+        (torch.Size([32, 32]), 3.0)
     """
     from attnwarp.render import render
 

@@ -81,14 +81,11 @@ def disagreement(
         two views of one point has no entry.
 
     Example:
-        >>> import numpy as np, torch
-        >>> from attnwarp import Camera, Gaussians
-        >>> wall = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                  torch.full((1, 2), 9.0), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> view = dict(width=8, height=8, fov_y=40, up=(0, 1, 0))
-        >>> cameras = {k: Camera.look_at((0, 0, 3 + k), (0, 0, 0), **view) for k in (0, 1)}
+        >>> import numpy as np
+        >>> from attnwarp.trial import disc, view
+        >>> cameras = {k: view(z=3 + k, side=8) for k in (0, 1)}
         >>> grey = {k: np.full((8, 8, 3), 51 * k, np.uint8) for k in cameras}
-        >>> round(disagreement(wall, cameras, {"grey": grey})["grey"], 3)  # 51 of 255
+        >>> round(disagreement(disc(9.0), cameras, {"grey": grey})["grey"], 3)  # 51 of 255
         0.2
     """
     near = near_of(list(cameras.values()), gaussians)
