@@ -50,8 +50,6 @@ def same_aspect(size: tuple[int, int], full: tuple[int, int], name: str, remedy:
     Args:
         size: (h, w) of the given picture.
         full: (H, W) of the full picture.
-        name: name of the argument.
-        remedy: end of the message.
 
     Example:
         >>> from attnwarp import check
@@ -109,12 +107,6 @@ def tensor(value: Array, name: str) -> torch.Tensor:
 
 def instance(value: Any, kind: type, name: str, expected: str) -> None:
     """Raise TypeError unless ``value`` is an instance of ``kind``.
-
-    Args:
-        value: value of the argument.
-        kind: expected class.
-        name: name of the argument.
-        expected: description of the class for the message, as it is imported.
 
     Example:
         >>> from attnwarp import check

@@ -73,12 +73,7 @@ class InputError(ValueError):
 
 class MissingExtraError(InputError):
     """Error for a package that is not installed, since it belongs to an extra. The message names
-    the extra.
-
-    Args:
-        module: top-level name of the missing module, one of :data:`EXTRAS`.
-        extra: name of the extra.
-    """
+    the extra."""
 
     def __init__(self, module: str, extra: str) -> None:
         super().__init__(

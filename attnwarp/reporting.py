@@ -56,11 +56,6 @@ SILENT = Reporter()
 class Part(Reporter):
     """Reporter of one part of several works: its messages are shown with the count of all works.
 
-    Args:
-        report: reporter of all works.
-        done: number of finished works.
-        total: total number of works.
-
     Example:
         >>> from attnwarp.reporting import Part, reporter
         >>> import sys

@@ -87,14 +87,9 @@ class Workdir:
     """Folder of one run.
 
     Args:
-        path: path of the folder, created by :meth:`claim` if missing.
         what: description of the run, for messages: "a fit", "an edit".
         folders: subfolders, created likewise.
         results: result files, besides those in ``folders``.
-
-    Attributes:
-        path, what: path and description of the run.
-        seconds: seconds by part.
     """
 
     def __init__(
@@ -126,10 +121,6 @@ class Workdir:
     def check_claimed(self, known: dict[str, Any], *, whole: bool = False) -> None:
         """Compare the known settings of a run with the folder, before any work.
 
-        Args:
-            known: entries of the manifest.
-            whole: True if the entries are the complete manifest.
-
         Raises:
             InputError: the folder holds a run of other settings or inputs, which the message lists;
                 or result files without a manifest that identifies their run.
@@ -153,11 +144,7 @@ class Workdir:
 
     def check_unclaimed(self) -> None:
         """Refuse result files in a folder without a manifest: they would be overwritten, or taken
-        for results of this run.
-
-        Raises:
-            InputError: a result file exists.
-        """
+        for results of this run."""
         if self.has(MANIFEST):
             return
         places = [self.path / name for name in (*self.results, *self.folders)]
@@ -302,10 +289,6 @@ class Workdir:
         """Load a file written by :meth:`save`. Only tensors and plain values are read; a file
         cannot run code.
 
-        Args:
-            name: name of the file.
-            remedy: end of the error message.
-
         Raises:
             FileFormatError: the file is damaged, from an older version, or not a checkpoint.
         """
@@ -354,11 +337,7 @@ class CheckpointClock:
 
 
 class Seconds:
-    """Seconds by part of a run's work, stored in its folder and summed over its processes.
-
-    Args:
-        folder: path of the run.
-    """
+    """Seconds by part of a run's work, stored in its folder and summed over its processes."""
 
     def __init__(self, folder: Workdir) -> None:
         self.folder = folder

@@ -16,12 +16,7 @@ STOPPED = 130
 
 
 def enter(name: str, module: str) -> None:
-    """Import a command and run its ``main``.
-
-    Args:
-        name: name of the command, the prefix of its messages.
-        module: module of the command's ``main``.
-    """
+    """Import a command and run its ``main``."""
 
     def leave(*_: Any) -> None:
         # No exception: raised inside an import, a destructor or the interpreter's shutdown, it

@@ -43,8 +43,6 @@ def read_views(path: Path, reading: Reading, **options: Any) -> Dataset:
     it.
 
     Args:
-        path: path as typed.
-        reading: reading options of the command line.
         options: keywords of `attnwarp.io.read_dataset` set by the command, which override reading
             options.
     """
@@ -97,10 +95,7 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera], report:
     """Refuse splats that no camera sees, before an edit spends minutes on them.
 
     Args:
-        path: path of the splats, for the message.
-        splats: splats of the scene.
         cameras: cameras of the dataset; the first that sees splats ends the search.
-        report: receiver of a line if kernels must be compiled.
 
     Raises:
         InputError: the splats cover less than :data:`COVERED` of every view.
@@ -128,7 +123,6 @@ def note_held_out(path: Path, dataset: Dataset, index: int) -> str:
     Args:
         path: path of the splats. A fit writes its held-out views to the same folder.
         dataset: views, with their splits.
-        index: number of the source among views with a picture.
     """
     from attnwarp.io.names import file_stems
 
@@ -149,11 +143,6 @@ def warn_of_misfit(path: Path, splats: Gaussians, dataset: Dataset) -> None:
     """Warn of splats whose renders differ from the pictures, such as splats moved by a trainer.
 
     A render farther from its picture than a uniform colour explains nothing of the picture.
-
-    Args:
-        path: path of the splats, for the message.
-        splats: splats of the scene.
-        dataset: views of the scene.
     """
     psnr, plain = likeness(splats, dataset)
     if psnr < min(plain, ALIKE):
@@ -207,10 +196,6 @@ def likeness(splats: Gaussians, dataset: Dataset) -> tuple[float, float]:
 
 def check_inputs_stay(results: Iterable[Path], read: Iterable[Path | None]) -> None:
     """Refuse to overwrite a command's inputs, under the same or another name, or by a link.
-
-    Args:
-        results: files that the command writes.
-        read: input files of the command; None entries are skipped.
 
     Raises:
         InputError: a result would replace an input.

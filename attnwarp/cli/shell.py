@@ -188,12 +188,7 @@ def use_threads(threads: int | None) -> None:
 
 
 def assignments(changes: list[str], options: dict[str, str]) -> dict[str, Any]:
-    """Parse NAME=VALUE with JSON values; a bare word is text.
-
-    Args:
-        changes: assignments as typed.
-        options: names with a separate option, mapped to that option.
-    """
+    """Parse NAME=VALUE with JSON values; a bare word is text."""
     values: dict[str, Any] = {}
     for change in changes:
         name, equals, text = change.partition("=")
@@ -209,12 +204,7 @@ def assignments(changes: list[str], options: dict[str, str]) -> dict[str, Any]:
 
 
 def run(app: typer.Typer, name: str) -> None:
-    """Run a command line to its exit code: the entry point of both programs.
-
-    Args:
-        app: command line of the program.
-        name: name of the program, the prefix of its messages.
-    """
+    """Run a command line to its exit code: the entry point of both programs."""
     skip_last_collection()
     begin(name)
     try:

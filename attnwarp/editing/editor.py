@@ -177,10 +177,6 @@ class Edit:
 def shared_noise(shape: tuple[int, int, int, int], seed: int) -> Tensor:
     """Draw (B, C, h, w) white noise, the same for all views.
 
-    Args:
-        shape: shape of the noise, (B, C, h, w).
-        seed: seed of torch's generator.
-
     Example:
         >>> first, second = shared_noise((2, 4, 8, 8), seed=0)
         >>> torch.equal(first, second)
@@ -194,10 +190,6 @@ def drawn(shape: Sequence[int], seed: int) -> Tensor:
 
     The draw runs on the CPU, so that every device starts from the same bits, and in float32 even
     if the process's default dtype is float64, which would draw other numbers.
-
-    Args:
-        shape: shape of the result.
-        seed: seed of torch's generator.
     """
     generator = torch.Generator().manual_seed(seed)
     return torch.randn(tuple(shape), generator=generator, dtype=torch.float32)
@@ -317,7 +309,6 @@ def tensor_of(images: Sequence[npt.NDArray[Any]], name: str, multiple: int) -> T
 
     Args:
         images: pictures, at least one, all of one size.
-        name: name of the argument, for errors.
         multiple: number that divides both sides.
 
     Raises:
@@ -370,13 +361,6 @@ def check_networks(
     hint: str = "",
 ) -> None:
     """Refuse networks whose configurations do not fit each other.
-
-    Args:
-        network: UNet or ControlNet.
-        text_encoder: text encoder of the same model.
-        channels: required number of input channels of the network.
-        name: name of the network, for the message.
-        hint: description of a network with this number of channels, for the message.
 
     Raises:
         ValueError: a different number of channels, texts of another size, or a model that needs

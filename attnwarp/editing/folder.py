@@ -78,11 +78,8 @@ def load_pipeline(
     """Load all parts of a pipeline with a flow: its networks, tokenizers, processor and scheduler.
 
     Args:
-        folder: folder in diffusers' format.
         networks: classes of diffusers or transformers by the name of the network's folder.
         optional: networks that may be missing; they become None, and their tokenizers.
-        device: device name.
-        dtype: dtype of the networks.
 
     Raises:
         InputError: the device is unknown, or files are missing (named), unreadable, or of another

@@ -86,10 +86,8 @@ def invert_view(
 
     Args:
         editor: model that draws the full picture, such as a depth ControlNet.
-        guide: guide of the view, as ``editor.task`` takes it.
         picture: (H, W, 3) picture of the view, in [0, 1].
         prompt: description of the picture; may be "".
-        steps: number of steps of the edit.
         seed: seed of the noise added to the latents if the schedule needs some, the same for all
             views.
 
@@ -154,14 +152,12 @@ def edit_friendly_invert(
 
     Args:
         schedule: schedule of the model, with any prediction type.
-        predict: function that returns the network's output.
         latents: (B, C, h, w) scaled latents of the picture.
         timesteps: timesteps, falling; omit the noisiest to skip them. The paper takes
             ``schedule.timesteps(100)[36:]`` of Stable Diffusion, text guidance 3.5 with a prompt
             for the picture, and 15 in the replay with a prompt for its edit.
         noises: (steps, B, C, h, w) white noise of the steps, in the order of ``timesteps``; drawn
             from ``seed`` if omitted.
-        seed: seed of the drawn noises.
 
     Raises:
         ValueError: the noises have a different shape.
@@ -200,15 +196,7 @@ def edit_friendly_invert(
 def noise_maps(
     editor: Editor, task: Task, picture: Image, timesteps: Sequence[Time], seed: int
 ) -> NoiseMaps:
-    """Compute noise maps of an external picture; its first state has the noise of all views.
-
-    Args:
-        editor: the model.
-        task: task of the picture's edit.
-        picture: external picture, (H, W, 3) in [0, 1].
-        timesteps: timesteps, falling.
-        seed: seed of :func:`attnwarp.editing.editor.shared_noise`.
-    """
+    """Compute noise maps of an external picture; its first state has the noise of all views."""
     latents = editor.encode([picture])
     noises = drawn((len(timesteps), *latents.shape), seed + 1)
     noises[0] = shared_noise((1, *latents.shape[1:]), seed)
@@ -227,8 +215,6 @@ def replay(
     The task of the inversion reproduces its picture; another prompt edits the picture.
 
     Args:
-        schedule: schedule used by the inversion.
-        predict: function that returns the network's output.
         noise: noise of :func:`edit_friendly_invert`.
         on_step: callback with the step, the number of steps and the latents, after each step.
     """

@@ -63,8 +63,6 @@ def stack_layers(
     """List the layers of a transformer from its configuration; no weights are needed.
 
     Args:
-        stacks: stacks of blocks.
-        config: configuration of the transformer.
         level: halvings from latents to tokens.
 
     Example:
@@ -214,8 +212,6 @@ class Joint(Coder):
         """Find the memory of an edit without weights: its networks run on torch's device "meta".
 
         Args:
-            folder: folder of the editor.
-            dtype: dtype of the networks.
             size: side of the square view in px; the model's own if omitted.
 
         Returns:
@@ -324,7 +320,6 @@ class Joint(Coder):
         """Encode words as arguments of the network, one row for each view.
 
         Args:
-            words: a prompt.
             pictures: (B, 3, H, W) pictures of the views in [0, 1], then each further reference.
         """
 
@@ -370,8 +365,6 @@ class Joint(Coder):
 
         Args:
             guides: (H, W, 3) pictures in [0, 1], or (1 + R, H, W, 3): a picture and R references.
-            prompt: the instruction.
-            regions: ignored.
         """
         self.check_text(prompt)
         stacks = [np.asarray(one)[None] if np.ndim(one) == 3 else np.asarray(one) for one in guides]
@@ -429,7 +422,6 @@ class JointTask:
     """Embedded instruction and encoded pictures of some views.
 
     Attributes:
-        editor: editor with the networks.
         shape: (B, C, h, w) of the latents.
         passes: passes of a step, in order.
         references: (B, N, C) tokens of reference pictures, if the network takes any.

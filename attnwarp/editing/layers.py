@@ -167,7 +167,6 @@ class BareUNet:
     """UNet of diffusers, used in a custom pipeline or loop.
 
     Args:
-        network: the UNet.
         branches: guidance branches in the order of its batch, such as :data:`PIX2PIX_BRANCHES`;
             ("text",) without guidance.
     """
@@ -192,11 +191,7 @@ def unet_call(branches: tuple[str, ...], args: Sequence[Any], kwargs: Mapping[st
 
 
 def all_layers(unet: torch.nn.Module) -> tuple[Layer, ...]:
-    """List all attention layers of a diffusers UNet, in the order of its processors.
-
-    Args:
-        unet: UNet with ``attn_processors`` and ``up_blocks``.
-    """
+    """List all attention layers of a diffusers UNet, in the order of its processors."""
     levels = len(list(unet.get_submodule("up_blocks").children()))
     layers = []
     for processor in unet.attn_processors:  # type: ignore[union-attr]
@@ -235,7 +230,6 @@ def choose_layers(
     """Select layers of an editor.
 
     Args:
-        layers: layers that the editor offers.
         kinds: kinds of features to choose; None for all outputs of attention.
         blocks: numbers of blocks, or names of ``sets``; None for all.
         sets: numbers of blocks by the name of their set.
@@ -277,8 +271,6 @@ def hooked(editor: Network, layers: Sequence[Layer], hook: Hook) -> Iterator[Non
     """Call ``hook(layer, features, call)`` on the image tokens of the layers while the block runs.
 
     Args:
-        editor: editor whose network is hooked.
-        layers: layers of that network.
         hook: function whose (batch, H W, C) result replaces the features; None keeps them.
             Gradients flow through.
 

@@ -132,9 +132,6 @@ def announced(
     is loaded.
 
     Args:
-        name_or_folder: name or folder of the editor.
-        dtype: dtype of the networks.
-        device: device name.
         size: side of a square view in px; the editor's own if omitted.
         recorded: (editor without weights, (h, w) of a view's latents) -> words on features.
 
@@ -170,10 +167,6 @@ def save_memory(editor: Editor, device: str) -> None:
     Each block of a network is moved to the device while it computes (diffusers' group offloading),
     and the autoencoder processes pictures beyond its training size in blended tiles. Attention is
     not sliced, since torch's attention takes less memory than slices do.
-
-    Args:
-        editor: editor whose networks are in main memory.
-        device: computing device, "cpu" or "cuda".
 
     Raises:
         InputError: the device is unknown.

@@ -106,9 +106,6 @@ class RecordingPlan:
 def in_words(plans: Sequence[RecordingPlan]) -> str:
     """Describe the recordings of one or several sources in a line, with their total memory.
 
-    Args:
-        plans: plans, at least one; the line states layers, branches and steps of the first.
-
     Example:
         >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
         >>> plan = RecordingPlan((layer,), (32, 32), ("text",), steps=20)

@@ -47,7 +47,6 @@ class Schedule(Protocol):
         """Compute falling times from pure noise.
 
         Args:
-            steps: number of steps.
             size: (h, w) of the latents; some models' steps depend on it.
 
         Raises:
@@ -67,7 +66,6 @@ class Schedule(Protocol):
         Args:
             start: Stable Diffusion's first timestep, in [0, 999].
             steps: number of steps.
-            grid: grid of the steps, :data:`Grid`.
 
         Raises:
             ValueError: the timestep is out of range, or has fewer timesteps below it than steps.
@@ -93,8 +91,6 @@ class Schedule(Protocol):
         """Take one deterministic step, in either direction.
 
         Args:
-            output: output of the network at ``x``.
-            x: latents at ``timestep``.
             timestep: time of ``x``; None for clean latents.
             following: target time; None for clean latents.
             clean: latents that replace the predicted clean ones; the noise is then the rest of
@@ -370,10 +366,6 @@ def widened(x: Tensor) -> Tensor:
 def steps_from(start: int, steps: int) -> list[int]:
     """Space ``steps`` timesteps evenly down from ``start``, as "trailing" does from the last.
 
-    Args:
-        start: first timestep, at least ``steps`` - 1.
-        steps: number of steps.
-
     Example:
         >>> steps_from(999, 4)
         [999, 749, 499, 249]
@@ -400,11 +392,6 @@ def stable_diffusion_alphas() -> Tensor:
 
 def published_steps(start: int, steps: int, grid: Grid = "even") -> list[int]:
     """Compute the Stable Diffusion timesteps at which an edit from ``start`` denoises.
-
-    Args:
-        start: timestep at which noise is added.
-        steps: number of steps.
-        grid: grid of the steps, :data:`Grid`.
 
     Raises:
         ValueError: fewer timesteps than steps.

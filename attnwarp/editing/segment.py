@@ -58,12 +58,7 @@ class Segmenter(Protocol):
 
 
 class NoDetectionError(InputError):
-    """Error for a picture in which a segmenter detects no object named by the words.
-
-    Args:
-        words: searched words.
-        view: name of the view, if any.
-    """
+    """Error for a picture in which a segmenter detects no object named by the words."""
 
     def __init__(self, words: str, view: str | None = None) -> None:
         place = "the picture" if view is None else f"view {view}"
@@ -77,11 +72,6 @@ def segments_of(
     segmenter: Segmenter, words: str, names: Sequence[str]
 ) -> Callable[[int, Image], Mask]:
     """Return a function from a view's number and picture to its mask, as methods take it.
-
-    Args:
-        segmenter: finder of the words, see :class:`Segmenter`.
-        words: words that name the edited part.
-        names: names of the views, for errors.
 
     Raises:
         NoDetectionError: raised by the function; the message names the words and the view.
@@ -109,7 +99,6 @@ def load_segmenter(name: str, *, device: str = "cpu") -> Segmenter:
 
     Args:
         name: "clip-parts", or "DINO_FOLDER,SAM_FOLDER" of transformers' models.
-        device: "cpu" or "cuda", for the models in folders.
 
     Raises:
         InputError: the segmenter is unknown, or files are missing; the message names them.
@@ -151,10 +140,6 @@ class GroundedSam:
     """Segmenter that outlines Grounding DINO's boxes with SAM and unites each box's best mask.
 
     Args:
-        detector: transformers' ``GroundingDinoForObjectDetection``.
-        detector_processor: processor of the detector.
-        sam: transformers' ``SamModel``.
-        sam_processor: processor of SAM.
         box_threshold: lower bound of a box's best score, in [0, 1].
         text_threshold: lower bound of the scores that label a box, in [0, 1]. A box labelled by no
             word of the text, only by punctuation, is dropped.
@@ -184,8 +169,6 @@ class GroundedSam:
                 preprocessor_config.json, and tokenizer.json or vocab.txt.
             sam: folder such as facebook/sam-vit-base: config.json, model.safetensors and
                 preprocessor_config.json.
-            device: "cpu" or "cuda".
-            thresholds: ``box_threshold``, ``text_threshold``.
 
         Raises:
             InputError: files are missing (named) or unreadable.
@@ -316,7 +299,6 @@ class ClipSegmenter:
     with exact masks is in reports/editor/segments.md. Inspect the masks before using them.
 
     Args:
-        encoder: encoder of regions and words; see :func:`attnwarp.encoders.load_encoder`.
         sides: short sides, in px, of the sizes at which the picture is scored.
         likely: lower bound of the probability of initial foreground pixels.
         background: probability below which a pixel never joins the mask.
@@ -363,12 +345,7 @@ class ClipSegmenter:
         return mask
 
     def relevance(self, image: Image, words: str) -> npt.NDArray[np.float64]:
-        """Estimate the probability that the words describe each pixel, (H, W) in [0, 1].
-
-        Args:
-            image: (H, W, 3) sRGB, floating, in [0, 1].
-            words: words as in :meth:`segment`.
-        """
+        """Estimate the probability that the words describe each pixel, (H, W) in [0, 1]."""
         import cv2
 
         picture: Image = checked_image(image)
@@ -449,7 +426,6 @@ def cut_out(
     of the next smaller and next larger radius. Boxes are more reliable.
 
     Args:
-        image: (H, W, 3) sRGB, floating, in [0, 1].
         box: x0, y0, x1, y1 in px around the object; everything outside is background.
         at: x, y in px of a point on the object, ideally its middle.
 
@@ -500,10 +476,6 @@ def cut_out(
 def snap(image: Image, region: Mask) -> Mask:
     """Move a region's outline to edges of colour near it, by OpenCV's grabCut, (H, W) bool.
 
-    Args:
-        image: (H, W, 3) sRGB, floating, in [0, 1].
-        region: (H, W) bool.
-
     Example:
         >>> import numpy as np
         >>> from attnwarp.editing.segment import snap
@@ -536,10 +508,6 @@ def check_marks(
     at: Sequence[float] | None = None,
 ) -> None:
     """Refuse a box or a point outside a picture, and a box without area.
-
-    Args:
-        width, height: width and height of the picture, px.
-        box, at: marks, see :func:`cut_out`.
 
     Raises:
         InputError: a mark is outside the picture, or the box has no area.

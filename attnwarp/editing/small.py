@@ -121,8 +121,6 @@ def check_words(name: str, text: str, *, anyway: bool = False) -> None:
     bundled editor was not trained on.
 
     Args:
-        name: name of the editor, as :func:`load_editor` takes it.
-        text: the instruction.
         anyway: True accepts an instruction without a word of :data:`LOOKS`, as for an editor
             guided by depth, whose text describes the edited scene.
 
@@ -172,9 +170,6 @@ def _words(text: str) -> list[str]:
 def guide_of(name_or_folder: str) -> Guide:
     """Determine the guide of an editor without loading it.
 
-    Args:
-        name_or_folder: name or folder of the editor, as :func:`load_editor` takes it.
-
     Raises:
         InputError: the editor or folder does not exist.
 
@@ -207,8 +202,6 @@ def dtype_of(name: str, device: str, name_or_folder: str) -> torch.dtype:
 
     Args:
         name: name of the precision; "auto" is on a GPU the half precision that the editor stands.
-        device: device name.
-        name_or_folder: name or folder of the editor.
     """
     return type_of(name, device, _kind_named(name_or_folder).half)
 
@@ -245,9 +238,6 @@ def kind_of(folder: Path) -> Any:
 
 def folders_of(name_or_folder: str) -> tuple[Path, Path | None]:
     """Find the folders of an editor and of its ControlNet (None for a picture-guided editor).
-
-    Args:
-        name_or_folder: name or folder of the editor, as :func:`load_editor` takes it.
 
     Raises:
         InputError: the editor or folder does not exist.

@@ -66,15 +66,7 @@ class EditUNet(UNet2DConditionModel):
         self, sample: Tensor, timestep: Any, encoder_hidden_states: Tensor, *args: Any,
         return_dict: bool = True, **more: Any,
     ) -> Any:  # fmt: skip
-        """Run the base class with the source's latents (the second half of ``sample``) added.
-
-        Args:
-            sample: (B, 2C, h, w) noisy latents and latents of the source.
-            timestep: timestep of the noisy latents.
-            encoder_hidden_states: (B, L, D) tokens of the text.
-            args, more: arguments of the base class.
-            return_dict: True returns an output object, False a tuple.
-        """
+        """Run the base class with the source's latents (the second half of ``sample``) added."""
         noisy, before = sample.split(self.config.out_channels, dim=1)
         if self.draw is not None:
             mean = self._pooled(noisy)

@@ -38,14 +38,7 @@ float32 gradient can still bring it back.
 
 
 def adam_step(tensor: Tensor, first: Tensor, second: Tensor, steps: int, rate: float) -> None:
-    """Take one Adam step along a leaf's gradient, in place, then clear the gradient.
-
-    Args:
-        tensor: leaf with a gradient.
-        first, second: Adam's moments, updated.
-        steps: steps done.
-        rate: learning rate.
-    """
+    """Take one Adam step along a leaf's gradient, in place, then clear the gradient."""
     assert tensor.grad is not None
     adam(
         [tensor.detach()],

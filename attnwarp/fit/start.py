@@ -175,10 +175,6 @@ def within_reach(points: Array, cameras: Sequence[Camera]) -> npt.NDArray[np.boo
     The usual distance is :func:`usual_distance`. Non-finite points stay, so that a later check
     refuses them.
 
-    Args:
-        points: (P, 3) world coordinates.
-        cameras: cameras that see the points, at least one.
-
     Example:
         >>> import numpy as np
         >>> from attnwarp import Camera
@@ -195,10 +191,6 @@ def within_reach(points: Array, cameras: Sequence[Camera]) -> npt.NDArray[np.boo
 
 def usual_distance(points: Array, cameras: Sequence[Camera]) -> float:
     """Median distance of points from the cameras' mean, or the scene's extent if larger.
-
-    Args:
-        points: (P, 3) world coordinates.
-        cameras: cameras that see the points, at least one.
 
     Example:
         >>> import numpy as np

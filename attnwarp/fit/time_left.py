@@ -19,11 +19,6 @@ class TimeLeft:
 
     An iteration's work is the sum of its splats' and its pixels' work. The estimate assumes that
     refinements keep adding as many splats as before.
-
-    Args:
-        settings: settings of the fit.
-        first: number of the first splats.
-        pixels: number of pixels of a picture.
     """
 
     def __init__(self, settings: FitSettings, first: int, pixels: int) -> None:

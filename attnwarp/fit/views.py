@@ -409,12 +409,7 @@ def twins(
     held_out_keys: Sequence[Collection[Hashable]],
 ) -> dict[int, int]:
     """Find held-out views that are also fitted on, and their fitted twins: views with a common key
-    or at the same pose.
-
-    Args:
-        fitted, held_out: cameras of each part.
-        fitted_keys, held_out_keys: keys that identify the pictures.
-    """
+    or at the same pose."""
     of_key = {key: j for j, keys in enumerate(fitted_keys) for key in keys}
     both = [*fitted, *held_out]
     centers = np.array([camera.position for camera in both])

@@ -131,13 +131,7 @@ class Dataset:
 
 def nearest_rotation(path: Path, name: str, R: Array) -> Array:
     """Return ``R`` if it is a rotation to 1e-12, or the nearest rotation (by SVD) if to 1e-4; raise
-    an error with the deviation otherwise.
-
-    Args:
-        path: file of ``R``, for the error.
-        name: name of the field in the file.
-        R: (3, 3) matrix.
-    """
+    an error with the deviation otherwise."""
     with np.errstate(over="ignore", invalid="ignore"):
         error = float(np.abs(R @ R.T - np.eye(3)).max())
     if not error <= ROTATION_TOLERANCE:
@@ -176,7 +170,6 @@ def with_images(
     """Check that each camera's image exists and has the camera's size.
 
     Args:
-        source: source of the cameras, for messages.
         cameras, paths: cameras and paths, one path for each camera.
         missing_images, resize_cameras: see :func:`attnwarp.io.read_dataset`.
         finder: file finder in the root folder of the images' names.

@@ -54,26 +54,13 @@ def is_file(path: Path) -> bool:
 
 
 def check_other(out: Path, source: Path, what: str) -> None:
-    """Refuse to overwrite an input.
-
-    Args:
-        out: path of a result.
-        source: path of the input.
-        what: description of the source, for the message.
-
-    Raises:
-        InputError: both are the same file or folder, under any name or by a link.
-    """
+    """Refuse to overwrite an input."""
     if out.exists() and source.exists() and out.samefile(source):
         raise InputError(f"{out}: is {what}; choose another name for the result")
 
 
 def inside(folder: Path, name: str | os.PathLike[str]) -> Path:
     """Return the path of an untrusted name in a folder.
-
-    Args:
-        folder: folder that the path must not leave.
-        name: relative path from the folder.
 
     Raises:
         InputError: the path leaves the folder, by ``..``, as an absolute path or by a link.

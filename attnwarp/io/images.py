@@ -265,11 +265,6 @@ def _with_pillow(path: Path, use: Callable[[Any], Any], data: bytes | None = Non
     """Open a picture with Pillow and return ``use`` of it; an error message has one line.
 
     Formats unknown to Pillow, such as TIFF of 16 bits and three channels, return None.
-
-    Args:
-        path: path of the picture.
-        use: function of the opened picture.
-        data: bytes that replace the file's, if given.
     """
     from PIL import Image, UnidentifiedImageError
 

@@ -19,10 +19,6 @@ WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EBADF, errno.EINVAL)
 def locked(path: Path, *, wait: bool) -> Iterator[None]:
     """Hold a lock file, creating it if missing.
 
-    Args:
-        path: path of the file, in an existing folder.
-        wait: True waits until the current holder releases the lock.
-
     Raises:
         BlockingIOError: another process holds the lock, and ``wait`` is False.
         OSError: the file cannot be written.

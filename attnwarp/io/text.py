@@ -19,14 +19,6 @@ _LINE_ENDS = re.compile(rb"\r\n|\n|\r")
 def read_text(path: Path, errors: str = "strict") -> str:
     """Read a text file, in UTF-8 or with a byte order mark, with line ends ``\\n``.
 
-    Args:
-        path: path of the file.
-        errors: treatment of invalid UTF-8, as for :meth:`bytes.decode`.
-
-    Raises:
-        OSError: the file is unreadable.
-        UnicodeDecodeError: a byte is not text.
-
     Example:
         >>> from pathlib import Path
         >>> written = Path("a.txt").write_bytes("a\\r\\nb\\rc".encode("utf-16"))
@@ -73,10 +65,6 @@ def plain_ply(data: bytes) -> bytes:
 def overstated(lines: list[bytes], size: int) -> tuple[str, str] | None:
     """Find the first element for which a PLY header announces more rows than the file has bytes,
     and its announced number; None without one. Readers allocate memory for announced rows.
-
-    Args:
-        lines: lines of the header.
-        size: size of the file, in bytes.
 
     Example:
         >>> overstated([b"ply", b"element vertex 8", b"element face 200000000"], 300)

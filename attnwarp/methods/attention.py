@@ -17,13 +17,7 @@ Rule = Callable[[str, Tensor, Attend], Tensor]
 
 @contextmanager
 def self_attention(network: Any, rule: Rule) -> Iterator[None]:
-    """Compute every self-attention of a network by a rule while the block runs.
-
-    Args:
-        network: a diffusers UNet or ControlNet.
-        rule: function of the layer's arguments; the first is the layer's name, such as
-            ``up_blocks.3.attentions.2.transformer_blocks.0.attn1``.
-    """
+    """Compute every self-attention of a network by a rule while the block runs."""
     before = dict(network.attn_processors)
     replaced = {
         name: _Ruled(name.removesuffix(".processor"), processor, rule)
@@ -68,10 +62,6 @@ class _Ruled:
 def joint(tokens: Tensor, branches: int) -> Tensor:
     """Return (branches V, V L, C): for each picture the tokens of all pictures of its branch.
 
-    Args:
-        tokens: (branches V, L, C), branch by branch.
-        branches: number of guidance branches.
-
     Example:
         >>> import torch
         >>> joint(torch.arange(6.0).reshape(6, 1, 1), branches=2)[[0, 2, 3], :, 0].int().tolist()
@@ -92,7 +82,6 @@ def aligned(references: int, self_share: float, branches: int) -> Rule:
     Args:
         references: R, the number of reference views.
         self_share: s in [0, 1], the weight of the view's self-attention.
-        branches: number of guidance branches.
     """
 
     def rule(name: str, tokens: Tensor, attend: Attend) -> Tensor:

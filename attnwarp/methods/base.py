@@ -203,10 +203,7 @@ class Loop(Protocol):
         """Edit views together.
 
         Args:
-            number: number of the round, from 0.
-            views: numbers of the views.
             edit: function that makes the edits; not called for edits already in the folder.
-            rows: rows through the UNet for the edit.
         """
         ...
 
@@ -216,10 +213,7 @@ class Loop(Protocol):
         """Tune the splats on edited views.
 
         Args:
-            number: number of the round, from 0.
             views: numbers of the views to tune on; views without an edit are left out.
-            iterations: number of iterations, one view each.
-            order: see :meth:`attnwarp.methods.tuning.Tuning.advance`.
         """
         ...
 
@@ -257,7 +251,6 @@ class Plan:
     """Loop that records a method's calls without executing them.
 
     Attributes:
-        rounds: number of rounds of the method.
         calls: list of edits and tunings, each with its round, views, and rows or iterations.
     """
 
@@ -300,13 +293,7 @@ def run(
     settings: MethodSettings | None,
     **options: Unpack[Options],
 ) -> Result:
-    """Run a method; the other arguments are those of :func:`attnwarp.methods.by_view`.
-
-    Args:
-        name: name of the method.
-        make: constructor of the method, from the work and the settings.
-        kind: class of the settings.
-    """
+    """Run a method; the other arguments are those of :func:`attnwarp.methods.by_view`."""
     for option in options:
         check.one_of(option, list(Options.__annotations__), "option")
     chosen = kind() if settings is None else settings

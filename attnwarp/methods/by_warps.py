@@ -22,8 +22,6 @@ class ByWarps(Method):
     """Method with warps between its views.
 
     Args:
-        work: the scene and the editor.
-        settings: settings with the warp's.
         warps: external warps, such as from exact depth; None uses the splats' depth.
         sources, targets: numbers of the views that external warps lead from and to; None for all.
     """
@@ -84,9 +82,5 @@ class ByWarps(Method):
 
 
 def checked_source(source: int, work: Work) -> int:
-    """Return the number of a source view.
-
-    Raises:
-        ValueError: no such view.
-    """
+    """Return the number of a source view."""
     return int(check.number(source, 0, len(work.sizes) - 1, "source", whole=True))

@@ -19,9 +19,6 @@ def carry(
     """Blend the sources' warped (C, h', w') maps into a target's (C, h, w) map.
 
     Args:
-        own: (C, h, w) map of the target.
-        maps: maps of the sources.
-        warps: warps from the sources.
         weight: weight of the sources' maps, in [0, 1].
     """
     tokens = own.flatten(1).T[None].contiguous()
@@ -36,9 +33,6 @@ def carry(
 class Noise:
     """Initial noise of views: shared by all views of a size, fresh for each view, or attached to
     the surface.
-
-    Args:
-        settings: settings with the kind of noise and the seed.
 
     Attributes:
         orders: (h, w) order of each source's noise, if noise sticks to the surface.

@@ -35,12 +35,7 @@ def change_of(
 
     Args:
         work: the scene before the edit, and the folder of its renders.
-        names: file names of the views.
         source: name of the source view, excluded from the scene's change; None for no source.
-        edited: edited views by their numbers.
-
-    Returns:
-        The change of renders from before the edit to after, and of the source's picture.
     """
     segments = work.scene.segments
 
@@ -76,8 +71,6 @@ def drift_of(work: Work, view: int, picture: Image) -> dict[str, Any] | None:
     """Measure how far an editor moved what lies outside the mask.
 
     Args:
-        work: the scene before the edit.
-        view: number of the view.
         picture: (h, w, 3) its edit, before it is composed with the original outside the mask.
 
     Returns:
@@ -94,9 +87,6 @@ def drift_of(work: Work, view: int, picture: Image) -> dict[str, Any] | None:
 
 def say_drift(edit: Mapping[str, Any]) -> tuple[str, bool]:
     """Write a line about the drift of an edit, and whether it warns.
-
-    Args:
-        edit: "view", and its "drift" as of :func:`drift_of`.
 
     Example:
         >>> say_drift({"view": "bear", "drift": None})

@@ -64,13 +64,7 @@ MOST_NAMES = 5
 @dataclass(frozen=True)
 class FitPlan:
     """Settings of the fit before an edit. ``reports/editing/time.md`` has the defaults' duration,
-    and the gain from half and twice as much time.
-
-    Args:
-        iterations: iterations of the fit.
-        kind: "2d" or "3d".
-        max_splats: largest number of splats.
-    """
+    and the gain from half and twice as much time."""
 
     iterations: int = 3_000
     kind: str = "2d"
@@ -82,17 +76,12 @@ class EditOptions:
     """Options of an edit by any method.
 
     Args:
-        marks: marks of the edited parts.
-        tune_outside: True also tunes splats that are not marked.
         source: name or number of the marked source view; None takes the first view, of the split
             "train" if the dataset has one.
         max_size: longest side in px; larger pictures are averaged down to it.
         device: device of the editor and the splats, "auto", "cpu" or "cuda".
         dtype: dtype of the editor; see :func:`attnwarp.devices.type_of`.
-        low_memory: see :func:`attnwarp.editing.memory.save_memory`.
-        threads: torch threads; None takes all cores.
         control: True also edits each of the page's views alone; None does so with a bundled editor.
-        turntable: file of the turntable film, GIF or MP4.
     """
 
     marks: Marks
@@ -128,18 +117,12 @@ def edit_dataset(
 
     Args:
         method: key of :data:`attnwarp.methods.METHODS`.
-        dataset: cameras and pictures.
         splats: the scene before the edit; None fits it first.
         editor_name: name or path, see :func:`attnwarp.editing.small.load_editor`.
-        instruction: instruction in words.
         settings: settings of the method. A missing size becomes the editor's default.
         out: folder of all results, including a PLY for other viewers.
-        options: options of the edit.
-        fit_plan: plan of the fit, if splats are None.
         source_picture: file of the source view edited elsewhere, for attention warping.
-        notes: warnings about the inputs, for the page.
         origin: sentence on the origin of the inputs, for the page.
-        report: receiver of progress.
         own: additional options of the method, such as "budget".
 
     Returns:
@@ -335,7 +318,6 @@ def check_asked(
 
     Args:
         method, instruction, settings, out, options: see :func:`edit_dataset`.
-        budget: budget of the method.
         asked: further options that decide the result, by name, as typed.
 
     Raises:
@@ -362,11 +344,7 @@ def check_asked(
 
 
 def check_marked(options: EditOptions, dataset: Dataset) -> None:
-    """Refuse an unknown source view, and marks outside its picture.
-
-    Raises:
-        InputError: the source view is unknown, or a mark lies outside its picture.
-    """
+    """Refuse an unknown source view, and marks outside its picture."""
     index, marks = view_of(dataset, options.source), options.marks
     camera = _with_picture(dataset)[index]
     check_marks(camera.width, camera.height, box=marks.box, at=marks.at)
@@ -391,11 +369,6 @@ def view_of(dataset: Dataset, name: str | None) -> int:
 
 def number_of(names: Sequence[str], name: str, left_out: Sequence[str] = ()) -> int:
     """Find the number of a view by its name, its file's name (suffix optional), or its number.
-
-    Args:
-        names: names of the views.
-        name: name as typed.
-        left_out: names of views whose picture is missing.
 
     Raises:
         InputError: no view has this name.

@@ -141,10 +141,7 @@ def mixing(
     """Mix the tokens that show one point in all views of a batch while the block runs.
 
     Args:
-        editor: editor whose network is hooked.
-        layers: layers whose features are mixed.
         views: number of views of a batch, in each branch.
-        latent_size: (h, w) of the latents.
         warps: function of a source's and a target's place in the batch that returns their warp.
     """
     sizes = {layer.size(latent_size) for layer in layers}

@@ -153,10 +153,6 @@ def by_angle(cameras: Sequence[Camera], views: Sequence[int]) -> list[int]:
 
     Angles cover the full circle and increase toward that camera's nearest neighbour.
 
-    Args:
-        cameras: all cameras.
-        views: numbers of the views to sort.
-
     Example:
         >>> import math
         >>> from attnwarp import Camera

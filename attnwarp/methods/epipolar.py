@@ -15,7 +15,6 @@ def line_distances(view: Camera, key: Camera, size: Size) -> Tensor | None:
     each cell of ``view``; None if both cameras share one centre, so that no line exists.
 
     Args:
-        view, key: cameras.
         size: (h, w) of both grids, L = h w. Cell centres are at +0.5.
 
     Example:

@@ -18,8 +18,6 @@ class Features:
     """Selection of the features to record.
 
     Args:
-        editor: the model.
-        settings: settings of the recording.
         store: "device", "cpu", or a folder.
 
     Attributes:
@@ -50,13 +48,7 @@ class Features:
         return s.guidance(0) if own is None else own
 
     def plan(self, view: int, size: Size, *, further: bool) -> RecordingPlan:
-        """Plan the recording of a source.
-
-        Args:
-            view: number of the source view.
-            size: (h, w) of the view's latents.
-            further: True for a source after the first.
-        """
+        """Plan the recording of a source."""
         s = self.settings
         branches = self.branches(self.source_guidance(further=further))
         return RecordingPlan(
@@ -101,10 +93,6 @@ class Features:
 
     def check_batches(self, stages: Sequence[int], *, further: bool) -> None:
         """Refuse, before any work, source branches that a later batch lacks.
-
-        Args:
-            stages: numbers of the stages that edit views, from 0.
-            further: True if there are several sources.
 
         Raises:
             ValueError: a batch uses none of the recorded branches, or cannot record all branches

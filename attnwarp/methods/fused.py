@@ -216,7 +216,6 @@ def guided_by(
     Args:
         editor: editor; its image guidance is s_S + s_M.
         fusion, picture: (h, w, 3) F and I.
-        words: the instruction.
         regions: (H, W) edited region; None for all.
         share: s_M as a part of the image guidance.
     """

@@ -28,8 +28,6 @@ class Geometry:
     """Warps along the scene's geometry.
 
     Args:
-        work: the scene.
-        settings: settings of the scene's edit.
         warps: external warps, such as from exact depth; None uses the splats' depth.
     """
 
@@ -140,10 +138,7 @@ def choose_chain(
     that share, the view of the largest share is next. The first of equal views is chosen.
 
     Args:
-        views: number of views.
-        source: number of the first source.
         count: number of sources, the first included; fewer if there are fewer views.
-        coverage: least share of the surface that the sources so far must see.
         seen: function of a source and a target that returns two (H, W) bool masks: target pixels
             that the source sees, and target pixels that show surface.
 

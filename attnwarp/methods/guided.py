@@ -195,11 +195,7 @@ def guided_step(
     is Polyak's step, which ends where a linear loss is 0.
 
     Args:
-        schedule: noise schedule.
-        predict: network's output for latents at a time.
-        loss: function of clean latents.
         x: (B, C, h, w) latents at ``now``.
-        now, then: times of the step.
         forward: s; 0 takes no gradient of the network.
         backward: number of steps of the clean latents.
         rate: share of a step of the clean latents that is taken.

@@ -99,11 +99,6 @@ class Marks:
 def numbers(text: str | None, names: str, option: str) -> tuple[float, ...] | None:
     """Parse the numbers of an option such as ``--at 64,68``.
 
-    Args:
-        text: text as typed, or None.
-        names: names of the numbers, "X,Y".
-        option: name of the option, for the error.
-
     Raises:
         InputError: the text has a different count of numbers, or none.
 
@@ -135,8 +130,6 @@ def picture_mask(marks: Marks, image: npt.NDArray[Any], size: tuple[int, int]) -
     """Segment a picture by a box or a point, (H, W) bool.
 
     Args:
-        marks: marks with ``box`` or ``at``.
-        image: (H, W, 3) sRGB.
         size: width and height, in px, of the file that the marks refer to.
 
     Raises:
@@ -167,14 +160,7 @@ def source_mask(
     """Compute the mask of the marked source view, (H, W) bool.
 
     Args:
-        marks: marks of the source.
-        camera: camera of the source view.
-        image: (H, W, 3) picture of the source view.
-        picture: file of the picture.
         size: width and height, in px, of the file that coordinates refer to.
-        out: folder of the edit, which stores masks found by words.
-        device: device of a segmenter.
-        report: receiver of the result.
         piece: (H, W) bool surface around a point, :func:`attnwarp.warp.piece_around`; all True if
             unknown, and colours alone decide.
 
@@ -200,13 +186,6 @@ def mask_by_words(
 ) -> Mask:
     """Mask a view by words, (H, W) bool, cached in the folder ``words``, since a network may take a
     minute and GPUs may differ in bits. Words, segmenter and picture determine the cache file.
-
-    Args:
-        marks: marks with ``words``.
-        camera: camera of the view.
-        image: (H, W, 3) picture of the view.
-        out: folder of the edit.
-        device: device of a segmenter.
 
     Raises:
         NoDetectionError: the view shows no object named by the words.
@@ -258,7 +237,6 @@ def check_middle(marks: Marks, mask: Mask, scale: float, lifted: Segment) -> Non
     """Refuse a lifted mask that leaves out the middle of the object marked in the source.
 
     Args:
-        marks: marks of the source.
         mask: (H, W) mask of the marked source view.
         scale: px of the view per px of its file, the unit of the marks.
         lifted: (H, W) lifted mask of the source view, in [0, 1].
@@ -293,8 +271,6 @@ def read_mask(
     """Read a mask, (H, W) bool: True for white and opaque pixels.
 
     Args:
-        path: path of the mask.
-        camera: camera of the mask's view.
         beside: picture of the view; see :func:`attnwarp.io.read_upright`.
         option: name of the option, for errors.
 

@@ -52,11 +52,6 @@ def nearest_keys(view: Camera, keys: Sequence[Camera], count: int) -> list[tuple
 
     Of cameras at distances d1 <= d2 the first weighs sigmoid(d2 / (d1 + d2)), the other the rest.
 
-    Args:
-        view: camera of the view.
-        keys: key cameras, at least one.
-        count: number of key cameras, 1 or 2.
-
     Example:
         >>> from attnwarp import Camera
         >>> size = dict(width=8, height=8, fov_y=60, up=(0, 1, 0))
@@ -79,7 +74,6 @@ class KeyViews:
     """Tokens of the key views at one step, by layer, and their use by other views.
 
     Args:
-        branches: guidance branches, in the order of the batch.
         layers: (h, w) of each self-attention layer, by name.
         epipolar: distance in cells beyond which a match is excluded; None excludes none.
     """
@@ -109,8 +103,6 @@ class KeyViews:
         """Let views passed through the network use the key views' tokens while the block runs.
 
         Args:
-            views: cameras of the pictures of the batch.
-            keys: cameras of the key pass.
             nearest: number of key views that each view takes tokens from, 1 or 2.
         """
         self._pass = _ViewPass(
@@ -179,14 +171,7 @@ def key_views(
     unet: Any, branches: tuple[str, ...], latent_size: Size, epipolar: float | None
 ) -> Iterator[KeyViews]:
     """Replace a UNet's self-attention while the block runs; outside of key passes and view passes
-    it is unchanged.
-
-    Args:
-        unet: a diffusers UNet.
-        branches: guidance branches, in the order of the batch.
-        latent_size: (h, w) of the latents.
-        epipolar: distance limit of matches, see :class:`KeyViews`.
-    """
+    it is unchanged."""
     layers = {layer.name: layer.size(latent_size) for layer in all_layers(unet)}
     keys = KeyViews(branches, layers, epipolar)
     with self_attention(unet, keys.rule):

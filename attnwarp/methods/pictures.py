@@ -48,8 +48,6 @@ def check_view_aspect(size: Size, camera: Camera, name: str) -> None:
     Args:
         size: (h, w) of the picture: the view's aspect ratio, up to an editor's rounding of the
             sides to multiples.
-        camera: camera of the view.
-        name: name of the argument.
 
     Raises:
         ValueError: the aspect ratio differs.
@@ -75,10 +73,6 @@ def enlarged_change(original: Image, edited: Image) -> Image:
     """Add the change of an edit of another size to the full-size picture.
 
     The change is enlarged linearly, or averaged if the edit is larger than the picture.
-
-    Args:
-        original: (H, W, 3) in [0, 1].
-        edited: (h, w, 3) in [0, 1].
 
     Example:
         >>> original = np.full((8, 8, 3), 0.5, np.float32)
@@ -132,10 +126,7 @@ def full_size(
     in pixels that :func:`composite` left black.
 
     Args:
-        original: (H, W, 3) in [0, 1].
-        edited: (h, w, 3) in [0, 1], from :func:`composite`.
         segment: (H, W) bool or in [0, 1]; None if all is edited.
-        how, blur: arguments of :func:`composite`.
     """
     picture = enlarged_change(original, edited)
     if segment is None or how == "none" or edited.shape == original.shape:
@@ -217,11 +208,7 @@ class Principal:
 
 
 class FeaturePictures:
-    """Recorded features of one layer as colours, half-way through the recorded steps.
-
-    Args:
-        first: recording of the first source, which defines the colours.
-    """
+    """Recorded features of one layer as colours, half-way through the recorded steps."""
 
     def __init__(self, first: Recording) -> None:
         self._principal = Principal(self._of(first)[1])

@@ -32,7 +32,6 @@ class Scene:
     """Views before the edit.
 
     Attributes:
-        cameras: cameras, one for each view.
         images: (H, W, 3) sRGB, uint8, uint16 or float32 in [0, 1]. Photographs keep their type in
             memory; :meth:`picture` converts one.
         segments: (H, W) bool, or float32 in [0, 1] with soft edges; None if everything is edited.
@@ -133,12 +132,7 @@ def images_of(views: Views) -> list[npt.NDArray[Any]]:
 
 
 def check_cameras(cameras: Any) -> list[Camera]:
-    """Return the cameras as a list.
-
-    Raises:
-        TypeError: the argument is no sequence of cameras.
-        ValueError: the sequence is empty.
-    """
+    """Return the cameras as a list."""
     if isinstance(cameras, Camera) or not isinstance(cameras, Iterable):
         raise TypeError(f"cameras: got {type(cameras).__name__}, expected a list of cameras")
     listed = list(cameras)

@@ -25,9 +25,6 @@ def pixel_ratio(view: WarpedView) -> Tensor:
     the unit normal n; the ratio of two cameras is the determinant of the Jacobian of the plane's
     homography. Below 1 the source is foreshortened against the target, or farther away.
 
-    Args:
-        view: warp with the target's normals.
-
     Raises:
         ValueError: the target has no normals.
 
@@ -131,8 +128,6 @@ class SourceWarp:
     :class:`attnwarp.editing.injection.LayerWarp`.
 
     Args:
-        sight: visibility: which source each target pixel uses.
-        number: number of the source.
         picture: True warps the source's picture, False its features.
     """
 
@@ -157,7 +152,6 @@ class LayerOfSource:
     """Warp of a layer from one source.
 
     Args:
-        warp: warp of the layer, with the mask.
         zeros: True surrounds the source's features with zeros, as zero padding does: a tap beyond
             the border counts 0, so the border's value returned by the warp is multiplied by the
             weight of the taps inside.

@@ -59,11 +59,6 @@ def perceptual_net(
 ) -> PerceptualLoss | None:
     """Load the settings' perceptual distance on a device; None if no iteration uses it.
 
-    Args:
-        settings: settings that name the distance.
-        device: device of the distance's network.
-        load: loader, called like :func:`attnwarp.encoders.load_encoder`.
-
     Raises:
         InputError: the encoder is unknown or of another kind.
     """
@@ -74,13 +69,7 @@ def perceptual_net(
 
 @dataclass(frozen=True, eq=False)
 class TrainingView:
-    """View to tune on.
-
-    Attributes:
-        number: number of the view.
-        camera: camera at the size of the picture.
-        picture: (H, W, 3) in [0, 1].
-    """
+    """View to tune on."""
 
     number: int
     camera: Camera
@@ -115,7 +104,6 @@ class DistanceToViews:
     views that fit. An iteration on a kept view needs a third less of the network.
 
     Args:
-        perceptual: the distance.
         kept_bytes: limit on the bytes of kept features.
         scaled: False feeds pictures in [0, 1] as if they were in [-1, 1].
     """
@@ -149,18 +137,12 @@ class Tuning:
     """Splats, their optimiser and its progress, shared by all rounds.
 
     Args:
-        start: the splats before the edit.
         cameras: cameras of all views, which determine the scene's extent.
-        settings: losses, rates, background, seed.
         iterations: total number of iterations, over which the centres' learning rate falls.
-        backend: name of the renderer.
         membership: (N,) in [0, 1], factor of each splat's steps; None for 1. A splat with factor 0
             keeps its bytes.
-        load: loader of the perceptual distance, see :func:`perceptual_net`.
 
     Attributes:
-        iteration: iterations done, over all rounds.
-        loss: loss of the last iteration.
         visits: number of iterations on each view, by the view's number.
         weights: SHA-256 of each loss network's weights, by the loss.
 
@@ -234,10 +216,8 @@ class Tuning:
 
         Args:
             begin, end: first iteration of the round, and the one after its last.
-            views: views to tune on.
             order: order of the views; None takes each once before any comes again, at random.
             spent: function that returns True once no further iteration may begin.
-            step: callback after each iteration.
         """
         if self.iteration == begin:
             self.queue = []  # the previous round had different views
@@ -322,12 +302,7 @@ class Tuning:
                 tensor.copy_(torch.lerp(before[name], tensor, share))
 
     def loss_of(self, picture: Render, view: TrainingView) -> Tensor:
-        """Compute the weighted sum of the losses.
-
-        Args:
-            picture: the render.
-            view: view with the target picture.
-        """
+        """Compute the weighted sum of the losses."""
         s = self.settings
         image = picture.color.float()
         target = view.on(image.device)

@@ -26,12 +26,7 @@ Unseen = Callable[[Size], Tensor]
 
 
 def unseen_of(sight: Sight, segment: npt.NDArray[Any]) -> Unseen:
-    """Mark the tokens of a target that no warp reaches, inside its segment.
-
-    Args:
-        sight: visibility of the target from its sources.
-        segment: (H, W) marked part of the target, in [0, 1].
-    """
+    """Mark the tokens of a target that no warp reaches, inside its segment."""
 
     def share(size: Size) -> Tensor:
         reached = torch.stack([sight.mask_at(k, size) for k in range(len(sight.views))]).any(dim=0)
@@ -58,10 +53,7 @@ def kept_tokens(
     """Keep the inputs of a network's self-attention while the block runs; outputs are unchanged.
 
     Args:
-        network: a diffusers UNet that denoises one view.
-        layers: layers to keep; those of cross-attention are ignored.
         dtype: precision of the kept tokens, which are in main memory.
-        passes: numbers of the passes to keep, from 0.
     """
     names = {layer.name for layer in layers}
     kept, done = SourceTokens(), dict.fromkeys(names, 0)
@@ -90,14 +82,6 @@ def attending(
     """Let unseen tokens of views attend to the source's tokens while the block runs.
 
     A token's output is (1 - u) attn(q, k, v) + u attn(q, k_source, v_source), with its share u.
-
-    Args:
-        network: the network that the tokens were kept from.
-        layers: layers that attend, as in :func:`kept_tokens`.
-        latent_size: (h, w) of the views' latents.
-        kept: tokens of the source's edit.
-        unseen: shares of each view of the batch.
-        passes: numbers of the passes in which tokens attend, from 0.
     """
     sizes = {layer.name: layer.size(latent_size) for layer in layers if layer.name in kept.by_pass}
     shares = {

@@ -74,8 +74,6 @@ class Start:
     """Initial state of views' edits.
 
     Attributes:
-        views: numbers of the views.
-        guides: guides of the views, as the editor takes them.
         pictures: pictures to noise to the first timestep; None for pure noise.
         latents: (B, C, h, w) latents of an inversion, or None.
         replayed: picture and noise of an edit made elsewhere, or None.
@@ -124,19 +122,9 @@ class ViewEdits:
     """Editor of single views, with its sources.
 
     Args:
-        work: the scene and the editor.
-        settings: settings of the method.
-        source: number of the source view.
         by_hand: edit of the source made elsewhere, or None.
-        warps: external warps, or None.
-        store: "device", "cpu" or "disk".
         edit_source: function that edits the source of an index, for a process that found the edit
             finished.
-
-    Attributes:
-        sources: numbers of the source views, in the order of editing.
-        features, geometry: recorded features, and the geometry of their warps.
-        about, inputs: entries of the run's manifest.
 
     Raises:
         ValueError: an argument or a setting does not fit the editor or the views.
@@ -316,8 +304,6 @@ class ViewEdits:
         """Prepare views' edits, before features are recorded or injected.
 
         Args:
-            views: numbers of the views.
-            model: the current splats.
             stage: number of the stage, from 0; sources are edited in the first.
             by_hand: True replays the edit made elsewhere, if given.
         """
@@ -365,11 +351,6 @@ class ViewEdits:
         self, start: Start, sights: Sequence[Sight | None], step: Callable[[], None]
     ) -> list[Image]:
         """Edit views from their start.
-
-        Args:
-            start: initial state of the views.
-            sights: visibility of each view, for warped noise.
-            step: callback after each step.
 
         Returns:
             (h, w, 3) pictures in [0, 1].
@@ -425,9 +406,6 @@ class ViewEdits:
         """Collect a view's edit with its record and pictures.
 
         Args:
-            view: number of the view.
-            picture: (h, w, 3) in [0, 1].
-            sight: visibility of the view from the sources.
             sources: number of sources available to the view; for a source, its index.
         """
         about: dict[str, Any] = {"injected": 0.0}

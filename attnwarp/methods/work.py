@@ -32,16 +32,6 @@ NOISE, TIMESTEP, KEYS, VIEWS = range(4)
 class Work:
     """A scene and an editor at work on it.
 
-    Args:
-        gaussians: the splats before the edit.
-        scene: cameras, pictures and segments.
-        editor: editor, see :mod:`attnwarp.editing`.
-        instruction: instruction in words.
-        settings: settings of the method.
-        backend: name of the renderer.
-        folder: path of the run.
-        report: receiver of progress.
-
     Attributes:
         frozen: the splats before the edit, outside autograd.
         sizes: (h, w) px of each view's edit.
@@ -105,9 +95,6 @@ class Work:
         """Edit views together, from their guides before the edit and their noise of a round.
 
         Args:
-            views: numbers of the views.
-            step: callback after each step.
-            number: number of the round.
             start: Stable Diffusion's timestep to start from; None starts as the editor begins.
             pictures: pictures noised to ``start``; those before the edit if omitted.
         """
@@ -178,7 +165,6 @@ class Work:
 
         Args:
             lowest: lowest starting timestep of Stable Diffusion; if it fits, all higher ones do.
-            field: field of the settings, for the error.
         """
         steps = self.settings.steps
         try:

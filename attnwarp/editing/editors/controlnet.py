@@ -51,11 +51,7 @@ def control_image(depth: npt.NDArray[Any]) -> Image:
 def check_base(
     unet: Mapping[str, Any], text_encoder: Mapping[str, Any], vae: Mapping[str, Any]
 ) -> None:
-    """Refuse configurations that do not form a plain Stable Diffusion model.
-
-    Raises:
-        ValueError: see :func:`attnwarp.editing.editor.check_networks`.
-    """
+    """Refuse configurations that do not form a plain Stable Diffusion model."""
     hint = (
         "; a ControlNet goes with a plain model, which takes no picture, mask or depth map besides"
     )
@@ -66,11 +62,7 @@ def check_base(
 def check_controlnet(
     controlnet: Mapping[str, Any], text_encoder: Mapping[str, Any], vae: Mapping[str, Any]
 ) -> None:
-    """Refuse a ControlNet's configuration that does not fit the base model's.
-
-    Raises:
-        ValueError: see :func:`attnwarp.editing.editor.check_networks`.
-    """
+    """Refuse a ControlNet's configuration that does not fit the base model's."""
     channels = vae.get("latent_channels", LATENT_CHANNELS)
     check_networks(controlnet, text_encoder, channels, "controlnet")
 
@@ -179,7 +171,6 @@ class ControlTask:
     """Embedded prompt and control pictures of some views.
 
     Attributes:
-        editor: editor with the networks.
         text: (branches x B, L, D) embeddings.
         control: (branches x B, 3, H, W) control pictures.
         shape: (B, C, h, w) of the latents.

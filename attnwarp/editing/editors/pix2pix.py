@@ -114,8 +114,6 @@ class InstructPix2Pix(Latent):
         """Prepare an edit of (H, W, 3) pictures in [0, 1] by one instruction.
 
         Args:
-            guides: the pictures.
-            prompt: the instruction.
             regions: (H, W) edited region of each picture in [0, 1]; a bundled editor averages its
                 noise there to settle choices that the instruction leaves open. None is the full
                 picture.
@@ -164,10 +162,8 @@ class Pix2PixTask:
     """Embedded instruction and encoded pictures of some views.
 
     Attributes:
-        editor: editor with the networks.
         text: (branches x B, L, D) embeddings.
         before: (branches x B, C, h, w) latents of the pictures.
-        views: B, the number of views.
         shares: coefficients of the branches in the output, in the order of the UNet's batch.
         region: (B, h, w) edited region, for :class:`attnwarp.editing.small_unet.EditUNet`.
     """

@@ -68,18 +68,10 @@ def show_edit(
     """Write the page of a finished edit, ``index.html``, from its folder's files.
 
     Args:
-        folder: path of the edit, by any method.
-        before: the splats before the edit.
-        cameras: cameras of the views.
         images: (H, W, 3) photograph of each view, sRGB, uint8, uint16 or floating in [0, 1].
         editor: editor of the control, which edits the page's views alone; None for no control.
         turntable: file of the orbit's film, GIF or MP4; None for no film.
-        notes: warnings at the top of the page.
         origin: sentence on the origin of the inputs, without its full stop.
-        report: receiver of the control's progress, view by view.
-
-    Returns:
-        Path of the page.
     """
     page = _Page(folder, cameras, images, before)
     # A method that edits views alone needs no control.

@@ -39,10 +39,7 @@ def edited_alone(
     """Edit each view alone, with separate noise and all else equal, into a run's folder.
 
     Args:
-        folder: path of the controlled run.
-        gaussians, scene, editor: splats and scene before the edit, and the editor.
         views: numbers of the views; views already in the folder are kept.
-        report: receiver of progress, view by view.
     """
     manifest, names = folder.read_json(MANIFEST), file_stems(scene.cameras)
     shared = {field.name for field in fields(ByViewSettings)} & manifest["settings"].keys()
@@ -71,7 +68,6 @@ def disagreement(
     at correspondences of rendered splats accepted by the preset ``corrected``.
 
     Args:
-        gaussians: the scene before the edit.
         cameras: cameras of the views, at the size of their pictures.
         pictures: (H, W, 3) uint8 of each view, by kind of picture.
         segments: (H, W) bool of each view: the pixels that count.

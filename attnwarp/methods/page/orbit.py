@@ -41,7 +41,6 @@ def focus_of(cameras: Sequence[Camera], points: Array) -> Array:
     If the axes are parallel or diverge, the point lies at the scene's distance before the cameras.
 
     Args:
-        cameras: cameras, at least one.
         points: (N, 3) points of the scene.
 
     Returns:
@@ -94,7 +93,6 @@ def orbit(cameras: Sequence[Camera], points: Array, *, first: int = 0) -> list[C
 
     Args:
         cameras: cameras of the capture; the orbit's height and distance follow those nearby.
-        points: (N, 3) points of the scene.
         first: number of the camera at which a full turn begins.
 
     Returns:
@@ -176,21 +174,13 @@ def renders(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[Bytes]:
 
 
 def check_film(path: Path | None) -> None:
-    """Refuse a film of an unsupported format.
-
-    Raises:
-        InputError: the name's suffix is not in :data:`FILMS`.
-    """
+    """Refuse a film of an unsupported format."""
     if path is not None and path.suffix.lower() not in FILMS:
         raise InputError(f"--turntable: got {path}, expected a name ending in {' or '.join(FILMS)}")
 
 
 def write_film(path: Path, before: Sequence[Bytes], after: Sequence[Bytes]) -> None:
     """Write a turn as GIF or MP4, before on the left and after on the right.
-
-    Args:
-        path: path that ends in one of :data:`FILMS`; an older file is replaced.
-        before, after: (H, W, 3) uint8 frames.
 
     Raises:
         InputError: the suffix is not in :data:`FILMS`.
