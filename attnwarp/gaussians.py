@@ -184,14 +184,9 @@ class Gaussians:
         """Limit or extend harmonics to ``degree``: higher ones are dropped, missing ones are 0.
 
         Example:
-            >>> import torch
-            >>> from attnwarp import Gaussians
-            >>> one = Gaussians(
-            ...     "3d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3),
-            ...     torch.ones(1), torch.zeros(1, 16, 3),
-            ... )
-            >>> one.with_sh_degree(0).sh.shape
-            torch.Size([1, 1, 3])
+            >>> from attnwarp.trial import disc
+            >>> disc().with_sh_degree(3).sh.shape
+            torch.Size([1, 16, 3])
         """
         if degree not in (0, 1, 2, 3):
             raise ValueError(f"degree: got {degree}, expected 0 to 3")
@@ -203,14 +198,9 @@ class Gaussians:
         """Find the highest degree of the harmonics with a nonzero coefficient.
 
         Example:
-            >>> import torch
-            >>> from attnwarp import Gaussians
-            >>> one = Gaussians(
-            ...     "3d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3),
-            ...     torch.ones(1), torch.zeros(1, 16, 3),
-            ... )
-            >>> one.sh_degree, one.used_sh_degree()
-            (3, 0)
+            >>> from attnwarp.trial import disc
+            >>> disc().with_sh_degree(3).used_sh_degree()
+            0
         """
         used = torch.nonzero((self.sh != 0).any(dim=2).any(dim=0))
         return math.isqrt(int(used.max())) if len(used) else 0

@@ -299,8 +299,7 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
     folder.mkdir(exist_ok=True)
     near = result.settings.near * result.extent
     chooses = choosing(len(held_out), result.settings)
-    white = result.settings.background == "white"
-    behind = 1.0 if white else 0.0
+    behind = 1.0 if result.settings.background == "white" else 0.0
     background = torch.full((3,), behind, dtype=torch.float32, device=result.gaussians.means.device)
     for index, (camera, name) in enumerate(
         zip(held_out.cameras, file_stems(held_out.cameras), strict=True)

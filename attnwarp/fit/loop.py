@@ -487,11 +487,7 @@ class _Run:
         choice = self.settings.background
         if choice == "auto":
             choice = "random" if self.views.transparent else "black"
-        if choice == "random" and fitting:
-            drawn = torch.rand(3, generator=self.random, dtype=torch.float32)
-            return drawn.to(self.model.device)
-        value = 1.0 if choice == "white" else 0.0
-        return torch.full((3,), value, dtype=torch.float32, device=self.model.device)
+        return self.model.background(choice, self.random if fitting else None)
 
     def iterate(self) -> None:
         s = self.settings
@@ -535,14 +531,7 @@ class _Run:
         if self.exposure is not None:
             self.exposure.step(self.iteration / s.iterations)
         squared = float((image.detach() - target).square().mean())
-        self.loss = (
-            value if math.isnan(self.loss) else SMOOTHING * self.loss + (1 - SMOOTHING) * value
-        )
-        self.error = (
-            squared
-            if math.isnan(self.error)
-            else SMOOTHING * self.error + (1 - SMOOTHING) * squared
-        )
+        self.loss, self.error = _smoothed(self.loss, value), _smoothed(self.error, squared)
 
     @property
     def sh_degree(self) -> int:
@@ -616,6 +605,10 @@ def choosing(held_out: int, settings: FitSettings) -> range:
         ([1, 3], [])
     """
     return range(1, held_out if settings.patience else 0, 2)
+
+
+def _smoothed(before: float, value: float) -> float:
+    return value if math.isnan(before) else SMOOTHING * before + (1 - SMOOTHING) * value
 
 
 def _chosen(record: Record) -> float:

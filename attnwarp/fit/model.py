@@ -100,12 +100,10 @@ class Model:
         for tensor in self.tensors.values():
             tensor.requires_grad_(True)
         self.steps = 0
-        self.first = {
-            name: torch.zeros_like(tensor.detach()) for name, tensor in self.tensors.items()
-        }
-        self.second = {
-            name: torch.zeros_like(tensor.detach()) for name, tensor in self.tensors.items()
-        }
+        self.first, self.second = (
+            {name: torch.zeros_like(tensor.detach()) for name, tensor in self.tensors.items()}
+            for _ in range(2)
+        )
 
     def __len__(self) -> int:
         return int(self.tensors["means"].shape[0])
@@ -138,6 +136,13 @@ class Model:
             screen_filter=self.screen_filter,
             far=self.far,
         )
+
+    def background(self, choice: str, random: torch.Generator | None) -> Tensor:
+        """Return the (3,) colour behind the splats: "white", "black", or "random", if drawn."""
+        if choice == "random" and random is not None:
+            return torch.rand(3, generator=random, dtype=torch.float32).to(self.device)
+        value = 1.0 if choice == "white" else 0.0
+        return torch.full((3,), value, dtype=torch.float32, device=self.device)
 
     def _clamp_scales(self) -> None:
         largest = torch.tensor(math.log(LARGEST * self.extent), device=self.device)

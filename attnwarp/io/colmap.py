@@ -103,15 +103,7 @@ def read_colmap(
             ``colmap/sparse/0``.
         images: folder of the images; a relative path is tried in ``path`` first, then in the
             working folder. By default the folder ``images`` in ``path`` or above the model.
-        missing_images: "error", or "none" to set the path of a missing image to None.
-        resize_cameras: True resizes a camera whose image has another size (``images_4`` for
-            instance); False refuses it.
-        points: False skips the points; their file is then not read, and may be missing or
-            damaged.
-        distorted: "error" to refuse lens distortion, or "keep" to return it in
-            ``Dataset.lenses`` for :func:`undistort`.
-        scale: downscaling factor such as 4, which reads ``images_4`` if ``images`` is omitted;
-            the cameras are resized to its pictures.
+        missing_images, resize_cameras, points, distorted, scale: see :func:`read_dataset`.
 
     A folder ``masks`` beside the images has masks of the same names, or with ".png" appended.
 

@@ -111,16 +111,11 @@ def read_ply(
             the property and the first bad row.
 
     Example:
-        >>> import torch
-        >>> from attnwarp import Gaussians
         >>> from attnwarp.io import read_ply, write_ply
-        >>> one = Gaussians(
-        ...     "3d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3),
-        ...     torch.ones(1), torch.zeros(1, 1, 3),
-        ... )
-        >>> write_ply("one.ply", one)
-        >>> read_ply("one.ply").scales
-        tensor([[1., 1., 1.]])
+        >>> from attnwarp.trial import disc
+        >>> write_ply("disc.ply", disc())
+        >>> read_ply("disc.ply").scales
+        tensor([[0.5000, 0.5000]])
     """
     path = existing_file(path)
     if kind is not None:
@@ -232,14 +227,11 @@ def write_ply(
             not fit float32.
 
     Example:
-        >>> import torch
-        >>> from attnwarp import Gaussians
         >>> from attnwarp.io import read_ply, write_ply
-        >>> splat = Gaussians("2d", torch.ones(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                   torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> write_ply("splat.ply", splat)
-        >>> read_ply("splat.ply").means.tolist()
-        [[1.0, 1.0, 1.0]]
+        >>> from attnwarp.trial import disc
+        >>> write_ply("disc.ply", disc())
+        >>> read_ply("disc.ply").means.tolist()
+        [[0.0, 0.0, 0.0]]
     """
     from plyfile import PlyData, PlyElement
 

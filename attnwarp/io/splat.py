@@ -52,13 +52,10 @@ def write_splat(
 
     Example:
         >>> from pathlib import Path
-        >>> import torch
-        >>> from attnwarp import Gaussians
         >>> from attnwarp.io import write_splat
-        >>> splat = Gaussians("2d", torch.ones(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                   torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> write_splat("splat.splat", splat)
-        >>> Path("splat.splat").stat().st_size  # bytes of one record
+        >>> from attnwarp.trial import disc
+        >>> write_splat("disc.splat", disc())
+        >>> Path("disc.splat").stat().st_size  # bytes of one record
         32
     """
     g = replace(gaussians.detach().to(device="cpu"))
@@ -114,16 +111,11 @@ def read_splat(path: str | os.PathLike[str]) -> Gaussians:
             positive, or a quaternion is zero; the message names the first bad row.
 
     Example:
-        >>> import torch
-        >>> from attnwarp import Gaussians
         >>> from attnwarp.io import read_splat, write_splat
-        >>> one = Gaussians(
-        ...     "3d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3),
-        ...     torch.ones(1), torch.zeros(1, 1, 3),
-        ... )
-        >>> write_splat("one.splat", one)
-        >>> read_splat("one.splat").scales
-        tensor([[1., 1., 1.]])
+        >>> from attnwarp.trial import disc
+        >>> write_splat("disc.splat", disc())
+        >>> read_splat("disc.splat").scales  # the third makes the disc thin
+        tensor([[5.0000e-01, 5.0000e-01, 1.0000e-06]])
     """
     path = existing_file(path)
     data = path.read_bytes()

@@ -116,15 +116,7 @@ def read_transforms(
     Args:
         path: file, or folder with transforms.json or with transforms_train.json, _val.json,
             _test.json, which are read together and distinguished by ``Dataset.splits``.
-        missing_images: "error", or "none" to set the path of a missing image to None.
-        resize_cameras: True resizes a camera whose image has another size; False refuses
-            it.
-        points: False skips the points; their file is then not read, and may be missing or
-            damaged.
-        distorted: "error" to refuse lens distortion, or "keep" to return it in
-            ``Dataset.lenses`` for :func:`undistort`.
-        ignore_keys: keys to ignore although they change a picture's content, such as
-            "white_transparent", or "mask_path" to use whole pictures.
+        missing_images, resize_cameras, points, distorted, ignore_keys: see :func:`read_dataset`.
         scale: downscaling factor; 4 reads ``images_4/a.png`` for the file's ``images/a.png``, in
             nerfstudio's layout, and resizes the cameras.
 
@@ -137,7 +129,6 @@ def read_transforms(
     Warns:
         InputWarning: unknown keys; frames without a split; a frame whose intrinsics differ from
             those at the top; an image named by several frames.
-
 
     Example:
         >>> import json

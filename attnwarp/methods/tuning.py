@@ -263,7 +263,7 @@ class Tuning:
             raise FileFormatError(path, f"lacks something ({error}); remove it") from error
 
     def _iterate(self, view: TrainingView) -> None:
-        background = self._background()
+        background = self.model.background(self.settings.background, self.random)
         try:
             gaussians = self.model.gaussians()
         except ValueError as error:
@@ -317,11 +317,3 @@ class Tuning:
             distortion = losses.depth_distortion(picture, "ordered", scale=self.model.extent)
             loss = loss + s.distortion * distortion
         return loss
-
-    def _background(self) -> Tensor:
-        choice = self.settings.background
-        if choice == "random":
-            drawn = torch.rand(3, generator=self.random, dtype=torch.float32)
-            return drawn.to(self.model.device)
-        value = 1.0 if choice == "white" else 0.0
-        return torch.full((3,), value, dtype=torch.float32, device=self.model.device)

@@ -62,27 +62,15 @@ class Render:
     Example:
         A disc that faces the camera: its normals point back at it, and beside it nothing is drawn.
 
-        >>> import torch
-        >>> from attnwarp import Camera, Gaussians
         >>> from attnwarp.render import render
-        >>> disc = Gaussians(
-        ...     "2d",
-        ...     means=torch.zeros(1, 3),
-        ...     quats=torch.tensor([[1.0, 0, 0, 0]]),
-        ...     scales=torch.full((1, 2), 0.2),
-        ...     opacities=torch.full((1,), 0.5),
-        ...     sh=torch.zeros(1, 1, 3),
-        ... )
-        >>> camera = Camera.look_at(
-        ...     [0, 0, 3], [0, 0, 0], width=65, height=49, fov_y=40, up=[0, 1, 0]
-        ... )
-        >>> view = render(disc, camera)
-        >>> bool(view.valid[24, 32]), bool(view.valid[0, 0]), bool(view.depth[0, 0].isnan())
+        >>> from attnwarp.trial import disc, view
+        >>> seen = render(disc(0.2), view(side=65))
+        >>> bool(seen.valid[32, 32]), bool(seen.valid[0, 0]), bool(seen.depth[0, 0].isnan())
         (True, False, True)
-        >>> [round(float(n), 4) + 0.0 for n in view.normal[24, 32]]
-        [0.0, 0.0, 0.5]
-        >>> bool(torch.isclose(view.weight[0], view.alpha.sum()))
-        True
+        >>> [round(float(n), 2) + 0.0 for n in seen.normal[32, 32]]
+        [0.0, 0.0, 0.99]
+        >>> round(float(seen.weight[0] / seen.alpha.sum()), 4)
+        1.0
     """
 
     color: Tensor
@@ -232,26 +220,14 @@ def render(
         TypeError: an argument has a wrong type; the message names it.
 
     Example:
-        >>> import torch
-        >>> from attnwarp import Camera, Gaussians
         >>> from attnwarp.render import render
-        >>> splat = Gaussians(
-        ...     "2d",
-        ...     means=torch.zeros(1, 3),
-        ...     quats=torch.tensor([[1.0, 0, 0, 0]]),
-        ...     scales=torch.full((1, 2), 0.2),
-        ...     opacities=torch.full((1,), 0.9),
-        ...     sh=Gaussians.sh_from_rgb(torch.tensor([[1.0, 0.5, 0.0]])),
-        ... )
-        >>> camera = Camera.look_at(
-        ...     [0, 0, 3], [0, 0, 0], width=65, height=49, fov_y=40, up=[0, 1, 0]
-        ... )
-        >>> view = render(splat, camera)
-        >>> view.color.shape
-        torch.Size([49, 65, 3])
-        >>> [round(float(c), 4) for c in view.color[24, 32]]
-        [0.9, 0.45, 0.0]
-        >>> round(float(view.depth[24, 32]), 4)
+        >>> from attnwarp.trial import disc, view
+        >>> seen = render(disc(0.2), view(side=65))
+        >>> seen.color.shape
+        torch.Size([65, 65, 3])
+        >>> [round(float(c), 2) for c in seen.color[32, 32]]
+        [0.5, 0.5, 0.5]
+        >>> round(float(seen.depth[32, 32]), 4)
         3.0
     """
     check.instance(gaussians, Gaussians, "gaussians", "attnwarp.Gaussians")
