@@ -47,7 +47,6 @@ def choose(name: str, report: Reporter = SILENT, *, splats: bool = True) -> str:
 
     Args:
         name: "auto", or a name of :func:`device_of`.
-        report: receiver of a line if "auto" finds a GPU.
         splats: True if splats are rendered there too, which needs the extra ``gpu``.
 
     Raises:

@@ -155,12 +155,6 @@ def ssim_terms(image: check.Array, target: check.Array) -> tuple[Tensor, Tensor]
 def check_sizes(cameras: Sequence[Camera], smallest: int, loss: str, setting: str) -> None:
     """Raise ValueError, naming the first such view, if a view is too small for a loss.
 
-    Args:
-        cameras: cameras of the views.
-        smallest: smallest side in px accepted by the loss.
-        loss: name of the loss, for the message.
-        setting: name of the loss's weight.
-
     Example:
         >>> import numpy as np
         >>> from attnwarp import Camera, losses

@@ -66,9 +66,6 @@ def kernel_folders(name: str) -> Iterator[Path]:
 
     Files there are executed, so a folder is skipped if another user may have created it, or a
     parent between it and the temporary folder.
-
-    Args:
-        name: name of the compiler, such as "numba".
     """
     folders = [cache_dir() / name]
     with suppress(FileNotFoundError):  # no temporary folder either
@@ -118,11 +115,7 @@ def stops_interrupt() -> Iterator[None]:
 @contextmanager
 def asked_to_stop(report: Reporter = SILENT) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns True after Ctrl-C, SIGTERM or SIGHUP; a second signal stops at
-    once, as by default.
-
-    Args:
-        report: receiver of a line at the first signal.
-    """
+    once, as by default."""
     asked = False
 
     def note(number: int, frame: Any) -> None:

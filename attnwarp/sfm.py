@@ -38,7 +38,6 @@ def write_pictures(
     """Write the input files of :func:`match`, and return the pictures' names in them.
 
     Args:
-        folder: folder for ``pictures.npz`` and ``cameras.json``.
         images: (H, W, 3) sRGB.
         cameras: pinhole cameras, one a picture, of its size.
     """
@@ -66,11 +65,6 @@ STEPS = {
 
 def run(task: str, *paths: Path, report: Reporter = SILENT) -> None:
     """Run a task of this program.
-
-    Args:
-        task: name of the task.
-        paths: its folder, and its further path if it has one.
-        report: receiver of progress.
 
     Raises:
         InputError: the package pycolmap stopped, or is missing (MissingExtraError).
@@ -162,7 +156,6 @@ def photographs(folder: Path, names: Path) -> None:
     Features and matches that ``database.db`` has are not computed again.
 
     Args:
-        folder: folder for the database and the models.
         names: JSON file of the pictures' folder, their names in it, whether one camera took all,
             and the files' times.
     """

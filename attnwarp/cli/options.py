@@ -75,10 +75,7 @@ def option(
     """Describe an option of a command.
 
     Args:
-        text: help.
-        metavar: name of the value in the help.
         names: spellings, such as "--set"; that of the argument if omitted.
-        panel: panel of the help.
         more: further keywords of :func:`typer.Option`.
     """
     return typer.Option(*names, help=text, metavar=metavar, rich_help_panel=panel, **more)

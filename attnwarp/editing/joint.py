@@ -209,14 +209,7 @@ class Joint(Coder):
     def rehearsed(
         cls, folder: Path, dtype: torch.dtype, size: int | None = None
     ) -> tuple[Self, int, int]:
-        """Find the memory of an edit without weights: its networks run on torch's device "meta".
-
-        Args:
-            size: side of the square view in px; the model's own if omitted.
-
-        Returns:
-            The editor without weights, the side, and the largest number of bytes beside weights.
-        """
+        """Find the memory of an edit without weights: its networks run on torch's device "meta"."""
         from attnwarp.editing.folder import index_of, load_empty
         from attnwarp.editing.memory import peak_bytes
 

@@ -135,9 +135,6 @@ def announced(
         size: side of a square view in px; the editor's own if omitted.
         recorded: (editor without weights, (h, w) of a view's latents) -> words on features.
 
-    Returns:
-        A line; None for a UNet in main memory, where it takes little.
-
     Example:
         >>> announced("small-plain", torch.float16, "cuda")
         'weights of the editor in float16: 0.01 GiB'

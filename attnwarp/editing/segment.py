@@ -49,10 +49,6 @@ class Segmenter(Protocol):
         Args:
             image: (H, W, 3) sRGB, floating, in [0, 1].
             words: a noun with or without attributes, such as "bear" or "red mug".
-
-        Raises:
-            NoDetectionError: the picture does not show the object.
-            ValueError: the picture has a wrong shape, dtype or range, or the words are empty.
         """
         ...
 
@@ -169,10 +165,6 @@ class GroundedSam:
                 preprocessor_config.json, and tokenizer.json or vocab.txt.
             sam: folder such as facebook/sam-vit-base: config.json, model.safetensors and
                 preprocessor_config.json.
-
-        Raises:
-            InputError: files are missing (named) or unreadable.
-            MissingExtraError: transformers is not installed.
         """
         from attnwarp.devices import device_of
 
@@ -299,7 +291,6 @@ class ClipSegmenter:
     with exact masks is in reports/editor/segments.md. Inspect the masks before using them.
 
     Args:
-        sides: short sides, in px, of the sizes at which the picture is scored.
         likely: lower bound of the probability of initial foreground pixels.
         background: probability below which a pixel never joins the mask.
         sure: probability from which a pixel always stays in the mask.

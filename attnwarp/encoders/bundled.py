@@ -37,7 +37,6 @@ def load(name: str, folder: Path = WEIGHTS) -> BundledClip | BundledDino | Bundl
     """Load a bundled encoder: "clip-small", "clip-parts", "dino-small" or "perceptual-small".
 
     Args:
-        name: name of the encoder.
         folder: folder with ``name``.safetensors, and a tokenizer for clip-small and clip-parts; the
             package's folder if omitted.
 

@@ -139,11 +139,8 @@ class Lpips:
     """LPIPS distance; see :class:`attnwarp.encoders.PerceptualDistance`.
 
     Args:
-        backbone: backbone network.
         network: ``features`` of the backbone, see :func:`features`.
         weights: linear layers, one (channels,) tensor per stage.
-        about: identity, stored with results.
-        device: device of the computation.
 
     Attributes:
         smallest: shortest accepted side of a picture, px.
@@ -230,8 +227,6 @@ def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
             ``lin0.model.1.weight``, ...), or a folder with torchvision's state dict of a backbone
             (``features.0.weight``, ...) and one or more published files of linear layers; the one
             that fits the backbone is used.
-        name: name in errors and results.
-        device: "cpu" or "cuda".
 
     Raises:
         InputError: the place is empty, a file is missing, or several files fit.

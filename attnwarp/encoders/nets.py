@@ -35,12 +35,7 @@ class Residual(nn.Module):
 
 class Stages(nn.Module):
     """Convolutional stages: the first at a quarter of the size, each further one at half of the
-    previous size.
-
-    Args:
-        widths: channels of the stages.
-        depths: residual blocks of the stages.
-    """
+    previous size."""
 
     def __init__(self, widths: Sequence[int], depths: Sequence[int]) -> None:
         super().__init__()
@@ -91,8 +86,6 @@ class Patches(nn.Module):
 
     Args:
         widths: channels of the stages, each of half the size of the previous one.
-        dim: number of dimensions of the vectors.
-        hidden: number of intermediate channels.
     """
 
     def __init__(self, widths: Sequence[int], dim: int, hidden: int = 128) -> None:
@@ -152,9 +145,7 @@ class TextTower(nn.Module):
 
     Args:
         vocabulary: number of tokens; token 0 is padding.
-        width, depth, heads: width, depth and heads of the transformer.
         length: longest text in tokens; longer texts are cut, keeping their end token.
-        dim: number of dimensions of the embedding.
     """
 
     def __init__(
@@ -178,12 +169,7 @@ class TextTower(nn.Module):
 
 
 class ClipSmall(nn.Module):
-    """Small encoder of pictures and texts in one space (Radford et al. 2021).
-
-    Args:
-        vocabulary: vocabulary of the tokenizer.
-        dim: number of dimensions of the shared space.
-    """
+    """Small encoder of pictures and texts in one space (Radford et al. 2021)."""
 
     size = 112
     length = 40
@@ -206,12 +192,7 @@ class ClipSmall(nn.Module):
 
 
 class ClipParts(ClipSmall):
-    """:class:`ClipSmall` with a vector for each region of 8 x 8 px in the space of texts.
-
-    Args:
-        vocabulary: vocabulary of the tokenizer.
-        dim: number of dimensions of the shared space.
-    """
+    """:class:`ClipSmall` with a vector for each region of 8 x 8 px in the space of texts."""
 
     def __init__(self, vocabulary: int, dim: int = 192) -> None:
         super().__init__(vocabulary, dim)

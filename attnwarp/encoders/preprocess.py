@@ -96,8 +96,6 @@ def resize(
     """Resize (H, W, 3) in [0, 1] to (h, w, 3) with a Pillow filter, antialiased when shrinking.
 
     Args:
-        image: picture to resize.
-        size: (h, w) of the result, in px.
         resample: Pillow's number of the filter; 3 is bicubic.
 
     Returns:
@@ -120,10 +118,6 @@ def resize(
 
 def sampled(image: npt.NDArray[np.float32], size: tuple[int, int]) -> npt.NDArray[np.float32]:
     """Resize (H, W, 3) in [0, 1] to (h, w, 3), bicubic, not antialiased, clipped to [0, 1].
-
-    Args:
-        image: picture to resize.
-        size: (h, w) of the result, in px.
 
     Example:
         >>> half = sampled(np.eye(4, dtype=np.float32)[..., None].repeat(3, axis=2), (2, 2))

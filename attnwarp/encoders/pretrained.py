@@ -189,8 +189,6 @@ def load_clip(folder: Path, *, name: str, device: str = "cpu", whole: bool = Fal
         folder: folder with config.json, model.safetensors (or pytorch_model.bin, or either in parts
             with its index), preprocessor_config.json, and tokenizer.json or vocab.json with
             merges.txt.
-        name: name in errors and results.
-        device: "cpu" or "cuda".
         whole: True resizes the full picture, without antialiasing and without a crop.
 
     Raises:
@@ -233,8 +231,6 @@ def load_dinov2(folder: Path, *, name: str, device: str = "cpu", side: int | Non
     Args:
         folder: folder with config.json, model.safetensors (or pytorch_model.bin, or either in parts
             with its index) and preprocessor_config.json.
-        name: name in errors and results.
-        device: "cpu" or "cuda".
         side: px to which the full picture is resized, without antialiasing and without a crop;
             None for the published preprocessing.
 

@@ -18,10 +18,6 @@ class Exposure:
     """Affine changes of colour, whose mean over the pictures is none: a colour that all pictures
     share belongs to the splats.
 
-    Args:
-        count: number of pictures.
-        device: device of the renders.
-
     Attributes:
         leaf: (count, 3, 4) changes of the colours' linear part and offset, before the mean is
             subtracted.

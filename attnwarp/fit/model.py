@@ -68,9 +68,6 @@ class Model:
         tensors: leaves by name: "means" (N, 3), "dc" (N, 1, 3), "rest" (N, K - 1, 3), "opacity"
             (N,) logits, "scales" (N, 2 or 3) logarithms, "quats" (N, 4).
         first, second: Adam's moments by name.
-        steps: steps done.
-        rates: learning rates by name.
-        extent: extent of the scene, in its units.
     """
 
     def __init__(self, start: Gaussians, settings: FitSettings, extent: float) -> None:
@@ -119,7 +116,6 @@ class Model:
         """Build the splats, differentiable in the leaves, or from ``tensors`` in their place.
 
         Args:
-            tensors: tensors by name, as in :attr:`tensors`.
             sh_degree: degree of the harmonics; all by default. Others cost a gradient of zeros.
         """
         t = self.tensors if tensors is None else tensors

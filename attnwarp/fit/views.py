@@ -57,7 +57,6 @@ class Drawn(Sequence[S]):
     memory.
 
     Args:
-        makers: constructors, one per value.
         held_bytes: limit on the bytes of kept values.
     """
 

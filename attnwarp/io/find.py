@@ -31,7 +31,6 @@ class FileFinder:
     A folder is listed once, and only if a name does not exist literally.
 
     Args:
-        folder: root folder of the names.
         suffixes: suffixes to try for a name without suffix, in order.
 
     Example:

@@ -38,10 +38,6 @@ def alone_in(folder: str | os.PathLike[str]) -> Iterator[None]:
     The folder itself is locked, so no lock file remains. File systems without folder locks make
     this a no-op.
 
-    Args:
-        folder: path of the results. A folder created here and left empty is
-            removed.
-
     Raises:
         InputError: another run holds the folder.
         FileExistsError: the path is a file.

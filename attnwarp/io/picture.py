@@ -19,8 +19,6 @@ def encode_picture(
 
     Args:
         image: (H, W, 3) sRGB, floating and clipped to [0, 1], or uint8.
-        suffix: ".png" or ".jpg".
-        quality: quality of a JPEG, 1 to 100.
         chroma: chroma of a JPEG: colours at full ("444") or half ("420") resolution.
 
     Raises:

@@ -47,11 +47,8 @@ class Marks:
     """One way to mark the edited part; no mark edits everything.
 
     Args:
-        masks: folder with one mask picture per view.
-        mask: mask file of the source view; white is edited.
         box: x0, y0, x1, y1 around the object, in px of the source's picture.
         at: x, y of a point on the object, in px of the source's picture.
-        words: words that name the object.
         segmenter: finder of the words, see :func:`attnwarp.editing.segment.load_segmenter`.
 
     Raises:

@@ -40,9 +40,7 @@ def outputs_of(
     """Assemble the outputs of a backend.
 
     Args:
-        inputs: drawn inputs.
         tensors: pictures, a placeholder for the exact distortion, and the weights.
-        counters: amounts of work.
         of_drawn: function that computes the exact distortion from the first pass's state.
         anew: function that computes it by drawing again.
     """

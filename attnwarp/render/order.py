@@ -23,7 +23,6 @@ def break_ties(
     Args:
         order: (M,) indices of splats, sorted by ``depth``; changed in place.
         depth: (N,) float32 depth of each splat.
-        content: arrays of (N,) or (N, k) parameters of a splat, most significant first.
         places: ascending positions in ``order`` whose depth equals a neighbour's, if known.
     """
     if places is None:

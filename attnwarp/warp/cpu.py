@@ -42,11 +42,8 @@ def correspond_and_mask(
     """Compute the correspondence and the rules that have a kernel, in one pass over the pixels.
 
     Args:
-        source, target: cameras of the pair.
         parts: parts of both surfaces, by :func:`attnwarp.warp.rules.parts_of`, with checked
             pictures.
-        rules: active rules of the settings.
-        settings: settings of the warp.
 
     Returns:
         Correspondence, the (H, W) mask of each rule with a kernel, and their conjunction.
@@ -85,9 +82,7 @@ def correspond_layer(
     """Compute :func:`attnwarp.warp.correspond_at` by kernels.
 
     Args:
-        source, target: cameras of the feature grids.
         target_depth: (H, W) float64 depth of the target's image.
-        settings: settings of the warp, with ``depth_interpolation`` and ``depth_spread``.
     """
     positions = _positions((target.height, target.width))
     views = _pair(source, target, settings)

@@ -452,10 +452,6 @@ class Rule:
     def arguments(self, settings: WarpSettings, parts: Mapping[str, Any]) -> dict[str, Any]:
         """Collect the keywords of the definition and of the margin.
 
-        Args:
-            settings: settings of the warp.
-            parts: all given parts, by :func:`parts_of`.
-
         Raises:
             ValueError: a required part is missing.
         """

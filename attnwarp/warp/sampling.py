@@ -136,7 +136,6 @@ def taps_at(
     Args:
         size: (h, w) of the resized image.
         dtype: dtype of the weights, which are computed in float64.
-        device: target device of the taps.
     """
     h, w = size
     taps = taps_of(positions_in(correspondence, w, h), h, w)
@@ -147,7 +146,6 @@ def sample_maps(maps: Tensor, taps: Taps) -> Tensor:
     """Sum weighted pixels of maps, (..., N), in the maps' dtype.
 
     Args:
-        maps: (..., h*w) floating maps.
         taps: taps of N positions, with weights of :func:`work_type`, on the maps' device.
     """
     total = torch.zeros((), dtype=taps.weight.dtype, device=maps.device)

@@ -66,7 +66,6 @@ def taps_of(xy: Tensor, h: int, w: int) -> Taps:
 
     Args:
         xy: (H, W, 2) float64 positions in pixels of the grid (centres at +0.5); NaN reads no tap.
-        h, w: size of the grid.
     """
     # NaN is masked before it reaches an index.
     defined = torch.isfinite(xy).all(dim=-1)

@@ -182,9 +182,6 @@ def check_film(path: Path | None) -> None:
 def write_film(path: Path, before: Sequence[Bytes], after: Sequence[Bytes]) -> None:
     """Write a turn as GIF or MP4, before on the left and after on the right.
 
-    Raises:
-        InputError: the suffix is not in :data:`FILMS`.
-
     Example:
         >>> from pathlib import Path
         >>> import numpy as np
