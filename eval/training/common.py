@@ -120,13 +120,10 @@ class Run:
     losses of each to a log (:mod:`training.log`).
 
     Attributes:
-        path: path of the checkpoint.
         state: everything that has a ``state_dict``, by name.
-        epochs: how many in all.
         recipe: the other settings of the result, see :func:`settings`; written into the checkpoint,
             which can be resumed with no other.
         every: least seconds between two checkpoints; 0 writes one after each epoch.
-        device: device, for cards.
         steps: in an epoch, for the log; None where the recipe does not count them.
         spent: seconds that went before the first epoch.
     """

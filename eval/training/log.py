@@ -18,7 +18,6 @@ class Entry:
     """An epoch that ended.
 
     Attributes:
-        stage: name of the checkpoint.
         epoch: how many epochs have ended.
         steps: how many steps they had in all; None where the recipe does not count them.
         seconds: seconds of all of them, and of what came before the first.

@@ -82,9 +82,6 @@ def train_steps(
     """Take a stage's steps, or those that are left, with an average of the weights beside them.
 
     Args:
-        net: on the device.
-        plan: how many steps, at which rate, from which seed.
-        checkpoint: written as it goes.
         recipe: inputs that decide the result, see :class:`training.common.Run`.
         spent: seconds that went before the first step.
     """
@@ -139,12 +136,7 @@ def minibatches(
 
 
 class Stepper:
-    """A network, its optimizer and its average, and the steps that change them.
-
-    Args:
-        net: on the device.
-        peak: learning rate.
-    """
+    """A network, its optimizer and its average, and the steps that change them."""
 
     def __init__(
         self, net: torch.nn.Module, peak: float, tasks: Sequence[Task], device: torch.device

@@ -72,11 +72,7 @@ class Case:
 
 
 def cases_of(worlds: Worlds, size: int, number: int = 0) -> list[Case]:
-    """Both whole views of every world whose thing is large enough.
-
-    Args:
-        number: number of the round, which draws the colour that each world has before.
-    """
+    """Both whole views of every world whose thing is large enough."""
     pairs = Pictures(worlds, size)
     further = [number] if number else []
     cases = []
@@ -342,11 +338,7 @@ def carries(
 
 
 def carried_section(carried: Sequence[Figure], pairs: int) -> str:
-    """A card's section of these figures.
-
-    Args:
-        pairs: that were asked of each question about a swap.
-    """
+    """A card's section of these figures."""
     lines = [
         "## Whether its attention carries the answer, and where", "",
         "Features of a run that answered one colour go into a run from other noise that alone answers another, by the paper's decay"

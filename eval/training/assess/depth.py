@@ -49,10 +49,6 @@ def separation(image: Image, mask: npt.NDArray[np.bool_]) -> float:
 def assess_depth(editor: Any, prompts: Prompts) -> list[tuple[Figure, Figure]]:
     """Held-out figures, each with the one of the control beside it.
 
-    Args:
-        editor: a :class:`attnwarp.editing.editors.controlnet.DepthControlNet`.
-        prompts: prompts of test worlds.
-
     Returns:
         For each question the figure with the right prompt and depth map, and the control's: the same
         pictures asked about the next world's prompt, or shape.
@@ -129,12 +125,7 @@ def prompt_of(editor: Any, prompts: Prompts, row: Row, rng: np.random.Generator)
 def assess_depth_editor(
     folder: Path, data: Path, facts: dict[str, Any], *, worlds: int | None = None
 ) -> str:
-    """The card of an exported editor of depth maps.
-
-    Args:
-        data: folder of the pictures.
-        worlds: worlds of the test split; all if left out.
-    """
+    """The card of an exported editor of depth maps."""
     from attnwarp.editing.small import DEPTH_GUIDANCE, load_editor
 
     torch.set_num_threads(1)

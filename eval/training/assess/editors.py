@@ -53,7 +53,6 @@ def assess(
     whose mean colour in the mask is nearest to the result's has to be the one that was asked for.
 
     Args:
-        worlds: worlds of the test split.
         noises: number of noises of an open instruction, for each of a quarter of the worlds; 0 leaves that
             figure out.
     """
@@ -146,11 +145,7 @@ def draw_row(pairs: Pictures, world: int, kind: str, rng: np.random.Generator) -
 def editor_card(
     name: str, figures: Sequence[Figure], control: Sequence[Figure], facts: dict[str, Any]
 ) -> str:
-    """A bundled editor's card in Markdown.
-
-    Args:
-        figures, control: figures of it and of an editor that changes nothing.
-    """
+    """A bundled editor's card in Markdown."""
     learned, missing = "", "parts of things (a jacket, a pot), "
     if facts["parts"]:
         learned, missing = (
@@ -187,11 +182,7 @@ def editor_card(
 def assess_editor(
     folder: Path, data: Path, facts: dict[str, Any], *, worlds: int | None = None
 ) -> str:
-    """The card of an exported editor.
-
-    Args:
-        worlds: worlds of each test split; all if left out.
-    """
+    """The card of an exported editor."""
     from attnwarp.editing.small import IMAGE_GUIDANCE, TEXT_GUIDANCE, load_editor
 
     torch.set_num_threads(1)

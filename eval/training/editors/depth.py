@@ -74,12 +74,8 @@ class DepthStage:
 
     Attributes:
         size: size of the pictures in px.
-        steps: number of steps of ``batch`` pictures each.
         peak: learning rate, which falls over the last 30 %.
-        worlds: how many of the training worlds are used.
         start: the editor's stage whose text encoder and UNet this one starts from.
-        batch: pictures a step.
-        seed: seed of everything random.
     """
 
     size: int
@@ -180,12 +176,7 @@ class Prompts(Pictures):
 
 
 class PromptPool(PicturePool):
-    """Depth maps, prompts and pictures of worlds on one device.
-
-    Args:
-        worlds, device: see :class:`training.editors.pool.PicturePool`.
-        prompts: made ahead for each world.
-    """
+    """Depth maps, prompts and pictures of worlds on one device."""
 
     def __init__(
         self, worlds: Worlds, tokenizer: Tokenizer, device: torch.device | str = "cpu", *, prompts: int = PROMPTS
@@ -207,13 +198,7 @@ class PromptPool(PicturePool):
     def prompted(
         self, noise: Tensor, generator: torch.Generator, *, size: int
     ) -> tuple[Rows, Tensor]:
-        """Draw pictures and (B, 24) tokens of their prompts; where one is true of several, the noise picks.
-
-        Args:
-            noise: (B, 48, h, w) of the latents.
-            generator: on the pool's device.
-            size: size of the pictures in px.
-        """
+        """Draw pictures and (B, 24) tokens of their prompts; where one is true of several, the noise picks."""
         count = len(noise)
         tokens, true = self.tokens, self.true
         world = self.integers(len(tokens), count, generator)
@@ -274,16 +259,7 @@ def train_depth_stage(
     name: str, data: Path, out: Path, *, stage: DepthStage | None = None, threads: int = 1,
     device: torch.device | str = "cpu", pool: PromptPool | None = None,
 ) -> Path:  # fmt: skip
-    """Train a stage, or go on with it; the checkpoint's path.
-
-    Args:
-        name: a key of :data:`DEPTH_STAGES`.
-        data: folder of the pictures, rendered where they are missing.
-        out: folder of checkpoints, with the one that the stage starts from.
-        stage: in place of the one of that name.
-        device: device of torch; on a GPU matrices are multiplied in bfloat16.
-        pool: on that device, if it is there already.
-    """
+    """Train a stage, or go on with it; the checkpoint's path."""
     stage = DEPTH_STAGES[name] if stage is None else stage
     device = torch.device(device)
     torch.set_num_threads(threads)

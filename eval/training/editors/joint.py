@@ -23,12 +23,7 @@ AXES = (8, 12, 12)
 
 
 class JointNet(torch.nn.Module):
-    """The transformer and the text encoder, trained together: 5.6 million weights.
-
-    Args:
-        vocabulary: number of the tokenizer's tokens.
-        shift: shift of the noise schedule.
-    """
+    """The transformer and the text encoder, trained together: 5.6 million weights."""
 
     alphas: Tensor
 

@@ -96,12 +96,7 @@ class Batch:
 
 
 class PicturePool:
-    """Pictures of worlds on one device, cut by the hundred.
-
-    Args:
-        worlds: at :data:`training.worlds.editing_pairs.SIZE`.
-        device: where everything lies and is drawn.
-    """
+    """Pictures of worlds on one device, cut by the hundred."""
 
     def __init__(self, worlds: Worlds, device: torch.device | str = "cpu") -> None:
         self.worlds = worlds
@@ -184,12 +179,7 @@ class PicturePool:
 
 
 class PairPool(PicturePool):
-    """Pictures, instructions and choices of looks before and after.
-
-    Args:
-        worlds, device: see :class:`PicturePool`.
-        sentences: instructions made ahead for each thing and result.
-    """
+    """Pictures, instructions and choices of looks before and after."""
 
     def __init__(
         self, worlds: Worlds, tokenizer: Tokenizer, device: torch.device | str = "cpu", *, sentences: int = SENTENCES
@@ -205,10 +195,8 @@ class PairPool(PicturePool):
         """Draw pairs.
 
         Args:
-            generator: on the pool's device.
             size: size of the pictures in px. At 64, half of the pictures are a quarter of the full one about
                 the thing, so that things come large and small.
-            kinds: how often each kind comes, by name.
             unclear: share of the pairs of kinds with open instructions that get one.
         """
         share = torch.tensor([kinds.get(k, 0.0) for k in KIND_NAMES], device=self.device)
@@ -260,8 +248,6 @@ class PairPool(PicturePool):
         """Draw pairs with noise at some steps.
 
         Args:
-            generator: on the pool's device.
-            size: size of the pictures in px, 64 or 128.
             t: (B,) time steps.
             kinds, unclear: see :meth:`rows`.
             composed: share of the open pairs at settled steps whose result has one answer in a region and another

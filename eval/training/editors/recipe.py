@@ -70,16 +70,13 @@ class Stage:
 
     Attributes:
         size: size of the pictures in px; latents have a quarter of it.
-        steps: number of steps of them.
         peak: learning rate, which falls over the last 30 %.
         worlds: how many of the training worlds of one thing each are used.
         parts: how many of those of things with parts (:mod:`attnwarp_eval.drawn.assemblies`).
         start: the stage whose networks this one starts from.
         batch: pictures of ``size`` in a step; there are a quarter as many large ones.
-        seed: seed of everything random.
         unclear: share of pairs whose instruction leaves the answer to the noise.
         draws: whether the noise's mean adds to the text (:class:`attnwarp.editing.small_unet.EditUNet`).
-        shift: shift of the noise schedule, see :func:`training.editors.net.scheduler`.
         noisy_from: :data:`training.editors.net.NOISY_SHARE` of the steps are drawn from here on.
         composed: share of the open pairs at settled steps whose result has one answer in a region and another
             outside it. Without them the network takes a thing to have one colour, and its late steps undo
@@ -119,12 +116,7 @@ STAGES = {
 
 
 def make_tokenizer(count: int = 80_000, worlds: int = 200) -> Tokenizer:
-    """Byte pairs learned from instructions: any text can be written with it, words of the worlds in a token or two.
-
-    Args:
-        count: number of instructions, about things and parts in turn.
-        worlds: worlds with the looks that they name.
-    """
+    """Byte pairs learned from instructions: any text can be written with it, words of the worlds in a token or two."""
     rng = np.random.default_rng(20)
     split = PAIR_SPLITS["edit-train"]
     corpus = []
@@ -188,15 +180,7 @@ def train_stage(
     name: str, data: Path, out: Path, *, stage: Stage | None = None, threads: int = 1, device: torch.device | str = "cpu",
     pool: PairPool | None = None,
 ) -> Path:  # fmt: skip
-    """Train a stage, or go on with it; the checkpoint's path.
-
-    Args:
-        name: a key of :data:`STAGES`.
-        data: folder of the pictures, rendered where they are missing.
-        stage: in place of the one of that name.
-        device: device of torch; on a GPU matrices are multiplied in bfloat16.
-        pool: on that device, if it is there already.
-    """
+    """Train a stage, or go on with it; the checkpoint's path."""
     stage = STAGES[name] if stage is None else stage
     device = torch.device(device)
     torch.set_num_threads(threads)

@@ -22,7 +22,6 @@ def learn_byte_pairs(
     """Byte-level byte pairs: any text can be encoded, and a word of the corpus takes a token or two.
 
     Args:
-        corpus: sentences.
         vocabulary: how many tokens there are; 0 pads and 1 ends a sentence.
         most_tokens: largest number of tokens of a sentence; the rest is cut.
         length: to which every sentence is padded; that of a batch's longest if left out.

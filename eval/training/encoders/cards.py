@@ -88,8 +88,6 @@ def card(
         figures: figures of the trained network (:class:`training.assess.figures.Figure` as
             dictionaries).
         control: the same of a network with random weights.
-        facts: contents of the text's blanks.
-        files: files of weights, whose hashes are given.
     """
     lines = [f"# {name}", "", ABOUT[name].format(**facts), "", DATA.format(**facts), ""]
     lines += [

@@ -147,7 +147,6 @@ def contrast(
     """Symmetric contrast of N pictures and 2 N texts, the first N of which are theirs.
 
     Args:
-        model: for its scale.
         i: (N, D) unit embeddings of the pictures.
         t: (2 N, D) unit embeddings of the texts.
         truth: (N, 2 N) bool, which texts are true of which pictures.
@@ -179,7 +178,6 @@ def naming_loss(
     Args:
         images: (N, D) unit embeddings.
         shown: (N, 6) attributes.
-        rng: picks one way to say each.
     """
     texts: list[str] = []
     spans: list[tuple[int, int, int]] = []

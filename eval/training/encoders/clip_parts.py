@@ -205,12 +205,10 @@ def part_losses(
     part's places.
 
     Args:
-        model: for its text tower and scales.
         pooled: (N, D) unit embeddings of the pictures.
         dense: (N, h, w, D) unit vectors of places.
         ids: (N, h, w).
         surfaces: (N, P, 3).
-        rng: to draw words and parts.
     """
     numbers = surface_number(surfaces)
     seen = np.stack([(ids == p).sum(axis=(1, 2)) for p in range(len(PARTS))], axis=1)

@@ -78,7 +78,6 @@ class Part:
     """A split, in the units that training draws.
 
     Attributes:
-        pictures: pictures of the split.
         views: for each view of each world, the rows of its looks.
         held_out: rows that are not trained on.
         times: how often an epoch shows it.

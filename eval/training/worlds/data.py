@@ -184,14 +184,7 @@ def _make_shard(path: Path, start: int, split: Split) -> Path:
 def render_missing(
     title: str, files: Mapping[Path, int], render: Callable[[Path, int], object], workers: int
 ) -> list[Path]:
-    """Render the files that are not there, each from its number; all of them are returned in order.
-
-    Args:
-        title: text of the progress bar.
-        files: their numbers.
-        render: writes a file; it runs in processes of their own.
-        workers: how many of these.
-    """
+    """Render the files that are not there, each from its number; all of them are returned in order."""
     from rich.progress import Progress
 
     missing = [pair for pair in files.items() if not pair[0].exists()]
