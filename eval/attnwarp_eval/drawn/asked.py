@@ -117,6 +117,10 @@ def _plain(rng: np.random.Generator, color: str) -> Entry:
     }
 
 
+def _seed(draft: Draft, rng: np.random.Generator) -> int:
+    return draft.long_seed(int(rng.random() * 2**31))
+
+
 def _colour(draft: Draft) -> Entry:
     """The colour held out of training for this kind; as a pattern if the thing already has it."""
     rng, thing = draft.stream("edit colour"), draft.things[0]
@@ -125,9 +129,7 @@ def _colour(draft: Draft) -> Entry:
     finish, second = "plain", -1
     if color == thing.look.color and thing.look.second < 0:
         finish, second = "striped", draft.other_color(rng, color)
-    look = Look(
-        FINISHES.index(finish), color, second, draft.ground, draft.time, int(rng.random() * 2**31)
-    )
+    look = Look(FINISHES.index(finish), color, second, draft.ground, draft.time, _seed(draft, rng))
     words = _words(look)
     return _edit(
         draft,
@@ -142,7 +144,7 @@ def _material(draft: Draft) -> Entry:
     rng, thing = draft.stream("edit material"), draft.things[0]
     kinds = [name for name in STATUES if name != FINISHES[thing.look.finish]]
     finish = kinds[index(rng, len(kinds))]
-    look = Look(FINISHES.index(finish), -1, -1, draft.ground, draft.time, int(rng.random() * 2**31))
+    look = Look(FINISHES.index(finish), -1, -1, draft.ground, draft.time, _seed(draft, rng))
     return _edit(
         draft,
         "material",
@@ -178,7 +180,7 @@ def _ground(draft: Draft) -> Entry:
     rng = draft.stream("edit ground")
     others = [k for k in range(len(GROUNDS)) if k != draft.ground]
     other = others[index(rng, len(others))]
-    look = Look(0, 0, -1, other, draft.time, int(rng.random() * 2**31))
+    look = Look(0, 0, -1, other, draft.time, _seed(draft, rng))
     return _edit(
         draft,
         "ground",
@@ -193,7 +195,7 @@ def _light(draft: Draft) -> Entry:
     rng = draft.stream("edit light")
     others = [k for k, name in enumerate(TIMES) if k != draft.time]
     other = others[index(rng, len(others))]
-    look = Look(0, 0, -1, draft.ground, other, int(rng.random() * 2**31))
+    look = Look(0, 0, -1, draft.ground, other, _seed(draft, rng))
     lights = look.lights if not draft.smooth else [x for x in look.lights if x["type"] == "sky"]
     return _edit(
         draft,

@@ -55,6 +55,23 @@ def test_a_thousand_small_seeds_find_no_sealed_scene_but_an_open_one(benches):
     assert found(suite.draw(0, seed=612).spec.description) == [612]
 
 
+def test_no_random_number_of_a_sealed_scene_comes_from_a_seed_that_can_be_tried(monkeypatch):
+    def shortest(seed):
+        """Bits of the longest number in the seed of each generator, and of these the fewest."""
+        seeds = []
+        with monkeypatch.context() as patch:
+            make = np.random.default_rng
+            patch.setattr(
+                np.random, "default_rng", lambda entropy: seeds.append(entropy) or make(entropy)
+            )
+            for number in range(4):
+                suite.draw(number, seed)
+        assert len(seeds) > 100
+        return min(max(int(part).bit_length() for part in one) for one in seeds)
+
+    assert shortest(2**255) >= 200 and shortest(7) < 32
+
+
 def test_no_file_of_a_sealed_bench_tells_the_secret_or_the_truth(benches):
     folder, key = benches[0]
     secret, names = secret_of(key), load_scene(str(suite.truth_file(key, SCENE))).object_names
