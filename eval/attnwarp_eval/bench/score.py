@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -32,12 +32,14 @@ from attnwarp_eval.bench.result import (
 )
 from attnwarp_eval.bench.suite import Suite, to_bytes, truth_file
 from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.document.model import Report, Section, Table
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.image import edit_drift
 from attnwarp_eval.study.shared.edit_figures import EditFigures
-from attnwarp_eval.study.shared.edit_truth import EditTruth, Judgement
+from attnwarp_eval.study.shared.edit_truth import EditTruth, Judgement, answers_of
+from attnwarp_eval.truth import appearance
 from attnwarp_eval.world import World
 
 Image = npt.NDArray[np.float32]
@@ -47,7 +49,7 @@ LITTLE = 3.0
 
 SMOOTH = 0.5
 """Share of a gradient inside the mask, the original's or the true edit's if less, below which
-pictures count as smoothed: an editor may keep either."""
+pictures count as smooth: an editor may keep either."""
 
 DISAGREEMENT = "multiview.delta_e_above.edit_inside"
 
@@ -119,7 +121,9 @@ def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path, track:
     # An own editor has answers of its own, so that any source has an edit to agree with.
     free = rows if judged.done else rows_of(replace(judged, done=True))
     rows = free if track == OWN else rows
-    faults = _remarks(truth, pictures, source, answer)
+    scenes = of.scene, of.scene.edited(edit, dict(answers_of(of.scene, edit))[answer])
+    again = [to_srgb(appearance(x, of.camera(source), spp=bench.spp, seed=1)) for x in scenes]
+    faults = _remarks(truth, pictures, source, answer, again)
     drifts = [edit_drift(truth.originals[view], image) for view, image in pictures.items()]
     values = {
         "error": _error(truth, pictures, answer),
@@ -172,9 +176,18 @@ def _pictures(bench: Suite, folder: Path) -> tuple[dict[str, Image], list[str]]:
 
 
 def _remarks(
-    truth: EditTruth, pictures: Mapping[str, Image], source: str, answer: str
+    truth: EditTruth,
+    pictures: Mapping[str, Image],
+    source: str,
+    answer: str,
+    again: Sequence[Image],
 ) -> list[str]:
-    """Describe pictures that no editing method would give."""
+    """Describe pictures whose agreement has no merit, or is in doubt.
+
+    Args:
+        truth, pictures, source, answer: those of an edit.
+        again: source before and after the edit, rendered by other random numbers.
+    """
     remarks = []
     inside = truth.union[source]
     if _difference(truth.originals[source], pictures[source], inside) < LITTLE:
@@ -193,15 +206,22 @@ def _remarks(
         nearest = min(errors, key=errors.__getitem__)
         if nearest != view and errors[nearest] < 0.5 * errors[view]:
             remarks.append(f"{view} looks like {nearest}: are their names swapped?")
-    slopes = []
+    # Without its border: a silhouette has a gradient, whatever fills it.
+    within = {v: binary_erosion(mask, np.ones((3, 3))) for v, mask in truth.union.items()}
+    before_after = {v: (truth.originals[v], truth.answers[answer][v]) for v in within}
+    # What two renders share is texture; the rest is noise, which no editor has to paint.
+    textures = [
+        max(0.01, _power(one, other, within[source]) / _power(one, one, within[source]))
+        for one, other in zip(before_after[source], again, strict=True)
+    ]
+    shares = []
     for view, image in pictures.items():
-        # Without its border: a silhouette has a gradient, whatever fills it.
-        within = binary_erosion(truth.union[view], np.ones((3, 3)))
-        if within.any():
-            least = (truth.originals[view], truth.answers[answer][view])
-            slopes.append(_slope(image, within) / min(_slope(one, within) for one in least))
-    if slopes and float(np.median(slopes)) < SMOOTH:
-        remarks.append(f"{SMOOTHED}: {np.median(slopes):.0%} of the gradient before or after")
+        of = (_power(one, one, within[view]) for one in before_after[view])
+        least = min(power * texture for power, texture in zip(of, textures, strict=True))
+        if within[view].any():
+            shares.append(math.sqrt(_power(image, image, within[view]) / least))
+    if shares and (share := float(np.median(shares))) < SMOOTH:
+        remarks.append(f"{SMOOTHED}: {share:.0%} of the true gradient, before or after")
     return remarks
 
 
@@ -227,9 +247,10 @@ def _difference(one: Image, two: Image, where: npt.NDArray[np.bool_]) -> float:
     return float(values.mean()) if values.size else math.nan
 
 
-def _slope(image: Image, where: npt.NDArray[np.bool_]) -> float:
-    down, right = np.gradient(image.astype(np.float64).mean(axis=2))
-    return float(np.hypot(down, right)[where].mean()) + 1e-9
+def _power(one: Image, two: Image, where: npt.NDArray[np.bool_]) -> float:
+    """Sum of the product of two pictures' gradients."""
+    a, b = (np.gradient(image.astype(np.float64).mean(axis=2)) for image in (one, two))
+    return float((a[0] * b[0] + a[1] * b[1])[where].sum()) + 1e-9
 
 
 def _mean(values: Any) -> float:

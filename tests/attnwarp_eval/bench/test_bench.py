@@ -24,6 +24,7 @@ from attnwarp_eval.files import write_picture
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import cells_of, load_study
 from attnwarp_eval.study.probe import probe
+from attnwarp_eval.study.shared.edit_truth import EditTruth
 from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.work import compute
 
@@ -158,6 +159,21 @@ def test_true_pictures_of_one_answer_have_no_error(bench, tmp_path):
         # Both sides are rounded to 8 bits.
         assert one.figures["error"] == 0 and one.figures["outside"] < 1
         assert one.figures["amount"] > score.LITTLE
+
+
+@pytest.mark.parametrize(("amplitude", "named"), [(1.0, False), (0.75, False), (0.25, True)])
+def test_noise_of_the_truth_is_no_texture_that_pictures_must_have(amplitude, named):
+    rng, size = np.random.default_rng(0), 128
+    wave = np.broadcast_to(0.1 * np.sin(np.arange(size) * np.pi / 4)[:, None], (size, size, 3))
+    one, two, *again = (wave + rng.normal(0, 0.15, (size, size, 1)) for _ in range(4))
+    where = {"source": np.ones((size, size), bool)}
+    truth = EditTruth({"source": one}, {"blue": {"source": two}}, {"blue": where}, where)
+    pictures = {"source": 0.5 + amplitude * wave}
+    said = [x for x in score._remarks(truth, pictures, "source", "blue", again) if "smooth" in x]
+    assert len(said) == named
+    for remark in said:
+        # Power that two renders of 16,000 pixels share has a standard error of 8 %.
+        assert abs(int(re.search(r"\d+", remark)[0]) - 100 * amplitude) < 5
 
 
 def spoiled(bench):
