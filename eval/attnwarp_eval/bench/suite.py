@@ -173,10 +173,9 @@ def export(
     if sealed is not None:
         if root.resolve().is_relative_to(folder.resolve()):
             raise InputError(f"{root}: lies in the bench, which is given away; name another folder")
+        root.mkdir(mode=0o700, parents=True, exist_ok=True)  # each scene's files name the secret
         if not (root / KEY).is_file():
-            secret = json.dumps({"secret": secrets.token_hex(32)}).encode()
-            write_atomic(root / KEY, secret)
-            (root / KEY).chmod(0o600)
+            write_atomic(root / KEY, json.dumps({"secret": secrets.token_hex(32)}).encode())
         seed = _secret(root)
     scenes = tuple(f"drawn-{number}" for number in range(count))
     asked = {"seed": seed, "size": size, "spp": spp, "targets": targets}

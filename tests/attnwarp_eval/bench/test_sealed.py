@@ -96,6 +96,7 @@ def test_no_file_of_a_sealed_bench_tells_the_secret_or_the_truth(benches):
         if path.suffix == ".png":
             assert set(chunks(data)) == {b"IHDR", b"IDAT", b"IEND"}
     assert {path.stat().st_mtime for path in folder.rglob("*")} == {suite.TIME}
+    assert key.stat().st_mode & 0o077 == 0  # on the host's machine others can't read it
     assert (folder / SCENE / "sparse" / "0" / "points3D.txt").read_text().strip() == ""
     bench = json.loads(files[suite.FILE].read_text())
     assert bench["seed"] is None and len(bench["sealed"]) == 1 + 6
