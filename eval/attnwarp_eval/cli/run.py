@@ -188,7 +188,7 @@ def run_study(
         keep_going: whether to continue after a failed cell.
     """
     from attnwarp_eval.cache import limit_bytes
-    from attnwarp_eval.report import problems, read_results
+    from attnwarp_eval.report import problems, read_results, write_report
     from attnwarp_eval.study.run import plan
     from attnwarp_eval.study.store import Store
 
@@ -219,7 +219,8 @@ def run_study(
                     summary = _watch(planned, store, jobs, scheduler, keep_going)
                 results = read_results(store)
                 _print_answer(results)
-                _write_report(store)
+                for path in write_report(store):
+                    typer.echo(path)
                 uncalibrated = problems(results)
     _print_failures(summary)
     if not summary.complete:
@@ -266,11 +267,11 @@ def _print_answer(results: Results) -> None:
     from rich.console import Console
 
     from attnwarp_eval.document.write import terminal
-    from attnwarp_eval.report.answer import answer, by_claims
+    from attnwarp_eval.report.answer import answer
     from attnwarp_eval.report.claims import load_claims
-    from attnwarp_eval.report.judging import judge
+    from attnwarp_eval.report.judging import claims_section, judge
 
-    section = answer(results) or by_claims(results, judge(results, load_claims()))
+    section = answer(results) or claims_section(results, judge(results, load_claims()))
     if section is None:
         return
     console = Console(highlight=False)
@@ -281,19 +282,19 @@ def _print_answer(results: Results) -> None:
         console.print(terminal(replace(table, rows=rows)))
 
 
-def _write_report(store: Store, *, timings: bool = True, pictures: bool = True) -> None:
-    from attnwarp_eval.report import write_report
-
-    for path in write_report(store, timings=timings, pictures=pictures):
-        typer.echo(path)
-
-
 def report(
     run: Annotated[
         Path, typer.Argument(help="The run's folder, or one of raw results (results*.jsonl.xz).")
     ],
     timings: Annotated[bool, typer.Option(help="Without: no seconds, to compare runs.")] = True,
     pictures: Annotated[bool, typer.Option(help="Without: tables and figures alone.")] = True,
+    long: Annotated[
+        bool, typer.Option("--long", help="Every table in report.md, not one page of them.")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the report, without pictures of views; by default RUN."),
+    ] = None,
     raw: Annotated[
         Path | None,
         typer.Option(
@@ -304,19 +305,22 @@ def report(
 ) -> None:
     """Make report.md, report.html and results.jsonl again from the cells of a run.
 
-    Raw results of a study's parts make one report.md and report.html, without pictures.
+    report.md is one page: the answer, the claims, a table for each group of variants.
+    report.html has all other tables too, folded. Raw results of a study's parts, as reports/ has
+    them, make one report.md and report.html, without pictures.
     """
-    from attnwarp_eval.report import read_results, write_report_of_parts
+    from attnwarp_eval.report import read_results, write_report, write_report_of_parts
     from attnwarp_eval.report.raw import PARTS, write_raw
     from attnwarp_eval.study.store import Store
 
     with clear_errors():
         if raw is None and not (run / "study.json").exists() and any(run.glob(PARTS)):
-            for path in write_report_of_parts(run, timings=timings):
+            for path in write_report_of_parts(run, out=out, timings=timings, long=long):
                 typer.echo(path)
             return
         store = Store(run)
-        _write_report(store, timings=timings, pictures=pictures)
+        for path in write_report(store, out=out, timings=timings, pictures=pictures, long=long):
+            typer.echo(path)
         results = read_results(store)
         if raw is not None:
             typer.echo(write_raw(store, raw))

@@ -12,8 +12,8 @@ class Table:
     """A table of ready-made text cells.
 
     Columns named in ``timed`` hold seconds or memory. A ``folded`` table is collapsed on a page
-    until a reader opens it. In a ``glossary`` the first column has terms that the others explain,
-    and the same terms elsewhere on the page link to it.
+    until a reader opens it, and is left out of short Markdown. In a ``glossary`` the first column
+    has terms that the others explain, and the same terms elsewhere on the page link to it.
 
     Example:
         >>> table = Table(["variant", "seconds"], [["paper", "0.1"]], timed=("seconds",))
@@ -107,7 +107,7 @@ class Grid:
 class Section:
     """A heading with text, grids, tables, figures and galleries, in this order.
 
-    A ``folded`` section is collapsed until a reader opens it.
+    A ``folded`` section is collapsed until a reader opens it, and is left out of short Markdown.
 
     Example:
         >>> section = Section("Depth", ["Against exact depth."], [Table(["AbsRel"], [["0.01"]])])

@@ -68,6 +68,8 @@ def _css(cell: str) -> Markup:
         return Markup(f' class="{_CLASSES[cell]}"')
     if cell.endswith("no verdict"):
         return Markup(' class="untold"')
+    if cell.rpartition(" ")[2] in ("better", "worse"):
+        return Markup(f' class="{cell.rpartition(" ")[2]}"')
     if len(cell) > 40:
         return Markup(' class="wide"')
     return Markup(' class="text"') if len(cell) > 12 and cell[0].isalpha() else Markup("")
@@ -243,15 +245,20 @@ def templates(package: str, *, autoescape: bool) -> Environment:
     )
 
 
-def _render(template: str, report: Report, autoescape: bool, filters: dict[str, Any]) -> str:
+def _render(
+    template: str, report: Report, autoescape: bool, filters: dict[str, Any], long: bool = True
+) -> str:
     environment = templates("attnwarp_eval.document", autoescape=autoescape)
     environment.filters.update(filters)
-    return environment.get_template(template).render(report=report)
+    return environment.get_template(template).render(report=report, long=long)
 
 
-def markdown(report: Report) -> str:
+def markdown(report: Report, *, long: bool = True) -> str:
     """The report as Markdown; pictures are links relative to the run's folder, and come last, since
     a CI's summary shows none.
+
+    Args:
+        long: False leaves out folded sections and tables.
 
     Example:
         >>> from attnwarp_eval.document.model import Section
@@ -260,7 +267,8 @@ def markdown(report: Report) -> str:
         >>> "| paper | 0.01 |" in text
         True
     """
-    text = _render("report.md.j2", report, False, {"plain": plain, "table": markdown_table})
+    filters = {"plain": plain, "table": markdown_table}
+    text = _render("report.md.j2", report, False, filters, long)
     return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
 
 
@@ -279,19 +287,20 @@ def page(report: Report, root: Path) -> str:
     return _render("report.html.j2", report, True, filters) + "\n"
 
 
-def write_files(report: Report, folder: Path, name: str) -> list[Path]:
+def write_files(report: Report, folder: Path, name: str, *, long: bool = True) -> list[Path]:
     """Write the report as Markdown and as a page; return their paths, the page at the end.
 
     Args:
         report: report with pictures and figures below ``folder``.
         name: name of the files, without a suffix.
+        long: as for :func:`markdown`.
 
     Example:
         >>> from pathlib import Path
         >>> [path.name for path in write_files(Report("Warps", [], []), Path(), "warps")]
         ['warps.md', 'warps.html']
     """
-    texts = {f"{name}.md": markdown(report), f"{name}.html": page(report, folder)}
+    texts = {f"{name}.md": markdown(report, long=long), f"{name}.html": page(report, folder)}
     for file, text in texts.items():
         write_atomic(folder / file, text.encode())
     return [folder / file for file in texts]

@@ -18,14 +18,23 @@ from attnwarp_eval.study.store import Store, StoreError
 __all__ = ["problems", "read_results", "write_report", "write_report_of_parts"]
 
 
-def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -> list[Path]:
+def write_report(
+    store: Store,
+    *,
+    out: Path | None = None,
+    timings: bool = True,
+    pictures: bool = True,
+    long: bool = False,
+) -> list[Path]:
     """Write the report of a run's folder from its finished cells.
 
     Args:
+        out: folder of the report, by default the run's; another one gets no pictures of views.
         timings: False leaves out measured seconds and memory, so that two runs of the
             same study on the same code give the same bytes.
         pictures: False leaves out the views' pictures, for a report stored with the code or
             in a CI summary.
+        long: whether report.md has the folded sections and tables of report.html.
 
     Returns:
         The written files; the last is the one to open first.
@@ -44,22 +53,26 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
         ['results.jsonl', 'report.md', 'report.html']
     """
     results = read_results(store)
-    if pictures:
+    folder = out or store.root
+    if shown := pictures and out is None:
         _check_pictures(results, store)
-    report = build(results, store.root, timings=timings, pictures=pictures)
-    path = store.root / "results.jsonl"
+    report = build(results, folder, timings=timings, pictures=shown)
+    path = folder / "results.jsonl"
     content = "".join(f"{line}\n" for line in lines(results, timings)).encode()
     write_atomic(path, content)
     write_atomic(_sum_of(path), _sum_line(path, content))
-    return [path, *write_files(report, store.root, "report")]
+    return [path, *write_files(report, folder, "report", long=long)]
 
 
-def write_report_of_parts(folder: Path, *, timings: bool = True) -> list[Path]:
+def write_report_of_parts(
+    folder: Path, *, out: Path | None = None, timings: bool = True, long: bool = False
+) -> list[Path]:
     """Write the report of a folder of raw results, without the views' pictures.
 
     Args:
         folder: path of ``results*.jsonl.xz``, parts of one study.
-        timings: as for :func:`write_report`.
+        out: folder of the report, by default that of the raw results.
+        timings, long: as for :func:`write_report`.
 
     Returns:
         The written files; the last is the one to open first.
@@ -79,9 +92,9 @@ def write_report_of_parts(folder: Path, *, timings: bool = True) -> list[Path]:
         >>> [path.name for path in write_report_of_parts(folder)]
         ['report.md', 'report.html']
     """
-    results = read_parts(folder)
-    report = build(results, folder, timings=timings, pictures=False)
-    return write_files(report, folder, "report")
+    results, out = read_parts(folder), out or folder
+    report = build(results, out, timings=timings, pictures=False)
+    return write_files(report, out, "report", long=long)
 
 
 def wrong_results(store: Store) -> list[str]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence, Set
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
@@ -15,7 +16,7 @@ from attnwarp_eval.report.controls import BLIND, blind
 from attnwarp_eval.report.judging import Comparison, JudgedClaim, of_comparisons
 from attnwarp_eval.statistics.contrasts import EQUAL_LEVEL, Contrast
 from attnwarp_eval.statistics.intervals import benjamini_hochberg
-from attnwarp_eval.study.probe_report import mean_values, report_of
+from attnwarp_eval.study.probe_report import ProbeReport, mean_values, report_of
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Ablation
 
@@ -24,6 +25,12 @@ POOLED = (
     " left out of it as undefined. Pooled PSNR is that of the mean squared error over the views and"
     " scenes, with those of the ends of its interval; equal pictures have error 0."
 )
+
+UNDEFINED = re.compile(r" \(\d+ undefined\)$")
+"""Note behind a mean."""
+
+MOST_LINES = 70
+"""Largest number of lines of short tables on a page; the tables after them are folded."""
 
 CLAIMED = "†"
 """Mark of a p-value that belongs to a claim."""
@@ -57,30 +64,99 @@ class Row:
         return difference_text(self.difference, self.specification.unit, level)
 
     @property
+    def short(self) -> str:
+        """The verdict, if it tells something."""
+        few = self.difference.scenes < FEWEST_SCENES or not any(self.difference.by_scene.values())
+        return "" if few or self.verdict == "can't tell" else self.verdict
+
+    @property
     def outcome(self) -> str:
         """The verdict; for fewer than six scenes, the number of scenes that agree."""
         few = self.verdict and self.difference.scenes < FEWEST_SCENES
         return no_verdict(self.difference) if few else self.verdict
 
 
-def ablations(results: Results, compared: Sequence[Sequence[Row]]) -> list[Section]:
-    """Sections, one for each ablation of the study."""
-    sections = list(map(partial(_section, results), results.study.ablations, compared))
-    for section, ablation in zip(sections, results.study.ablations, strict=True):
-        own = report_of(ablation.probe)
-        if any(own.probe.metric(m).squared for m in own.columns_at(results.layer).values()):
-            section.text.append(POOLED)
-            break
-    return sections
+def differences(results: Results, compared: Sequence[Sequence[Row]]) -> list[Section]:
+    """The section with one short table for each ablation of the study; none without any."""
+    ablations = results.study.ablations
+    if not ablations:
+        return []
+    section, lines = Section("Differences"), 0
+    for ablation, rows in zip(ablations, compared, strict=True):
+        names = _names(ablation)
+        table = _main(results, ablation, rows)
+        lines += len(table.rows) + 5
+        table.folded = lines > MOST_LINES
+        section.tables.append(table)
+        missing = [n for n in names if not results.records(ablation.probe, n)]
+        if missing:
+            section.text.append(f"**{ablation.title}: not measured: {', '.join(missing)}.**")
+        section.text += [f"{ablation.title}: {ablation.note}"] if ablation.note else []
+    if len(results.study.scenes) >= FEWEST_SCENES:
+        section.text.insert(
+            0,
+            "Behind a mean and its 95 % interval stands the verdict on its difference from the"
+            " table's first row, paired on scene and view: `better`, `worse`, `equal`, `blind` if"
+            " features from a wrong place do as well, or nothing if it can't be told. Flipped signs"
+            " of the scenes decide, adjusted over a table, or over the claims.",
+        )
+    if folded := [table.caption for table in section.tables if table.folded]:
+        section.text.append(f"Folded, as they would not fit on a page: {'; '.join(folded)}.")
+    return [section]
+
+
+def glossary(results: Results) -> str:
+    """Meaning of the columns of all short tables; empty without any."""
+    meanings = {
+        title: own.probe.metric(key)
+        for own in (report_of(ablation.probe) for ablation in results.study.ablations)
+        for title, key in main_columns(own, results).items()
+    }
+    return "; ".join(
+        f"**{title}**: {m.description}"
+        + f" ({m.direction} is better)" * (m.direction in ("higher", "lower"))
+        for title, m in meanings.items()
+    )
+
+
+def _names(ablation: Ablation) -> list[str]:
+    return [ablation.baseline, *[v for v in ablation.variants if v != ablation.baseline]]
+
+
+def main_columns(own: ProbeReport, results: Results) -> dict[str, str]:
+    """Columns of a short table, title -> metric: those in which variants are compared."""
+    columns = own.columns_at(results.layer)
+    titles = {metric: title for title, metric in columns.items()}
+    metrics = [metric.format(layer=results.layer) for metric in own.contrasts]
+    return {titles.get(metric, metric): metric for metric in metrics or columns.values()}
+
+
+def _main(results: Results, ablation: Ablation, compared: Sequence[Row]) -> Table:
+    own = report_of(ablation.probe)
+    columns = main_columns(own, results)
+    told = {(row.variant, row.metric): row.short for row in compared}
+    names, table = _names(ablation), {"variant": _names(ablation)}
+    for title, metric in columns.items():
+        means = [mean_values(results, own.name, name, [metric])[0] for name in names]
+        if set(means) == {"–"}:
+            continue
+        if len(notes := {(UNDEFINED.search(mean) or [""])[0] for mean in means}) == 1:
+            note = notes.pop()
+            means, title = [mean.removesuffix(note) for mean in means], title + note
+        words = (told.get((name, metric), "") for name in names)
+        table[title] = [f"{mean} {word}".strip() for mean, word in zip(means, words, strict=True)]
+    cells = [list(row) for row in zip(*table.values(), strict=True)]
+    return Table(list(table), cells, ablation.title)
+
+
+def in_detail(results: Results, compared: Sequence[Sequence[Row]]) -> list[Section]:
+    """Folded sections, one for each ablation of the study."""
+    return list(map(partial(_section, results), results.study.ablations, compared))
 
 
 def _section(results: Results, ablation: Ablation, compared: Sequence[Row]) -> Section:
-    own, baseline = report_of(ablation.probe), ablation.baseline
-    names = [baseline, *[v for v in ablation.variants if v != baseline]]
-    section = Section(ablation.title, [ablation.note] if ablation.note else [])
-    missing = [name for name in names if not results.records(own.name, name)]
-    if missing:
-        section.text.append(f"**Not measured:** {', '.join(missing)}.")
+    own, names = report_of(ablation.probe), _names(ablation)
+    section = Section(f"In detail: {ablation.title}", folded=True)
     columns = own.columns_at(results.layer)
     # A probe without renders has no counts of pairs.
     counted = any("pairs" in results.counters(own.name, name) for name in names)
@@ -101,16 +177,10 @@ def _section(results: Results, ablation: Ablation, compared: Sequence[Row]) -> S
     pairs = ["M splat-pixel pairs a view"] if counted else []
     section.tables.append(Table(["variant", *columns, *pairs, time], rows, timed=(time,)))
     section.tables += own.details(results, names)
+    if any(own.probe.metric(m).squared for m in columns.values()):
+        section.text.append(POOLED)
     if len(names) > 1:
-        untold = {r.metric for r in compared if r.outcome == "can't tell"}
-        unseen = {m for m in untold if own.probe.edits and blind(results, own.name, m, baseline)}
-        section.tables.append(_table(compared, ablation.baseline, unseen))
-        if unseen:
-            section.text.append(
-                f"**{BLIND.capitalize()}:** {', '.join(sorted(unseen))}. Features from the wrong"
-                " place did not do worse here, so this study cannot see where features come from"
-                f' by these figures; {BLIND!r} stands for "can\'t tell".'
-            )
+        section.tables.append(_table(compared, ablation.baseline))
         if any(row.claim is not None for row in compared):
             section.text.append(
                 f"{CLAIMED} in the table of differences: a claim makes this comparison. p-value and"
@@ -151,6 +221,11 @@ def rows_of(
             for difference, claim in zip(differences, of_claims, strict=True)
         ]
     )
+
+    @cache
+    def unseen(metric: str) -> bool:
+        return own.probe.edits and blind(results, own.name, metric, baseline)
+
     rows = []
     for pair, difference, of_table, claim in zip(
         pairs, differences, adjusted, of_claims, strict=True
@@ -162,17 +237,17 @@ def rows_of(
             outcome = claim.verdict
         elif specification.direction in ("higher", "lower"):
             outcome = difference.verdict(specification.direction, adjusted_p=p)
+            if outcome == "can't tell" and unseen(pair[1]):
+                outcome = BLIND
         rows.append(Row(*pair, specification, difference, p, claim, outcome))
     return rows
 
 
-def _table(compared: Sequence[Row], baseline: str, unseen: Set[str]) -> Table:
+def _table(compared: Sequence[Row], baseline: str) -> Table:
     rows = []
     for row in compared:
         difference = row.difference
         judged = row.outcome or "–"
-        if judged == "can't tell" and row.metric in unseen:
-            judged = BLIND
         if difference.views == 0:
             judged = "not measured"
         elif not any(difference.by_scene.values()):
@@ -197,6 +272,4 @@ def _table(compared: Sequence[Row], baseline: str, unseen: Set[str]) -> Table:
         "adjusted p",
         "scenes, views",
     ]
-    return Table(
-        columns, rows, caption=f"Differences from {baseline!r}, with verdicts", folded=True
-    )
+    return Table(columns, rows, f"Differences from {baseline!r}, with verdicts")

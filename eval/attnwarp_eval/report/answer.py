@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
 from attnwarp_eval.metrics.registry import Metric
-from attnwarp_eval.report.judging import JudgedClaim
+from attnwarp_eval.report.compared import in_words
 from attnwarp_eval.statistics.intervals import Interval, over_scenes
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of, side_by_side
@@ -18,20 +18,6 @@ from attnwarp_eval.study.schema import FIGURE, Answer, AnswerColumn
 from attnwarp_eval.study.turns import timed_in_turn
 
 TITLE = "Answer"
-
-ASKS = re.compile(r"(^|, )(what|which|how|where|do|does|is|are)\b", re.IGNORECASE)
-"""Beginning of a question in a title or in a title's last part."""
-
-_UNITS = {
-    "px": "px",
-    "dB": "dB",
-    "dE00": "dE00",
-    "deg": "degrees",
-    "pixels": "pixels",
-    "rows": "rows",
-    "views": "views",
-}
-"""Unit of a metric -> the word after its figure, for figures shown unconverted."""
 
 
 def answer(results: Results, timings: bool = True, pictures: bool = True) -> Section | None:
@@ -61,106 +47,6 @@ def answer(results: Results, timings: bool = True, pictures: bool = True) -> Sec
     return section
 
 
-MOST_CLAIMS, MOST_TOLD = 12, 5
-"""Limits of the rows in an answer's table of claims, and of the claims in its text."""
-
-OUTCOMES = {
-    "holds": "As expected",
-    "the opposite holds": "The opposite of what was expected",
-    "equal": "No difference, within a bound",
-    "depends on the editor": "One way with one editor, another way with another",
-    "can't tell": "Cannot be told",
-    "blind": "No verdict, since the control failed",
-}
-"""Verdict -> its wording, in the order in which claims are shown."""
-
-
-def by_claims(
-    results: Results, judged: Sequence[JudgedClaim], timings: bool = True
-) -> Section | None:
-    """The answer of a study that judges claims and states no question; None for a run
-    without a verdict.
-
-    Args:
-        timings: whether seconds are shown.
-    """
-    own = [one for one in judged if one.verdict is not None]
-    if not own or len(results.study.scenes) < FEWEST_SCENES:
-        return None
-    kinds = list(OUTCOMES)
-    own.sort(key=lambda one: (kinds.index(str(one.verdict)), one.claim.headline or math.inf, one.p))
-    counts = {kind: sum(one.verdict == kind for one in own) for kind in kinds}
-    counted = " ".join(f"{OUTCOMES[kind]}: {n}." for kind, n in counts.items() if n)
-    several = len(own) > 1
-    text = [f"{len(own)} expectation{'s are' if several else ' is'} judged. {counted}"]
-    # The headlines, then unexpected results; in their order, since a claim may refer to another.
-    chosen = sorted(
-        (one for one in judged if one.told),
-        key=lambda one: (one.claim.headline or math.inf, one.verdict != "the opposite holds"),
-    )[:MOST_TOLD]
-    told = [one for one in judged if any(one is other for other in chosen)]
-    text.append(
-        "\n".join(
-            f"- {OUTCOMES[str(one.verdict)]}: **{one.claim.text}** ({against(one)})."
-            for one in told
-        )
-    )
-    sure = [
-        f"Of {results.study.sampled}, each test has those in which its difference is defined."
-        + f" Each verdict allows for all {len(own)} being asked at once." * several
-    ]
-    if timings:
-        sure += _time_of_pair(results)
-    if told:
-        sure.append("Build on what has a verdict.")
-    if counts["can't tell"]:
-        sure.append(
-            '"Can\'t tell" does not mean equal: more scenes may tell, or `attnwarp-eval verdicts`,'
-            " which adjusts over the claims of all studies together."
-        )
-    text.append(" ".join(sure))
-    if len(own) > MOST_CLAIMS:
-        text.append(f"The table has {MOST_CLAIMS} of the {len(own)}; a section below has all.")
-    rows = [
-        [one.claim.text, one.in_words, one.difference, against(one)] for one in own[:MOST_CLAIMS]
-    ]
-    columns = ["what was expected", "verdict", "difference", "measured"]
-    return Section(
-        TITLE,
-        question(results) + list(filter(None, text)),
-        [Table(columns, rows, "Expected, and found")],
-    )
-
-
-def against(judged: JudgedClaim) -> str:
-    """Mean of each side of a claim in words, in the order of the claim."""
-    metric = probe(judged.claim.probe).metric(judged.metric)
-    means = [in_words(side.mean, metric, judged.metric) for side in judged.sides.values()]
-    return " against ".join(reversed(means))
-
-
-def question(results: Results) -> list[str]:
-    """The study's title in bold, if it is a question."""
-    title = results.study.title.rstrip("?. ")
-    return [f"**{title}?**"] if ASKS.search(title) else []
-
-
-def _time_of_pair(results: Results) -> Iterator[str]:
-    """Sentence on the seconds of the first table's baseline and its first variant."""
-    for ablation in results.study.ablations[:1]:
-        own = report_of(ablation.probe)
-        timed = timed_in_turn(results, own.stage) if own.stage else None
-        taken = {}
-        for name in (ablation.baseline, ablation.variants[0]):
-            if timed is not None and name in timed.names:
-                taken[name] = timed.seconds(name).mean
-            elif timed is None:
-                taken[name] = results.usual_seconds(own.name, name, own.cost)
-        if len(taken) == 2 and all(map(math.isfinite, taken.values())):
-            each = ", ".join(f"`{name}` {number(s, 2)} s" for name, s in taken.items())
-            yield f"Time of {own.cost_of}{'' if timed else ', in one pass'}: {each}."
-
-
 def measured_in_words(results: Results) -> str:
     """Summary of a run's measurements, for a report that answers no question."""
     study = results.study
@@ -174,34 +60,6 @@ def measured_in_words(results: Results) -> str:
     scenes = "" if study.sampled else f"scene{'s' if len(study.scenes) > 1 else ''} "
     size = f" At {study.size} x {study.size} px, in {scenes}{where}." if study.scenes else ""
     return f"{of} run measured {'; '.join(things)}.{size}"
-
-
-def in_words(value: float, metric: Metric, key: str) -> str:
-    """Format a figure with its unit for a sentence.
-
-    Args:
-        value: value of the figure; NaN where undefined.
-        metric: specification of the figure.
-        key: name of the figure in a record; its last part may be the size of a feature grid.
-
-    Example:
-        >>> from attnwarp_eval.metrics.registry import METRICS
-        >>> in_words(0.686, METRICS["occlusion.hidden_share"], "occlusion.hidden_share")
-        '69 %'
-        >>> key = "warp.epe_median_layer.64"
-        >>> in_words(0.4671, METRICS[key], key)
-        '0.47 px of a 64 grid'
-    """
-    if not math.isfinite(value):
-        return "undefined"
-    if metric.unit in ("share", "ratio"):
-        percent = 100 * value
-        return f"{percent:.0f} %" if abs(percent) >= 10 else f"{number(percent, 2)} %"
-    text = number(value, 2 if abs(value) < 10 else 3)
-    if metric.unit == "layer px":
-        grid = key.rpartition(".")[2]
-        return f"{text} px of a {grid} grid" if grid.isdigit() else f"{text} px of the grid"
-    return f"{text} {_UNITS.get(metric.unit, '')}".strip()
 
 
 def _figure(results: Results, column: AnswerColumn, variant: str) -> tuple[Interval, str]:

@@ -10,6 +10,7 @@ from importlib import resources
 from typing import Any, Literal
 
 from attnwarp_eval.report.compared import between
+from attnwarp_eval.report.controls import Share, control_share
 from attnwarp_eval.scene.yaml import read_yaml
 from attnwarp_eval.statistics.contrasts import Contrast, contrast
 from attnwarp_eval.statistics.intervals import ByView, Interval, common, over_scenes
@@ -139,20 +140,29 @@ class Claim:
             return Measured(metric, sides, limit, first, contrast(limit, first, "plain"))
         # Means over the shared views: only their difference is the claim's.
         sides = dict(zip(names, map(over_scenes, common([first, second])), strict=True))
-        return Measured(metric, sides, first, second, value, self._control(results, names[1]))
+        control, share = self._control(results, names[1], first, second)
+        return Measured(metric, sides, first, second, value, control, share)
 
-    def _control(self, results: Results, reference: str) -> Seen:
-        """Test at 5 % whether the run detects the claim's control."""
+    def _control(
+        self, results: Results, reference: str, first: ByView, second: ByView
+    ) -> tuple[Seen, Share | None]:
+        """Test at 5 % whether the run detects the claim's control; the control's share of a gain
+        from the first table to the second, if it has to be worse in the claim's own metric.
+        """
         if self.control is None:
-            return ""
+            return "", None
         key = str(self.control.get("metric", self.metric)).replace("{layer}", str(results.layer))
         direction = probe(self.probe).metric(key).direction
         expected = "worse" if "worse" in self.control else "better"
         label = self._variant(results, self.control[expected])
         if label is None or direction not in ("higher", "lower"):
-            return "not measured"
+            return "not measured", None
         found = between(results, self.probe, reference, label, key, self.yaw).verdict(direction)
-        return "seen" if found == expected else "not seen"
+        share = None
+        if expected == "worse" and "metric" not in self.control:
+            table = results.views(self.probe, label, key, self.yaw)
+            share = control_share(second, table, first, sign=1 if direction == "higher" else -1)
+        return "seen" if found == expected else "not seen", share
 
     def _variant(self, results: Results, data: Mapping[str, Any] | None) -> str | None:
         if data is None:
@@ -163,7 +173,7 @@ class Claim:
 @dataclass(frozen=True)
 class Measured:
     """Sides of a claim by name, the two tables whose difference it predicts, that difference on the
-    scale of the figure, and whether the claim's control was detected.
+    scale of the figure, whether the claim's control was detected, and its share of a gain.
     """
 
     metric: str
@@ -172,6 +182,7 @@ class Measured:
     b: ByView
     contrast: Contrast
     control: Seen = ""
+    share: Share | None = None
 
 
 @cache

@@ -100,6 +100,46 @@ def _counts(
     return dict(total) if tables and known else None
 
 
+_UNITS = {
+    "px": "px",
+    "dB": "dB",
+    "dE00": "dE00",
+    "deg": "degrees",
+    "pixels": "pixels",
+    "rows": "rows",
+    "views": "views",
+}
+"""Unit of a metric -> the word after its figure, for figures shown unconverted."""
+
+
+def in_words(value: float, metric: Metric, key: str) -> str:
+    """Format a figure with its unit for a sentence.
+
+    Args:
+        value: value of the figure; NaN where undefined.
+        metric: specification of the figure.
+        key: name of the figure in a record; its last part may be the size of a feature grid.
+
+    Example:
+        >>> from attnwarp_eval.metrics.registry import METRICS
+        >>> in_words(0.686, METRICS["occlusion.hidden_share"], "occlusion.hidden_share")
+        '69 %'
+        >>> key = "warp.epe_median_layer.64"
+        >>> in_words(0.4671, METRICS[key], key)
+        '0.47 px of a 64 grid'
+    """
+    if not math.isfinite(value):
+        return "undefined"
+    if metric.unit in ("share", "ratio"):
+        percent = 100 * value
+        return f"{percent:.0f} %" if abs(percent) >= 10 else f"{number(percent, 2)} %"
+    text = number(value, 2 if abs(value) < 10 else 3)
+    if metric.unit == "layer px":
+        grid = key.rpartition(".")[2]
+        return f"{text} px of a {grid} grid" if grid.isdigit() else f"{text} px of the grid"
+    return f"{text} {_UNITS.get(metric.unit, '')}".strip()
+
+
 def difference_text(value: Contrast, unit: str, level: float = 0.95) -> str:
     """Format a difference with the interval of its verdict's level; below six scenes
     with the lowest and the highest scene.

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from statistics import fmean
 from typing import Literal
 
+import numpy as np
+import numpy.typing as npt
+
 from attnwarp_eval.document.model import Section, Table
-from attnwarp_eval.document.numbers import FEWEST_SCENES
+from attnwarp_eval.document.numbers import FEWEST_SCENES, number
 from attnwarp_eval.report.compared import between
+from attnwarp_eval.statistics.intervals import ByView, common
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.results import Results
@@ -17,6 +22,60 @@ from attnwarp_eval.study.shared.edits import VariantPart
 
 BLIND: Literal["blind"] = "blind"
 """Replacement of "can't tell" if the study's control failed."""
+
+HALF = 0.5
+"""Share of a gain that features from a wrong place reach, above which it is no evidence."""
+
+DRAWS = 1000
+"""Number of resamples of scenes for the interval of a control's share."""
+
+Share = tuple[float, float, float]
+"""Share of a gain that a control reaches, and the ends of its 95 % interval."""
+
+
+def control_share(method: ByView, control: ByView, alone: ByView, *, sign: int = 1) -> Share:
+    """Share of a method's gain that a control reaches, with its 95 % interval.
+
+    Scenes are drawn with replacement. NaN without a gain.
+
+    Args:
+        method, control, alone: figures of the method, of its control, and without either.
+        sign: -1 if lower is better.
+
+    Example:
+        >>> tables = [{f"s{k}": {"v": value} for k in range(6)} for value in (0.9, 0.4, 0.3)]
+        >>> [round(value, 3) for value in control_share(*tables)]
+        [0.167, 0.167, 0.167]
+    """
+    tables = common([method, control, alone])
+    means = np.array([[fmean(views.values()) for views in table.values()] for table in tables])
+    if not means.size:
+        return np.nan, np.nan, np.nan
+    count = means.shape[1]
+    drawn = np.random.default_rng(0).integers(count, size=(DRAWS, count))
+
+    def share(of: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        gain = sign * (of[0] - of[2])
+        return np.where(gain > 0, sign * (of[1] - of[2]), np.nan) / np.where(gain > 0, gain, 1)
+
+    mean, shares = float(share(means.mean(axis=-1))), share(means[:, drawn].mean(axis=-1))
+    shares = shares[np.isfinite(shares)]
+    if not len(shares):
+        return mean, np.nan, np.nan
+    return mean, *np.quantile(shares, [0.025, 0.975]).tolist()
+
+
+def share_text(share: Share) -> str:
+    """A control's share in percent, with its interval.
+
+    Example:
+        >>> share_text((0.08, 0.05, 0.12)), share_text((float("nan"),) * 3)
+        ('8.0 % (5.0 to 12 %)', 'no gain')
+    """
+    if not np.isfinite(share[0]):
+        return "no gain"
+    mean, low, high = (number(100 * value, 2) for value in share)
+    return f"{mean} % ({low} to {high} %)"
 
 
 def is_control(variant: Variant) -> bool:
@@ -88,7 +147,7 @@ def controls(results: Results) -> list[Section]:
         " seen it. A figure that sees none of them is blind to where features come from. The same"
         " variant with another seed must not be seen."
     )
-    return [Section("Controls", [text], tables)]
+    return [Section("Controls", [text], tables, folded=True)]
 
 
 def _tables(results: Results, name: str, baseline: str) -> Iterator[Table]:

@@ -24,8 +24,6 @@ from attnwarp_eval.study.results import Results, Shared
 from attnwarp_eval.study.schema import Front
 from attnwarp_eval.study.turns import Timed, timed_in_turn
 
-TITLE = "What accuracy costs in time"
-
 DRAWS = 1000
 """Number of resamples of scenes and rounds."""
 
@@ -35,7 +33,7 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
     reports = {front.probe: report_of(front.probe) for front in results.study.fronts}
     in_turn = {own.stage: timed_in_turn(results, own.stage) for own in reports.values()}
     text = _text(reports.values(), in_turn)
-    section = Section(TITLE, list(text))
+    section = Section("What accuracy costs in time", list(text))
     for index, front in enumerate(results.study.fronts):
         metric = front.metric.format(layer=results.layer)
         shared = results.shared(front.probe, front.variants, metric)
@@ -76,7 +74,7 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
                 else [*row, "–", "–"]
                 for row in rows
             ]
-        section.tables.append(Table(columns, marked, front.title))
+        section.tables.append(Table(columns, marked, front.title, folded=True))
         section.tables += _cheapest(results, shared, points, time)
     return [section] if section.tables or len(section.text) > len(text) else []
 

@@ -57,4 +57,4 @@ def _shared(results: Results, apart: set[str]) -> list[Section]:
             f" blue too near, red too far, full colour at {100 * DEPTH_RANGE:g} %."
         ),
     ]
-    return [Section("Pictures", text, gallery=Gallery(rows, picker=True))]
+    return [Section("Pictures", text, gallery=Gallery(rows, picker=True), folded=True)]

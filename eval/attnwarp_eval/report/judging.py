@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
@@ -11,7 +13,8 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number, spread
 from attnwarp_eval.metrics.multiview import ABOVE_FLOOR, BELOW_FLOOR
 from attnwarp_eval.report.claims import Claim, Measured, load_claims
-from attnwarp_eval.report.compared import difference_text, no_verdict, scene_texts
+from attnwarp_eval.report.compared import difference_text, in_words, no_verdict, scene_texts
+from attnwarp_eval.report.controls import HALF, share_text
 from attnwarp_eval.statistics.contrasts import EQUAL_LEVEL, Contrast
 from attnwarp_eval.statistics.intervals import (
     ROUNDING,
@@ -104,6 +107,33 @@ class JudgedClaim:
         needed = self.contrast.needed(self.p, self.claim.bound)
         return f"can't tell: {count_of(needed)} scenes would"
 
+    @property
+    def means(self) -> str:
+        """Mean of each side in words, in the order of the claim."""
+        metric = probe(self.claim.probe).metric(self.metric)
+        means = [in_words(side.mean, metric, self.metric) for side in self.sides.values()]
+        return " against ".join(reversed(means))
+
+    @property
+    def control(self) -> str:
+        """Outcome of the control in words, with its share of a gain that was told."""
+        share, told = self.measured.share, self.verdict in ("holds", "the opposite holds", "blind")
+        if told and share is not None and math.isfinite(share[0]):
+            return f"{self.measured.control}: {share_text(share)}"
+        return self.measured.control or "none"
+
+    @property
+    def row(self) -> tuple[str, ...]:
+        """Cells of a table of claims."""
+        return (
+            self.claim.text,
+            self.in_words,
+            self.difference,
+            self.means,
+            str(self.contrast.scenes),
+            self.control,
+        )
+
 
 def count_of(scenes: int) -> str:
     """A number of scenes in words.
@@ -182,6 +212,9 @@ def _verdict(judged: JudgedClaim, p: float) -> Verdict:
         # meaning. A loss keeps its meaning.
         lost = told == "worse" and "worse" in (claim.control or {})
         return "the opposite holds" if lost else "blind"
+    share = judged.measured.share
+    if told in ("better", "worse") and share is not None and share[0] >= HALF:
+        return "blind"
     words: dict[str, Verdict] = {"better": "holds", "worse": "the opposite holds", "equal": "equal"}
     return words.get(told, "can't tell")
 
@@ -242,101 +275,94 @@ def _below_floor(measured: Measured) -> tuple[str, ...]:
     return tuple(s for s in a if max(fmean(a[s].values()), fmean(b[s].values())) < 0)
 
 
-def _scenes(finding: JudgedClaim, scenes: int) -> str:
-    below = ", ".join(finding.below_floor)
-    text = f"{finding.contrast.scenes} of {scenes}"
-    return f"{text}; below the floor: {below}" if below else text
+OUTCOMES = {
+    "holds": "As expected",
+    "the opposite holds": "The opposite of what was expected",
+    "equal": "No difference, within a bound",
+    "depends on the editor": "One way with one editor, another way with another",
+    "can't tell": "Cannot be told",
+    "blind": "No verdict, since the control failed",
+}
+"""Verdict -> its wording, in the order in which claims are shown."""
+
+COLUMNS = ("claim", "verdict", "difference", "measured", "scenes", "control")
+"""Columns of :attr:`JudgedClaim.row`."""
 
 
-HEAD = (
-    "{columns}"
-    " **Views that agree** have the expected sign.\n"
-    "- **Measured** are means. Those of two variants are over the views that both have, so that the"
-    " difference is theirs."
-)
+def claims_section(results: Results, judged: Sequence[JudgedClaim]) -> Section | None:
+    """The section on the claims that a study judges; None for a run without a verdict."""
+    own = [one for one in judged if one.verdict is not None]
+    if not own or len(results.study.scenes) < FEWEST_SCENES:
+        return None
+    kinds = list(OUTCOMES)
+    own.sort(key=lambda one: (kinds.index(str(one.verdict)), one.claim.headline or math.inf, one.p))
+    counts = Counter(str(one.verdict) for one in own)
+    counted = " ".join(f"{OUTCOMES[kind]}: {counts[kind]}." for kind in kinds if counts[kind])
+    several = len(own) > 1
+    text = [
+        f"{len(own)} claim{'s are' if several else ' is'} judged. {counted}",
+        f"Of {results.study.sampled}, each test has those in which its difference is defined."
+        " Flipped signs of their differences decide"
+        + f", adjusted for all {len(own)} claims"
+        * several
+        + ", and the interval is that of the test. **Control**: what has to do worse, such as"
+        " features from a wrong place; in percent the share of the gain that it reaches too, from"
+        ' a half on of which the claim is blind. "Can\'t tell" does not mean equal.',
+    ]
+    rows = [list(one.row) for one in own]
+    for claim in load_claims():
+        alike = [one for one in own if one.claim.id == claim.id]
+        if claim.editors and alike:
+            _, verdict = together(alike, claim.editors)
+            text_of_both = f"**{claim.text}: both editors together**"
+            rows.append([text_of_both, str(verdict), *["–"] * (len(COLUMNS) - 2)])
+    return Section("Claims", text, [Table(list(COLUMNS), rows)])
 
-SCALE = (
-    "errors as ratios, in percent (or as factors, ×); shares by their odds; the rest as they are."
+
+HERE = (
+    "**Here** speaks of these scenes alone: {here} **Views that agree** have the expected sign."
+    " **Measured** are means; those of two variants are over the views that both have. Errors"
+    " differ by a ratio, shares by their odds. One study judges each claim, on scenes that were"
+    " drawn; others show the same difference without a verdict."
 )
 
 MANY = (
-    "- **Here** speaks of these scenes alone. `seen`: the difference has the expected sign in every"
-    " scene of the study. `seen where defined`: in every scene that has values, and some have none."
-    " `not seen`: in no scene.\n"
-    "- **In general**: one study judges each claim, on scenes that were drawn. Other reports show"
-    " the same difference without a verdict.\n"
-    f"- **Difference**: {SCALE}\n"
-    "- **Scenes**: those in which the difference is defined."
+    "`seen`: the difference has the expected sign in every scene. `seen where defined`: in every"
+    " scene that has values. `not seen`: in no scene."
 )
-"""Meaning of the columns for at least six scenes."""
+"""Meaning of the column for at least six scenes."""
 
-FEW = (
-    "- **Here** says how many scenes have the sign of their mean. So few give no verdict; one study"
-    " judges each claim, on scenes that were drawn.\n"
-    f"- Each scene's column has its difference: {SCALE} A dash: undefined."
-)
-"""Meaning of the columns for fewer scenes."""
-
-SAMPLED = (
-    "**In general** is said of {scenes}, and scenes like these. Flipped signs of the scenes'"
-    " differences decide, with p-values adjusted over the claims that this study judges. The"
-    " interval is the test's, at the level that the adjustment leaves, so it agrees with the"
-    " verdict; that of `equal` is at 90 %. `blind`: the control, features from a wrong place or"
-    " true pictures, was not told apart. **p by t** is Student's on the same scale, not adjusted."
-    " Below six scenes there is no verdict."
-)
-"""Paragraph for a report whose study judges claims."""
+FEW = "how many have the sign of their mean. So few give no verdict."
+"""Meaning of the column for fewer scenes."""
 
 
-def claims_section(results: Results, findings: Sequence[JudgedClaim]) -> Section:
-    """The report's section on claims."""
-    declared = {claim.id: claim for claim in load_claims()}
+def claims_in_detail(results: Results, findings: Sequence[JudgedClaim]) -> list[Section]:
+    """The folded section on every claim that a run has measured; none without any."""
+    if not findings:
+        return []
     judges = any(finding.judges for finding in findings)
     rows, names = [], results.study.scene_names
     few = len(names) < FEWEST_SCENES
     for finding in findings:
-        claim = finding.claim
-        sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
-        agree, views = finding.agreement
-        own = [finding.in_words, _scenes(finding, len(names)), finding.difference]
-        if judges:
-            own += [number(finding.p), number(finding.contrast.student.p)]
-            own.append(finding.measured.control or "–")
         if few:
-            unit = probe(claim.probe).metric(finding.metric).unit
+            unit = probe(finding.claim.probe).metric(finding.metric).unit
             own = scene_texts(finding.contrast, unit, names)
             below = finding.below_floor
             own = [t + " (below)" * (n in below) for n, t in zip(names, own, strict=True)]
+        else:
+            own = [f"{finding.contrast.scenes} of {len(names)}", finding.difference]
+            if finding.below_floor:
+                own[0] += f"; below the floor: {', '.join(finding.below_floor)}"
+            if judges:
+                own += [number(finding.p), number(finding.contrast.student.p)]
         here = no_verdict(finding.contrast) if few else finding.here
-        rows.append([claim.text, here, *own, f"{agree} of {views}", sides, finding.metric])
-        editors = declared[claim.id].editors if claim.id in declared else ()
-        alike = [other for other in findings if other.claim.id == claim.id]
-        if editors and finding is alike[-1]:
-            of_both, verdict = together(alike, editors)
-            text = f"**{declared[claim.id].text}: both editors together**"
-            dashes = ["–"] * len(own)
-            if not few:
-                dashes[0] = verdict or finding.in_words
-            rows.append([text, "–" if few else of_both, *dashes, "–", "–", finding.metric])
-    made = Section("What was expected, and what was seen")
-    if not rows:
-        made.text = ["Nothing that a claim speaks of was measured."]
-        return made
-    head = HEAD.format(columns=FEW if few else MANY)
-    made.text = ["A claim that does not hold on these scenes is a result, not an error.", head]
-    if judges and not few:
-        made.text.append(SAMPLED.format(scenes=results.study.sampled))
+        agree, views = finding.agreement
+        sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
+        rows.append([finding.claim.text, here, *own, f"{agree} of {views}", sides, finding.metric])
+    text = [HERE.format(here=FEW if few else MANY)]
     if any(finding.metric.startswith(ABOVE_FLOOR) for finding in findings):
-        named = (
-            'Where both sides are, a scene\'s column says "below".'
-            if few
-            else "The column of scenes names those in which both sides are."
-        )
-        made.text.append(f"{BELOW_FLOOR} {named}")
-    columns = ["in general", "scenes", "difference"]
-    columns += ["adjusted p", "p by t", "control"] if judges else []
+        text.append(f"{BELOW_FLOOR} Scenes in which both sides are stand in the table.")
+    columns = ["scenes", "difference", *["adjusted p", "p by t"] * judges]
     columns = names if few else columns
-    made.tables = [
-        Table(["claim", "here", *columns, "views that agree", "measured", "metric"], rows)
-    ]
-    return made
+    table = Table(["claim", "here", *columns, "views that agree", "measured", "metric"], rows)
+    return [Section("Claims in detail", text, [table], folded=True)]

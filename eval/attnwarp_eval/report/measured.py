@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from attnwarp_eval.document.model import Section, Table
-from attnwarp_eval.document.numbers import number
+from attnwarp_eval.document.numbers import FEWEST_SCENES, number
+from attnwarp_eval.report.ablations import glossary
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.shared.splats import is_fitted
+
+NOISE = {
+    "fresh": "each view's own",
+    "shared": "the same in all views",
+    "surface": "one that sticks to the surface",
+}
+"""Setting of the noise -> its wording."""
 
 STAGES = ("setup", "truth", "splats", "method", "sample", "checks", "pictures")
+
+
+MOST_FAILURES = 12
+"""Largest number of failed cells in a report."""
 
 
 def failures(results: Results) -> list[Section]:
@@ -18,12 +33,15 @@ def failures(results: Results) -> list[Section]:
     if not results.failures:
         return []
     rows = [[f.scene, f.variant, f.probe, f.error] for f in results.failures]
-    text = ["These cells are missing from every table above. Run the study again to retry them."]
-    return [Section("Failed cells", text, [Table(["scene", "variant", "probe", "error"], rows)])]
+    text = ["These cells are missing from every table. Run the study again to retry them."]
+    rest = len(rows) - MOST_FAILURES
+    text += [f"{rest} more failed; `attnwarp-eval verify` names them."] * (rest > 0)
+    table = Table(["scene", "variant", "probe", "error"], rows[:MOST_FAILURES])
+    return [Section("Failed cells", text, [table])]
 
 
-def measured(results: Results, timings: bool) -> Section:
-    """The section on the meaning of the figures and the environment of their computation."""
+def meanings(results: Results, timings: bool) -> Section:
+    """The folded section on the meaning of all figures, and the seconds of their computation."""
     metrics = {
         metric.name: metric
         for cell in results.cells
@@ -44,27 +62,104 @@ def measured(results: Results, timings: bool) -> Section:
         ),
     ]
     records = results.all_records()
-    if records:
-        text += _environments(records)
-        if timings:
-            total = {
-                stage: sum(record.cost.seconds.get(stage) or 0.0 for record in records)
-                for stage in STAGES
-            }
-            peak = max(record.cost.peak_memory_mb for record in records)
-            text.append(
-                "Seconds over all cells: "
-                + ", ".join(f"{stage} {number(seconds)}" for stage, seconds in total.items())
-                + f". Peak memory {peak:.0f} MiB."
-            )
-    return Section(
-        "How it was measured",
-        text,
-        [Table(["metric", "unit", "better", "version", "meaning"], rows, glossary=True)],
+    text += _environments(records)
+    if records and timings:
+        total = {
+            stage: sum(record.cost.seconds.get(stage) or 0.0 for record in records)
+            for stage in STAGES
+        }
+        peak = max(record.cost.peak_memory_mb for record in records)
+        text.append(
+            "Seconds over all cells: "
+            + ", ".join(f"{stage} {number(seconds)}" for stage, seconds in total.items())
+            + f". Peak memory {peak:.0f} MiB."
+        )
+    table = Table(["metric", "unit", "better", "version", "meaning"], rows, glossary=True)
+    return Section("What the figures mean", text, [table], folded=True)
+
+
+MOST_NOTICES = 6
+"""Largest number of notices on scenes in a report; the command that runs a study prints all."""
+
+
+def measured(results: Results) -> Section:
+    """The section on what a run was measured on: cells, scenes, splats, noise, code."""
+    study = results.study
+    cells = f"Study `{study.name}`: {results.measured} of {len(results.cells)} cells measured"
+    text = [f"- {cells}, {len(results.failures)} failed."]
+    if study.scenes:
+        seeds = f"seed{'s' * (len(study.seeds) > 1)} {', '.join(map(str, study.seeds))}"
+        size = f"{study.size} x {study.size} px"
+        text.append(f"- {_capital(study.scenes_in_words)}; {size}; {seeds}. {_means(results)}")
+    text += [f"- {line}" for line in _regimes(results)]
+    text += [f"- {line}" for line in _revisions(results.all_records())]
+    # Formatted as code: names of files may have asterisks.
+    notices = [
+        "- **Scene {}**: `{}`".format(scene, line.replace("`", "'"))
+        for scene, lines in results.notices.items()
+        for line in lines
+    ]
+    rest = len(notices) - MOST_NOTICES
+    text += notices[:MOST_NOTICES] + [f"- {rest} more notices on scenes."] * (rest > 0)
+    text += [f"- Columns: {columns}."] if (columns := glossary(results)) else []
+    text.append("- Tables of all figures: folded in report.html; `attnwarp-eval report --long`.")
+    return Section("What it was measured on", ["\n".join(text)])
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _means(results: Results) -> str:
+    count = len(results.study.scenes)
+    if count == 1:
+        return (
+            "Figures are means over the views of one scene, which has no interval. **One scene says"
+            " nothing of others. Name six scenes or more for a verdict.**"
+        )
+    text = f"Figures are means over {count} scenes of means over their views"
+    if count < FEWEST_SCENES:
+        return f"{text}; brackets hold the lowest and the highest scene. So few give no verdict."
+    return f"{text}, ± half of the 95 % interval (Student's t over scenes)."
+
+
+def _regimes(results: Results) -> Iterator[str]:
+    """Sentences on the splats and on the noise of edited views, by the variants of each."""
+    splats: dict[str, list[str]] = {}
+    noise: dict[str, list[str]] = {}
+    for cell in results.cells:
+        if cell.record is None:
+            continue
+        spec = cell.record.spec
+        if is_fitted(spec):
+            splats.setdefault("fitted to true pictures", []).extend(cell.variants)
+        elif "splats" in spec:
+            splats.setdefault("sampled on the true surfaces", []).extend(cell.variants)
+        if probe(cell.probe).edits and "noise" in spec.get("settings", {}):
+            kind = NOISE.get(spec["settings"]["noise"], spec["settings"]["noise"])
+            noise.setdefault(kind, []).extend(cell.variants)
+    for title, kinds in (("Splats", splats), ("Noise of edited views", noise)):
+        named = {kind: dict.fromkeys(names) for kind, names in kinds.items()}
+        most = max(named, key=lambda kind: len(named[kind]), default="")
+        rest = [f"{kind} in {', '.join(n)}" for kind, n in named.items() if kind != most]
+        if named:
+            yield f"{title}: {'; '.join([most, *rest])}."
+
+
+def _revisions(records: Sequence[Record[Any]]) -> Iterator[str]:
+    """A sentence on the code that computed the cells."""
+    counted = Counter(
+        (record.environment.revision[:12] if record.environment.revision else "an installed copy")
+        + " with local changes" * bool(record.environment.dirty)
+        for record in records
     )
+    if counted:
+        several = len(counted) > 1
+        told = (f"`{code}`" + f" ({count} cells)" * several for code, count in counted.items())
+        yield f"Revision{'s' * several}: {', '.join(told)}."
 
 
-def _environments(records: list[Record[Any]]) -> list[str]:
+def _environments(records: Sequence[Record[Any]]) -> list[str]:
     """Every state of code, versions and machine that computed cells of this run, with the number of
     cells.
     """
@@ -85,8 +180,8 @@ def _environments(records: list[Record[Any]]) -> list[str]:
         computer = f"{machine['system']} {machine['arch']}, {machine['cores']} cores"
         described = f"{code}; {versions}; {computer}"
         counted[described] = counted.get(described, 0) + 1
-    if len(counted) == 1:
-        return [f"Computed with {next(iter(counted))}."]
+    if len(counted) < 2:
+        return [f"Computed with {described}." for described in counted]
     lines = [
         f"{count} cell{'s' if count > 1 else ''} with {described}"
         for described, count in sorted(counted.items(), key=lambda x: -x[1])

@@ -13,10 +13,9 @@ from attnwarp_eval.document.model import Table
 from attnwarp_eval.document.numbers import number as rounded
 from attnwarp_eval.document.numbers import ratio_text
 from attnwarp_eval.document.write import markdown_table
-from attnwarp_eval.report.answer import against
 from attnwarp_eval.report.claims import Claim, load_claims
 from attnwarp_eval.report.compared import difference_text
-from attnwarp_eval.report.judging import JudgedClaim, decided, found
+from attnwarp_eval.report.judging import COLUMNS, JudgedClaim, decided, found
 from attnwarp_eval.report.raw import PARTS, read_raw, together
 from attnwarp_eval.statistics.contrasts import contrast
 from attnwarp_eval.statistics.intervals import time_ratio
@@ -47,11 +46,6 @@ class Judged:
     time: str = "–"
     report: Path | None = None
     by_answers: str = ""
-
-    @property
-    def measured(self) -> str:
-        """Mean of each side in words, in the order of the claim."""
-        return "–" if self.judged is None else against(self.judged)
 
 
 def verdicts(folder: Path) -> list[Judged]:
@@ -136,9 +130,6 @@ def _time(results: Results, one: JudgedClaim) -> str:
     return ratio_text(time_ratio(second, first))
 
 
-COLUMNS = ("claim", "verdict", "difference", "measured", "scenes", "control", "time", "report")
-
-
 def table(judged: list[Judged], beside: Path) -> Table:
     """The table of all claims.
 
@@ -150,22 +141,11 @@ def table(judged: list[Judged], beside: Path) -> Table:
         one = each.judged
         if one is None or each.report is None:
             absent = f"not measured: `{each.claim.study}` judges it"
-            rows.append([each.claim.text, absent, *["–"] * (len(COLUMNS) - 2)])
+            rows.append([each.claim.text, absent, *["–"] * len(COLUMNS)])
             continue
         link = Path(os.path.relpath(each.report / "report.md", beside)).as_posix()
-        rows.append(
-            [
-                each.claim.text,
-                one.in_words,
-                one.difference,
-                each.measured,
-                str(one.contrast.scenes),
-                one.measured.control or "–",
-                each.time,
-                f"[{each.claim.study}]({link})",
-            ]
-        )
-    return Table(list(COLUMNS), rows)
+        rows.append([*one.row, each.time, f"[{each.claim.study}]({link})"])
+    return Table([*COLUMNS, "time", "report"], rows)
 
 
 def headlines(judged: list[Judged]) -> list[str]:
@@ -190,7 +170,7 @@ def _plainly(one: JudgedClaim) -> str:
     """Difference in plain words: shares side by side, errors in percent or as a factor."""
     factor, _, _ = one.contrast.shown()
     if one.contrast.scale != "ratio":
-        return against(one)
+        return one.means
     if factor > 2:
         return f"{rounded(factor, 2)} times the error"
     return f"{rounded(100 * abs(factor - 1), 2)} % {'less' if factor < 1 else 'more'} error"

@@ -29,7 +29,7 @@ class Place(IntEnum):
     """Place of a probe's section in the report; probes of one place keep their order."""
 
     ANSWER = -1
-    """First of all: the opening of a report whose study has no question."""
+    """First of all, after the study's own answer."""
 
     INSTRUMENT = 0
     """Before the tables of variants: checks of the instrument."""

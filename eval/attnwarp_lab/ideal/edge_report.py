@@ -8,29 +8,22 @@ its errors beyond those of exact geometry are more at a depth edge than away fro
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from statistics import fmean
 
 import numpy as np
-import numpy.typing as npt
 
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
-from attnwarp_eval.document.numbers import FEWEST_SCENES, number, spread
+from attnwarp_eval.document.numbers import FEWEST_SCENES, spread
 from attnwarp_eval.report.compared import difference_text, no_verdict
+from attnwarp_eval.report.controls import HALF, control_share, share_text
 from attnwarp_eval.statistics.contrasts import Contrast, contrast
-from attnwarp_eval.statistics.intervals import ByView, benjamini_hochberg, common, over_scenes
+from attnwarp_eval.statistics.intervals import ByView, benjamini_hochberg, over_scenes
 from attnwarp_eval.study.probe_report import Layout
 from attnwarp_eval.study.results import Results
 from attnwarp_lab.ideal.edges import AT, AWAY, FAR, OFF, PLACES, Edges, edges_of
 
 EQUAL_WITHIN = 0.05
 """Difference of shares up to which a method errs equally at an edge and away from it."""
-
-BLIND = 0.5
-"""Share of a method's gain that features from a wrong place reach, from which it is no evidence."""
-
-DRAWS = 1000
-"""Number of resamples of scenes for the interval of a control's share."""
 
 
 def minus(a: ByView, b: ByView) -> dict[str, dict[str, float]]:
@@ -46,34 +39,6 @@ def minus(a: ByView, b: ByView) -> dict[str, dict[str, float]]:
         }
         for scene in a.keys() & b.keys()
     }
-
-
-def control_share(method: ByView, control: ByView, alone: ByView) -> tuple[float, float, float]:
-    """Share of a method's gain over views alone that a control reaches, with its 95 % interval.
-
-    Scenes are drawn with replacement. NaN without a gain.
-
-    Example:
-        >>> tables = [{f"s{k}": {"v": value} for k in range(6)} for value in (0.9, 0.4, 0.3)]
-        >>> [round(value, 3) for value in control_share(*tables)]
-        [0.167, 0.167, 0.167]
-    """
-    tables = common([method, control, alone])
-    means = np.array([[fmean(views.values()) for views in table.values()] for table in tables])
-    if not means.size:
-        return np.nan, np.nan, np.nan
-    count = means.shape[1]
-    drawn = np.random.default_rng(0).integers(count, size=(DRAWS, count))
-
-    def share(of: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        gain = of[0] - of[2]
-        return np.where(gain > 0, of[1] - of[2], np.nan) / np.where(gain > 0, gain, 1)
-
-    mean, shares = float(share(means.mean(axis=-1))), share(means[:, drawn].mean(axis=-1))
-    shares = shares[np.isfinite(shares)]
-    if not len(shares):
-        return mean, np.nan, np.nan
-    return mean, *np.quantile(shares, [0.025, 0.975]).tolist()
 
 
 Figures = tuple[str, str, str, str]
@@ -140,41 +105,39 @@ class EdgeTable:
         found, share = self.judged[title], self.share_of_control(title)
         if found.scenes < FEWEST_SCENES:
             return no_verdict(found) if found.scenes else "not measured"
-        if share is not None and share[0] > BLIND:
+        if share is not None and share[0] > HALF:
             return "blind"
         told = found.verdict("lower", adjusted_p=self.p[title], bound=EQUAL_WITHIN)
         words = {"worse": "holds", "better": "the opposite holds", "equal": "does not hold: equal"}
         return words.get(told, told)
 
-    def table(self) -> Table:
-        """Right shares by distance, errors at an edge and away from it, the verdict."""
+    def tables(self) -> list[Table]:
+        """Errors at an edge and away from it with the verdict; right shares by distance."""
         scenes = len(self.results.study.scenes)
-        rows = []
+        rows, places = [], []
         for title in self.metrics:
             shown = [spread(over_scenes(self.right(title, p)), scenes) for p in PLACES]
             shown += [spread(over_scenes(self._views(title, 3, p)), scenes) for p in (AT, OFF)]
+            places.append([title, *shown])
             if title not in self.judged:
-                rows.append([title, *shown, *5 * ["–"]])
                 continue
             share = self.share_of_control(title)
             rows.append([
-                title, *shown,
+                title,
                 spread(over_scenes(self.errors(title, AT)), scenes),
                 spread(over_scenes(self.errors(title, OFF)), scenes),
                 difference_text(self.judged[title], "share"),
-                "none" if share is None else _percent(share),
+                "none" if share is None else share_text(share),
                 self.verdict(title),
             ])  # fmt: skip
-        heads = [*map(str, range(FAR)), f"{FAR} and more"]
-        heads += ["hidden, edge", "hidden, away", "errors, edge", "errors, away", "difference"]
-        return Table(["variant", *heads, "the control's share", "errs more at depth edges"], rows)
-
-
-def _percent(share: Sequence[float]) -> str:
-    if not np.isfinite(share[0]):
-        return "no gain"
-    mean, low, high = (number(100 * value, 2) for value in share)
-    return f"{mean} % ({low} to {high} %)"
+        heads = ["variant", "errors, edge", "errors, away", "difference"]
+        heads += ["the control's share", "errs more at depth edges"]
+        by_distance = [*map(str, range(FAR)), f"{FAR} and more", "hidden, edge", "hidden, away"]
+        caption = "Right tokens by distance to a depth edge, and hidden ones that take something"
+        return [
+            Table(heads, rows),
+            Table(["variant", *by_distance], places, caption, folded=True),
+        ]
 
 
 TEXT = (
@@ -224,4 +187,4 @@ def edge_section(
                 place, series, x=x, y="share that is right", title="", share=True, apart=0.05
             )
     picture = Picture(f"figures/{path.name}", "Right tokens by distance to a depth edge")
-    return Section("Do carried features err at depth edges?", [TEXT], [found.table()], [picture])
+    return Section("Do carried features err at depth edges?", [TEXT], found.tables(), [picture])

@@ -15,17 +15,23 @@ from scipy import stats
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.document.write import inline, markdown
 from attnwarp_eval.metrics.occlusion import COUNTS
-from attnwarp_eval.report.ablations import ablations, compared_of
-from attnwarp_eval.report.answer import by_claims
+from attnwarp_eval.report.ablations import compared_of, differences, glossary, in_detail
 from attnwarp_eval.report.build import build, problems
 from attnwarp_eval.report.claims import Claim, load_claims
 from attnwarp_eval.report.compared import between
 from attnwarp_eval.report.fronts import fronts
-from attnwarp_eval.report.judging import claims_section, decided, found, judge, together
+from attnwarp_eval.report.judging import (
+    claims_in_detail,
+    claims_section,
+    decided,
+    found,
+    judge,
+    together,
+)
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import Layout, report_of
-from attnwarp_eval.study.probes.editing.report import abilities, by_scene
+from attnwarp_eval.study.probes.editing.report import abilities, source_edits
 from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.shared.edit_truth import EditTruth, Judgement
 from attnwarp_eval.study.study import load_study, parse_variant
@@ -35,7 +41,7 @@ SLIP = "warp.epe_median_layer.64"
 
 
 def tabulated(run):
-    return ablations(run, compared_of(run, judge(run, load_claims())))
+    return in_detail(run, compared_of(run, judge(run, load_claims())))
 
 
 def study(**changes):
@@ -217,7 +223,8 @@ def test_a_comparison_that_a_claim_makes_has_its_verdict_in_the_tables_and_no_pa
 
 def test_a_baseline_that_was_not_measured_stays_in_the_table_and_is_named():
     (section,) = tabulated(results({"good": [None] * 3, "slipped": CLEAR["slipped"]}))
-    assert section.text == ["**Not measured:** good."]
+    run = results({"good": [None] * 3, "slipped": CLEAR["slipped"]})
+    assert differences(run, compared_of(run, []))[0].text == ["**Slip: not measured: good.**"]
     assert [row[0] for row in section.tables[0].rows] == ["good", "slipped"]
     contrasts = section.tables[-1]
     assert {row[3] for row in contrasts.rows} <= {"not measured", "–"}
@@ -291,6 +298,26 @@ def test_a_claim_whose_control_does_no_worse_than_its_last_side_is_blind(factor,
     claim = dataclasses.replace(SLIP_CLAIM, control={"worse": variants["wrong"]})
     (finding,) = judge(run, [claim])
     assert (finding.measured.control, finding.verdict) == (control, verdict)
+
+
+@pytest.mark.parametrize(("control", "verdict"), [(0.8, "holds"), (0.5, "blind")])
+def test_a_control_that_reaches_more_than_half_of_a_gain_is_seen_and_the_claim_blind(
+    control, verdict
+):
+    """Oracle: from an error of 0.9 px to one of 0.3 px, of which the control has a part."""
+    wiggle = 0.001 * np.arange(8)
+    table = {"good": [0.9 + wiggle], "slipped": [0.3 + wiggle], "wrong": [control + wiggle]}
+    variants = {**study()["variants"], "wrong": {"set": {"depth_agreement": False}}}
+    run = drawn(table, variants=variants, probes={"warp": list(variants)})
+    claim = dataclasses.replace(
+        SLIP_CLAIM, expect="lower", control={"worse": variants["wrong"]}, equal_within=None
+    )
+    (finding,) = judge(run, [claim])
+    share = (0.9 - control) / (0.9 - 0.3)
+    assert finding.measured.share == pytest.approx([share] * 3)
+    assert (finding.measured.control, finding.verdict) == ("seen", verdict)
+    text = number(100 * share, 2)
+    assert finding.control == finding.row[-1] == f"seen: {text} % ({text} to {text} %)"
 
 
 @pytest.mark.parametrize(
@@ -470,47 +497,6 @@ def test_a_claim_names_the_scenes_in_which_both_sides_are_below_the_floor_and_sa
     assert (finding.here, finding.below_floor) == ("seen", ("one",))
 
 
-def test_a_scene_without_a_part_of_the_controls_disagreement_says_why():
-    metric = "multiview.delta_e_above.edit_inside"
-    values = {
-        "alone": {"one": 4.0, "two": -1.0, "three": None, "four": 3.0, "five": 2.0},
-        "mine": {"one": 1.0, "two": -2.0, "three": 1.0, "four": None, "five": None},
-    }
-    undone = {("alone", "three"), ("mine", "four")}
-    cells = [
-        edited(
-            name,
-            value,
-            metric=metric,
-            scene=scene,
-            done=(name, scene) not in undone,
-            editor={"sha256": "e"},
-            method={"alone": "by_view", "mine": "attention_warping"}[name],
-        )
-        for name, own in values.items()
-        for scene, value in own.items()
-    ]
-    names = list(values)
-    content = study(
-        scenes=list(values["mine"]),
-        variants={name: {} for name in names},
-        probes={"editing": names},
-        ablations=[],
-    )
-    section = by_scene(written_runs.results(content, cells), "editing", names)
-    assert section.tables[0].rows == [
-        [
-            "mine",
-            "alone",
-            "0.250",  # 1 / 4
-            "below the floor",
-            "control's source edit not done",
-            "source edit not done",
-            "no view in common",
-        ]
-    ]
-
-
 def test_a_comparison_counts_the_source_edits_of_each_method_and_shows_those_of_the_control():
     cells = [
         edited("A", method="dge", done=False),
@@ -523,15 +509,10 @@ def test_a_comparison_counts_the_source_edits_of_each_method_and_shows_those_of_
     run = written_runs.results(
         study(variants={name: {} for name in names}, probes={"editing": names}, ablations=[]), cells
     )
-    counts, edits = abilities(run, "editing").tables
-    assert counts.rows == [
-        ["A", "1", "2"], ["alone, short", "1", "1"], ["control", "1", "1"], ["warped", "0", "1"],
-    ]  # fmt: skip
+    (edits,) = abilities(run, "editing").tables
+    (text,) = source_edits(run, "editing").text
+    assert text.endswith("Done: 1 of 2: A; 1 of 1: alone, short, control; 0 of 1: warped.")
     assert [row[3] for row in edits.rows] == ["control"]
-    one_method = written_runs.results(
-        study(variants={"warped": {}}, probes={"editing": ["warped"]}, ablations=[]), cells[-1:]
-    )
-    assert len(abilities(one_method, "editing").tables) == 1
 
 
 def test_the_numbers_of_an_edit_decide_whether_it_is_done():
@@ -635,10 +616,12 @@ def test_an_undefined_scene_neither_agrees_nor_disagrees_and_seen_needs_every_sc
     assert (finding.here, finding.agreement, finding.contrast.scenes) == (here, (2, 2), 2)
     missing = results({"good": [[0.1]] * 3, "slipped": [[0.6], None, [0.7]]})
     assert [one.here for one in judge(missing, [SLIP_CLAIM])] == [here]
-    (table,) = claims_section(missing, judge(missing, load_claims())).tables
-    # Fewer than six scenes stand side by side, and nothing is said in general.
+    judged = judge(missing, load_claims())
+    assert claims_section(missing, judged) is None
+    (table,) = claims_in_detail(missing, judged)[0].tables
+    # Fewer than six scenes stand side by side.
     assert table.columns[:5] == ["claim", "here", *SCENES]
-    assert not {"in general", "difference", "scenes"} & set(table.columns)
+    assert not {"difference", "scenes"} & set(table.columns)
     for row in table.rows:
         # 0.6 and 0.7 px against 0.1 px; nothing of scene two.
         assert row[2:5] == ["× 6.00", "–", "× 7.00"]
@@ -701,9 +684,9 @@ def test_a_study_of_one_scene_says_at_its_top_that_no_verdict_is_possible(tmp_pa
     ]
     text = markdown(build(written_runs.results(study(scenes=["one"]), cells), tmp_path))
     lead = text[: text.index("\n## ")]
-    assert "One scene says nothing of others" in lead
-    assert lead.count("one, two, three") == 0 and "At 512 x 512 px, in scene one." in lead
-    assert "means over the views of one scene, which has no interval" in lead and "±" not in lead
+    assert "At 512 x 512 px, in scene one." in lead
+    assert "One scene says nothing of others" in text and "one, two, three" not in text
+    assert "means over the views of one scene, which has no interval" in text and "±" not in text
     # It is true: a difference of 0.8 in every view stays undecided.
     row = next(line for line in text.splitlines() if line.startswith(f"| slipped | {SLIP}"))
     assert "1 of 1 scene higher; no verdict" in row and "| in general |" not in text
@@ -714,20 +697,37 @@ def test_a_study_that_judges_claims_begins_with_their_verdicts():
     clear = {"good": [[0.1] * 8], "slipped": [[0.5, 0.6, 0.7, 0.6, 0.5, 0.8, 0.9, 0.6]]}
     claims = [SLIP_CLAIM, dataclasses.replace(SLIP_CLAIM, text="It does not", expect="lower")]
     run = drawn(clear, title="What slips")
-    asked, counted, told, sure = by_claims(run, judge(run, claims)).text
-    assert asked == "**What slips?**"
-    assert counted == (
-        "2 expectations are judged. As expected: 1. The opposite of what was expected: 1."
+    section = claims_section(run, judge(run, claims))
+    assert section.text[0] == (
+        "2 claims are judged. As expected: 1. The opposite of what was expected: 1."
     )
     # The mean of the eight is 0.65 px.
-    assert told.splitlines() == [
-        "- As expected: **It slips** (0.65 px of a 64 grid against 0.10 px of a 64 grid).",
-        "- The opposite of what was expected: **It does not** (0.65 px of a 64 grid against 0.10"
-        " px of a 64 grid).",
+    means = "0.65 px of a 64 grid against 0.10 px of a 64 grid"
+    rows = [[row[0], row[1], *row[3:]] for row in section.tables[0].rows]
+    assert rows == [
+        ["It slips", "holds", means, "8", "none"],
+        ["It does not", "the opposite holds", means, "8", "none"],
     ]
-    assert sure.startswith("Of 8 scenes drawn by generator") and "all 2 being asked at once" in sure
-    assert "Time of a view, in one pass: `good` 0.10 s, `slipped` 0.10 s." in sure
-    assert by_claims(results(CLEAR), judge(results(CLEAR), claims)) is None
+    assert section.text[1].startswith("Of 8 scenes drawn by generator")
+    assert "for all 2 claims" in section.text[1]
+    assert claims_section(results(CLEAR), judge(results(CLEAR), claims)) is None
+
+
+def test_a_short_table_has_each_main_figure_with_the_verdict_on_its_difference():
+    """Oracle: means by hand; of eight scenes of one sign p is 2 / 256, of half of them 1."""
+    table = {"good": [[0.1] * 8], "slipped": [[0.2 + 0.01 * k for k in range(8)]]}
+    run = drawn(table, name="other")
+    (short,) = differences(run, compared_of(run, []))[0].tables
+    # Figures that no view has are left out.
+    assert short.columns == ["variant", "EPE on 64, layer px"]
+    (good, slipped) = short.rows
+    assert good == ["good", "0.100 ± 0"]
+    spacing = np.std([0.01 * k for k in range(8)], ddof=1)
+    half = stats.t.ppf(0.975, 7) * spacing / math.sqrt(8)
+    assert slipped == ["slipped", f"0.235 ± {number(half, 2)} worse"]
+    assert glossary(run).startswith("**EPE on 64, layer px**: median endpoint error")
+    unsure = drawn({**table, "slipped": [[0.1 + 0.01 * (-1) ** k for k in range(8)]]}, name="other")
+    assert differences(unsure, compared_of(unsure, []))[0].tables[0].rows[1][1].count(" ") == 2
 
 
 def test_a_study_that_asks_nothing_begins_with_what_was_measured(tmp_path):

@@ -12,6 +12,7 @@ import hashlib
 import json
 import lzma
 import shutil
+from pathlib import Path
 
 import pytest
 import written_runs
@@ -25,6 +26,8 @@ from attnwarp_eval.study import Store
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import Layout, report_of
 from attnwarp_eval.study.run import verify
+
+REPORTS = Path(__file__).parents[3] / "reports"
 
 
 @pytest.fixture(autouse=True)
@@ -108,6 +111,39 @@ def test_raw_results_from_elsewhere_show_no_file(folder, tmp_path):
     done = CliRunner().invoke(app, ["report", str(raw.parent)])
     assert done.exit_code == 0, done.output
     assert base64.b64encode(SECRET) not in (raw.parent / "report.html").read_bytes()
+
+
+MOST_LINES = 150
+"""Lines of report.md that a person reads."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", sorted({path.parent.name for path in REPORTS.rglob("results*.jsonl.xz")})
+)
+def test_the_report_of_every_committed_run_is_one_page(name, tmp_path):
+    done = CliRunner().invoke(app, ["report", str(REPORTS / name), "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    lines = (tmp_path / "report.md").read_text().splitlines()
+    assert len(lines) <= MOST_LINES
+    assert len(list(tmp_path.glob("figures/*"))) <= 6
+
+
+def test_the_long_report_has_the_tables_that_are_folded_on_the_page(folder, tmp_path):
+    run = str(folder / "variants")
+    for option in ([], ["--long"]):
+        out = str(tmp_path / f"out{len(option)}")
+        done = CliRunner().invoke(app, ["report", run, "--out", out, *option])
+        assert done.exit_code == 0, done.output
+    short, long = ((tmp_path / f"out{k}/report.md").read_text() for k in range(2))
+    assert len(short.splitlines()) <= MOST_LINES < len(long.splitlines())
+    assert "<details>" not in short and "## Calibration" in long
+    # Every row of the short one stands in the long one, and every table of that one in the page.
+    assert set(short.splitlines()) <= set(long.splitlines())
+    page = (tmp_path / "out0/report.html").read_text()
+    assert page.count("<tr") == sum(line.startswith("|") for line in long.splitlines()) - sum(
+        line.startswith("|---") for line in long.splitlines()
+    )
 
 
 @pytest.mark.parametrize(("size", "small"), [(255, True), (256, False)])

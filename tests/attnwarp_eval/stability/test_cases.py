@@ -333,8 +333,11 @@ def test_the_command_lists_cases_sweeps_one_and_fails_where_it_breaks(tmp_path, 
     monkeypatch.chdir(tmp_path)
     swept = runner.invoke(app, ["stability", "--case", "not_a_rotation", "--quick"])
     assert swept.exit_code == 0, swept.output
-    text = (tmp_path / "runs/stability-not_a_rotation-quick/report.md").read_text()
-    assert "Oracle: pinhole projection in mpmath" in text and "1 sweeps of 1 hard cases" in text
+    run = tmp_path / "runs/stability-not_a_rotation-quick"
+    assert "1 sweeps of 1 hard cases" in (run / "report.md").read_text()
+    assert runner.invoke(app, ["report", str(run), "--long"]).exit_code == 0
+    text = (run / "report.md").read_text()
+    assert "Oracle: pinhole projection in mpmath" in text
     assert "| 0.001 | refused |" in text
     unknown = runner.invoke(app, ["stability", "--case", "nedle"])
     assert unknown.exit_code == 2 and "did you mean 'needle'" in unknown.output

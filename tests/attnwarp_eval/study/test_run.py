@@ -282,7 +282,7 @@ def test_an_instrument_that_is_not_calibrated_ends_with_exit_code_3(finished, fo
     done = call("run", "study.yaml", "--out", run)
     assert done.exit_code == 3
     assert "not calibrated" in done.stderr
-    assert "FAILED" in (run / "report.md").read_text()
+    assert "is not calibrated" in (run / "report.md").read_text()
 
 
 def test_the_instrument_is_calibrated_in_every_run(finished):

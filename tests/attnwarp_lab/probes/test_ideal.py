@@ -176,7 +176,7 @@ def test_the_report_says_what_the_editor_is(records, tmp_path):
         ],
     }
     text = markdown(build(written_runs.results(study, outcomes), tmp_path, timings=False))
-    assert "## The ideal editor" in text and "| spheres | 8 | " in text
+    assert "## The ideal editor" in text and "| parts | colors | settled | cross | steps |" in text
     assert "seen" in text and "through" in text and "bleed, dE00" in text
 
 

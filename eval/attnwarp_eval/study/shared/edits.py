@@ -70,17 +70,12 @@ class Editing(Part):
 
     ``edits``: by scene, an edit's name, or ``edit=answer`` for a single answer, with the words for
     the editor; null for the edit's words. Scenes that are left out have all their edits.
-    ``by_yaw``: variants whose figures the report shows by yaw.
     """
 
     editor: EditorPart = EditorPart()
     edits: dict[str, dict[str, str | None]] = Field(default_factory=dict)
     options: dict[str, Any] = Field(
         default_factory=dict, description="fields of attnwarp.methods.AttentionWarpingSettings"
-    )
-    by_yaw: list[str] = Field(default_factory=list)
-    choice: list[str] = Field(
-        default_factory=list, description="variants, one of which is chosen for a given time"
     )
 
 

@@ -377,6 +377,7 @@ def _real(pairs: Pairs) -> Section:
         "Real edits and their true disagreement",
         ["Edits of the same scenes by methods, each view with noise of its own."],
         [Table(["edit", *(row.title for row in shown)], rows)],
+        folded=True,
     )
 
 
@@ -402,7 +403,8 @@ def _settings(pairs: Pairs) -> Section:
         "figure", *(f"edit {edit}" for edit in kinds), *(f"{yaw:g} degrees" for yaw in pairs.yaws),
         "against metal", "undefined",
     ]  # fmt: skip
-    return Section("Over scenes, by edit and by yaw", [text], [Table(columns, rows)])
+    title = "Over scenes, by edit and by yaw"
+    return Section(title, [text], [Table(columns, rows)], folded=True)
 
 
 def _sizes(pairs: Pairs) -> Section:
@@ -419,7 +421,8 @@ def _sizes(pairs: Pairs) -> Section:
         f"Spearman's rank correlation of a flaw's size, 0 for the right pair, with a figure's"
         f" disagreement on the same pair, up to {NEAR:g} degrees; in brackets the sizes."
     )
-    return Section("Does a figure follow the size of a flaw", [text], [Table(columns, follows)])
+    title = "Does a figure follow the size of a flaw"
+    return Section(title, [text], [Table(columns, follows)], folded=True)
 
 
 def _everything(pairs: Pairs) -> Section:
@@ -442,8 +445,8 @@ def _everything(pairs: Pairs) -> Section:
     columns = ["flaw", *(row.title for row in pairs.rows)]
     yaws = ["figure", *(f"{yaw:g} degrees" for yaw in pairs.yaws)]
     tables = [
-        Table(heads, within, "Flawed pairs below the right ones of their scene", folded=True),
-        Table(columns, areas, f"AUROC up to {NEAR:g} degrees", folded=True),
-        Table(yaws, floor, "Floor: values of right pairs, means over scenes", folded=True),
+        Table(heads, within, "Flawed pairs below the right ones of their scene"),
+        Table(columns, areas, f"AUROC up to {NEAR:g} degrees"),
+        Table(yaws, floor, "Floor: values of right pairs, means over scenes"),
     ]
-    return Section("All figures of the audit", [], tables)
+    return Section("All figures of the audit", [], tables, folded=True)

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
-from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.document.numbers import spread
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
 from attnwarp_eval.study.results import Results
@@ -82,29 +82,31 @@ class IdealReport(ProbeReport):
             }
             section = edge_section(results, layout, self.name, metrics, stages, "stage of the edit")
             if section is not None:
-                yield Place.RESULT, section
-        found: dict[tuple[object, ...], list[str]] = {}
+                yield Place.ANSWER, section
+        found: dict[tuple[object, ...], dict[str, dict[str, list[float]]]] = {}
         for cell, record in results.finished(self.name):
-            ideal, extra = record.spec["editor"]["ideal"], record.extra
-            key = (cell.scene, *ideal.values(), record.spec["settings"]["steps"])
-            found[key] = [
-                cell.scene,
-                str(ideal["parts"]),
-                f"{100 * extra.part_share:.1f} %",
-                str(ideal["colors"]),
-                f"{extra.settled * record.spec['settings']['steps']:.1f}"
-                f" of {record.spec['settings']['steps']}",
-                ideal["cross"],
-                number(extra.share),
-                ", ".join(f"{100 * f:.0f} %" for f in extra.frequencies),
-                f"{100 * extra.agreement:.0f} %",
-            ]
+            ideal, extra, steps = (
+                record.spec["editor"]["ideal"], record.extra, record.spec["settings"]["steps"],
+            )  # fmt: skip
+            values = found.setdefault((*ideal.values(), steps), {})
+            for name, value in (
+                ("size of a part, %", 100 * extra.part_share),
+                ("settled at step", extra.settled * steps),
+                ("share of signal", extra.share),
+                ("alone: agreement, %", 100 * extra.agreement),
+            ):
+                values.setdefault(name, {}).setdefault(cell.scene, []).append(value)
         if not found:
             return
-        columns = [
-            "scene", "parts", "size of a part", "answers", "settled at step", "cross-attention",
-            "share of signal", "alone: answers", "alone: agreement",
-        ]  # fmt: skip
+        names = [*results.finished(self.name)[0][1].spec["editor"]["ideal"], "steps"]
+        rows = [
+            [
+                *map(str, key),
+                *(spread(interval(of), len(results.study.scenes)) for of in own.values()),
+            ]
+            for key, own in found.items()
+        ]
+        columns = [*names, *next(iter(found.values()))]
         text = [
             (
                 "An editor that repairs whatever it can tell to be wrong. Damage by wrong features"
@@ -123,10 +125,10 @@ class IdealReport(ProbeReport):
             )
         yield (
             Place.INSTRUMENT,
-            Section("The ideal editor", text, [Table(columns, [found[k] for k in found])]),
+            Section("The ideal editor", text, [Table(columns, rows)], folded=True),
         )
         if any("drift" in record.spec for _, record in results.finished(self.name)):
-            yield Place.RESULT, _drift(results, layout)
+            yield Place.ANSWER, _drift(results, layout)
 
 
 def _drift(results: Results, layout: Layout) -> Section:

@@ -15,7 +15,7 @@ from attnwarp_eval.study.probe_report import (
 )
 from attnwarp_eval.study.results import Results
 from attnwarp_lab.ideal.edge_report import edge_section
-from attnwarp_lab.ideal.edges import FAR, edges_of
+from attnwarp_lab.ideal.edges import edges_of
 
 RIGHT, WRONG, HIDDEN = (f"labels.{name}.{{}}" for name in ("right", "wrong", "painted_hidden"))
 """Figures of a row on depth edges."""
@@ -55,10 +55,10 @@ class LabelReport(ProbeReport):
                 ]
         section = edge_section(results, layout, self.name, metrics, beside, "links of a chain")
         if section is not None:
-            yield Place.RESULT, section
+            yield Place.ANSWER, section
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
-        """Labels by distance to depth edges, and right labels by grid and number of parts."""
+        """Right labels by grid and number of parts."""
         specs = [record.spec for _, record in results.finished(self.name)]
         if not specs:
             return []
@@ -75,25 +75,4 @@ class LabelReport(ProbeReport):
             for count in specs[0]["parts"]
         ]
         caption = "Right labels by tokens along a side"
-        return [
-            self._by_distance(results, names),
-            Table(["variant", "parts", *map(str, grids)], rows, caption, folded=True),
-        ]
-
-    def _by_distance(self, results: Results, names: Sequence[str]) -> Table:
-        figures = {
-            "right": "labels.right",
-            "wrong": "labels.wrong",
-            "painted, hidden": "labels.painted_hidden",
-        }
-        rows = [
-            [name, text, *mean_values(results, self.name, name, keys)]
-            for name in names
-            for text, figure in figures.items()
-            if (keys := [f"{figure}.edge{tokens}" for tokens in range(FAR + 1)])
-        ]
-        heads = [*map(str, range(FAR)), f"{FAR} and more"]
-        return Table(
-            ["variant", "labels", *heads], rows,
-            "Labels by the token's distance to the nearest true depth edge, in whole tokens",
-        )  # fmt: skip
+        return [Table(["variant", "parts", *map(str, grids)], rows, caption)]

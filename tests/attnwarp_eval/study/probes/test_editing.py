@@ -181,7 +181,7 @@ def test_where_the_source_is_not_edited_agreement_is_undefined_and_the_report_na
     assert not record.extra.source.done
     for name in ("multiview.same_answer.edit", "multiview.delta_e_above.edit_inside"):
         assert all(map(math.isnan, figure(record, name)))
-    write_report(store, timings=False)
+    write_report(store, timings=False, long=True)
     report = (store.root / "report.md").read_text()
     row = next(line for line in report.splitlines() if "Paint the ball" in line)
     assert "some_colour" in row
@@ -198,8 +198,8 @@ def test_each_method_stands_beside_its_own_edit_of_the_source(tmp_path):
         for name, color in sources.items()
     }
     store = Store(write_run(tmp_path, views=1, seeds=(0,), more=made).root)
-    write_report(store)
-    section = (store.root / "report.md").read_text().split("Edited views side by side")[1]
+    write_report(store, long=True)
+    section = (store.root / "report.md").read_text().split("## Edited views side by side")[1]
     for edit in ("red", "blue"):
         row = re.findall(rf"!\[([^]]*)\]\((pictures/[^)]*/{edit}/[^)]*)\)", section)
         pictures = [

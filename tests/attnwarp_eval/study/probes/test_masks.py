@@ -94,7 +94,7 @@ def test_figures_are_those_of_masks_lifted_by_hand_against_the_balls_outline(fol
     given = [records[name].views[0].metrics["masks.given"] for name in ("one", "from a box")]
     assert given == [1, (cut & exact[0]).sum() / (cut | exact[0]).sum()]
 
-    write_report(store)
+    write_report(store, long=True)
     text = (folder / "run/report.md").read_text()
     assert "Lifted masks by yaw" in text and "Overlap where it does not" in text
     assert len(list((folder / "run/pictures").glob("*/yaw030-lifted.jpg"))) == 1

@@ -181,7 +181,6 @@ def results(timed=(), more=(), drift=DRIFT):
         "scenes": scenes,
         "variants": {name: {} for name in VARIANTS},
         "probes": {"editing": VARIANTS},
-        "editing": {"choice": VARIANTS},
         "fronts": [{"title": "Cost", "probe": "editing", "metric": ERROR, "variants": VARIANTS}],
     }
     cells = [edited(scene, name) for scene in scenes for name in VARIANTS]
@@ -218,42 +217,14 @@ def test_few_rounds_call_nothing_faster_and_say_how_few_they_are(tmp_path):
             assert verdicts["fast"] == verdicts["slow"] == f"can't tell ({rounds} rounds)"
 
 
-def test_a_variant_is_chosen_by_seconds_taken_in_turn_and_left_out_without_any(tmp_path):
-    def chosen(run):
-        sections = {s.title: s for _, s in report_of("editing").sections(run, Layout(tmp_path))}
-        section = sections["Which variant for a given time"]
-        return [row[:2] for row in section.tables[0].rows], section.text[-1]
-
-    # The best of what the time allows, by the errors above.
-    rows, text = chosen(results(VARIANTS))
-    assert rows == [["1.00", "fast"], ["4.00", "full"], ["16.0", "slow"]]
-    assert "in turn" in text
-    rows, text = chosen(results(["full", "alone"]))
-    assert rows == [["3.20", "alone"], ["4.00", "full"]]
-    assert "left out: fast, slow" in text
-    assert chosen(results())[0] == [["0.100", "slow"]]
-
-
-def test_one_pass_has_the_same_seconds_in_the_front_the_choice_and_the_table_of_parts(tmp_path):
+def test_one_pass_has_means_over_scenes_of_the_seconds_of_their_edits_in_the_front(tmp_path):
     # A scene with two edits does not outvote the other: (s + 3 s) / 2 of bear, s of face.
     run = results(more=[edited("bear", name, "blue", 3.0) for name in VARIANTS])
     expected = {name: (2 * BY_CELLS[name] + BY_CELLS[name]) / 2 for name in VARIANTS}
-    sections = {s.title: s for _, s in report_of("editing").sections(run, Layout(tmp_path))}
     (section,) = fronts(run, Layout(tmp_path))
     assert {row[0]: row[2] for row in section.tables[0].rows} == {
         name: number(1000 * seconds) for name, seconds in expected.items()
     }
-    parts = sections["Seconds by part"]
-    whole = parts.tables[0].columns.index("whole")
-    assert {row[0]: row[whole] for row in parts.tables[0].rows} == {
-        name: number(seconds) for name, seconds in expected.items()
-    }
-    row = sections["Which variant for a given time"].tables[0].rows[0]
-    assert row[:2] == [number(expected["slow"]), "slow"]
-    assert "no seconds taken in turn" in parts.text[0]
-    timed = report_of("editing").sections(results(VARIANTS), Layout(tmp_path))
-    (parts,) = [s for _, s in timed if s.title == "Seconds by part"]
-    assert "believe that one" in parts.text[0]
 
 
 def test_the_section_of_seconds_holds_medians_spreads_and_ratios(tmp_path):

@@ -121,7 +121,7 @@ class CalibrationReport(ProbeReport):
                 f" pixel to pixel by more than the {100 * TAP_SPREAD:g} % that these rules let its"
                 " taps spread. So they reject much that is visible, and their F1 is low."
             )
-        return Section("Calibration", text, [Table(columns, rows)])
+        return Section("Calibration", text, [Table(columns, rows)], folded=True)
 
     def _transport(self, results: Results) -> list[Section]:
         alike: dict[tuple[str, ...], list[str]] = {}
@@ -157,7 +157,7 @@ class CalibrationReport(ProbeReport):
         )
         columns = ["scenes", "effects", "not simulated", "plan", "everything on would be"]
         title = "What light does in these scenes, and what of it is simulated"
-        return [Section(title, text, [Table(columns, rows)])]
+        return [Section(title, text, [Table(columns, rows)], folded=True)]
 
 
 def _values(record: Record[Any], metric: str) -> list[float]:

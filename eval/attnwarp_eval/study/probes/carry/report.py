@@ -55,4 +55,4 @@ class CarryReport(ProbeReport):
     def gallery(self, results: Results) -> Section | None:
         """Pictures of each scene."""
         grids = scenes_side_by_side(results, self.name, "after", {"before": "before"})
-        return Section("Edited views side by side", grids=grids) if grids else None
+        return Section("Edited views side by side", grids=grids, folded=True) if grids else None

@@ -34,6 +34,7 @@ class DepthReport(ProbeReport):
     measures = "depth and normals of sampled splats"
     columns: ClassVar[Mapping[str, str]] = {
         "AbsRel": "depth.abs_rel",
+        "AbsRel inside": "depth.abs_rel.interior",
         "RMSE": "depth.rmse",
         "bias": "depth.bias_relative",
         "median bias inside": "depth.bias_median.interior",
@@ -80,4 +81,4 @@ class DepthReport(ProbeReport):
             for name in names
             for title, region in regions.items()
         ]
-        return [Table(columns, rows, "Inside surfaces and at edges apart", folded=True)]
+        return [Table(columns, rows, "Inside surfaces and at edges apart")]

@@ -69,16 +69,13 @@ class EditingProbe(MethodProbe[EditResult]):
     # From a study to cells
 
     def check(self, study: Study) -> None:
-        """Require that the variants of figures by yaw are measured."""
-        part = study.part(EditingPart).editing
+        """Refuse the ideal editor, and budgets by variants that cannot give one."""
         for name in sorted(self.measured(study) & study.variants.keys()):
             if editor_of(study, study.variants[name]).ideal is not None:
                 raise ValueError(
                     f"probes.{self.name}: {name!r} has the ideal editor, whose answers are those of"
                     " parts; measure it by probes.ideal"
                 )
-        study.check_variants(part.by_yaw, "editing.by_yaw", self.name)
-        study.check_variants(part.choice, "editing.choice", self.name)
         for name, variant in study.variants.items():
             budget = variant.part(VariantPart).budget
             if budget is None or budget.seconds_of is None:

@@ -1,63 +1,26 @@
-"""Report of edited scenes: the editor's abilities, agreement by yaw and by scene, seconds by part,
-and the best variant for a given time.
-"""
+"""Report of edited scenes: the source edits, the editor's abilities, budgets, and pictures."""
 
 from __future__ import annotations
 
-import math
-import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
-from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Grid, Picture, Section, Table
-from attnwarp_eval.document.numbers import decibels, number, pooled, spread
-from attnwarp_eval.metrics.multiview import BELOW_FLOOR
-from attnwarp_eval.statistics.intervals import common, interval, over_scenes
+from attnwarp_eval.document.numbers import number
+from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe_report import (
     Layout,
     Place,
     ProbeReport,
     in_degrees,
     register_report,
-    report_of,
     views_of,
 )
 from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.record import PictureFile, Record
 from attnwarp_eval.study.results import Results
-from attnwarp_eval.study.shared.edits import EditingPart
 from attnwarp_eval.study.shared.encoders import encoders_named
-from attnwarp_eval.study.shared.method_run import PARTS, WHOLE, is_alone
-from attnwarp_eval.study.turns import timed_in_turn
-
-BY_YAW = {
-    "multiview.same_answer.edit": "views with the source's answer",
-    "multiview.delta_e_above.edit_inside": "disagreement with the source above its floor, dE00",
-    "fidelity.psnr.edit_inside": "PSNR to the true edit inside the object, dB",
-}
-"""Figures that are shown by yaw, with descriptions."""
-
-BY_SCENE = {
-    "multiview.same_answer.edit_seen": "Views with the source's answer where the source saw it",
-    "multiview.same_answer.edit": "Views with the source's answer",
-    "multiview.delta_e_above.edit_inside": "Disagreement with the source above its floor, dE00",
-    "multiview.delta_e_above.edit_next": "Disagreement of neighbouring views above its floor, dE00",
-    "multiview.delta_e_above.render_inside": "Disagreement of renders above its floor, dE00",
-    "fidelity.psnr.edit_inside": "PSNR to the true edit inside the object, dB",
-    "fidelity.mse.edit_inside": "The same, pooled: of the mean squared error over the views, dB",
-    "depth.abs_rel.before": "AbsRel of the splats' depth before the edit",
-    "depth.abs_rel.after": "AbsRel of the splats' depth after tuning",
-}
-
-DISAGREEMENT = "multiview.delta_e_above.edit_inside"
-
-ONE_SOURCE = frozenset({"attention_warping", "true pictures"})
-"""Methods that edit the source view in the same way and differ in the others."""
-
-
-CHOSEN_BY = ("multiview.delta_e_above.edit_inside", "fidelity.mse.edit_inside")
-"""Figures by which the variant for a given time is chosen; lower is better."""
+from attnwarp_eval.study.shared.method_run import is_alone
 
 
 @register_report
@@ -68,11 +31,11 @@ class EditingReport(ProbeReport):
     measures = "edits of scenes against true pictures of the edit"
     tabulates_all = True
     columns: ClassVar[Mapping[str, str]] = {
-        "same answer": "multiview.same_answer.edit",
+        "shows the source's answer": "multiview.same_answer.edit",
         "... where the source saw it": "multiview.same_answer.edit_seen",
         "disagreement above floor, dE00": "multiview.delta_e_above.edit_inside",
         "... of neighbours": "multiview.delta_e_above.edit_next",
-        "... in renders": "multiview.delta_e_above.render_inside",
+        "disagreement in renders, dE00": "multiview.delta_e_above.render_inside",
         "PSNR to truth inside, dB": "fidelity.psnr.edit_inside",
         "... inside, pooled": "fidelity.mse.edit_inside",
         "PSNR of renders, dB": "fidelity.psnr.render_inside",
@@ -100,27 +63,17 @@ class EditingReport(ProbeReport):
     )
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """Sections on the editor's abilities, budgets, figures by yaw, time by part."""
+        """Sections on the source edits, the editor's abilities, and budgets."""
         if not results.finished(self.name):
             return
+        yield Place.RESULT, source_edits(results, self.name)
         able = abilities(results, self.name)
         spec = results.finished(self.name)[0][1].spec
         if "encoders" in spec:
             able.text.append(encoders_named(results.study, spec))
         yield Place.INSTRUMENT, able
-        part = results.study.part(EditingPart).editing
         if (section := budgets(results, self.name)) is not None:
             yield Place.RESULT, section
-        if part.by_yaw:
-            yield Place.RESULT, by_yaw(results, self.name, part.by_yaw, layout)
-            yield Place.RESULT, by_scene(results, self.name, part.by_yaw)
-        if layout.timings:
-            yield Place.RESULT, parts_of_time(results, self.name)
-        if layout.timings and part.choice:
-            yield (
-                Place.RESULT,
-                choice(results, self.name, part.choice, CHOSEN_BY),
-            )
 
     def gallery(self, results: Results) -> Section | None:
         """Edited views side by side."""
@@ -130,7 +83,7 @@ class EditingReport(ProbeReport):
 def abilities(results: Results, probe: str) -> Section:
     """Section on the editor's success in the source view, and in every view alone."""
     names = controls(results, probe)
-    section = Section("What the editor can do")
+    section = Section("What the editor can do", folded=True)
     section.text = [
         (
             "An edit counts as done where the picture, inside the edited object, is nearer to a"
@@ -172,27 +125,20 @@ def abilities(results: Results, probe: str) -> Section:
         "all views, dB",
         "all views done",
     ]
-    section.tables = [*_done_by_method(results, probe), Table(columns, rows)]
+    section.tables = [Table(columns, rows)]
     return section
 
 
-def _done_by_method(results: Results, probe: str) -> list[Table]:
-    """Tables of the source edits that succeeded, by variant of a comparison; none for a study of
-    one method.
-    """
-    records = {
-        name: [record for _, _, record in results.records(probe, name)]
-        for name in results.study.variants
-    }
-    methods = {record.spec["method"] for own in records.values() for record in own}
-    if methods <= ONE_SOURCE:
-        return []
-    rows = [
-        [name, str(sum(record.extra.source.done for record in own)), str(len(own))]
-        for name, own in records.items()
-        if own
-    ]
-    return [Table(["variant", "source edits done", "of"], rows, "Each method's own source edits")]
+def source_edits(results: Results, probe: str) -> Section:
+    """Section on the number of source edits that succeeded, by variants with equal numbers."""
+    counts: dict[tuple[int, int], list[str]] = {}
+    for name in results.study.variants:
+        if own := [record for _, _, record in results.records(probe, name)]:
+            done = sum(record.extra.source.done for record in own)
+            counts.setdefault((done, len(own)), []).append(name)
+    told = "; ".join(f"{done} of {of}: {', '.join(n)}" for (done, of), n in counts.items())
+    text = f"Only edits whose source view shows a right answer have figures. Done: {told}."
+    return Section("Source edits", [text])
 
 
 def controls(results: Results, probe: str) -> list[str]:
@@ -211,149 +157,6 @@ def controls(results: Results, probe: str) -> list[str]:
 def _against(judgement: Any) -> str:
     limits = f"{number(judgement.unedited)}, {number(judgement.unchanged)}"
     return f"{number(judgement.psnr)} ({limits})"
-
-
-def by_yaw(results: Results, probe: str, names: Sequence[str], layout: Layout) -> Section:
-    """Means over scenes at each yaw from the source."""
-    measured = [name for name in names if results.records(probe, name)]
-    yaws = sorted(
-        {
-            view.yaw
-            for name in measured
-            for _, _, record in results.records(probe, name)
-            for view in record.views
-        }
-    )
-    curves = {
-        (metric, name): [
-            over_scenes(results.views(probe, name, metric, (yaw, yaw))) for yaw in yaws
-        ]
-        for metric in BY_YAW
-        for name in measured
-    }
-    path = layout.figure("editing-by-yaw.svg")
-    with charts.drawing(path, columns=len(BY_YAW)) as panels:
-        for axes, (metric, title) in zip(panels, BY_YAW.items(), strict=True):
-            series = [charts.Line(name, yaws, curves[metric, name]) for name in measured]
-            charts.lines(
-                axes,
-                series,
-                x="yaw from the source, degrees",
-                y=_unit(metric),
-                title=title,
-                share="same_answer" in metric,
-                legend=metric == list(BY_YAW)[-1],
-                apart=charts.APART,
-            )
-    tables = [
-        Table(
-            ["variant", *(f"{yaw:g}°" for yaw in yaws)],
-            [[name, *(number(v.mean) for v in curves[metric, name])] for name in measured],
-            title,
-            folded=True,
-        )
-        for metric, title in BY_YAW.items()
-    ]
-    text = [
-        (
-            "Means over the scenes whose source edit was done. Bars are 95 % intervals over scenes;"
-            " of fewer than six scenes they end at the lowest and the highest one."
-        ),
-        BELOW_FLOOR,
-    ]
-    for name in measured:
-        scenes = dict.fromkeys(scene for scene, _, _ in results.records(probe, name))
-        if len(scenes) < len(results.study.scenes):
-            text.append(f"**Of {', '.join(scenes)} alone, not to be compared: {name}.**")
-    figure = Picture(f"figures/{path.name}", "Agreement and fidelity by yaw from the source.")
-    return Section("Edited views by yaw", text, tables, [figure])
-
-
-def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
-    """A table for each figure: variants by scenes."""
-    measured = [name for name in names if results.records(probe, name)]
-    scenes = results.study.scene_names
-    tables = []
-    for metric, title in BY_SCENE.items():
-        rows = []
-        for name in measured:
-            table = results.views(probe, name, metric)
-            means = [over_scenes({s: table.get(s, {})}).mean for s in scenes]
-            squared = report_of(probe).probe.metric(metric).squared
-            one, overall = (decibels, pooled) if squared else (number, spread)
-            rows.append([name, *map(one, means), overall(over_scenes(table))])
-        tables.append(Table(["variant", *scenes, "all scenes"], rows, title))
-    tables.insert(0, _ratios(results, probe, measured))
-    tables += _injected(results, probe, measured)
-    text = [
-        (
-            "A dash: no view has the figure. Agreement needs a source edit that is done, a view"
-            " that was edited, and a surface of the object in both views. The share of views with"
-            " the source's answer needs an edit with several answers besides."
-        ),
-        BELOW_FLOOR,
-        (
-            "A part of the control's disagreement is over the views that both have. A control at or"
-            " below its floor has no parts, and the cell says so."
-        ),
-    ]
-    return Section("Edited views by scene", text, tables)
-
-
-def _injected(results: Results, probe: str, names: Sequence[str]) -> list[Table]:
-    """Shares of injected features: variants by scenes; none if no variant injects."""
-    scenes = results.study.scene_names
-    rows = []
-    for name in names:
-        shares: dict[str, list[float]] = {}
-        for scene, _, record in results.records(probe, name):
-            shares.setdefault(scene, []).append(record.extra.injected)
-        if any(any(own) for own in shares.values()):
-            means = [_mean(shares.get(scene, [])) for scene in scenes]
-            rows.append([name, *(number(mean) for mean in means), spread(interval(shares))])
-    title = "Share of the targets' pixels that got features of a source; the rest is edited alone"
-    return [Table(["variant", *scenes, "all scenes"], rows, title)] if rows else []
-
-
-def _ratios(results: Results, probe: str, names: Sequence[str]) -> Table:
-    """Ratio of disagreement above the floor to the control's with the same editor."""
-    control = {
-        results.records(probe, name)[0][2].spec["editor"]["sha256"]: name
-        for name in reversed(controls(results, probe))
-    }
-    rows = []
-    for name in names:
-        base = control.get(results.records(probe, name)[0][2].spec["editor"]["sha256"], "")
-        if base in ("", name):
-            continue
-        shared = common([results.views(probe, each, DISAGREEMENT) for each in (name, base)])
-        parts = [_part(results, probe, (name, base), shared, s) for s in results.study.scene_names]
-        rows.append([name, base, *parts])
-    title = "Disagreement with the source above its floor, as a part of the control's"
-    return Table(["variant", "control", *results.study.scene_names], rows, title)
-
-
-def _part(
-    results: Results,
-    probe: str,
-    names: tuple[str, str],
-    shared: Sequence[Mapping[str, Mapping[str, float]]],
-    scene: str,
-) -> str:
-    """The ratio of a variant's sum over the shared views to its control's, or why there is none.
-
-    Args:
-        names: names of the variant and its control.
-        shared: values of both in their shared views, by scene.
-    """
-    if scene in shared[0]:
-        own, control = (sum(table[scene].values()) for table in shared)
-        return number(own / control) if control > 0 else "below the floor"
-    for name, whose in zip(names, ("", "control's "), strict=True):
-        records = [record for where, _, record in results.records(probe, name) if where == scene]
-        if not any(record.extra.source.done for record in records):
-            return f"{whose}source edit not done"
-    return "no view in common"
 
 
 SOURCE = "source's edit"
@@ -380,7 +183,7 @@ def side_by_side(results: Results, probe: str) -> Section | None:
         "Rows are methods, columns views. The truth is that of the answer that a source's edit"
         " gave. A method whose source edit failed takes part in no comparison."
     ]
-    return Section("Edited views side by side", text, grids=grids)
+    return Section("Edited views side by side", text, grids=grids, folded=True)
 
 
 def _grid(caption: str, methods: Mapping[str, Record[EditResult]]) -> Grid:
@@ -413,101 +216,6 @@ def _grid(caption: str, methods: Mapping[str, Record[EditResult]]) -> Grid:
         label = "truth" if len(truths) == 1 else f"truth: {', '.join(names)}"
         rows.append(row(label, files[names[0]], "truth"))
     return Grid(caption, heads, rows)
-
-
-def parts_of_time(results: Results, probe: str) -> Section:
-    """Mean seconds of each part, and the ratio of editing to the control's."""
-    control = controls(results, probe)[0]
-    base = _seconds(results, probe, control)
-    rows, columns = [], ["variant", *PARTS, "whole", "editing, ratio to control", "network rows"]
-    for name in results.study.variants:
-        records = results.records(probe, name)
-        if not records:
-            continue
-        own = _seconds(results, probe, name)
-        shared = [cell for cell in own if cell in base and _editing(base[cell]) > 0]
-        ratios = [_editing(own[cell]) / _editing(base[cell]) for cell in shared]
-        means = [
-            _over_scenes((scene, row[part]) for (scene, *_), row in own.items()) for part in PARTS
-        ]
-        whole = _over_scenes((scene, sum(row.values())) for (scene, *_), row in own.items())
-        counts = _over_scenes(
-            (scene, record.cost.counters.get("network_rows", 0)) for scene, _, record in records
-        )
-        rows.append(
-            [
-                name,
-                *(number(value) for value in means),
-                number(whole),
-                number(statistics.median(ratios) if ratios else None),
-                number(counts),
-            ]
-        )
-    better = (
-        "Where it differs from the table of seconds taken in turn, believe that one."
-        if timed_in_turn(results, WHOLE) is not None
-        else "This run has no seconds taken in turn, which would be the ones to believe."
-    )
-    text = [
-        (
-            "Own seconds of the cells, as means over scenes: they show how the time of an edit"
-            " divides. Each cell ran at another time, beside whatever else the machine did."
-            f" {better} The ratio is the median over scenes, edits and seeds of source, warps and"
-            f" edited views together against {control!r}, tuning apart."
-        ),
-    ]
-    timed = tuple(columns[1:-1])
-    return Section("Seconds by part", text, [Table(columns, rows, timed=timed)])
-
-
-def choice(results: Results, probe: str, names: Sequence[str], metrics: Sequence[str]) -> Section:
-    """The best variant for a given time: chosen on every other scene, checked on the rest."""
-    scenes = results.study.scene_names
-    chosen_on, checked_on = scenes[::2], scenes[1::2]
-    measured = [name for name in names if results.records(probe, name)]
-    timed = timed_in_turn(results, WHOLE)
-    if timed is None:
-        seconds = {name: results.usual_seconds(probe, name, WHOLE) for name in measured}
-        origin = "Seconds are those of the fronts: of one pass, for orientation."
-    else:
-        seconds = {name: timed.seconds(name).mean for name in measured if name in timed.names}
-        origin = (
-            "Seconds are those of the fronts, taken in turn in one process:"
-            f" {', '.join(t.of for t in timed.turns)}."
-        )
-        if rest := [name for name in measured if name not in seconds]:
-            origin += f" Not timed in turn, so left out: {', '.join(rest)}."
-    section = Section("Which variant for a given time")
-    section.text = [
-        (
-            "Of the variants that take at most the seconds of the row, the one with the least mean"
-            f" on {', '.join(chosen_on)}; beside it the same variant on"
-            f" {', '.join(checked_on) or 'no other scene'}, which had no part in the choice."
-        ),
-        origin,
-    ]
-    columns = ["seconds at most", "variant", "where chosen", "elsewhere", "best elsewhere"]
-    for metric in metrics:
-        shared = results.shared(probe, list(seconds), metric)
-        section.text += shared.text(metric)
-        rows, last = [], ""
-        for limit in sorted(seconds.values()):
-            scores = {
-                name: (shared.mean(name, chosen_on).mean, shared.mean(name, checked_on).mean)
-                for name, taken in seconds.items()
-                if taken <= limit and name not in shared.apart
-            }
-            defined = {name: pair for name, pair in scores.items() if math.isfinite(pair[0])}
-            best = min(defined, key=lambda name: defined[name][0], default="")
-            if not best or best == last:
-                continue
-            last = best
-            others = {n: pair[1] for n, pair in scores.items() if math.isfinite(pair[1])}
-            least = min(others, key=others.__getitem__, default="–")
-            chosen, checked = defined[best]
-            rows.append([number(limit), best, number(chosen), number(checked), least])
-        section.tables.append(Table(columns, rows, metric, timed=(columns[0],)))
-    return section
 
 
 def budgets(results: Results, probe: str) -> Section | None:
@@ -570,7 +278,7 @@ def budgets(results: Results, probe: str) -> Section | None:
             f" before the edit: {'; '.join(untuned)}."
         )
     timed = (columns[1], columns[5])
-    return Section("Methods with a budget", text, [Table(columns, rows, timed=timed)])
+    return Section("Methods with a budget", text, [Table(columns, rows, timed=timed, folded=True)])
 
 
 def _limit(cells: Sequence[tuple[str, Any]], name: str) -> float:
@@ -579,34 +287,9 @@ def _limit(cells: Sequence[tuple[str, Any]], name: str) -> float:
     return _over_scenes((scene, limit) for scene, limit in limits if limit is not None)
 
 
-def _seconds(results: Results, probe: str, name: str) -> dict[tuple[Any, ...], dict[str, float]]:
-    """Seconds by part of each cell, by (scene, seed, edit)."""
-    return {
-        (scene, seed, record.extra.name): {
-            part: float(record.cost.seconds.get(f"method: {part}") or 0.0) for part in PARTS
-        }
-        for scene, seed, record in results.records(probe, name)
-    }
-
-
 def _over_scenes(values: Iterable[tuple[str, float]]) -> float:
     """Mean over scenes of the means over their cells, from (scene, value) pairs."""
     by_scene: dict[str, list[float]] = {}
     for scene, value in values:
         by_scene.setdefault(scene, []).append(value)
     return interval(by_scene).mean
-
-
-def _editing(seconds: Mapping[str, float]) -> float:
-    return seconds["source"] + seconds["warp"] + seconds["edit"]
-
-
-def _mean(values: Iterable[float]) -> float:
-    listed = list(values)
-    return sum(listed) / len(listed) if listed else math.nan
-
-
-def _unit(metric: str) -> str:
-    if "same_answer" in metric:
-        return "share"
-    return "dB" if "psnr" in metric else "dE00"

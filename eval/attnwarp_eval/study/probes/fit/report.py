@@ -101,7 +101,7 @@ class FitReport(ProbeReport):
                 " same splats stand in the tables above."
             ),
         ]
-        section = Section("Fits", text, [Table(columns, rows, timed=TIMED)])
+        section = Section("Fits", text, [Table(columns, rows, timed=TIMED, folded=True)])
         if layout.timings:
             section.text.append(
                 "Curves: means over scenes at each evaluation, 95 % intervals over scenes, against"

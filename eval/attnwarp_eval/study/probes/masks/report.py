@@ -53,6 +53,8 @@ class MasksReport(ProbeReport):
         """Tables of medians over scenes by yaw."""
         names = results.study.probes.get(self.name, [])
         tables = [self._by_yaw(results, names, title, metric) for title, metric in PARTS.items()]
+        for table in tables[1:]:
+            table.folded = True
         if any(table.rows for table in tables):
             text = (
                 "Intersection over union of a lifted mask and the exact one: medians over scenes,"
@@ -80,7 +82,7 @@ class MasksReport(ProbeReport):
         """Masks of each scene, in the colours of right, lost and wrong."""
         grids = scenes_side_by_side(results, self.name, "lifted", {"true view": "target"})
         legend = "; ".join(f"`{color}` {name}" for name, color in MARKS.items())
-        return Section("Lifted masks", [f"{legend}."], grids=grids) if grids else None
+        return Section("Lifted masks", [f"{legend}."], grids=grids, folded=True) if grids else None
 
 
 def _median(values: list[float]) -> str:

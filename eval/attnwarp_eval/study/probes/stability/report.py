@@ -122,7 +122,7 @@ def _every_error(swept: Sequence[Swept]) -> Section:
     """Section on each case: a row a level, a column a way, and the first refusal."""
     text = "One row a level; `!` marks a required level that does not hold, `~` a harder one."
     tables = [_case_table(part) for part in _grouped(swept, directions=False)]
-    return Section("Every hard case", [text], tables)
+    return Section("Every hard case", [text], tables, folded=True)
 
 
 def _case_table(swept: Sequence[Swept]) -> Table:
@@ -139,7 +139,7 @@ def _case_table(swept: Sequence[Swept]) -> Table:
     )
     if refusals := [one for level in by_level for o in level if (one := o.refusal)]:
         caption += f" First refusal: {refusals[0]}."
-    return Table([hard.hardness, *(s.way.name for s in swept)], rows, caption, folded=True)
+    return Table([hard.hardness, *(s.way.name for s in swept)], rows, caption)
 
 
 def _cell(outcome: Outcome) -> str:

@@ -58,7 +58,8 @@ class TimingReport(ProbeReport):
                 " image about 1, nothing is called faster or slower."
             ),
         ]
-        return Section("Seconds of an edit, taken in turn", text, [Table(columns, rows)])
+        title = "Seconds of an edit, taken in turn"
+        return Section(title, text, [Table(columns, rows)], folded=True)
 
 
 def _spread(rounds: Sequence[Sequence[float]]) -> tuple[str, str]:

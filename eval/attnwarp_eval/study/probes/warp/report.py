@@ -10,7 +10,7 @@ from typing import ClassVar
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number
-from attnwarp_eval.metrics.occlusion import COUNTS, by_yaw
+from attnwarp_eval.metrics.occlusion import COUNTS, YawBin, by_yaw
 from attnwarp_eval.statistics.intervals import Interval, over_scenes
 from attnwarp_eval.study.probe_report import (
     Layout,
@@ -26,15 +26,15 @@ YAW_EDGES = (0, 15, 45, 75, 105, 135, 165, 180)
 """Bins around the yaws 30, 60, ... 150 that studies often use, with separate bins at the ends."""
 
 RATES = {
-    "occlusion.false_positive_rate": (
-        "Of surface that the source does not show, accepted (false positive rate)"
-    ),
-    "occlusion.false_negative_rate": (
-        "Of surface that the source shows, rejected (false negative rate)"
-    ),
     "occlusion.behind_share": "Of what is accepted, behind the source camera",
     "occlusion.hidden_share": "Of what is accepted, hidden from the source",
 }
+
+CURVES = {
+    "occlusion.false_positive_rate": "hidden surface accepted",
+    "occlusion.recall": "visible surface kept",
+}
+"""Shares that stand on the page, as a figure and side by side in one table."""
 
 
 @register_report
@@ -79,46 +79,31 @@ class WarpReport(ProbeReport):
             for kind, metric in kinds.items()
         ]
         caption = "Feature error by grid size (the floor stands under Calibration)"
-        return [Table(["variant", "over", *map(str, sizes)], rows, caption, folded=True)]
+        return [Table(["variant", "over", *map(str, sizes)], rows, caption)]
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """Section on masks by yaw, if the study asks for them."""
         wanted = results.study.part(StudyPart).yaw.variants
         names = [name for name in wanted if results.records(self.name, name)]
         if names:
-            yield Place.RESULT, self._by_yaw(results, layout, names)
+            yield Place.ANSWER, self._by_yaw(results, layout, names)
 
     def _by_yaw(self, results: Results, layout: Layout, names: list[str]) -> Section:
         columns = ["variant", *(f"{low}–{high}°" for low, high in itertools.pairwise(YAW_EDGES))]
-        bins = {
-            (name, region): by_yaw(self._counts(results, name, region), YAW_EDGES)
-            for name in names
-            for region in ("", ".interior", ".edge")
-        }
+        bins = {name: by_yaw(self._counts(results, name), YAW_EDGES) for name in names}
         tables = [
             Table(
                 columns,
-                [[name, *(number(b.scores[metric]) for b in bins[name, ""])] for name in names],
+                [[name, *(number(b.scores[metric]) for b in bins[name])] for name in names],
                 caption,
+                folded=True,
             )
             for metric, caption in RATES.items()
         ]
-        places = {"": "everywhere", ".interior": "inside surfaces", ".edge": "at edges"}
-        for metric in ("precision", "recall"):
-            rows = [
-                [
-                    name,
-                    place,
-                    *(number(b.scores[f"occlusion.{metric}"]) for b in bins[name, region]),
-                ]
-                for name in names
-                for region, place in places.items()
-            ]
-            caption = f"{metric.capitalize()}, inside surfaces and at edges apart"
-            tables.append(Table([columns[0], "where", *columns[1:]], rows, caption, folded=True))
-        rows = [[name, *(number(_ambiguous(b.counts)) for b in bins[name, ""])] for name in names]
-        caption = "Of ambiguous pixels, which are not scored, accepted"
-        tables.append(Table(columns, rows, caption, folded=True))
+        seen = [i for i, of in enumerate(zip(*bins.values(), strict=True)) if any(map(_seen, of))]
+        rows = [[name, *(_both(bins[name][i]) for i in seen)] for name in names]
+        heads = ["variant", *(columns[i + 1] for i in seen)]
+        tables.insert(0, Table(heads, rows, f"{' / '.join(CURVES.values())}, %".capitalize()))
         text = [
             (
                 "Counts of all scenes' views summed in bins of the yaw between source and target. A"
@@ -127,10 +112,7 @@ class WarpReport(ProbeReport):
             ),
         ]
         with charts.drawing(layout.figure("masks-by-yaw.svg"), columns=2) as (left, right):
-            for axes, metric, title in (
-                (left, "occlusion.false_positive_rate", "unseen surface accepted"),
-                (right, "occlusion.false_negative_rate", "visible surface rejected"),
-            ):
+            for axes, (metric, title) in zip((left, right), CURVES.items(), strict=True):
                 series = [charts.Line(name, *self._curve(results, name, metric)) for name in names]
                 x, y = "yaw from the source, degrees", "share"
                 charts.lines(
@@ -145,18 +127,16 @@ class WarpReport(ProbeReport):
                 )
         drawn = Picture(
             "figures/masks-by-yaw.svg",
-            "Both errors of the masks by yaw; means and 95 % intervals over scenes.",
+            "What masks accept, by yaw; means and 95 % intervals over scenes.",
         )
         return Section("Masks by yaw", text, tables, [drawn])
 
-    def _counts(
-        self, results: Results, variant: str, region: str
-    ) -> list[tuple[float, dict[str, int]]]:
-        """(yaw, confusion counts) of every view: everywhere, or in ".interior" or ".edge"."""
+    def _counts(self, results: Results, variant: str) -> list[tuple[float, dict[str, int]]]:
+        """(yaw, confusion counts) of every view."""
         return [
             (
                 view.yaw,
-                {name: int(view.metrics[f"occlusion.{name}{region}"]) for name in COUNTS},
+                {name: int(view.metrics[f"occlusion.{name}"]) for name in COUNTS},
             )
             for _, _, record in results.records(self.name, variant)
             for view in record.views
@@ -177,7 +157,11 @@ class WarpReport(ProbeReport):
         return yaws, list(map(over_scenes, tables))
 
 
-def _ambiguous(counts: Mapping[str, int]) -> float:
-    """Share of the ambiguous pixels that are accepted."""
-    total = counts["ambiguous_accepted"] + counts["ambiguous_rejected"]
-    return counts["ambiguous_accepted"] / total if total else math.nan
+def _seen(one: YawBin) -> bool:
+    return any(math.isfinite(one.scores[metric]) for metric in CURVES)
+
+
+def _both(one: YawBin) -> str:
+    """The shares of a bin in percent."""
+    shares = [100 * one.scores[metric] for metric in CURVES]
+    return " / ".join(f"{x:.0f}" if x >= 10 else number(x, 2) for x in shares)
