@@ -85,13 +85,7 @@ class MissingExtraError(InputError):
 
 
 def missing_extra(error: ImportError) -> MissingExtraError | None:
-    """Convert a failed import into the error to show; None if no extra has the module.
-
-    Example:
-        >>> error = missing_extra(ModuleNotFoundError(name="diffusers"))
-        >>> print(str(error).partition(";")[0])
-        needs the package diffusers, which comes with the extra 'edit'
-    """
+    """Convert a failed import into the error to show; None if no extra has the module."""
     module = (error.name or "").partition(".")[0]
     extra = next((name for name, extra in EXTRAS.items() if module in extra.modules), None)
     if extra is None or not isinstance(error, ModuleNotFoundError):

@@ -37,12 +37,7 @@ def keep_freed_memory() -> None:
 
 
 def core_count() -> int:
-    """Count the cores available to this process; all cores if the system cannot tell (macOS).
-
-    Example:
-        >>> core_count() >= 1
-        True
-    """
+    """Count the cores available to this process; all cores if the system cannot tell (macOS)."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 

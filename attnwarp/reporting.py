@@ -54,16 +54,7 @@ SILENT = Reporter()
 
 
 class Part(Reporter):
-    """Reporter of one part of several works: its messages are shown with the count of all works.
-
-    Example:
-        >>> from attnwarp.reporting import Part, reporter
-        >>> import sys
-        >>> from rich.console import Console
-        >>> with reporter(Console(file=sys.stdout, width=100)) as report:
-        ...     Part(report, 9, 9).step(1, 400, "view 1")
-        [9/9] view 1
-    """
+    """Reporter of one part of several works: its messages are shown with the count of all works."""
 
     def __init__(self, report: Reporter, done: int, total: int) -> None:
         self._report, self._done, self._total = report, done, total
@@ -80,13 +71,7 @@ class Part(Reporter):
 class Pace:
     """Estimator of the time left from the mean pace of the latter half of the steps since the first
     count, where a resumed work began: the first steps compile and are not typical. With fewer than
-    :data:`FEWEST` steps, all count.
-
-    Example:
-        >>> from attnwarp.reporting import Pace
-        >>> Pace().left(3, 9) is None  # too early to tell
-        True
-    """
+    :data:`FEWEST` steps, all count."""
 
     def __init__(self) -> None:
         self._counts: list[tuple[float, int]] = []

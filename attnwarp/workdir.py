@@ -106,11 +106,7 @@ class Workdir:
     # --- ownership
 
     def claim(self, manifest: dict[str, Any]) -> None:
-        """Write the manifest, or compare it with the existing one; create the folders.
-
-        Raises:
-            InputError: see :meth:`check_claimed`.
-        """
+        """Write the manifest, or compare it with the existing one; create the folders."""
         manifest = {"format": FORMAT, **manifest}
         self.check_claimed(manifest, whole=True)
         for name in self.folders:
@@ -170,11 +166,7 @@ class Workdir:
         write_atomically(self.path / name, lambda stream: stream.write(text.encode()))
 
     def read_json(self, name: str) -> Any:
-        """Read the object of a JSON file.
-
-        Raises:
-            FileFormatError: the file is damaged.
-        """
+        """Read the object of a JSON file."""
         path = self.path / name
         # Without its manifest, a folder's results have unknown settings.
         remedy = "name another folder" if name == MANIFEST else "remove it, it is made anew"
@@ -192,11 +184,7 @@ class Workdir:
         write_atomically(self.path / name, lambda stream: stream.write(data))
 
     def read_picture(self, name: str) -> npt.NDArray[np.uint8]:
-        """Read a PNG written by :meth:`write_picture`, (H, W, 3) uint8.
-
-        Raises:
-            FileFormatError: the file is damaged.
-        """
+        """Read a PNG written by :meth:`write_picture`, (H, W, 3) uint8."""
         path = self.path / name
         try:
             return read_image(path)
@@ -209,21 +197,13 @@ class Workdir:
         self, picture: str, pixels: npt.NDArray[np.uint8], about: dict[str, Any]
     ) -> None:
         """Write a picture, then its record, which has its hash and marks it as finished. A picture
-        written again must be the same, since later results depend on the first version.
-
-        Raises:
-            InputError: the picture differs.
-        """
+        written again must be the same, since later results depend on the first version."""
         self.check_same(picture, pixels)
         self.write_picture(picture, pixels)
         self.write_json(record_of(picture), {**about, "sha256": digest(pixels)})
 
     def check_same(self, picture: str, pixels: npt.NDArray[np.uint8]) -> None:
-        """Compare a picture computed again with its record, if any.
-
-        Raises:
-            InputError: the picture differs.
-        """
+        """Compare a picture computed again with its record, if any."""
         if self.has(record_of(picture)) and self.record(picture)["sha256"] != digest(pixels):
             raise InputError(
                 f"{self.path}: the edit is not the one that {picture} was; go on with the same"
@@ -231,11 +211,7 @@ class Workdir:
             )
 
     def record(self, picture: str) -> dict[str, Any]:
-        """Read the record of a picture.
-
-        Raises:
-            FileFormatError: the file is not JSON, or not a record.
-        """
+        """Read the record of a picture."""
         record: dict[str, Any] = self.read_json(record_of(picture))
         if "sha256" not in record:
             path = self.path / record_of(picture)

@@ -54,15 +54,7 @@ def enter(name: str, module: str) -> None:
 
 
 def expanded(argument: str) -> str:
-    """Expand an argument's leading home folder, since a shell leaves ``--out=~/x`` unexpanded.
-
-    Example:
-        >>> import os
-        >>> expanded("--out=~/x") == "--out=" + os.path.expanduser("~/x")
-        True
-        >>> expanded("--instruction=a ~ bear")
-        '--instruction=a ~ bear'
-    """
+    """Expand an argument's leading home folder, since a shell leaves ``--out=~/x`` unexpanded."""
     option, equals, value = "", "", argument
     if argument.startswith("--"):
         option, equals, value = argument.rpartition("=")

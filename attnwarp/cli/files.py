@@ -96,9 +96,6 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera], report:
 
     Args:
         cameras: cameras of the dataset; the first that sees splats ends the search.
-
-    Raises:
-        InputError: the splats cover less than :data:`COVERED` of every view.
     """
     import torch
 
@@ -195,11 +192,7 @@ def likeness(splats: Gaussians, dataset: Dataset) -> tuple[float, float]:
 
 
 def check_inputs_stay(results: Iterable[Path], read: Iterable[Path | None]) -> None:
-    """Refuse to overwrite a command's inputs, under the same or another name, or by a link.
-
-    Raises:
-        InputError: a result would replace an input.
-    """
+    """Refuse to overwrite a command's inputs, under the same or another name, or by a link."""
     # Writing a PLY to a link replaces the link's target.
     existing = {_identity(look): path for path in results for look in (path.lstat, path.stat)}
     existing.pop(None, None)

@@ -207,11 +207,7 @@ class Marking:
     ] = None
 
     def marks(self) -> Marks:
-        """Build the marks.
-
-        Raises:
-            InputError, ValueError: two kinds of marks are given, or a mark is empty.
-        """
+        """Build the marks."""
         check_segmenter(self.segmenter, self.words)
         from attnwarp.methods.marks import Marks, numbers
 
@@ -246,11 +242,7 @@ class Editing(Marking):
     ] = None
 
     def checked(self) -> EditOptions:
-        """Check the options and convert them for an edit.
-
-        Raises:
-            InputError, ValueError: two kinds of marks are given, or a mark is empty.
-        """
+        """Check the options and convert them for an edit."""
         from attnwarp.methods.command import EditOptions
 
         return EditOptions(

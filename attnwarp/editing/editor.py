@@ -175,13 +175,7 @@ class Edit:
 
 
 def shared_noise(shape: tuple[int, int, int, int], seed: int) -> Tensor:
-    """Draw (B, C, h, w) white noise, the same for all views.
-
-    Example:
-        >>> first, second = shared_noise((2, 4, 8, 8), seed=0)
-        >>> torch.equal(first, second)
-        True
-    """
+    """Draw (B, C, h, w) white noise, the same for all views."""
     return drawn((1, *shape[1:]), seed).expand(shape).clone()
 
 
@@ -360,12 +354,7 @@ def check_networks(
     name: str,
     hint: str = "",
 ) -> None:
-    """Refuse networks whose configurations do not fit each other.
-
-    Raises:
-        ValueError: a different number of channels, texts of another size, or a model that needs
-            more inputs than a text.
-    """
+    """Refuse networks whose configurations do not fit each other."""
     if network.get("addition_embed_type") is not None:
         raise ValueError(
             f"{name}: is of Stable Diffusion XL's kind, which takes more than a text; expected"
@@ -390,11 +379,7 @@ def check_networks(
 
 
 def check_scheduler(scheduler: Any) -> None:
-    """Refuse a scheduler without DDIM steps, and warn of settings that these steps ignore.
-
-    Raises:
-        ValueError: the scheduler is not a DDIMScheduler.
-    """
+    """Refuse a scheduler without DDIM steps, and warn of settings that these steps ignore."""
     from diffusers import DDIMScheduler
 
     if not isinstance(scheduler, DDIMScheduler):

@@ -35,11 +35,7 @@ def require_diffusers() -> None:
 
 
 def load_parts(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -> dict[str, Any]:
-    """Load a folder's UNet, autoencoder, text encoder, tokenizer and a DDIM scheduler.
-
-    Raises:
-        InputError: the device is unknown, or files are missing (named) or unreadable.
-    """
+    """Load a folder's UNet, autoencoder, text encoder, tokenizer and a DDIM scheduler."""
     folder = _checked(folder, ("unet", "vae", "text_encoder"), ("tokenizer",), device)
 
     from diffusers import AutoencoderKL, AutoencoderTiny, DDIMScheduler, UNet2DConditionModel
@@ -80,10 +76,6 @@ def load_pipeline(
     Args:
         networks: classes of diffusers or transformers by the name of the network's folder.
         optional: networks that may be missing; they become None, and their tokenizers.
-
-    Raises:
-        InputError: the device is unknown, or files are missing (named), unreadable, or of another
-            class.
     """
     folder = Path(folder)
     left_out = {name for name in optional if not (folder / name).is_dir()}
@@ -179,11 +171,7 @@ def _checked(
 
 
 def load_controlnet(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -> Any:
-    """Load a folder's ControlNet.
-
-    Raises:
-        InputError: files are missing (named) or unreadable.
-    """
+    """Load a folder's ControlNet."""
     require_diffusers()
     folder = Path(folder)
     missing = _missing(folder)
@@ -196,11 +184,7 @@ def load_controlnet(folder: str | Path, *, device: str = "cpu", dtype: torch.dty
 
 
 def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> Any:
-    """Load a network of diffusers or transformers from its folder.
-
-    Raises:
-        InputError: files are unreadable, lack tensors, or hold values that are not finite.
-    """
+    """Load a network of diffusers or transformers from its folder."""
     from transformers import PreTrainedModel
     from transformers.utils import logging
 
@@ -236,11 +220,7 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
 
 
 def index_of(folder: str | Path) -> dict[str, Any]:
-    """Read a folder's model_index.json; empty without the file.
-
-    Raises:
-        InputError: the file is unreadable.
-    """
+    """Read a folder's model_index.json; empty without the file."""
     path = Path(folder) / "model_index.json"
     if not path.is_file():
         return {}
@@ -249,22 +229,14 @@ def index_of(folder: str | Path) -> dict[str, Any]:
 
 
 def pipeline_of(folder: Path) -> str | None:
-    """Read the pipeline's name from a folder's model_index.json; None without the file.
-
-    Raises:
-        InputError: the file is unreadable.
-    """
+    """Read the pipeline's name from a folder's model_index.json; None without the file."""
     index = index_of(folder)
     with readable(folder):
         return str(index["_class_name"]) if index else None
 
 
 def config_of(folder: str | Path, name: str) -> dict[str, Any]:
-    """Read a network's configuration in a folder; empty if missing, which loading reports.
-
-    Raises:
-        InputError: the file is unreadable.
-    """
+    """Read a network's configuration in a folder; empty if missing, which loading reports."""
     place = Path(folder) / name
     path = place / "config.json"
     if not path.is_file():
@@ -277,11 +249,7 @@ def config_of(folder: str | Path, name: str) -> dict[str, Any]:
 
 
 def class_of(folder: Path, *kinds: Any) -> Any:
-    """Find a network's class by its folder's configuration; the first if none is configured.
-
-    Raises:
-        InputError: the configured class is not among ``kinds``.
-    """
+    """Find a network's class by its folder's configuration; the first if none is configured."""
     wanted = config_of(folder.parent, folder.name).get("_class_name")
     names = [kind.__name__ for kind in kinds]
     if wanted is not None and wanted not in names:

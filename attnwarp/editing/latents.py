@@ -25,11 +25,6 @@ def haar_basis() -> Tensor:
 
     Channels 0 to 2 are the mean of a block's luminance, red against blue, green against both; 3 to
     11 the coarse details; 12 to 47 the fine ones.
-
-    Example:
-        >>> kernels = haar_basis().flatten(1)
-        >>> torch.allclose(kernels @ kernels.T, torch.eye(48, dtype=kernels.dtype), atol=1e-6)
-        True
     """
     color = torch.tensor([[1.0, 1, 1], [1, 0, -1], [1, -2, 1]], dtype=torch.float64)
     color = color / color.norm(dim=1, keepdim=True)
@@ -61,15 +56,6 @@ class HaarLatents(ModelMixin, ConfigMixin):
             between picture and latents, 2 ** (3 - 1) = 4.
         latent_channels: number of channels, 48.
         scaling_factor: factor of latents after encoding; here the gains replace it.
-
-    Example:
-        >>> import torch
-        >>> coder = HaarLatents()
-        >>> latents = coder.encode(torch.zeros(1, 3, 64, 48)).latents
-        >>> tuple(latents.shape)
-        (1, 48, 16, 12)
-        >>> tuple(coder.decode(latents).sample.shape)
-        (1, 3, 64, 48)
     """
 
     @register_to_config

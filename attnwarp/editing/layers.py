@@ -236,12 +236,6 @@ def choose_layers(
 
     Raises:
         ValueError: a kind or a set is unknown, or no layer matches.
-
-    Example:
-        >>> from attnwarp.editing.small import load_editor
-        >>> layers = load_editor("small-plain").layers()
-        >>> {layer.kind for layer in choose_layers(layers, kinds=("self",))}
-        {'self'}
     """
     for kind in kinds or ():
         check.one_of(kind, get_args(Kind), "kinds")

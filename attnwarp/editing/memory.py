@@ -30,13 +30,7 @@ def networks_of(editor: Editor) -> dict[str, Any]:
 
 
 def weight_bytes(editor: Editor) -> int:
-    """Count the bytes of an editor's loaded weights; activations need additional memory.
-
-    Example:
-        >>> from attnwarp.editing.small import load_editor
-        >>> round(weight_bytes(load_editor("small-plain")) / 2**20)  # MiB
-        14
-    """
+    """Count the bytes of an editor's loaded weights; activations need additional memory."""
     return sum(
         tensor.numel() * tensor.itemsize
         for network in networks_of(editor).values()

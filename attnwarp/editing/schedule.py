@@ -364,14 +364,7 @@ def widened(x: Tensor) -> Tensor:
 
 
 def steps_from(start: int, steps: int) -> list[int]:
-    """Space ``steps`` timesteps evenly down from ``start``, as "trailing" does from the last.
-
-    Example:
-        >>> steps_from(999, 4)
-        [999, 749, 499, 249]
-        >>> steps_from(700, 4)
-        [700, 525, 349, 174]
-    """
+    """Space ``steps`` timesteps evenly down from ``start``, as "trailing" does from the last."""
     if steps < 1 or start < steps - 1:
         raise ValueError(
             f"start, steps: got {start}, {steps}, expected at least one step and start >= steps - 1"
@@ -391,15 +384,7 @@ def stable_diffusion_alphas() -> Tensor:
 
 
 def published_steps(start: int, steps: int, grid: Grid = "even") -> list[int]:
-    """Compute the Stable Diffusion timesteps at which an edit from ``start`` denoises.
-
-    Raises:
-        ValueError: fewer timesteps than steps.
-
-    Example:
-        >>> published_steps(980, 20)[:2], published_steps(980, 20, "scheduler")[:2]
-        ([980, 931], [932, 883])
-    """
+    """Compute the Stable Diffusion timesteps at which an edit from ``start`` denoises."""
     if grid == "even":
         return steps_from(start, steps)
     if steps < 1 or start < steps:
@@ -410,20 +395,11 @@ def published_steps(start: int, steps: int, grid: Grid = "even") -> list[int]:
 
 
 def published_alphas(start: int, steps: int, grid: Grid) -> Tensor:
-    """Return alpha-bar of :func:`published_steps`, (steps,) float64.
-
-    Raises:
-        ValueError: the timestep is out of range, or there are fewer timesteps than steps.
-    """
+    """Return alpha-bar of :func:`published_steps`, (steps,) float64."""
     check.number(start, 0, PUBLISHED_STEPS - 1, "start", whole=True)
     return stable_diffusion_alphas()[published_steps(start, steps, grid)]
 
 
 def following(timesteps: Sequence[T]) -> list[tuple[T, T | None]]:
-    """Pair each timestep with its successor; None after the last.
-
-    Example:
-        >>> following([999, 499])
-        [(999, 499), (499, None)]
-    """
+    """Pair each timestep with its successor; None after the last."""
     return list(zip(timesteps, [*timesteps[1:], None], strict=True))

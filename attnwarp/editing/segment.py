@@ -110,11 +110,7 @@ def load_segmenter(name: str, *, device: str = "cpu") -> Segmenter:
 
 
 def segmenter_folders(name: str) -> tuple[Path, Path] | None:
-    """Parse the Grounding DINO and SAM folders from a segmenter's name; None for clip-parts.
-
-    Raises:
-        InputError: the segmenter is unknown, or files are missing; the message names them.
-    """
+    """Parse the Grounding DINO and SAM folders from a segmenter's name; None for clip-parts."""
     if name == "clip-parts":
         return None
     folders = [Path(folder.strip()) for folder in name.split(",") if folder.strip()]
@@ -498,11 +494,7 @@ def check_marks(
     box: Sequence[float] | None = None,
     at: Sequence[float] | None = None,
 ) -> None:
-    """Refuse a box or a point outside a picture, and a box without area.
-
-    Raises:
-        InputError: a mark is outside the picture, or the box has no area.
-    """
+    """Refuse a box or a point outside a picture, and a box without area."""
     for name, marks in (("--box", box), ("--at", at)):
         limits = [width, height] * (len(marks or ()) // 2)
         if not all(0 <= v <= limit for v, limit in zip(marks or (), limits, strict=True)):

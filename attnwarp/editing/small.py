@@ -62,11 +62,7 @@ def say_foreign(name: str) -> str:
 
 
 def check_sums(folder: Path) -> None:
-    """Check the files of a bundled editor against their recorded SHA-256.
-
-    Raises:
-        InputError: a file is missing or differs; the message names the file.
-    """
+    """Check the files of a bundled editor against their recorded SHA-256."""
     for name, expected in json.loads((folder / SUMS).read_text()).items():
         path = folder / name
         if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != expected:
@@ -123,10 +119,6 @@ def check_words(name: str, text: str, *, anyway: bool = False) -> None:
     Args:
         anyway: True accepts an instruction without a word of :data:`LOOKS`, as for an editor
             guided by depth, whose text describes the edited scene.
-
-    Raises:
-        InputError: the text has no words, or, for a bundled editor guided by pictures, no word
-            of :data:`LOOKS`.
     """
     if not text.strip():
         raise InputError("instruction: is empty, expected words such as 'make it red'")
@@ -151,12 +143,7 @@ def check_words(name: str, text: str, *, anyway: bool = False) -> None:
 
 def unknown_words(name: str, text: str) -> list[str]:
     """Words that a bundled editor was not trained on: its tokenizer has a token for each training
-    word and splits other words.
-
-    Example:
-        >>> unknown_words("small-plain", "make the bear furious and red")
-        ['furious']
-    """
+    word and splits other words."""
     file = WEIGHTS / name / "tokenizer" / "tokenizer.json"
     tokens = json.loads(file.read_text(encoding="utf-8"))["model"]["vocab"]
     return [word for word in _words(text) if f"Ġ{word.lower()}" not in tokens]
@@ -168,15 +155,7 @@ def _words(text: str) -> list[str]:
 
 
 def guide_of(name_or_folder: str) -> Guide:
-    """Determine the guide of an editor without loading it.
-
-    Raises:
-        InputError: the editor or folder does not exist.
-
-    Example:
-        >>> guide_of("small-depth"), guide_of("small-plain")
-        ('depth', 'picture')
-    """
+    """Determine the guide of an editor without loading it."""
     folder, control = folders_of(name_or_folder)
     if control is not None:
         return "depth"
@@ -185,12 +164,7 @@ def guide_of(name_or_folder: str) -> Guide:
 
 
 def own_steps_of(name_or_folder: str) -> int:
-    """Find an editor's own number of steps without loading it.
-
-    Example:
-        >>> own_steps_of("small-plain")
-        20
-    """
+    """Find an editor's own number of steps without loading it."""
     from attnwarp.editing.folder import index_of
 
     steps: int = _kind_named(name_or_folder).steps_of(index_of(folders_of(name_or_folder)[0]))
@@ -238,9 +212,6 @@ def kind_of(folder: Path) -> Any:
 
 def folders_of(name_or_folder: str) -> tuple[Path, Path | None]:
     """Find the folders of an editor and of its ControlNet (None for a picture-guided editor).
-
-    Raises:
-        InputError: the editor or folder does not exist.
 
     Example:
         >>> [folder.name for folder in folders_of("small-depth")]

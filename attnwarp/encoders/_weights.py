@@ -23,11 +23,7 @@ def sha256_of(files: Sequence[Path]) -> str:
 
 
 def state_of(path: Path) -> dict[str, torch.Tensor]:
-    """Read the tensors of a .safetensors, .pth, .pt or .bin file to the CPU; run no code.
-
-    Raises:
-        InputError: the file is unreadable, or has anything but named tensors.
-    """
+    """Read the tensors of a .safetensors, .pth, .pt or .bin file to the CPU; run no code."""
     try:
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file

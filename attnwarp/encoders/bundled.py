@@ -39,10 +39,6 @@ def load(name: str, folder: Path = WEIGHTS) -> BundledClip | BundledDino | Bundl
     Args:
         folder: folder with ``name``.safetensors, and a tokenizer for clip-small and clip-parts; the
             package's folder if omitted.
-
-    Raises:
-        InputError: the encoder is unknown, or its weights are missing, of another network, or
-            differ from those named in the model card.
     """
     kinds: dict[str, Callable[[str, Path], Any]] = {
         "clip-small": BundledClip, "clip-parts": BundledClipParts,

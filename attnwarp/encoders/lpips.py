@@ -227,9 +227,6 @@ def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
             ``lin0.model.1.weight``, ...), or a folder with torchvision's state dict of a backbone
             (``features.0.weight``, ...) and one or more published files of linear layers; the one
             that fits the backbone is used.
-
-    Raises:
-        InputError: the place is empty, a file is missing, or several files fit.
     """
     torch_device = device_of(device)
     if place.is_file():

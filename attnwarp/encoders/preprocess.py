@@ -157,10 +157,6 @@ def read_preprocessing(folder: Path) -> Preprocessing:
 
     Missing keys take CLIP's values: shorter edge to 224 px, bicubic, the central 224 x 224 px,
     CLIP's mean and deviation.
-
-    Raises:
-        InputError: the file is missing, not JSON, or has an unsupported value; the message names
-            file and key.
     """
     path = next((folder / name for name in _FILES if (folder / name).is_file()), None)
     if path is None:

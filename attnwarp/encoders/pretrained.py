@@ -190,10 +190,6 @@ def load_clip(folder: Path, *, name: str, device: str = "cpu", whole: bool = Fal
             with its index), preprocessor_config.json, and tokenizer.json or vocab.json with
             merges.txt.
         whole: True resizes the full picture, without antialiasing and without a crop.
-
-    Raises:
-        InputError: a file is missing or invalid; the message names the file and its source.
-        MissingExtraError: transformers is not installed.
     """
     torch_device = device_of(device)
     _config(folder, name, "clip", ("clip",))
@@ -233,10 +229,6 @@ def load_dinov2(folder: Path, *, name: str, device: str = "cpu", side: int | Non
             with its index) and preprocessor_config.json.
         side: px to which the full picture is resized, without antialiasing and without a crop;
             None for the published preprocessing.
-
-    Raises:
-        InputError: a file is missing or invalid; the message names the file and its source.
-        MissingExtraError: transformers is not installed.
     """
     torch_device = device_of(device)
     config = _config(folder, name, "dino", ("dinov2", "dinov2_with_registers"))

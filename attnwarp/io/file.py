@@ -130,13 +130,6 @@ def write_atomically(
         FileNotFoundError: the folder does not exist.
         IsADirectoryError: the path is a folder.
         OSError: the disk is full, or the folder is not writable.
-
-    Example:
-        >>> from pathlib import Path
-        >>> from attnwarp.io.file import write_atomically
-        >>> write_atomically("a.txt", lambda stream: stream.write(b"whole"))
-        >>> Path("a.txt").read_text()
-        'whole'
     """
     path = Path(path)
     if follow_link and path.is_symlink():

@@ -208,9 +208,6 @@ def read_mask(path: str | os.PathLike[str], height: int, width: int) -> npt.NDAr
     """Read a mask, (height, width) bool: False where it is dark, below half of white.
 
     A smaller mask pixel is True if all that it covers is.
-
-    Raises:
-        FileFormatError: the mask is unreadable or of another aspect ratio.
     """
     import cv2
 

@@ -11,15 +11,7 @@ from attnwarp.camera import Camera
 
 def file_stems(cameras: Sequence[Camera]) -> list[str]:
     """Build a file name without suffix for each camera: the last part of the camera's name,
-    numbered if several are equal. No two cameras share a name.
-
-    Example:
-        >>> from attnwarp import Camera
-        >>> view = dict(width=8, height=6, fov_y=40)
-        >>> names = ["a/1.png", "b/1.png", "b/2.png"]
-        >>> file_stems([Camera.look_at((3, 0, 0), (0, 0, 0), name=n, **view) for n in names])
-        ['0000-1', '0001-1', '2']
-    """
+    numbered if several are equal. No two cameras share a name."""
     return numbered([Path(camera.name).stem or "view" for camera in cameras])
 
 

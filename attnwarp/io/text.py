@@ -36,10 +36,6 @@ def split_ply(data: bytes) -> tuple[list[bytes], int] | None:
     None if the header does not end.
 
     Only a separate line ends the header: a comment may contain the word.
-
-    Example:
-        >>> split_ply(b"ply\\rcomment end_header\\rend_header\\r\\x00")
-        ([b'ply', b'comment end_header', b'end_header'], 34)
     """
     lines, start = [], 0
     for match in _LINE_ENDS.finditer(data):

@@ -86,12 +86,7 @@ def drift_of(work: Work, view: int, picture: Image) -> dict[str, Any] | None:
 
 
 def say_drift(edit: Mapping[str, Any]) -> tuple[str, bool]:
-    """Write a line about the drift of an edit, and whether it warns.
-
-    Example:
-        >>> say_drift({"view": "bear", "drift": None})
-        ("whether the edit of bear moved the picture can't be told", False)
-    """
+    """Write a line about the drift of an edit, and whether it warns."""
     if not edit["view"]:
         return "no view was edited", False
     if edit["drift"] is None:

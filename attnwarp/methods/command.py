@@ -319,10 +319,6 @@ def check_asked(
     Args:
         method, instruction, settings, out, options: see :func:`edit_dataset`.
         asked: further options that decide the result, by name, as typed.
-
-    Raises:
-        InputError: an unknown device, precision or segmenter; an unsupported film format; an edit
-            of other settings in the folder, or foreign files in the results' folder.
     """
     check_film(options.turntable)
     type_of(options.dtype, "cpu" if options.device == "auto" else str(device_of(options.device)))
@@ -369,9 +365,6 @@ def view_of(dataset: Dataset, name: str | None) -> int:
 
 def number_of(names: Sequence[str], name: str, left_out: Sequence[str] = ()) -> int:
     """Find the number of a view by its name, its file's name (suffix optional), or its number.
-
-    Raises:
-        InputError: no view has this name.
 
     Example:
         >>> number_of(["left/a.png", "left/b.png"], "b"), number_of(["a", "b", "c"], "2")

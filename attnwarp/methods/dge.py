@@ -152,15 +152,6 @@ def by_angle(cameras: Sequence[Camera], views: Sequence[int]) -> list[int]:
     """Sort views by the angle of their direction to the leftmost camera's (smallest x).
 
     Angles cover the full circle and increase toward that camera's nearest neighbour.
-
-    Example:
-        >>> import math
-        >>> from attnwarp import Camera
-        >>> from attnwarp.methods.dge import by_angle
-        >>> places = [(-3 * math.cos(a), 3 * math.sin(a), 0) for a in (0, 3, 0.5, 5, 1)]
-        >>> view = dict(width=8, height=8, fov_y=60)
-        >>> by_angle([Camera.look_at(place, (0, 0, 0), **view) for place in places], range(5))
-        [0, 2, 4, 1, 3]
     """
     forwards = {view: cameras[view].forward for view in views}
     first = min(views, key=lambda view: float(cameras[view].position[0]))

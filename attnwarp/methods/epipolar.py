@@ -16,14 +16,6 @@ def line_distances(view: Camera, key: Camera, size: Size) -> Tensor | None:
 
     Args:
         size: (h, w) of both grids, L = h w. Cell centres are at +0.5.
-
-    Example:
-        >>> from attnwarp import Camera
-        >>> view = dict(width=8, height=8, fov_y=60, up=(0, 1, 0))
-        >>> left = Camera.look_at((0, 0, 3), (0, 0, 0), **view)
-        >>> right = Camera.look_at((1, 0, 3), (1, 0, 0), **view)
-        >>> line_distances(left, right, (3, 2))[0].reshape(3, 2)[:, 0].tolist()  # from row 0
-        [0.0, 1.0, 2.0]
     """
     h, w = size
     matrix = fundamental(view.resize(w, h), key.resize(w, h))

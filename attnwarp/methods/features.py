@@ -22,9 +22,6 @@ class Features:
 
     Attributes:
         layers: layers to record; empty if the features' weight is 0.
-
-    Raises:
-        ValueError: the editor lacks a layer or branch.
     """
 
     def __init__(
@@ -92,12 +89,7 @@ class Features:
                 )
 
     def check_batches(self, stages: Sequence[int], *, further: bool) -> None:
-        """Refuse, before any work, source branches that a later batch lacks.
-
-        Raises:
-            ValueError: a batch uses none of the recorded branches, or cannot record all branches
-                named by the settings.
-        """
+        """Refuse, before any work, source branches that a later batch lacks."""
         if not self.layers:
             return
         s = self.settings

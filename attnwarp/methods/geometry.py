@@ -141,15 +141,6 @@ def choose_chain(
         count: number of sources, the first included; fewer if there are fewer views.
         seen: function of a source and a target that returns two (H, W) bool masks: target pixels
             that the source sees, and target pixels that show surface.
-
-    Example:
-        >>> import numpy as np
-        >>> def seen(source, target):  # a ring of six views; each sees half of its neighbours
-        ...     steps = abs((target - source + 3) % 6 - 3)
-        ...     pixels = np.arange(4) < {0: 4, 1: 2}.get(steps, 0)
-        ...     return pixels[None], np.ones((1, 4), bool)
-        >>> choose_chain(6, 0, 4, 0.5, seen)
-        (1, 2, 3)
     """
     chain: list[int] = []
     seen_by_some: dict[int, Mask] = {}

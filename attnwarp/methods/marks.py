@@ -96,9 +96,6 @@ class Marks:
 def numbers(text: str | None, names: str, option: str) -> tuple[float, ...] | None:
     """Parse the numbers of an option such as ``--at 64,68``.
 
-    Raises:
-        InputError: the text has a different count of numbers, or none.
-
     Example:
         >>> from attnwarp.methods.marks import numbers
         >>> numbers("64,68", "X,Y", "--at")
@@ -128,9 +125,6 @@ def picture_mask(marks: Marks, image: npt.NDArray[Any], size: tuple[int, int]) -
 
     Args:
         size: width and height, in px, of the file that the marks refer to.
-
-    Raises:
-        InputError: nothing is found.
     """
     # Shrunk sides are rounded, so a mark on the border could leave the picture.
     scales = [(side / full, side) for side, full in zip(image.shape[1::-1], size, strict=True)]
@@ -160,9 +154,6 @@ def source_mask(
         size: width and height, in px, of the file that coordinates refer to.
         piece: (H, W) bool surface around a point, :func:`attnwarp.warp.piece_around`; all True if
             unknown, and colours alone decide.
-
-    Raises:
-        InputError: the marks select nothing, or nothing was found.
     """
     if marks.mask is not None:
         mask = read_mask(marks.mask, camera, beside=picture, option="--mask")
@@ -182,11 +173,7 @@ def mask_by_words(
     marks: Marks, camera: Camera, image: npt.NDArray[Any], out: Path, device: str
 ) -> Mask:
     """Mask a view by words, (H, W) bool, cached in the folder ``words``, since a network may take a
-    minute and GPUs may differ in bits. Words, segmenter and picture determine the cache file.
-
-    Raises:
-        NoDetectionError: the view shows no object named by the words.
-    """
+    minute and GPUs may differ in bits. Words, segmenter and picture determine the cache file."""
     assert marks.words is not None
     plain = re.sub(r"[^a-z0-9]+", "-", marks.words.lower()).strip("-")[:24] or "mask"
     of = digest([marks.words, marks.segmenter, digest(image)])[:8]
@@ -237,9 +224,6 @@ def check_middle(marks: Marks, mask: Mask, scale: float, lifted: Segment) -> Non
         mask: (H, W) mask of the marked source view.
         scale: px of the view per px of its file, the unit of the marks.
         lifted: (H, W) lifted mask of the source view, in [0, 1].
-
-    Raises:
-        InputError: the lifted mask lacks the middle of a box, a click, or the mask's widest part.
     """
     import cv2
 
@@ -270,10 +254,6 @@ def read_mask(
     Args:
         beside: picture of the view; see :func:`attnwarp.io.read_upright`.
         option: name of the option, for errors.
-
-    Raises:
-        InputError: the mask is coloured.
-        ValueError: the aspect ratio differs from the camera's.
     """
     import cv2
 
@@ -286,11 +266,7 @@ def read_mask(
 
 
 def bright_of(path: Path, beside: Path | None, option: str) -> npt.NDArray[Any]:
-    """Read the brightness of a grey picture, (H, W) in [0, 1]; transparent pixels are black.
-
-    Raises:
-        InputError: the picture is coloured, or its white is 1 of 255.
-    """
+    """Read the brightness of a grey picture, (H, W) in [0, 1]; transparent pixels are black."""
     pixels, top = read_over_black(path, beside)
     if np.ptp(pixels, axis=-1).max() > COLORED * top:
         raise InputError(

@@ -38,12 +38,7 @@ def own_seed(*numbers: int) -> int:
 
 
 def unmoved(size: tuple[int, int]) -> Tensor:
-    """Return the order of a first source, (h, w) int64: the pixels' numbers in turn.
-
-    Example:
-        >>> unmoved((2, 3)).tolist()
-        [[0, 1, 2], [3, 4, 5]]
-    """
+    """Return the order of a first source, (h, w) int64: the pixels' numbers in turn."""
     return torch.arange(size[0] * size[1]).reshape(size)
 
 

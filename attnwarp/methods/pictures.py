@@ -25,14 +25,7 @@ Size = tuple[int, int]
 
 
 def edit_size(height: int, width: int, longest: int | None, multiple: int) -> Size:
-    """Compute the (h, w) of a picture's edit: a longest side, both sides multiples of a number.
-
-    Example:
-        >>> edit_size(1080, 1920, 512, 32)
-        (288, 512)
-        >>> edit_size(64, 64, None, 16)
-        (64, 64)
-    """
+    """Compute the (h, w) of a picture's edit: a longest side, both sides multiples of a number."""
     scale = 1.0 if longest is None else longest / max(height, width)
     h, w = (max(multiple, round(n * scale / multiple) * multiple) for n in (height, width))
     return h, w
@@ -48,9 +41,6 @@ def check_view_aspect(size: Size, camera: Camera, name: str) -> None:
     Args:
         size: (h, w) of the picture: the view's aspect ratio, up to an editor's rounding of the
             sides to multiples.
-
-    Raises:
-        ValueError: the aspect ratio differs.
     """
     full = (camera.height, camera.width)
     if all(edit_size(*full, max(size), multiple) != size for multiple in MULTIPLES):
@@ -73,12 +63,6 @@ def enlarged_change(original: Image, edited: Image) -> Image:
     """Add the change of an edit of another size to the full-size picture.
 
     The change is enlarged linearly, or averaged if the edit is larger than the picture.
-
-    Example:
-        >>> original = np.full((8, 8, 3), 0.5, np.float32)
-        >>> edited = np.full((4, 4, 3), 0.75, np.float32)
-        >>> float(enlarged_change(original, edited).mean())
-        0.75
     """
     import cv2
 
@@ -172,13 +156,6 @@ class Principal:
     Args:
         features: (N, C) features of the source, which define the basis and the range of the
             colours, so that equal features of other views have equal colours.
-
-    Example:
-        >>> import torch
-        >>> line = torch.arange(5.0)[:, None] * torch.tensor([[3.0, 4.0]])
-        >>> colors = Principal(line).colors(line)
-        >>> colors[:, 0].tolist() == sorted(colors[:, 0].tolist())
-        True
     """
 
     def __init__(self, features: Tensor) -> None:

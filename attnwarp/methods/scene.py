@@ -48,12 +48,7 @@ class Scene:
         images: Sequence[npt.NDArray[Any]],
         segments: Segments | None,
     ) -> Scene:
-        """Validate external inputs.
-
-        Raises:
-            ValueError: lists of different lengths, a picture or segment of another size or type, or
-                segments that are all empty; the message names the argument.
-        """
+        """Validate external inputs."""
         if len(images) != len(cameras):
             raise ValueError(f"images: got {len(images)}, expected {len(cameras)}, as cameras")
         stored = []
@@ -99,11 +94,7 @@ class Scene:
 
 
 def checked_image(image: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
-    """Check a picture: 8 or 16 bits stay unchanged, floating values become float32.
-
-    Raises:
-        ValueError: unsupported type, or values beyond [0, 1]; the message has the name.
-    """
+    """Check a picture: 8 or 16 bits stay unchanged, floating values become float32."""
     array = np.asarray(image)
     if array.dtype in (np.uint8, np.uint16):
         return array
@@ -158,11 +149,7 @@ def near_of(cameras: Sequence[Camera], gaussians: Gaussians) -> float:
 
 
 def render_picture(gaussians: Gaussians, camera: Camera, near: float, backend: str) -> Image:
-    """Render a view over black, (H, W, 3) float32 in [0, 1].
-
-    Raises:
-        RuntimeError: the render has NaN, as after a diverged tuning.
-    """
+    """Render a view over black, (H, W, 3) float32 in [0, 1]."""
     with torch.no_grad():
         color = render(gaussians, camera, backend=backend, near=near).color
     if bool(color.isnan().any()):

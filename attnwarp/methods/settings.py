@@ -87,11 +87,7 @@ LAST_STEP = PUBLISHED_STEPS - 1
 
 
 def checked_start(start: tuple[int, int] | None) -> tuple[int, int] | None:
-    """Check ``start``: a (lowest, highest) timestep of Stable Diffusion, or None.
-
-    Raises:
-        ValueError: ``start`` is neither.
-    """
+    """Check ``start``: a (lowest, highest) timestep of Stable Diffusion, or None."""
     if start is None:
         return None
     right = len(start) == 2 and all(check.is_number(t, whole=True) for t in start)

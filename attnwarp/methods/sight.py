@@ -27,15 +27,6 @@ def pixel_ratio(view: WarpedView) -> Tensor:
 
     Raises:
         ValueError: the target has no normals.
-
-    Example:
-        >>> from attnwarp.trial import wall
-        >>> from attnwarp.warp import Surface, warp_surfaces
-        >>> _, target, seen = wall()
-        >>> source = target.moved((0, 0, -2))  # twice as far from the wall
-        >>> behind = Surface(2 * seen.depth, seen.normal)
-        >>> pixel_ratio(warp_surfaces(source, target, seen, behind))[4, 4].item()
-        0.25
     """
     normal = as_float64(needed(view.target.normal, "target.normal", "pixel_ratio"), "normal")
     both = view.correspondence
@@ -62,16 +53,6 @@ class Sight:
             Features have the edits' resolution, which may differ between photographs of several
             sizes. None if all are 1.
         zeros: True pads features outside a source with zeros, False with the border's values.
-
-    Example:
-        >>> from attnwarp.trial import wall
-        >>> from attnwarp.warp import Surface, warp_surfaces
-        >>> near, target, seen = wall()
-        >>> far, behind = target.moved((0, 0, -2)), Surface(2 * seen.depth, seen.normal)
-        >>> pairs = ((far, behind), (near, seen))
-        >>> views = [warp_surfaces(source, target, seen, own) for source, own in pairs]
-        >>> Sight(views).choice((8, 8))[0].tolist()  # the near source, where it sees the wall
-        [1, 1, 1, 1, 1, 1, 0, 0]
     """
 
     views: Sequence[WarpedView]

@@ -19,11 +19,6 @@ def draw_stages(unedited: Sequence[int], settings: AttentionWarpingSettings) -> 
 
     If all views are sources, one stage without views remains, which tunes on the sources. A last
     stage short of views takes some of the earlier views again, if the settings say so.
-
-    Example:
-        >>> stages = draw_stages(range(1, 7), AttentionWarpingSettings(stages=2))
-        >>> [len(views) for views in stages], sorted(sum(stages, []))
-        ([3, 3], [1, 2, 3, 4, 5, 6])
     """
     s = settings
     if s.views_per_stage is None:

@@ -57,11 +57,7 @@ class PerceptualLoss(Protocol):
 def perceptual_net(
     settings: MethodSettings, device: str = "cpu", load: Callable[..., Any] = load_encoder
 ) -> PerceptualLoss | None:
-    """Load the settings' perceptual distance on a device; None if no iteration uses it.
-
-    Raises:
-        InputError: the encoder is unknown or of another kind.
-    """
+    """Load the settings' perceptual distance on a device; None if no iteration uses it."""
     if not (settings.perceptual and settings.iterations):
         return None
     return cast(PerceptualLoss, load(settings.perceptual_encoder, "perceptual", device=device))
@@ -145,9 +141,6 @@ class Tuning:
     Attributes:
         visits: number of iterations on each view, by the view's number.
         weights: SHA-256 of each loss network's weights, by the loss.
-
-    Raises:
-        InputError: the perceptual distance is unknown.
     """
 
     def __init__(
@@ -246,11 +239,7 @@ class Tuning:
         }
 
     def restore(self, folder: Workdir, name: str) -> None:
-        """Resume from a checkpoint of a folder.
-
-        Raises:
-            FileFormatError: the checkpoint is damaged.
-        """
+        """Resume from a checkpoint of a folder."""
         state = folder.load(name)
         try:
             self.model.restore(state["model"])

@@ -87,12 +87,7 @@ class Start:
 
 
 def check_editor(editor: Editor, settings: AttentionWarpingSettings) -> int | None:
-    """Draw the Stable Diffusion timestep at which all edits start; None for pure noise.
-
-    Raises:
-        ValueError: the settings need an inversion but the editor changes pictures, the prompt is
-            too long, or the start is too low for the number of steps.
-    """
+    """Draw the Stable Diffusion timestep at which all edits start; None for pure noise."""
     s = settings
     if s.reference != "none" and editor.references == 0:
         raise ValueError(
@@ -125,9 +120,6 @@ class ViewEdits:
         by_hand: edit of the source made elsewhere, or None.
         edit_source: function that edits the source of an index, for a process that found the edit
             finished.
-
-    Raises:
-        ValueError: an argument or a setting does not fit the editor or the views.
     """
 
     def __init__(

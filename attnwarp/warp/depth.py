@@ -68,11 +68,7 @@ def resize_depth(
 
 
 def as_tensor(value: Array, name: str) -> Tensor:
-    """Convert floating values to a detached tensor, sharing memory if torch can read it.
-
-    Raises:
-        ValueError: the values are not of a floating type.
-    """
+    """Convert floating values to a detached tensor, sharing memory if torch can read it."""
     given = value if isinstance(value, Tensor) else np.asarray(value)
     tensor = check.tensor(given, name).detach()
     if not tensor.dtype.is_floating_point:
@@ -81,11 +77,7 @@ def as_tensor(value: Array, name: str) -> Tensor:
 
 
 def as_float64(value: Array, name: str) -> Tensor:
-    """Convert floating values to a detached float64 tensor on the CPU.
-
-    Raises:
-        ValueError: the values are not of a floating type.
-    """
+    """Convert floating values to a detached float64 tensor on the CPU."""
     return as_tensor(value, name).to(device="cpu", dtype=torch.float64)
 
 

@@ -45,14 +45,6 @@ def focus_of(cameras: Sequence[Camera], points: Array) -> Array:
 
     Returns:
         (3,) in world units.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
-        >>> view = dict(width=8, height=8, fov_y=40)
-        >>> ring = [Camera.look_at((x, y, 2), (0, 0, 1), **view) for x, y in ((3, 0), (0, 3))]
-        >>> (focus_of(ring, np.zeros((1, 3))).round(6) + 0.0).tolist()
-        [0.0, 0.0, 1.0]
     """
     positions = np.stack([camera.position for camera in cameras])
     axes = np.stack([camera.forward for camera in cameras])
@@ -97,15 +89,6 @@ def orbit(cameras: Sequence[Camera], points: Array, *, first: int = 0) -> list[C
 
     Returns:
         :data:`FRAMES` cameras; the last leads to the first.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp import Camera
-        >>> ring = [Camera.look_at((3 * np.cos(a), 3 * np.sin(a), 1), (0, 0, 0), width=8, height=8,
-        ...                        fov_y=40) for a in np.radians(np.arange(0, 360, 45))]
-        >>> turn = orbit(ring, np.zeros((1, 3)))
-        >>> len(turn), turn[9].position.round(2).tolist()  # a quarter of the way around
-        (36, [0.0, 3.0, 1.0])
     """
     focus, up = focus_of(cameras, points), up_of(cameras)
     ahead = focus - cameras[first].position
@@ -180,14 +163,7 @@ def check_film(path: Path | None) -> None:
 
 
 def write_film(path: Path, before: Sequence[Bytes], after: Sequence[Bytes]) -> None:
-    """Write a turn as GIF or MP4, before on the left and after on the right.
-
-    Example:
-        >>> from pathlib import Path
-        >>> import numpy as np
-        >>> frames = [np.full((8, 8, 3), value, np.uint8) for value in (0, 200)]
-        >>> write_film(Path("turn.gif"), frames, frames)
-    """
+    """Write a turn as GIF or MP4, before on the left and after on the right."""
     check_film(path)
     frames = []
     for pair in zip(before, after, strict=True):
