@@ -346,17 +346,12 @@ class ClipSegmenter:
 
     def _cut(self, picture: Image, probability: npt.NDArray[np.float64]) -> Mask:
         """Snap the mask of probable pixels, (H, W), to borders of colour."""
-        import cv2
-
-        labels = np.full(probability.shape, cv2.GC_PR_BGD, np.uint8)
-        labels[probability >= self.likely] = cv2.GC_PR_FGD
-        labels[probability < self.background] = cv2.GC_BGD
-        labels[probability >= self.sure] = cv2.GC_FGD
-        likely = probability >= self.likely
+        likely, possible = probability >= self.likely, probability >= self.background
         # grabCut needs pixels of both foreground and background.
         if likely.all() or not likely.any():
             return likely
-        return _grab_cut(np.rint(255 * picture).astype(np.uint8), labels)
+        pixels = np.rint(255 * picture).astype(np.uint8)
+        return _grab_cut(pixels, possible, likely & possible, probability >= self.sure)
 
 
 def _resized(picture: Image, short: int) -> Image:
@@ -372,11 +367,13 @@ def _resized(picture: Image, short: int) -> Image:
     return np.clip(cv2.resize(picture, size, interpolation=way), 0, 1)
 
 
-def _grab_cut(pixels: npt.NDArray[np.uint8], labels: npt.NDArray[np.uint8]) -> Mask:
-    """Compute the (H, W) foreground in five rounds from (H, W) labels, which stay unchanged."""
+def _grab_cut(pixels: npt.NDArray[np.uint8], possible: Mask, likely: Mask, sure: Mask) -> Mask:
+    """Compute the (H, W) foreground in five rounds; what is not even possible stays outside."""
     import cv2
 
-    result = labels.copy()
+    result = np.where(possible, cv2.GC_PR_BGD, cv2.GC_BGD).astype(np.uint8)
+    result[likely] = cv2.GC_PR_FGD
+    result[sure] = cv2.GC_FGD
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.setRNGSeed(0)  # seeds grabCut's k-means
     cv2.grabCut(pixels, result, (0, 0, 0, 0), *models, 5, cv2.GC_INIT_WITH_MASK)
@@ -477,14 +474,12 @@ def snap(image: Image, region: Mask) -> Mask:
 
     side = 2 * max(1, round(BAND * max(region.shape))) + 1
     square, inside = np.ones((side, side), np.uint8), region.astype(np.uint8)
-    core = cv2.erode(inside, square, borderType=cv2.BORDER_REPLICATE)
-    labels = np.where(region, _label("PR_FGD"), _label("PR_BGD"))
-    labels[core > 0] = _label("FGD")
-    labels[cv2.dilate(inside, square) == 0] = _label("BGD")
+    core = cv2.erode(inside, square, borderType=cv2.BORDER_REPLICATE) > 0
     # grabCut needs pixels of both kinds, and a thin region is all outline.
     if not core.any() or region.all():
         return region
-    return _grab_cut(np.rint(255 * image).astype(np.uint8), labels.astype(np.uint8))
+    pixels = np.rint(255 * image).astype(np.uint8)
+    return _grab_cut(pixels, cv2.dilate(inside, square) > 0, region, core)
 
 
 def check_marks(
@@ -521,12 +516,10 @@ def _cut_box(
     away = np.hypot((x - middle[0]) / half[0], (y - middle[1]) / half[1])
     if within.all():  # grabCut needs background pixels too
         within = away < 1
-    labels = np.where(within, _label("PR_BGD"), _label("BGD"))
-    labels[within & (away < WITHIN)] = _label("PR_FGD")
-    labels[within & (away < CORE)] = _label("FGD")
-    if within.all() or not (within & (away < WITHIN)).any():
+    likely = within & (away < WITHIN)
+    if within.all() or not likely.any():
         return np.zeros_like(within)
-    return _grab_cut(pixels, labels.astype(np.uint8)) & within
+    return _grab_cut(pixels, within, likely, within & (away < CORE)) & within
 
 
 def _cut_click(
@@ -540,17 +533,14 @@ def _cut_click(
     away = np.hypot(x - at[0], y - at[1]) / np.hypot(*pixels.shape[:2])
     cuts, grown = [], []
     for reach in RADII:
-        labels = np.full(away.shape, _label("BGD"), np.uint8)
-        labels[away < reach] = _label("PR_BGD")
-        labels[away < NEAR * reach] = _label("PR_FGD")
-        labels[away < max(CLICKED * reach, away.min() + 1e-9)] = _label("FGD")
-        if not (labels == _label("BGD")).any():
+        possible, sure = away < reach, away < max(CLICKED * reach, away.min() + 1e-9)
+        if (possible | sure).all():
             break
-        mask = _grab_cut(pixels, labels)
+        mask = _grab_cut(pixels, possible, away < NEAR * reach, sure)
         parts = cv2.connectedComponents(mask.astype(np.uint8))[1]
         part = parts[int(at[1]), int(at[0])]
         cuts.append((parts == part) & mask)
-        grown.append(cuts[-1].sum() > GROWN * (labels == _label("FGD")).sum())
+        grown.append(cuts[-1].sum() > GROWN * sure.sum())
 
     def alike(a: Mask, b: Mask) -> float:
         return float((a & b).sum() / max(1, (a | b).sum()))
@@ -560,10 +550,3 @@ def _cut_click(
     steps = [alike(a, b) for a, b in pairwise(cuts)]
     steadiness = [min(a, b) * big for (a, b), big in zip(pairwise(steps), grown[1:], strict=False)]
     return cuts[1 + int(np.argmax(steadiness))] & (max(steadiness) > 0)
-
-
-def _label(name: str) -> int:
-    """Look up grabCut's number of a label, such as "PR_FGD" (probably foreground)."""
-    import cv2
-
-    return int(getattr(cv2, f"GC_{name}"))

@@ -108,9 +108,7 @@ def depth_agrees(
         >>> depth_agrees(c, np.full((8, 8), 1.5)).any().item()  # something stands before it
         False
     """
-    seen = sample_depth(as_float64(source_depth, "source_depth"), correspondence, spread=spread)
-    tolerance = depth_tolerance(correspondence, source_depth, relative=relative, slope=slope)
-    return (correspondence.z - seen).abs() <= tolerance
+    return _depth_margin(correspondence, source_depth, relative, slope, spread) >= 0
 
 
 def depth_tolerance(
