@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -245,10 +245,8 @@ class Editing(Marking):
         """Check the options and convert them for an edit."""
         from attnwarp.methods.command import EditOptions
 
-        return EditOptions(
-            self.marks(), self.tune_outside, self.source, self.max_size, self.device, self.dtype,
-            self.low_memory, self.threads, self.control, self.turntable,
-        )  # fmt: skip
+        own = {field.name for field in fields(EditOptions)} - {"marks"}
+        return EditOptions(self.marks(), **{name: getattr(self, name) for name in own})
 
 
 def options_of(
@@ -262,7 +260,7 @@ def options_of(
         groups: dataclass by argument name: `Reading` for ``reading``, `Editing` for ``editing``.
         without: name of a field that is no option of this command and keeps its default.
     """
-    fields = {
+    own_options = {
         group: [
             field
             for name, field in inspect.signature(group, eval_str=True).parameters.items()
@@ -277,13 +275,13 @@ def options_of(
         def run(**values: Any) -> None:
             made = {
                 names[group]: group(**{option.name: values.pop(option.name) for option in options})
-                for group, options in fields.items()
+                for group, options in own_options.items()
             }
             command(**values, **made)
 
         signature = inspect.signature(command, eval_str=True)
         own = [p for p in signature.parameters.values() if p.name not in names.values()]
-        options = [*own, *(option for group in groups for option in fields[group])]
+        options = [*own, *(option for group in groups for option in own_options[group])]
         run.__signature__ = signature.replace(parameters=sorted(options, key=_place))  # type: ignore[attr-defined]
         return run
 

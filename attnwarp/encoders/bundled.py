@@ -4,7 +4,7 @@ weights/.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -95,11 +95,20 @@ class _OfSquares:
     about: EncoderInfo
     preprocess: Preprocessing
 
-    def _batches(self, images: Sequence[Image]) -> Iterator[torch.Tensor]:
-        checked = checked_images(images)
+    def _rows(
+        self,
+        images: Sequence[Image],
+        network: Callable[[torch.Tensor], torch.Tensor],
+        shape: tuple[int, ...],
+    ) -> Array:
+        """Compute a row of a shape for each picture."""
+        checked, rows = checked_images(images), []
         for start in range(0, len(checked), BATCH):
             stack = np.stack([self.preprocess(image) for image in checked[start : start + BATCH]])
-            yield torch.from_numpy(stack).to(memory_format=torch.channels_last)
+            batch = torch.from_numpy(stack).to(memory_format=torch.channels_last)
+            with full_float32():
+                rows.append(network(batch).double().numpy())
+        return np.concatenate(rows) if rows else np.zeros((0, *shape))
 
 
 class BundledClip(_OfSquares):
@@ -137,12 +146,11 @@ class BundledClip(_OfSquares):
         An embedding averages the picture's and its mirror image's: training captions never
         distinguish left from right, so any difference between the two is an error.
         """
-        with full_float32():
-            embeddings = [
-                (0.5 * (self.net.images(batch) + self.net.images(batch.flip(-1)))).double().numpy()
-                for batch in self._batches(images)
-            ]
-        return np.concatenate(embeddings) if embeddings else np.zeros((0, self.about.dim or 0))
+
+        def mean(batch: torch.Tensor) -> torch.Tensor:
+            return 0.5 * (self.net.images(batch) + self.net.images(batch.flip(-1)))
+
+        return self._rows(images, mean, (self.about.dim or 0,))
 
     def cut(self, text: str) -> int:
         """Count a text's tokens beyond the network's length, which are dropped."""
@@ -200,20 +208,14 @@ class BundledDino(_OfSquares):
 
     def images(self, images: Sequence[Image]) -> Array:
         """Compute class tokens, (N, D) float64, not normalised."""
-        with full_float32():
-            embeddings = [self.net(batch)[0].double().numpy() for batch in self._batches(images)]
-        return np.concatenate(embeddings) if embeddings else np.zeros((0, self.net.dim))
+        return self._rows(images, lambda batch: self.net(batch)[0], (self.net.dim,))
 
     def tokens(self, images: Sequence[Image]) -> Array:
         """Compute patch tokens of the central square, (N, 8, 8, D) float64; a patch has 16 x 16 of
         128 x 128 px."""
-        with full_float32():
-            grids = [
-                self.net(batch)[1].permute(0, 2, 3, 1).double().numpy()
-                for batch in self._batches(images)
-            ]
         side = DinoSmall.size // DinoSmall.patch
-        return np.concatenate(grids) if grids else np.zeros((0, side, side, self.net.dim))
+        shape = side, side, self.net.dim
+        return self._rows(images, lambda batch: self.net(batch)[1].permute(0, 2, 3, 1), shape)
 
 
 class BundledPerceptual:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -25,6 +25,9 @@ ROTATION_TOLERANCE = 1e-4
 """Largest |R R^T - I| treated as float32 or printing noise and repaired; Camera allows
 1e-5.
 """
+
+OF_IMAGES = ("cameras", "image_paths", "splits", "lenses", "mask_paths")
+"""Fields of :class:`Dataset` with one value for each image."""
 
 Missing = Literal["error", "none"]
 Distorted = Literal["error", "keep"]
@@ -75,7 +78,7 @@ class Dataset:
         self.splits = self.splits or [None] * len(self.cameras)
         self.lenses = self.lenses or [None] * len(self.cameras)
         self.mask_paths = self.mask_paths or [None] * len(self.cameras)
-        for name in ("image_paths", "splits", "lenses", "mask_paths"):
+        for name in OF_IMAGES:
             if len(getattr(self, name)) != len(self.cameras):
                 raise ValueError(
                     f"{name}: got {len(getattr(self, name))}, expected {len(self.cameras)}, as"
@@ -102,16 +105,8 @@ class Dataset:
 
     def select(self, indices: Sequence[int]) -> Dataset:
         """Select the images at ``indices``, in that order, with the same points."""
-        return Dataset(
-            [self.cameras[i] for i in indices],
-            [self.image_paths[i] for i in indices],
-            self.points,
-            self.colors,
-            [self.splits[i] for i in indices],
-            self.applied_transform,
-            [self.lenses[i] for i in indices],
-            [self.mask_paths[i] for i in indices],
-        )
+        chosen = {name: [getattr(self, name)[i] for i in indices] for name in OF_IMAGES}
+        return replace(self, **chosen)  # type: ignore[arg-type]
 
     def split(self, name: str) -> Dataset:
         """Select the images of one split.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from attnwarp import check
 from attnwarp.io.blendedmvs import is_blendedmvs, read_blendedmvs
@@ -107,27 +107,18 @@ def read_dataset(
                 "scale, images: a scene of BlendedMVS has one folder of images; leave them out"
             )
         return read_blendedmvs(path, missing_images=missing_images)
+    shared: dict[str, Any] = {
+        "missing_images": missing_images,
+        "resize_cameras": resize_cameras,
+        "points": points,
+        "distorted": distorted,
+        "scale": scale,
+    }
     if format == "colmap":
-        return read_colmap(
-            path,
-            images=images,
-            missing_images=missing_images,
-            resize_cameras=resize_cameras,
-            points=points,
-            distorted=distorted,
-            scale=scale,
-        )
+        return read_colmap(path, images=images, **shared)
     if images is not None:
         raise ValueError(
             "images (--images): only COLMAP models take a folder of images; a transforms.json names"
             " its own"
         )
-    return read_transforms(
-        path,
-        missing_images=missing_images,
-        resize_cameras=resize_cameras,
-        points=points,
-        distorted=distorted,
-        ignore_keys=ignore_keys,
-        scale=scale,
-    )
+    return read_transforms(path, ignore_keys=ignore_keys, **shared)

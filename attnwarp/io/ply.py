@@ -233,8 +233,6 @@ def write_ply(
         >>> read_ply("disc.ply").means.tolist()
         [[0.0, 0.0, 0.0]]
     """
-    from plyfile import PlyData, PlyElement
-
     # Fields may have been assigned or trained since the checks, and float64 may exceed the
     # file's float32, so replace() runs the checks again.
     original = gaussians.detach().to(device="cpu")
@@ -270,10 +268,6 @@ def write_ply(
         (_names("scale", scales.shape[1]), np.log(scales)),
         (_names("rot", 4), g.quats.numpy()),
     ]
-    rows = np.empty(len(g), dtype=[(name, "<f4") for names, _ in parts for name in names])
-    for names, block in parts:
-        for i, name in enumerate(names):
-            rows[name] = block[:, i]
     comments = [f"attnwarp kind {g.kind}"]
     if origin.any():
         comments += ["attnwarp origin " + " ".join(repr(float(v)) for v in origin)]
@@ -285,8 +279,7 @@ def write_ply(
             comments += [f"attnwarp screen_filter {g.screen_filter!r}"]
     if np.isfinite(g.far):
         comments += [f"attnwarp far {g.far!r}"]
-    data = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments)
-    write_atomically(path, data.write, follow_link=True)
+    _write_vertices(path, [(names, "<f4", block) for names, block in parts], comments)
 
 
 def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uint8] | None]:
@@ -355,30 +348,38 @@ def write_points(
         >>> read_points("points.ply")[1].tolist()
         [[255, 128, 0]]
     """
-    from plyfile import PlyData, PlyElement
-
     xyz = np.asarray(points, dtype=np.float64)
     check.shape(xyz, ("P", 3), "points")
     check.finite(xyz, "points")
-    dtype = [(name, "<f8") for name in "xyz"]
-    rgb = None
+    parts: list[tuple[Sequence[str], str, npt.NDArray[Any]]] = [("xyz", "<f8", xyz)]
     if colors is not None:
         rgb = np.asarray(colors)
         check.shape(rgb, (len(xyz), 3), "colors")
         if rgb.dtype != np.uint8:
             raise ValueError(f"colors: got {rgb.dtype}, expected uint8")
-        dtype += [(name, "u1") for name in ("red", "green", "blue")]
-    rows = np.empty(len(xyz), dtype=dtype)
-    for i, name in enumerate("xyz"):
-        rows[name] = xyz[:, i]
-    if rgb is not None:
-        for i, name in enumerate(("red", "green", "blue")):
-            rows[name] = rgb[:, i]
-    data = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<")
-    write_atomically(path, data.write, follow_link=True)
+        parts.append((COLORS[0], "u1", rgb))
+    _write_vertices(path, parts)
 
 
 # --------------------------------------------------------------------------------------------------
+
+
+def _write_vertices(
+    path: str | os.PathLike[str],
+    parts: Sequence[tuple[Sequence[str], str, npt.NDArray[Any]]],
+    comments: Sequence[str] = (),
+) -> None:
+    """Write columns, each part's names, numpy's type and (N, names) values, atomically."""
+    from plyfile import PlyData, PlyElement
+
+    kinds = [(name, kind) for names, kind, _ in parts for name in names]
+    rows = np.empty(len(parts[0][2]), dtype=kinds)
+    for names, _, block in parts:
+        for i, name in enumerate(names):
+            rows[name] = block[:, i]
+    element = PlyElement.describe(rows, "vertex")
+    data = PlyData([element], byte_order="<", comments=list(comments))
+    write_atomically(path, data.write, follow_link=True)
 
 
 def _names(stem: str, count: int) -> tuple[str, ...]:
@@ -492,6 +493,15 @@ def _refuse_other_formats(path: Path, columns: Columns) -> None:
         )
 
 
+def _check_there(path: Path, columns: Columns, name: str) -> None:
+    if name not in columns:
+        raise FileFormatError(
+            path,
+            f"missing (the file has: {', '.join(columns)}); export the whole model again",
+            field=name,
+        )
+
+
 def _column(
     path: Path,
     columns: Columns,
@@ -501,12 +511,7 @@ def _column(
     infinities: bool = False,
 ) -> npt.NDArray[Any]:
     """Read one property and check that it is finite in ``dtype``."""
-    if name not in columns:
-        raise FileFormatError(
-            path,
-            f"missing (the file has: {', '.join(columns)}); export the whole model again",
-            field=name,
-        )
+    _check_there(path, columns, name)
     raw = columns[name]
     with np.errstate(over="ignore", invalid="ignore"):
         values = raw.astype(dtype)
@@ -653,12 +658,7 @@ def _recognise(
 ) -> tuple[Kind, tuple[str, ...]]:
     """Determine the kind of the splats and the names of its scales."""
     for name in ("scale_0", "scale_1"):
-        if name not in columns:
-            raise FileFormatError(
-                path,
-                f"missing (the file has: {', '.join(columns)}); export the whole model again",
-                field=name,
-            )
+        _check_there(path, columns, name)
     if kind is None:
         if len(header.kinds) > 1:
             both = " and ".join(map(repr, header.kinds.values()))

@@ -15,6 +15,7 @@ import os
 import warnings
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,14 @@ import numpy.typing as npt
 from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.errors import InputWarning, suggest
-from attnwarp.io.dataset import Dataset, Distorted, Missing, nearest_rotation, with_images
+from attnwarp.io.dataset import (
+    OF_IMAGES,
+    Dataset,
+    Distorted,
+    Missing,
+    nearest_rotation,
+    with_images,
+)
 from attnwarp.io.file import FileFormatError, existing_file, is_file, write_atomically
 from attnwarp.io.find import FileFinder, name_key
 from attnwarp.io.images import IMAGE_SUFFIXES, image_size
@@ -164,16 +172,10 @@ def read_transforms(
             f"{path}: neither transforms.json nor transforms_train.json is there"
         )
     with_points = next((part for part in parts if part.points is not None), parts[0])
-    return Dataset(
-        [camera for part in parts for camera in part.cameras],
-        [image for part in parts for image in part.image_paths],
-        with_points.points,
-        with_points.colors,
-        [split for part in parts for split in part.splits],
-        parts[0].applied_transform,
-        [lens for part in parts for lens in part.lenses],
-        [mask for part in parts for mask in part.mask_paths],
-    )
+    each: dict[str, Any] = {
+        name: [value for part in parts for value in getattr(part, name)] for name in OF_IMAGES
+    }
+    return replace(with_points, applied_transform=parts[0].applied_transform, **each)
 
 
 def write_transforms(

@@ -174,7 +174,8 @@ def edit_dataset(
         report=report,
         **own,
     )
-    _report_memory(device, report)
+    if peak := peak_memory(device):
+        report.log(f"edited{peak}")
     if result.gaussians.kind == "2d":
         # Other programs cannot read splats of two scales.
         write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
@@ -223,12 +224,6 @@ def _editor(
     if line := announced(name, dtype, device, settings.size, recorded):
         report.log(line)
     return load_editor(name, device=device, dtype=dtype, low_memory=options.low_memory)
-
-
-def _report_memory(device: str, report: Reporter) -> None:
-    """Report the peak memory of a GPU."""
-    if peak := peak_memory(device):
-        report.log(f"edited{peak}")
 
 
 def marked(
