@@ -46,9 +46,6 @@ from attnwarp.reporting import reporter
 NO_FEATURES = 0.001
 """Share of warped target pixels below which each view was effectively edited alone."""
 
-FIT_ITERATIONS, FIT_SPLATS = 3_000, 30_000
-"""Limits of the fit that precedes an edit without splats."""
-
 DECIDING = (*(field.name for field in fields(Marking)), "tune_outside", "max_size")
 """Fields of `Editing` that decide the result of an edit."""
 
@@ -228,13 +225,11 @@ def edit(
             if note := note_held_out(ply, dataset, view_of(dataset, editing.source)):
                 notes.append(note)
                 warnings.warn(note, InputWarning, stacklevel=1)
+        planned: dict[str, Any] = {"iterations": fit_iterations, "max_splats": max_splats}
+        planned["kind"] = kind and kind.value[:2]
         result, page = edit_dataset(
             method, dataset, splats, editor, instruction, settings, out, edit_options,
-            fit_plan=FitPlan(
-                fit_iterations or FIT_ITERATIONS,
-                (kind or Kind.two).value[:2],
-                max_splats or FIT_SPLATS,
-            ),
+            fit_plan=FitPlan(**{k: v for k, v in planned.items() if v is not None}),
             notes=notes, origin=origin, budget=budget, asked=asked, report=report, **own,
         )  # fmt: skip
         typer.echo(say_change(result.change, edit_options.marks.option != ""))

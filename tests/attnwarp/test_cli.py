@@ -29,6 +29,7 @@ from attnwarp.cli.shell import COMMANDS, clear_errors
 from attnwarp.io import Dataset, read_dataset, read_ply, write_ply, write_transforms
 from attnwarp.render import render
 from attnwarp.render.threads import set_thread_count
+from attnwarp.trial import disc
 
 ATTNWARP = [sys.executable, "-m", "attnwarp"]
 
@@ -78,15 +79,11 @@ def data(tmp_path_factory):
     return folder
 
 
-def one_splat():
-    return Gaussians(
-        "2d",
-        torch.zeros(1, 3),
-        torch.tensor([[1.0, 0, 0, 0]]),
-        torch.full((1, 2), 0.2),
-        torch.ones(1),
-        torch.zeros(1, 1, 3),
-    )
+@pytest.fixture
+def splat(tmp_path):
+    """A file of one splat."""
+    write_ply(tmp_path / "m.ply", disc(0.2))
+    return tmp_path / "m.ply"
 
 
 def test_help_of_every_command_imports_nothing_heavy():
@@ -288,7 +285,7 @@ def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
     done = in_process("fit", data, *once, "--start", splats, "--out", tmp_path / "a")
     assert done.exit_code == 2 and f"--start: the fit would write over {splats}" in done.stderr
     far = tmp_path / "far.ply"
-    write_ply(far, Gaussians(**{**vars(one_splat()), "means": torch.full((1, 3), 900.0)}))
+    write_ply(far, Gaussians(**{**vars(disc(0.2)), "means": torch.full((1, 3), 900.0)}))
     done = in_process("fit", data, *once, "--start", far, "--out", tmp_path / "c")
     assert done.exit_code == 2 and "cover less than" in done.stderr
 
@@ -297,7 +294,7 @@ def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
 
     # The kind is the file's, or the one that is asked for.
     full = tmp_path / "full.ply"
-    round_one = {**vars(one_splat()), "kind": "3d", "scales": torch.full((1, 3), 0.2)}
+    round_one = {**vars(disc(0.2)), "kind": "3d", "scales": torch.full((1, 3), 0.2)}
     write_ply(full, Gaussians(**round_one))
     for asked, kind in (((), "3d"), (("--kind", "2dgs"), "2d")):
         out = tmp_path / kind
@@ -421,11 +418,10 @@ def test_what_cannot_be_used_ends_in_one_clear_line_and_code_2(data, tmp_path, a
 
 @pytest.mark.door
 @pytest.mark.parametrize("command", ["fit", "render"])
-def test_an_out_that_cannot_be_a_folder_ends_in_one_clear_line(data, tmp_path, command):
+def test_an_out_that_cannot_be_a_folder_ends_in_one_clear_line(data, tmp_path, command, splat):
     taken = tmp_path / "taken"
     taken.write_text("not to be lost")
-    write_ply(tmp_path / "m.ply", one_splat())
-    first = [data] if command == "fit" else [tmp_path / "m.ply", data]
+    first = [data] if command == "fit" else [splat, data]
     long = tmp_path / ("n" * 300)
     for out, message in [
         (taken, f"{taken}: --out is a file, expected a folder"),
@@ -439,10 +435,9 @@ def test_an_out_that_cannot_be_a_folder_ends_in_one_clear_line(data, tmp_path, c
 
 
 @pytest.mark.parametrize("command", ["fit", "render"])
-def test_a_disk_without_room_ends_in_one_clear_line(data, tmp_path, command):
+def test_a_disk_without_room_ends_in_one_clear_line(data, tmp_path, command, splat):
     """No file may grow beyond 100 bytes, which to a writer is what a full disk is."""
-    write_ply(tmp_path / "m.ply", one_splat())
-    arguments = [data, "--iterations", 1] if command == "fit" else [tmp_path / "m.ply", data]
+    arguments = [data, "--iterations", 1] if command == "fit" else [splat, data]
     # Once without the limit, lest it be numba's cache of compiled kernels that finds the disk full.
     assert in_process(command, *arguments, "--out", tmp_path / "warm").exit_code == 0
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -535,30 +530,27 @@ def test_a_misspelt_scene_and_a_command_of_the_other_program_are_named(data, tmp
         )
 
 
-def test_render_needs_no_points(data, tmp_path):
-    write_ply(tmp_path / "m.ply", one_splat())
+def test_render_needs_no_points(data, tmp_path, splat):
     colmap = tmp_path / "colmap"
     colmap.mkdir()
     (colmap / "cameras.txt").write_text("1 PINHOLE 8 6 10 10 4 3\n")
     (colmap / "images.txt").write_text("1 1 0 0 0 0 0 3 1 front.png\n\n")
     for cloud in (b"", b"damaged"):
         (colmap / "points3D.txt").write_bytes(cloud)
-        done = in_process("render", tmp_path / "m.ply", colmap, "--out", tmp_path / "out")
+        done = in_process("render", splat, colmap, "--out", tmp_path / "out")
         assert done.exit_code == 0, done.stderr
         assert cv2.imread(str(tmp_path / "out" / "front.png")).shape == (6, 8, 3)
     # A transforms.json whose points were not copied along.
     alone = tmp_path / "transforms.json"
     alone.write_bytes((data / "transforms.json").read_bytes())
     assert "ply_file_path" in alone.read_text()
-    done = in_process(
-        "render", tmp_path / "m.ply", alone, "--out", tmp_path / "out", "--size", "16"
-    )
+    done = in_process("render", splat, alone, "--out", tmp_path / "out", "--size", "16")
     assert done.exit_code == 0, done.stderr
 
 
 def test_render_says_where_no_view_shows_a_splat(data, tmp_path):
     for name, shift, expected in (("there.ply", 0.0, 0), ("far.ply", 50.0, 1)):
-        splat = one_splat()
+        splat = disc(0.2)
         write_ply(tmp_path / name, replace(splat, means=splat.means + torch.tensor([0, 0, shift])))
         out = tmp_path / name.removesuffix(".ply")
         done = in_process("render", tmp_path / name, data, "--out", out)
@@ -571,7 +563,7 @@ def test_render_says_where_no_view_shows_a_splat(data, tmp_path):
 
 def test_what_render_cuts_does_not_depend_on_the_scenes_units(data, tmp_path):
     """Oracle: the same scene in units of its own, a floater at a 150th of its distance included."""
-    dataset, splat, pictures = read_dataset(data), one_splat(), []
+    dataset, splat, pictures = read_dataset(data), disc(0.2), []
     eye = torch.tensor(dataset.cameras[0].position).float()
     floater = eye * (1 - 0.02 / eye.norm())
     for times in (1.0, 1 / 64, 4.0, 64.0):
@@ -600,19 +592,17 @@ def test_what_render_cuts_does_not_depend_on_the_scenes_units(data, tmp_path):
         assert np.array_equal(picture, pictures[0])
 
 
-def test_render_says_how_far_it_is(data, tmp_path, monkeypatch):
+def test_render_says_how_far_it_is(data, tmp_path, monkeypatch, splat):
     """Oracle: a line a view where the time between lines is 0, and the last one in any case."""
-    write_ply(tmp_path / "m.ply", one_splat())
     for seconds, counts in ((0.0, range(1, 10)), (100.0, [9])):
         monkeypatch.setattr(reporting, "LINE_SECONDS", seconds)
-        done = in_process("render", tmp_path / "m.ply", data, "--out", tmp_path / "views")
+        done = in_process("render", splat, data, "--out", tmp_path / "views")
         assert re.findall(r"^views \[(\d+)/9\]", done.stderr, re.M) == [str(k) for k in counts]
 
 
 @pytest.mark.parametrize("way", ["itself", "through a link", "from a link"])
-def test_render_leaves_the_photographs_of_its_cameras_alone(way, data, tmp_path):
+def test_render_leaves_the_photographs_of_its_cameras_alone(way, data, tmp_path, splat):
     """Oracle: the photographs' bytes."""
-    write_ply(tmp_path / "m.ply", one_splat())
     capture = shutil.copytree(data, tmp_path / "capture")
     images, out = capture / "images", capture / "images"
     if way == "through a link":
@@ -624,7 +614,7 @@ def test_render_leaves_the_photographs_of_its_cameras_alone(way, data, tmp_path)
         for path in out.iterdir():
             (images / path.name).symlink_to(path)
     before = {path.name: path.read_bytes() for path in images.iterdir()}
-    done = in_process("render", tmp_path / "m.ply", capture, "--out", out)
+    done = in_process("render", splat, capture, "--out", out)
     assert done.exit_code == 2
     assert "0.png: is read, and a result would replace it; name another folder" in done.stderr
     assert {path.name: path.read_bytes() for path in images.iterdir()} == before
@@ -647,15 +637,14 @@ def test_an_edit_leaves_the_splats_that_it_is_given_alone(name, data, tmp_path):
     assert set(tmp_path.iterdir()) == {path, link.parent} and [*link.parent.iterdir()] == [link]
 
 
-def test_views_of_the_same_file_name_do_not_overwrite_each_other(data, tmp_path):
-    write_ply(tmp_path / "m.ply", one_splat())
+def test_views_of_the_same_file_name_do_not_overwrite_each_other(data, tmp_path, splat):
     cameras = [
         Camera.look_at([3, 0, z], [0, 0, 0], width=8, height=8, fov_y=40, name=f"{side}/a.png")
         for z, side in ((0, "left"), (1, "right"))
     ]
     write_transforms(tmp_path / "c.json", Dataset(cameras, [None, None]))
     done = in_process(
-        "render", tmp_path / "m.ply", tmp_path / "c.json", "--out", tmp_path / "out", "--size", "16"
+        "render", splat, tmp_path / "c.json", "--out", tmp_path / "out", "--size", "16"
     )
     assert done.exit_code == 0, done.stderr
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["0000-a.png", "0001-a.png"]
@@ -687,8 +676,7 @@ def test_a_folder_of_both_formats_and_images_of_another_size_have_their_flags(da
     assert done.exit_code == 0, done.stderr
 
 
-def test_smaller_copies_of_the_images_are_taken_by_their_scale(data, tmp_path):
-    write_ply(tmp_path / "m.ply", one_splat())
+def test_smaller_copies_of_the_images_are_taken_by_their_scale(data, tmp_path, splat):
     small = tmp_path / "data"
     shutil.copytree(data, small)
     (small / "images_2").mkdir()
@@ -696,22 +684,21 @@ def test_smaller_copies_of_the_images_are_taken_by_their_scale(data, tmp_path):
         image = cv2.imread(str(path))
         half = (image.shape[1] // 2, image.shape[0] // 2)
         cv2.imwrite(str(small / "images_2" / path.name), cv2.resize(image, half))
-    done = in_process("render", tmp_path / "m.ply", small, "--scale", 2, "--out", tmp_path / "out")
+    done = in_process("render", splat, small, "--scale", 2, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
     assert cv2.imread(str(next((tmp_path / "out").iterdir()))).shape[:2] == half[::-1]
-    done = in_process("render", tmp_path / "m.ply", small, "--scale", 3, "--out", tmp_path / "out")
+    done = in_process("render", splat, small, "--scale", 3, "--out", tmp_path / "out")
     assert done.exit_code == 2 and "(--scale): got 3, expected one of 1, 2, 4, 8" in done.stderr
-    done = in_process("render", tmp_path / "m.ply", small, "--scale", 4, "--out", tmp_path / "out")
+    done = in_process("render", splat, small, "--scale", 4, "--out", tmp_path / "out")
     assert done.exit_code == 2 and "images_4" in done.stderr
 
 
-def test_masks_are_not_passed_over_silently(data, tmp_path):
+def test_masks_are_not_passed_over_silently(data, tmp_path, splat):
     text = json.loads((data / "transforms.json").read_text())
     text["frames"][2]["mask_path"] = "masks/2.png"
     text["exposure"] = 3
     (data / "masked.json").write_text(json.dumps(text))
-    write_ply(tmp_path / "m.ply", one_splat())
-    command = ["render", tmp_path / "m.ply", data / "masked.json", "--out", tmp_path / "out"]
+    command = ["render", splat, data / "masked.json", "--out", tmp_path / "out"]
     done = in_process(*command)
     assert done.exit_code == 2 and "--ignore-key mask_path" in done.stderr
     done = in_process(*command, "--ignore-key", "mask_path")
@@ -842,11 +829,10 @@ def test_a_fit_writes_a_third_scale_for_other_viewers(data, tmp_path):
 # -------- pipes, disks, signals, packages
 
 
-def test_a_polite_kill_says_what_is_kept(data, tmp_path, monkeypatch):
+def test_a_polite_kill_says_what_is_kept(data, tmp_path, monkeypatch, splat):
     """In the middle of a render: after the first of the pictures was written."""
     from attnwarp.io import images
 
-    write_ply(tmp_path / "m.ply", one_splat())
     encode = images.encode_png
 
     def killed(rgb):
@@ -856,7 +842,7 @@ def test_a_polite_kill_says_what_is_kept(data, tmp_path, monkeypatch):
         return encode(rgb)
 
     monkeypatch.setattr(images, "encode_png", killed)
-    done = in_process("render", tmp_path / "m.ply", data, "--out", tmp_path / "out")
+    done = in_process("render", splat, data, "--out", tmp_path / "out")
     assert done.exit_code == 130
     assert done.stderr.startswith(f"attnwarp: stopped; the files in {tmp_path / 'out'} are whole")
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["0.png"]

@@ -16,6 +16,7 @@ from attnwarp.editing.small import load_editor
 from attnwarp.methods import attention_warping, preset
 from attnwarp.methods.change import say_drift
 from attnwarp.render import render
+from attnwarp.trial import disc
 from benchmarks.drift import Formula, of_formula, read, row
 
 ROOT = Path(__file__).parents[2]
@@ -94,15 +95,12 @@ def test_an_edit_says_how_far_its_source_moved_before_it_is_composed() -> None:
     formula = Formula(4)
     K = np.array([[128.0, 0, 64], [0, 128, 64], [0, 0, 1]])
     cameras = [Camera(K, np.eye(4), 128, 128, name) for name in ("one", "two")]
-    disc = Gaussians(
-        "2d", torch.tensor([[0.0, 0, 3]]), torch.tensor([[1.0, 0, 0, 0]]),
-        torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3),
-    )  # fmt: skip
+    ahead = replace(disc(), means=torch.tensor([[0.0, 0, 3]]))
     before = formula.picture(128).astype(np.float32)
     marked = np.zeros((128, 128), bool)
     marked[:32, :32] = True
     result = attention_warping(
-        disc, cameras, [before, before], load_editor("small-plain"), "red",
+        ahead, cameras, [before, before], load_editor("small-plain"), "red",
         preset("attention_warping", stages=1, steps=2, iterations=0),
         source_picture=formula.picture(128, (3, 0, 0, 0)).astype(np.float32),
         segments=[marked, marked],

@@ -21,8 +21,8 @@ from attnwarp.render import api, constants, cpu, reference
 from attnwarp.render.interface import OUTPUTS, Inputs
 
 MODES = [
-    ("2d", "intersection", False),
-    ("2d", "center", False),
+    ("2d", "intersection", None),
+    ("2d", "center", None),
     ("3d", "center", False),
     ("3d", "peak", True),
 ]
@@ -43,6 +43,22 @@ def prepared(splats: Gaussians, camera: Camera, **options: object) -> Inputs:
     given = dict.fromkeys(("depth", "background", "features", "sh_degree", "antialiased", "pose"))
     given |= {"near": constants.NEAR, "ndc": (constants.NDC_NEAR, constants.NDC_FAR)}
     return api._prepare(splats, camera, **(given | options), on_cpu=True)  # type: ignore[arg-type]
+
+
+def leaves_of(splats: Gaussians) -> list[Tensor]:
+    """Copies of the splats' parameters that take gradients."""
+    parts = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    return [part.clone().requires_grad_() for part in parts]
+
+
+def maps_and_gradients(splats: Gaussians, camera: Camera, backend: str) -> list[Tensor]:
+    """All outputs, and the gradients of their sum in all parameters and in the pose."""
+    leaves = [*leaves_of(splats), torch.tensor(camera.world_to_camera).requires_grad_()]
+    moved = Gaussians(splats.kind, *leaves[:5])
+    view = api.render(moved, camera, pose=leaves[5], backend=backend)
+    sum(getattr(view, name).nan_to_num().sum() for name in OUTPUTS).backward()
+    maps = [getattr(view, name).detach().nan_to_num(-1) for name in OUTPUTS]
+    return [*maps, *(leaf.grad for leaf in leaves)]
 
 
 def mixed_scales(splats: Gaussians, seed: int, ratio: float) -> Gaussians:

@@ -58,6 +58,13 @@ def begin(scene, **changes):
     )
 
 
+def sitting(scene, start, settings, folder, until=None, **more):
+    """A fit in a folder, asked to stop after so many iterations of this sitting."""
+    steps = itertools.count()
+    stop = None if until is None else lambda: next(steps) >= until
+    return fit(start, scene[0], settings, held_out=scene[1], folder=folder, stop=stop, **more)
+
+
 def values(splats: Gaussians):
     return {name: getattr(splats, name) for name in ("means", "quats", "scales", "opacities", "sh")}
 
@@ -110,16 +117,8 @@ def test_the_gpu_backend_fits_as_well_as_the_cpus(kind):
 def test_a_fit_begun_by_one_backend_goes_on_by_another(scene, tmp_path):
     start, settings = begin(scene, iterations=40, **FAST)
     whole = fit(start, scene[0], settings, held_out=scene[1])
-    steps = itertools.count()
-    fit(
-        start,
-        scene[0],
-        settings,
-        held_out=scene[1],
-        folder=tmp_path,
-        stop=lambda: next(steps) == 20,
-    )
-    result = fit(start, scene[0], settings, held_out=scene[1], folder=tmp_path, backend="gpu")
+    sitting(scene, start, settings, tmp_path, until=20)
+    result = sitting(scene, start, settings, tmp_path, backend="gpu")
     assert result.history[-1].psnr == pytest.approx(whole.history[-1].psnr, abs=0.05)
 
 
@@ -182,18 +181,9 @@ def test_stopped_anywhere_and_gone_on_with_a_fit_gives_the_same_bits(scene, kind
     start, settings = begin(scene, kind=kind, **BUSY)
     whole = fit(start, scene[0], settings, held_out=scene[1])
     assert len(whole.gaussians) > len(start)  # splats were added, or nothing much was tested
-    for at in (7, 30, 41):
-        asked = iter(range(1000))
-        fit(
-            start,
-            scene[0],
-            settings,
-            held_out=scene[1],
-            folder=tmp_path,
-            stop=lambda at=at, i=asked: next(i) >= at,
-        )
-        if at == 41:
-            parts = fit(start, scene[0], settings, held_out=scene[1], folder=tmp_path)
+    for until in (7, 30, 41):
+        sitting(scene, start, settings, tmp_path, until)
+    parts = sitting(scene, start, settings, tmp_path)
     assert same_bits(whole.gaussians, parts.gaussians)
     # Sittings that ended between two evaluations evaluated once more; those in common are equal.
     common = {record.iteration for record in whole.history}
@@ -217,15 +207,7 @@ def test_torchs_threads_change_no_bit_of_the_splats():
 
 def test_a_fit_that_is_stopped_leaves_its_splats_and_a_checkpoint(scene, tmp_path):
     start, settings = begin(scene, **BUSY)
-    asked = itertools.count()
-    result = fit(
-        start,
-        scene[0],
-        settings,
-        folder=tmp_path,
-        checkpoint_seconds=0,
-        stop=lambda: next(asked) > 9,
-    )
+    result = sitting(scene, start, settings, tmp_path, until=10, checkpoint_seconds=0)
     assert result.stopped == "asked" and result.iteration < settings.iterations
     final = read_ply(tmp_path / SPLATS)
     expected = result.gaussians.world_means().astype(np.float32)
@@ -324,8 +306,6 @@ def test_scaling_the_world_changes_nothing():
             pose[:3, 3] *= scale
             moved.append(dataclasses.replace(camera, world_to_camera=pose))
         near = 0.01 * scale
-        from attnwarp.render import render
-
         images = [render(truth, c, near=near).color.clamp(0, 1).numpy() for c in moved]
         start = from_points(truth.world_means(), kind="2d", sh_degree=0)
         settings = FitSettings(
@@ -345,8 +325,6 @@ def test_a_random_background_keeps_what_is_transparent_transparent():
     assert views.transparent
     start = from_points(truth.world_means(), kind="3d", sh_degree=0)
     result = fit(start, views, FitSettings(kind="3d", iterations=200, **FAST))
-    from attnwarp.render import render
-
     alpha = render(result.gaussians, cameras[0]).alpha.numpy()
     assert np.abs(alpha - views.images[0][..., 3]).mean() < 0.05
 
@@ -430,17 +408,9 @@ def test_a_sitting_that_ends_between_evaluations_does_not_cost_patience(scene, t
     start, settings = begin(
         scene, iterations=60, evaluate_every=20, patience=1, min_gain=0.05, **FAST
     )
-    sitting = iter(range(100))
-    fit(
-        start,
-        scene[0],
-        settings,
-        held_out=scene[1],
-        folder=tmp_path,
-        stop=lambda: next(sitting) >= 21,
-    )
+    sitting(scene, start, settings, tmp_path, until=21)
     # One iteration gains no 0.05 dB; 20 may, or the uninterrupted fit ends there, too.
-    parts = fit(start, scene[0], settings, held_out=scene[1], folder=tmp_path)
+    parts = sitting(scene, start, settings, tmp_path)
     whole = fit(start, scene[0], settings, held_out=scene[1])
     assert (parts.stopped, parts.iteration) == (whole.stopped, whole.iteration)
     assert 21 in [record.iteration for record in parts.history]

@@ -35,6 +35,7 @@ from attnwarp.io.images import encode_png
 from attnwarp.methods import attention_warping, preset, tuning
 from attnwarp.methods.pictures import to_bytes
 from attnwarp.methods.tuning import Tuning
+from attnwarp.trial import disc
 from attnwarp.warp import Surface, warp_surfaces
 
 QUICK = preset("attention_warping", stages=2, views_per_stage=2, steps=2, iterations=3)
@@ -42,6 +43,7 @@ IDEAS = {
     "sources": {"sources": 3},
     "surface noise": {"noise": "surface"},
 }
+FLAT = Surface(np.full((32, 32), 2.0), np.broadcast_to([0.0, 0, -1], (32, 32, 3)))
 ALL_IDEAS = {name: value for idea in IDEAS.values() for name, value in idea.items()}
 
 
@@ -110,8 +112,7 @@ def test_a_view_at_the_sources_place_gets_the_sources_edit(scene, editor):
 def test_a_warp_from_outside_takes_the_place_of_the_splats_own(scene, editor, tmp_path):
     model, views, images = scene
     # The identity, which no geometry gives for two cameras apart.
-    flat = Surface(np.full((32, 32), 2.0), np.broadcast_to([0.0, 0, -1], (32, 32, 3)))
-    identity = warp_surfaces(views[0], views[0], flat, flat)
+    identity = warp_surfaces(views[0], views[0], FLAT, FLAT)
     pair = (model, views[:2], [images[0], images[0]])
     settings = replace(QUICK, stages=1, iterations=0, a0=1.0, decay="constant")
     given = run(pair, editor, tmp_path, settings, warps=lambda source, target: identity)
@@ -123,8 +124,8 @@ def test_a_warp_from_outside_takes_the_place_of_the_splats_own(scene, editor, tm
     small = warp_surfaces(
         views[0],
         views[0].resize(16, 16),
-        Surface(flat.depth[:16, :16], flat.normal[:16, :16]),
-        flat,
+        Surface(FLAT.depth[:16, :16], FLAT.normal[:16, :16]),
+        FLAT,
     )
     with pytest.raises(ValueError, match=r"warps\(0, 1\)\.mask: got shape \(16, 16\)"):
         run(pair, editor, settings=settings, warps=lambda source, target: small)
@@ -133,13 +134,12 @@ def test_a_warp_from_outside_takes_the_place_of_the_splats_own(scene, editor, tm
 def test_of_warps_from_outside_one_is_held_at_a_time_while_they_are_hashed(scene, editor, tmp_path):
     """Oracles: references that do not hold their objects, hashlib."""
     views = scene[1]
-    flat = Surface(np.full((32, 32), 2.0), np.broadcast_to([0.0, 0, -1], (32, 32, 3)))
     alive, most, made = weakref.WeakSet(), 0, {}
 
     def warps(source, target):
         nonlocal most
         most = max(most, len(alive))
-        warp = warp_surfaces(views[source], views[target], flat, flat)
+        warp = warp_surfaces(views[source], views[target], FLAT, FLAT)
         alive.add(warp)
         made[target] = warp.correspondence.xy.numpy().copy(), warp.mask.numpy().copy()
         return warp
@@ -158,7 +158,7 @@ def test_without_a_mask_features_go_where_the_target_has_a_depth(scene, editor, 
     views = scene[1]
     depth = np.full((32, 32), 2.0)
     depth[:, 8:] = np.nan
-    part = Surface(depth, np.broadcast_to([0.0, 0, -1], (32, 32, 3)))
+    part = Surface(depth, FLAT.normal)
     # The segment leaves no pixel, so by its mask the view would get no features.
     rules = attnwarp.warp.preset("corrected", segment=True)
     nothing = np.zeros((32, 32), bool)
@@ -214,9 +214,7 @@ def test_weight_zero_records_nothing_and_edits_each_view_as_the_editor_alone_doe
 def wall():
     """One disc so large that both cameras see it alone, in the plane z = 0."""
     color = Gaussians.sh_from_rgb(torch.tensor([[0.8, 0.4, 0.2]]))
-    return Gaussians(
-        "2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 2), 50.0), torch.ones(1), color,
-    )  # fmt: skip
+    return replace(disc(50.0), sh=color)
 
 
 def positions(source, target, h, w):
@@ -518,8 +516,7 @@ def test_an_argument_of_another_type_is_named(scene, editor, changes, message):
 @pytest.mark.parametrize("part", further("features", "masks", "features/v0.png"))
 def test_pictures_of_where_features_went_are_drawn_again(part, finished, scene, editor, tmp_path):
     """Oracle: the bytes of the edit that nobody touched."""
-    folder = tmp_path / "folder"
-    shutil.copytree(finished[1], folder)
+    folder = shutil.copytree(finished[1], tmp_path / "folder")
     path = folder / part if part.endswith(".png") else next((folder / part).glob("*.png"))
     path.unlink()
     with pytest.warns(InputWarning, match=f"{path.name}: missing"):
@@ -533,8 +530,7 @@ def test_an_edit_made_again_for_a_picture_beside_it_has_to_be_the_same(
     """Other threads or another device give another edit: the tuned scene rests on the former
     edit.
     """
-    folder = tmp_path / "folder"
-    shutil.copytree(finished[1], folder)
+    folder = shutil.copytree(finished[1], tmp_path / "folder")
     other = np.zeros_like(read_image(folder / "rounds/1/v0.png"))
     for part, place in (
         ("features/v0.png", "rounds/1/v0.png"),
@@ -559,8 +555,7 @@ def test_an_edit_made_again_for_a_picture_beside_it_has_to_be_the_same(
 
 @pytest.mark.parametrize("place", further("rounds/1/v0.png", "rounds/2/*.png"))
 def test_the_same_picture_in_other_bytes_is_the_edit(place, finished, scene, editor, tmp_path):
-    folder = tmp_path / "folder"
-    shutil.copytree(finished[1], folder)
+    folder = shutil.copytree(finished[1], tmp_path / "folder")
     path = next(folder.glob(place))
     Image.fromarray(read_image(path)).save(path, compress_level=0)
     before = files(folder)
@@ -574,8 +569,7 @@ def test_another_picture_in_place_of_an_edit_is_not_taken_for_it(
     place, finished, scene, editor, tmp_path
 ):
     """Oracle: the bytes of the edit that nobody touched."""
-    folder = tmp_path / "folder"
-    shutil.copytree(finished[1], folder)
+    folder = shutil.copytree(finished[1], tmp_path / "folder")
     path = next(folder.glob(place))
     path.write_bytes(encode_png(255 - read_image(path)))
     with pytest.warns(InputWarning, match=f"{path.name}: not the picture that the edit made"):
@@ -1073,8 +1067,7 @@ def test_features_of_chosen_steps_alone_reach_a_target(scene, editor, tmp_path):
     # A view at the source's place takes all of its features.
     model, views, images = scene
     twin = Camera(views[0].K, views[0].world_to_camera, 32, 32, "twin")
-    flat = Surface(np.full((32, 32), 2.0), np.broadcast_to([0.0, 0, -1], (32, 32, 3)))
-    identity = warp_surfaces(views[0], views[0], flat, flat)
+    identity = warp_surfaces(views[0], views[0], FLAT, FLAT)
     pair = model, [views[0], twin], [images[0], images[1]]
     some = run(pair, editor, settings=settings, warps=lambda source, target: identity)
     with inject(

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -38,20 +39,20 @@ from attnwarp.render import render
 from attnwarp.warp import lift_masks, piece_around
 
 runner = CliRunner()
-QUICK = (
-    "--steps",
-    2,
-    "--iterations",
-    3,
-    "--stages",
-    2,
-    "--views-per-stage",
-    1,
-    "--size",
-    32,
-    "--threads",
-    1,
-)
+QUICK = shlex.split("--steps 2 --iterations 3 --stages 2 --views-per-stage 1 --size 32 --threads 1")
+
+
+LEFT = np.arange(32) < np.full((32, 1), 16)
+"""(32, 32) mask of the left half."""
+
+
+def save_mask(mask, *paths):
+    """Write a bool mask as PNG files; the first path."""
+    picture = 255 * np.repeat(mask[..., None], 3, axis=2).astype(np.uint8)
+    for path in paths:
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(encode_png(picture))
+    return paths[0]
 
 
 @pytest.fixture(scope="module")
@@ -70,30 +71,18 @@ def place(tmp_path_factory):
     )
     write_ply(folder / "splats.ply", model)
     pix2pix().save_pretrained(folder / "editor")
-    for name, value in (("black", 0), ("ones", 1)):
-        (folder / name).mkdir()
-        for camera in views:
-            grey = np.full((32, 32, 3), value, np.uint8)
-            (folder / name / camera.name).write_bytes(encode_png(grey))
-    pixel = np.zeros((32, 32, 3), np.uint8)
-    pixel[16, 16] = 255
-    (folder / "pixel.png").write_bytes(encode_png(pixel))
+    save_mask(LEFT & False, *(folder / "black" / camera.name for camera in views))
+    (folder / "ones").mkdir()
+    for camera in views:
+        (folder / "ones" / camera.name).write_bytes(encode_png(np.ones((32, 32, 3), np.uint8)))
+    save_mask(np.eye(32, dtype=bool) & (np.arange(32) == 16), folder / "pixel.png")
     (folder / "wide.png").write_bytes(encode_png(np.zeros((32, 48, 3), np.uint8)))
     return folder
 
 
 def run(place, out, *more, instruction="a bear"):
-    arguments = [
-        "edit",
-        place / "data",
-        "--instruction",
-        instruction,
-        "--editor",
-        place / "editor",
-        "--out",
-        out,
-    ]
-    return runner.invoke(app, [*map(str, arguments), *map(str, QUICK), *map(str, more)])
+    given = ("--instruction", instruction, "--editor", place / "editor", "--out", out)
+    return runner.invoke(app, list(map(str, ("edit", place / "data", *given, *QUICK, *more))))
 
 
 def test_it_leaves_an_edited_ply_and_a_page(place, tmp_path):
@@ -197,11 +186,7 @@ def test_an_interrupt_while_it_fits_leaves_a_checkpoint(place, tmp_path):
 
 def test_a_mask_and_a_picture_by_hand_are_read_from_files(place, tmp_path):
     masks = tmp_path / "masks"
-    masks.mkdir()
-    half = np.zeros((32, 32, 3), np.uint8)
-    half[:, :16] = 255
-    for camera in cameras():
-        (masks / camera.name).write_bytes(encode_png(half))
+    save_mask(LEFT, *(masks / camera.name for camera in cameras()))
     hand = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
     (tmp_path / "hand.png").write_bytes(encode_png(hand))
     result = run(
@@ -235,15 +220,11 @@ def test_words_are_asked_of_the_source_alone_and_lifted_as_its_mask_is(place, tm
 
 def test_a_mask_of_the_source_is_lifted_into_every_view(place, tmp_path):
     """Oracle: the library's lifting, and the photographs where it marks nothing."""
-    half = np.zeros((32, 32), dtype=bool)
-    half[:, :16] = True
-    picture = 255 * np.repeat(half[..., None], 3, axis=2).astype(np.uint8)
-    (tmp_path / "mask.png").write_bytes(encode_png(picture))
-    out = tmp_path / "out"
-    result = run(place, out, "--ply", place / "splats.ply", "--mask", tmp_path / "mask.png")
+    out, mask = tmp_path / "out", save_mask(LEFT, tmp_path / "mask.png")
+    result = run(place, out, "--ply", place / "splats.ply", "--mask", mask)
     assert result.exit_code == 0, result.output
     model, views = read_ply(place / "splats.ply"), cameras()
-    lifted = lift_masks(model, views[:1], [half], near=near_of(views, model))
+    lifted = lift_masks(model, views[:1], [LEFT], near=near_of(views, model))
     for k, view in enumerate(views):
         share = read_image(out / "segments" / f"v{k}.png")[..., 0] / 255
         raw = lifted.render(view)
@@ -255,31 +236,17 @@ def test_a_mask_of_the_source_is_lifted_into_every_view(place, tmp_path):
     assert (edited[~unmarked] != original[~unmarked]).any()
 
 
-@pytest.mark.parametrize("option, value", [("--box", "4,4,28,28")])
-def test_a_box_marks_what_opencv_cuts_out(place, tmp_path, option, value):
-    """Oracle: the cut of the source's picture, given as a file."""
+@pytest.mark.parametrize(("option", "value"), [("--box", "4,4,28,28"), ("--at", "8,20")])
+def test_a_box_marks_what_opencv_cuts_out_and_a_click_its_surface(place, tmp_path, option, value):
+    """Oracle: the cut of the source's picture, or of the piece around the point, given as a file."""
     source = read_image(place / "data" / "images" / "v0.png").astype(np.float32) / 255
-    marks = tuple(map(float, value.split(",")))
-    mask = cut_out(source, **{option[2:]: marks})
-    picture = 255 * np.repeat(mask[..., None], 3, axis=2).astype(np.uint8)
-    (tmp_path / "mask.png").write_bytes(encode_png(picture))
-    ply = ("--ply", place / "splats.ply")
+    if option == "--box":
+        mask = cut_out(source, box=(4, 4, 28, 28))
+    else:
+        mask = snap(source, piece_around(read_ply(place / "splats.ply"), cameras()[0], (8, 20)))
+    file, ply = save_mask(mask, tmp_path / "mask.png"), ("--ply", place / "splats.ply")
     assert run(place, tmp_path / "a", *ply, option, value).exit_code == 0
-    assert run(place, tmp_path / "b", *ply, "--mask", tmp_path / "mask.png").exit_code == 0
-    for k in range(len(cameras())):
-        one, two = ((tmp_path / f / "segments" / f"v{k}.png").read_bytes() for f in "ab")
-        assert one == two
-
-
-def test_a_click_marks_the_surface_around_it_up_to_edges_of_colour(place, tmp_path):
-    """Oracle: grabCut from the piece around the point, given as a file."""
-    source = read_image(place / "data" / "images" / "v0.png").astype(np.float32) / 255
-    mask = snap(source, piece_around(read_ply(place / "splats.ply"), cameras()[0], (8, 20)))
-    picture = 255 * np.repeat(mask[..., None], 3, axis=2).astype(np.uint8)
-    (tmp_path / "mask.png").write_bytes(encode_png(picture))
-    ply = ("--ply", place / "splats.ply")
-    assert run(place, tmp_path / "a", *ply, "--at", "8,20").exit_code == 0
-    assert run(place, tmp_path / "b", *ply, "--mask", tmp_path / "mask.png").exit_code == 0
+    assert run(place, tmp_path / "b", *ply, "--mask", file).exit_code == 0
     for k in range(len(cameras())):
         one, two = ((tmp_path / f / "segments" / f"v{k}.png").read_bytes() for f in "ab")
         assert one == two
@@ -515,12 +482,9 @@ def test_each_kind_of_marks_has_a_middle_that_its_lifted_mask_keeps(marks):
 
 def test_an_edit_begins_with_how_much_it_changed_inside_the_mask(place, tmp_path):
     """Oracle: scikit-image on the files of the folder."""
-    half = np.zeros((32, 32), dtype=bool)
-    half[:, :16] = True
-    picture = 255 * np.repeat(half[..., None], 3, axis=2).astype(np.uint8)
-    (tmp_path / "mask.png").write_bytes(encode_png(picture))
+    mask = save_mask(LEFT, tmp_path / "mask.png")
     out, ply = tmp_path / "out", ("--ply", place / "splats.ply")
-    result = run(place, out, *ply, "--mask", tmp_path / "mask.png", "--iterations", 0)
+    result = run(place, out, *ply, "--mask", mask, "--iterations", 0)
     assert result.exit_code == 0, result.output
     inside = read_image(out / "segments" / "v0.png")[..., 0] > 127
     source = read_image(place / "data" / "images" / "v0.png")
@@ -637,11 +601,9 @@ def test_stages_sources_and_a_size_that_cannot_be_had_are_said_in_one_line_each(
 
 def test_an_edit_whose_targets_got_no_features_says_so(place, tmp_path):
     """Oracle: the masks leave no pixel of a view but the source's to be edited."""
-    white = np.full((32, 32, 3), 255, np.uint8)
     masks = tmp_path / "masks"
-    masks.mkdir()
     for k, camera in enumerate(cameras()):
-        (masks / camera.name).write_bytes(encode_png(white if k == 2 else 0 * white))
+        save_mask(np.full((32, 32), k == 2), masks / camera.name)
     ply = ("--ply", place / "splats.ply", "--source", 2, "--set", "warp.segment=true")
     result = run(place, tmp_path / "out", *ply, "--masks", masks)
     assert result.exit_code == 0, result.output
@@ -699,20 +661,16 @@ def test_the_commands_help_names_every_preset():
 
 def test_a_refused_edit_leaves_the_masks_of_the_edit_that_is_there(place, tmp_path):
     ply = ("--ply", place / "splats.ply")
-    masks = tmp_path / "masks"
-    masks.mkdir()
-    half = np.zeros((32, 32, 3), np.uint8)
-    half[:, :16] = 255
-    for camera in cameras():
-        (masks / camera.name).write_bytes(encode_png(half))
+    masks, segments = tmp_path / "masks", tmp_path / "out" / "segments"
+    save_mask(LEFT, *(masks / camera.name for camera in cameras()))
+    given = {path.name: path.read_bytes() for path in masks.iterdir()}
     assert run(place, tmp_path / "out", *ply, "--masks", masks).exit_code == 0
-    stored = {p.name: p.read_bytes() for p in (tmp_path / "out" / "segments").iterdir()}
-    assert stored == {camera.name: encode_png(half) for camera in cameras()}
-    (masks / cameras()[0].name).write_bytes(encode_png(255 - half))
+    assert {path.name: path.read_bytes() for path in segments.iterdir()} == given
+    save_mask(~LEFT, masks / cameras()[0].name)
     result = run(place, tmp_path / "out", *ply, "--masks", masks)
     assert result.exit_code == 2
     assert "holds an edit of other inputs.segments" in result.output
-    assert {p.name: p.read_bytes() for p in (tmp_path / "out" / "segments").iterdir()} == stored
+    assert {path.name: path.read_bytes() for path in segments.iterdir()} == given
 
 
 @pytest.mark.slow

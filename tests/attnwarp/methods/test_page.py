@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from attnwarp import Camera, Gaussians
+from attnwarp import Camera
 from attnwarp.errors import InputError
 from attnwarp.io import read_image, read_splat
 from attnwarp.io.names import file_stems
@@ -20,6 +20,7 @@ from attnwarp.methods import page as pages
 from attnwarp.methods.base import workdir_of
 from attnwarp.methods.page.measured import disagreement
 from attnwarp.methods.page.orbit import check_film, focus_of, orbit, write_film
+from attnwarp.trial import disc
 
 QUICK = {"steps": 2, "iterations": 3}
 
@@ -157,10 +158,7 @@ def test_a_method_that_edits_views_alone_has_no_other_control(edits):
 
 def test_views_disagree_by_the_difference_of_shifted_pictures():
     """Two cameras before a wall, 4 px apart: the closed form is a shift."""
-    wall = Gaussians(
-        "2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 2), 50.0),
-        torch.ones(1), torch.zeros(1, 1, 3),
-    )  # fmt: skip
+    wall = disc(50.0)
     K = np.array([[32.0, 0, 16], [0, 32, 16], [0, 0, 1]])
     cameras = {}
     for k in (0, 1):

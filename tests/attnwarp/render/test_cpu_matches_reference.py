@@ -14,7 +14,7 @@ import pytest
 import torch
 from backends import GPU
 from further import further
-from rounding import MODES, excess, mixed_scales, prepared
+from rounding import MODES, excess, leaves_of, maps_and_gradients, mixed_scales, prepared
 
 from attnwarp import Camera, Gaussians
 from attnwarp.render import binned, constants, cpu, render
@@ -37,10 +37,7 @@ def test_two_hundred_random_scenes_agree_to_1e_5(
         camera = make_camera(seed, int(rng.integers(1, 20)), int(rng.integers(1, 20)))
         count = int(rng.integers(1, 40)) if seed % 5 == 0 else int(rng.integers(12, 40))
         splats = make_splats(seed, kind, count, camera, degree=seed % 4)
-        options: dict[str, object] = {
-            "depth": mode,
-            "antialiased": antialiased if kind == "3d" else None,
-        }
+        options: dict[str, object] = {"depth": mode, "antialiased": antialiased}
         # With the distortion's near plane at the picture's, m lies in [0, 1]; at 0.2 it reaches -19
         # for what is nearer.
         options["ndc"] = (constants.NEAR, constants.NDC_FAR)
@@ -63,7 +60,7 @@ def test_pictures_of_many_tiles_agree(
     camera = make_camera(11, width, height)
     splats = make_splats(11, kind, 40, camera)
     splats.scales[::4] *= 20
-    options = {"depth": mode, "antialiased": antialiased if kind == "3d" else None}
+    options = {"depth": mode, "antialiased": antialiased}
     inputs = prepared(splats, camera, ndc=(constants.NEAR, constants.NDC_FAR), **options)
     worst = excess(inputs, backend=backend)
     assert max(worst.values()) < 1e-5, worst
@@ -98,7 +95,7 @@ def test_scales_of_ratio_1e6_agree_to_1e_4(
     for seed in seeds:
         camera = make_camera(seed, 40, 30)
         splats = mixed_scales(make_splats(seed, kind, 24, camera, degree=1), seed + 77, 1e6)
-        options = {"depth": mode, "antialiased": antialiased if kind == "3d" else None}
+        options = {"depth": mode, "antialiased": antialiased}
         displacements = 8 if kind == "2d" else 0
         for name, beyond in excess(
             prepared(splats, camera, **options), displacements, backend
@@ -117,17 +114,14 @@ def test_gradients_with_scales_of_ratio_1e6_agree_with_autograd(
     start = mixed_scales(make_splats(1, kind, 24, camera, degree=1), 78, 1e6).to(
         dtype=torch.float64
     )
-    options = {"depth": mode, "antialiased": antialiased if kind == "3d" else None}
+    options = {"depth": mode, "antialiased": antialiased}
     gradients = {}
 
     def weights_of(value):
         return torch.linspace(-1, 1, value.numel(), dtype=torch.float64).sin().reshape(value.shape)
 
     for each in ("reference", backend):
-        leaves = [
-            t.clone().requires_grad_()
-            for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
-        ]
+        leaves = leaves_of(start)
         view = render(Gaussians(kind, *leaves), camera, backend=each, **options)
         for name in OUTPUTS:
             value = getattr(view, name).nan_to_num(0).double()
@@ -196,10 +190,7 @@ def test_gradients_of_every_output_agree_with_autograd(
     gradients: dict[str, dict[str, list[torch.Tensor]]] = {}
     weights: dict[str, torch.Tensor] = {}
     for each in ("reference", backend):
-        leaves = [
-            t.clone().requires_grad_()
-            for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
-        ]
+        leaves = leaves_of(start)
         pose = torch.tensor(camera.world_to_camera).requires_grad_()
         extra = features.clone().requires_grad_()
         behind = torch.linspace(
@@ -210,7 +201,7 @@ def test_gradients_of_every_output_agree_with_autograd(
             camera,
             backend=each,
             depth=mode,
-            antialiased=antialiased if kind == "3d" else None,
+            antialiased=antialiased,
             pose=pose,
             background=behind,
             features=None if harmonic else extra,
@@ -266,30 +257,11 @@ def test_the_bits_do_not_depend_on_the_number_of_threads(kind, make_camera, make
     try:
         for count in (1, 2, 5):
             torch.set_num_threads(count)
-            leaves = [
-                t.clone().requires_grad_()
-                for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
-            ]
-            pose = torch.tensor(camera.world_to_camera).requires_grad_()
-            view = render(Gaussians(kind, *leaves), camera, pose=pose)
-            loss = (
-                view.color.sum()
-                + view.depth.nan_to_num().sum()
-                + view.distortion_l1.sum()
-                + view.distortion_ordered.sum()
-                + view.normal.sum()
-            )
-            loss.backward()
-            seen.append(
-                [getattr(view, n).detach() for n in OUTPUTS]
-                + [leaf.grad for leaf in (*leaves, pose)]
-            )
+            seen.append(maps_and_gradients(start, camera, "cpu"))
     finally:
         torch.set_num_threads(threads)
     for other in seen[1:]:
-        for a, b in zip(seen[0], other, strict=True):
-            assert a is not None and b is not None
-            assert torch.equal(a.nan_to_num(-1), b.nan_to_num(-1))
+        assert all(map(torch.equal, seen[0], other))
 
 
 def test_gradients_gathered_in_small_groups_of_tiles_are_the_same(
@@ -500,5 +472,4 @@ def test_a_deep_scene_worked_off_from_the_front_is_the_same(
         )
         results[-1].append(torch.tensor(view.counters["contributing"]))
     for other in results[1:]:
-        for a, b in zip(results[0], other, strict=True):
-            assert torch.equal(a, b)
+        assert all(map(torch.equal, results[0], other))

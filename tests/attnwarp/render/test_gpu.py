@@ -8,11 +8,9 @@ import dataclasses
 import pytest
 import torch
 from imported_modules import modules_after
-from rounding import excess, prepared
+from rounding import excess, maps_and_gradients, prepared
 
-from attnwarp import Gaussians
 from attnwarp.render import render
-from attnwarp.render.interface import OUTPUTS
 
 
 @pytest.mark.usefixtures("one_thread")
@@ -47,19 +45,8 @@ def test_every_kernel_compiles_for_a_gpu_that_is_not_here(architecture: int, tmp
 def test_two_runs_have_the_same_bits(kind: str, make_camera, make_splats) -> None:
     camera = make_camera(2, 67, 45)
     start = make_splats(2, kind, 500, camera)
-    runs = []
-    for _ in range(2):
-        leaves = [
-            t.clone().requires_grad_()
-            for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
-        ]
-        pose = torch.tensor(camera.world_to_camera).requires_grad_()
-        view = render(Gaussians(kind, *leaves), camera, pose=pose, backend="gpu")
-        sum(getattr(view, name).nan_to_num().sum() for name in OUTPUTS).backward()
-        pictures = [getattr(view, name).detach().nan_to_num(-1) for name in OUTPUTS]
-        runs.append([*pictures, *(leaf.grad for leaf in (*leaves, pose))])
-    for first, second in zip(*runs, strict=True):
-        assert torch.equal(first, second)
+    runs = [maps_and_gradients(start, camera, "gpu") for _ in range(2)]
+    assert all(map(torch.equal, *runs))
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from closed_forms import faces, orbit, plane_depth, shell, sphere
 
 from attnwarp import Camera, Gaussians
 from attnwarp.settings import Weight
+from attnwarp.trial import disc as one_disc
 from attnwarp.warp.depth import resize_depth
 from attnwarp.warp.rules import RULES, Rule, gaussian_filter, in_front
 from attnwarp.warp.settings import PRESETS, WarpSettings, preset
@@ -325,24 +326,20 @@ def test_what_no_rule_reads_is_refused_with_the_setting_that_would_read_it():
 
 def test_a_view_without_a_position_says_what_to_check_and_why():
     """Oracle: poses in the other conventions, made by hand from one in OpenCV's."""
-    disc = Gaussians(
-        "2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 2), 0.3),
-        torch.ones(1), torch.zeros(1, 1, 3),
-    )  # fmt: skip
     given = {"width": 16, "height": 16, "fov_y": 40, "up": (0, 1, 0)}
     right = Camera.look_at((0.5, 0, -3), (0, 0, 0), **given)
     opengl = np.diag([1.0, -1, -1, 1]) @ right.world_to_camera
     backwards = np.linalg.inv(right.world_to_camera)
     remedy = "; check world_to_camera of both: from world to camera, not camera-to-world; OpenCV"
     wall = Surface(np.full((16, 16), 2.0))
-    assert warp_view(disc, right, right).mask.any()
+    assert warp_view(one_disc(0.3), right, right).mask.any()
     for pose in (opengl, backwards):
         wrong = Camera(right.K, pose, 16, 16)
         with pytest.warns(UserWarning, match=f"the target sees no surface{remedy}") as issued:
-            view = warp_view(disc, wrong, wrong)
+            view = warp_view(one_disc(0.3), wrong, wrong)
         assert [warning.filename for warning in issued] == [__file__]
         assert not view.mask.any()
-        warp_view(disc, wrong, wrong, warn_empty=False)  # a warning would be an error here
+        warp_view(one_disc(0.3), wrong, wrong, warn_empty=False)  # a warning would be an error here
     ahead, behind = (Camera(right.K, np.diag(d), 16, 16) for d in ([1.0] * 4, [1.0, -1, -1, 1]))
     settings = preset("corrected", depth_agreement=False, normal_test="none")
     for backend in ("auto", "reference"):
