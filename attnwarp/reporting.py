@@ -39,8 +39,6 @@ class Reporter:
         """Receive the number of finished steps, and the current step.
 
         Args:
-            done: number of finished steps.
-            total: total number of steps; 0 while unknown.
             text: name of the current step, or of the step that has just ended.
             left: seconds left, if the work knows better than the pace; NaN while it does not
                 know.

@@ -35,12 +35,7 @@ SEED = 0
 def write_pictures(
     folder: Path, images: Sequence[npt.NDArray[np.uint8]], cameras: Sequence[Camera]
 ) -> list[str]:
-    """Write the input files of :func:`match`, and return the pictures' names in them.
-
-    Args:
-        images: (H, W, 3) sRGB.
-        cameras: pinhole cameras, one a picture, of its size.
-    """
+    """Write the input files of :func:`match`, and return the pictures' names in them."""
     names = [f"{i:05d}" for i in range(len(images))]
     alike: dict[tuple[float, ...], list[str]] = {}
     for name, camera in zip(names, cameras, strict=True):

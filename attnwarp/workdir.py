@@ -84,13 +84,7 @@ def results_in(folder: Path | str | None) -> Iterator[Path]:
 
 
 class Workdir:
-    """Folder of one run.
-
-    Args:
-        what: description of the run, for messages: "a fit", "an edit".
-        folders: subfolders, created likewise.
-        results: result files, besides those in ``folders``.
-    """
+    """Folder of one run."""
 
     def __init__(
         self,

@@ -92,11 +92,7 @@ def read_splats(
 
 
 def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera], report: Reporter) -> None:
-    """Refuse splats that no camera sees, before an edit spends minutes on them.
-
-    Args:
-        cameras: cameras of the dataset; the first that sees splats ends the search.
-    """
+    """Refuse splats that no camera sees, before an edit spends minutes on them."""
     import torch
 
     from attnwarp.fit import compile_kernels
@@ -119,7 +115,6 @@ def note_held_out(path: Path, dataset: Dataset, index: int) -> str:
 
     Args:
         path: path of the splats. A fit writes its held-out views to the same folder.
-        dataset: views, with their splits.
     """
     from attnwarp.io.names import file_stems
 

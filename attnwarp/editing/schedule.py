@@ -46,9 +46,6 @@ class Schedule(Protocol):
     def timesteps(self, steps: int, size: Size) -> Sequence[Time]:
         """Compute falling times from pure noise.
 
-        Args:
-            size: (h, w) of the latents; some models' steps depend on it.
-
         Raises:
             ValueError: more steps than the schedule has.
         """
@@ -62,10 +59,6 @@ class Schedule(Protocol):
         becomes the time at which the same share of the picture remains under the same noise. If T
         comes from a range, it is drawn on Stable Diffusion's clock and each draw is converted, so
         shares of signal occur as often as published.
-
-        Args:
-            start: Stable Diffusion's first timestep, in [0, 999].
-            steps: number of steps.
 
         Raises:
             ValueError: the timestep is out of range, or has fewer timesteps below it than steps.
@@ -285,7 +278,6 @@ class Flow:
         """Convert a diffusers FlowMatchEulerDiscreteScheduler, including its shift.
 
         Args:
-            scheduler: the scheduler.
             mu: function of the scheduler and the numbers of tokens and steps that returns the
                 shift, for a scheduler that shifts by it.
             token: side of a token in latents.

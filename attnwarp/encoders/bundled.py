@@ -34,12 +34,7 @@ Array = npt.NDArray[np.float64]
 
 
 def load(name: str, folder: Path = WEIGHTS) -> BundledClip | BundledDino | BundledPerceptual:
-    """Load a bundled encoder: "clip-small", "clip-parts", "dino-small" or "perceptual-small".
-
-    Args:
-        folder: folder with ``name``.safetensors, and a tokenizer for clip-small and clip-parts; the
-            package's folder if omitted.
-    """
+    """Load a bundled encoder: "clip-small", "clip-parts", "dino-small" or "perceptual-small"."""
     kinds: dict[str, Callable[[str, Path], Any]] = {
         "clip-small": BundledClip, "clip-parts": BundledClipParts,
         "dino-small": BundledDino, "perceptual-small": BundledPerceptual,

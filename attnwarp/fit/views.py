@@ -54,11 +54,7 @@ S = TypeVar("S", bound=Sized)
 
 class Drawn(Sequence[S]):
     """Values created when drawn. The first that fit are kept, since all at once may fill the
-    memory.
-
-    Args:
-        held_bytes: limit on the bytes of kept values.
-    """
+    memory."""
 
     def __init__(self, makers: Sequence[Callable[[], S]], held_bytes: int) -> None:
         self._makers = makers

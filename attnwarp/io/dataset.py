@@ -165,8 +165,6 @@ def with_images(
     """Check that each camera's image exists and has the camera's size.
 
     Args:
-        cameras, paths: cameras and paths, one path for each camera.
-        missing_images, resize_cameras: see :func:`attnwarp.io.read_dataset`.
         finder: file finder in the root folder of the images' names.
         elsewhere: hint on naming another folder of images, if possible.
 

@@ -222,11 +222,7 @@ def read_mask(path: str | os.PathLike[str], height: int, width: int) -> npt.NDAr
 
 
 def encode_png(rgb: npt.NDArray[Any]) -> bytes:
-    """Encode a picture as PNG.
-
-    Args:
-        rgb: (H, W, 3) or (H, W, 4) uint8 or uint16 RGB(A).
-    """
+    """Encode a picture as PNG."""
     import cv2
 
     code = cv2.COLOR_RGBA2BGRA if rgb.shape[2] == 4 else cv2.COLOR_RGB2BGR

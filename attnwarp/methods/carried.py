@@ -16,11 +16,7 @@ from attnwarp.methods.sight import Sight, SourceWarp
 def carry(
     own: Tensor, maps: Sequence[Tensor], warps: Sequence[SourceWarp], weight: float
 ) -> Tensor:
-    """Blend the sources' warped (C, h', w') maps into a target's (C, h, w) map.
-
-    Args:
-        weight: weight of the sources' maps, in [0, 1].
-    """
+    """Blend the sources' warped (C, h', w') maps into a target's (C, h, w) map."""
     tokens = own.flatten(1).T[None].contiguous()
     for warp, map_ in zip(warps, maps, strict=False):
         h, w = own.shape[1:]

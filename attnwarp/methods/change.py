@@ -34,7 +34,6 @@ def change_of(
     """Measure the change inside the mask of an edit whose renders are written.
 
     Args:
-        work: the scene before the edit, and the folder of its renders.
         source: name of the source view, excluded from the scene's change; None for no source.
     """
     segments = work.scene.segments

@@ -119,8 +119,6 @@ def edit_dataset(
         method: key of :data:`attnwarp.methods.METHODS`.
         splats: the scene before the edit; None fits it first.
         editor_name: name or path, see :func:`attnwarp.editing.small.load_editor`.
-        settings: settings of the method. A missing size becomes the editor's default.
-        out: folder of all results, including a PLY for other viewers.
         source_picture: file of the source view edited elsewhere, for attention warping.
         origin: sentence on the origin of the inputs, for the page.
         own: additional options of the method, such as "budget".
@@ -312,7 +310,6 @@ def check_asked(
     """Refuse invalid arguments before a capture is rendered or read.
 
     Args:
-        method, instruction, settings, out, options: see :func:`edit_dataset`.
         asked: further options that decide the result, by name, as typed.
     """
     check_film(options.turntable)

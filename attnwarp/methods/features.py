@@ -17,9 +17,6 @@ from attnwarp.methods.sight import Size
 class Features:
     """Selection of the features to record.
 
-    Args:
-        store: "device", "cpu", or a folder.
-
     Attributes:
         layers: layers to record; empty if the features' weight is 0.
     """

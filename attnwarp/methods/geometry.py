@@ -25,11 +25,7 @@ Warps = Callable[[int, int], WarpedView]
 
 
 class Geometry:
-    """Warps along the scene's geometry.
-
-    Args:
-        warps: external warps, such as from exact depth; None uses the splats' depth.
-    """
+    """Warps along the scene's geometry."""
 
     def __init__(self, work: Work, settings: AttentionWarpingSettings, warps: Warps | None) -> None:
         self.work, self.settings, self.outside = work, settings, warps

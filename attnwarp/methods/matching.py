@@ -74,7 +74,6 @@ class KeyViews:
     """Tokens of the key views at one step, by layer, and their use by other views.
 
     Args:
-        layers: (h, w) of each self-attention layer, by name.
         epipolar: distance in cells beyond which a match is excluded; None excludes none.
     """
 

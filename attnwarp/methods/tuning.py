@@ -208,7 +208,6 @@ class Tuning:
         """Tune from the current iteration to the end of a round, or until the budget is spent.
 
         Args:
-            begin, end: first iteration of the round, and the one after its last.
             order: order of the views; None takes each once before any comes again, at random.
             spent: function that returns True once no further iteration may begin.
         """

@@ -50,11 +50,7 @@ class SourceTokens:
 def kept_tokens(
     network: Any, layers: Sequence[Layer], dtype: torch.dtype, passes: range
 ) -> Iterator[SourceTokens]:
-    """Keep the inputs of a network's self-attention while the block runs; outputs are unchanged.
-
-    Args:
-        dtype: precision of the kept tokens, which are in main memory.
-    """
+    """Keep the inputs of a network's self-attention while the block runs; outputs are unchanged."""
     names = {layer.name for layer in layers}
     kept, done = SourceTokens(), dict.fromkeys(names, 0)
 

@@ -114,13 +114,7 @@ def check_editor(editor: Editor, settings: AttentionWarpingSettings) -> int | No
 
 
 class ViewEdits:
-    """Editor of single views, with its sources.
-
-    Args:
-        by_hand: edit of the source made elsewhere, or None.
-        edit_source: function that edits the source of an index, for a process that found the edit
-            finished.
-    """
+    """Editor of single views, with its sources."""
 
     def __init__(
         self,

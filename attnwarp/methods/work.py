@@ -161,11 +161,7 @@ class Work:
             )
 
     def starts_at(self, lowest: int, field: str) -> None:
-        """Raise ValueError unless the settings' steps fit below a starting timestep.
-
-        Args:
-            lowest: lowest starting timestep of Stable Diffusion; if it fits, all higher ones do.
-        """
+        """Raise ValueError unless the settings' steps fit below a starting timestep."""
         steps = self.settings.steps
         try:
             self.editor.schedule.published(lowest, steps, self.grid)

@@ -131,23 +131,14 @@ def work_type(dtype: torch.dtype) -> torch.dtype:
 def taps_at(
     correspondence: Correspondence, size: tuple[int, int], dtype: torch.dtype, device: torch.device
 ) -> Taps:
-    """Compute the taps of a correspondence in the source's image at another size.
-
-    Args:
-        size: (h, w) of the resized image.
-        dtype: dtype of the weights, which are computed in float64.
-    """
+    """Compute the taps of a correspondence in the source's image at another size."""
     h, w = size
     taps = taps_of(positions_in(correspondence, w, h), h, w)
     return Taps(taps.index.to(device), taps.weight.to(dtype).to(device))
 
 
 def sample_maps(maps: Tensor, taps: Taps) -> Tensor:
-    """Sum weighted pixels of maps, (..., N), in the maps' dtype.
-
-    Args:
-        taps: taps of N positions, with weights of :func:`work_type`, on the maps' device.
-    """
+    """Sum weighted pixels of maps, (..., N), in the maps' dtype."""
     total = torch.zeros((), dtype=taps.weight.dtype, device=maps.device)
     # Converted before reading: the gradient then sums the reads of a pixel in this dtype too, and
     # is rounded once.
@@ -163,7 +154,6 @@ def sample_tokens(tokens: Tensor, taps: Taps) -> Tensor:
 
     Args:
         tokens: (B, h*w, C) floating tokens, row by row of the picture.
-        taps: as in :func:`sample_maps`.
     """
     total = torch.zeros((), dtype=taps.weight.dtype, device=tokens.device)
     values = tokens.to(total.dtype)  # as in sample_maps

@@ -111,13 +111,7 @@ class InstructPix2Pix(Latent):
         prompt: str,
         regions: Sequence[npt.NDArray[Any]] | None = None,
     ) -> Pix2PixTask:
-        """Prepare an edit of (H, W, 3) pictures in [0, 1] by one instruction.
-
-        Args:
-            regions: (H, W) edited region of each picture in [0, 1]; a bundled editor averages its
-                noise there to settle choices that the instruction leaves open. None is the full
-                picture.
-        """
+        """Prepare an edit of (H, W, 3) pictures in [0, 1] by one instruction."""
         pictures = tensor_of(guides, "guides", self.factor)
         before = self.raw_latents(pictures)  # not scaled, as the model was trained
         shares = branch_shares(self.text_guidance, self.image_guidance)
