@@ -154,8 +154,8 @@ def check_out(out: Path) -> None:
 COMMANDS = {
     "attnwarp": ("poses", "fit", "edit", "render", "convert", "undistort", "edit-image"),
     "attnwarp-eval": (
-        "run", "report", "verdicts", "verify", "studies", "captures", "compare", "stability",
-        "metrics", "tracks", "encoders", "doctor", "scenes", "userstudy", "cache",
+        "run", "report", "bench", "verdicts", "verify", "studies", "captures", "compare",
+        "stability", "metrics", "tracks", "encoders", "doctor", "scenes", "userstudy", "cache",
     ),
 }  # fmt: skip
 """Commands available in only one of the two programs."""
