@@ -30,15 +30,6 @@ class Hits:
         object_id: (H, W) int32 index of the object in the scene, -1 where nothing is hit.
         primitive_id: (H, W) int64, -1 where nothing is hit.
         valid: (H, W) bool.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> from attnwarp_eval.truth import Geometry
-        >>> scene = load_scene("spheres").with_size(16, 16)
-        >>> hits = Geometry(scene).trace(scene.source)
-        >>> bool((np.isfinite(hits.depth) == hits.valid).all()), hits.normal.shape
-        (True, (16, 16, 3))
     """
 
     depth: Array
@@ -72,14 +63,6 @@ class TwoView:
             a cosine of incidence under 1e-3 by either camera.
         edge: (H, W) bool: within 2 px of a depth or object edge of the target, or, where the point
             falls inside the source image, within 2 px of one there.
-
-    Example:
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> from attnwarp_eval.truth import HIDDEN, VISIBLE, Geometry, two_view
-        >>> scene = load_scene("spheres").with_size(16, 16)
-        >>> pair = two_view(Geometry(scene), scene.source, scene.camera("yaw030"))
-        >>> bool((pair.label == VISIBLE).any()), bool((pair.label == HIDDEN).any())
-        (True, True)
     """
 
     source: Camera

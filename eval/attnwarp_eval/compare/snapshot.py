@@ -71,10 +71,6 @@ class Snapshot:
         digest: hash of the resolved study.
         cells: sorted by their key.
         missing: expected cells without a record -> the reason.
-
-    Example:
-        >>> Snapshot("my", "", ()).seeds
-        frozenset()
     """
 
     study: str

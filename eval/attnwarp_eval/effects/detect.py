@@ -33,11 +33,6 @@ class Finding:
         source: "detected", "pinned", "said" (excluded by the scene's cap on bounces) or
             "absent".
         evidence: signs in the file, in Mitsuba's graph and in the loaded scene.
-
-    Example:
-        >>> finding = Finding(True, True, "detected", ("lights[0] is a sun",))
-        >>> finding.needed, finding.simulated
-        (True, True)
     """
 
     needed: bool

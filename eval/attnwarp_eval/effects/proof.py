@@ -88,11 +88,6 @@ class Level:
         worst: the largest difference in standard errors, as a share of the picture's mean.
         detectable: the difference, as a share of the picture's mean, that a value of median noise
             would have been detected with a power of 80 %.
-
-    Example:
-        >>> level = Level("pixel", 64, 1e-9, threshold=1e-5, worst=0.02, detectable=0.01)
-        >>> level.differs
-        True
     """
 
     name: str
@@ -156,12 +151,7 @@ def levels(a: npt.ArrayLike, b: npt.ArrayLike, *, alpha: float = ALPHA) -> list[
 
 @dataclass(frozen=True)
 class Rung:
-    """One test of the ladder: its outcome in words and numbers.
-
-    Example:
-        >>> Rung("same seed", None, "the pictures differ").passed is None
-        True
-    """
+    """One test of the ladder: its outcome in words and numbers."""
 
     name: str
     passed: bool | None
@@ -183,10 +173,6 @@ class Proof:
         rungs: the tests, in order.
         detectable: the smallest detectable difference, as a share of the mean, by level.
         seconds: seconds spent.
-
-    Example:
-        >>> print(Proof("can't tell", (), {}, 1.0, "certified", ("dispersion",)).words)
-        can't tell: not simulated: dispersion; certified but for that
     """
 
     verdict: Verdict
@@ -303,12 +289,7 @@ and count.
 
 @dataclass(frozen=True)
 class Climb:
-    """The outcome of the rungs that compare pictures.
-
-    Example:
-        >>> Climb("can't tell", (), {"picture": 0.004}).detectable["picture"]
-        0.004
-    """
+    """The outcome of the rungs that compare pictures."""
 
     verdict: Verdict
     rungs: tuple[Rung, ...]

@@ -37,11 +37,6 @@ class Cap:
         at_equal_error: time ratio at equal noise, which is equal error, since its
             pictures have the plan's mean; infinite if the plan has no noise.
         interval: 95 % interval of ``at_equal_error``; None if the plan has no noise.
-
-    Example:
-        >>> cap = Cap(1, -0.06, (-0.08, -0.04), 0.2, 0.01, 1.5, 1.4, (1.3, 1.5))
-        >>> cap.bounces, cap.bias
-        (1, -0.06)
     """
 
     bounces: int
@@ -76,11 +71,6 @@ class Cost:
         again: 95 % interval of the ratio of the plan's seconds between its two runs of a round:
             inside this band nothing is faster or slower. None with too few rounds.
         cap: cap on bounces and its loss; None without a cap.
-
-    Example:
-        >>> cost = Cost(48, 16, 7, (0.1, 0.2), 2.0, (0.01, 0.03), (5.0, 7.0), (0.9, 1.1))
-        >>> cost.at_equal_noise
-        6.0
     """
 
     size: int

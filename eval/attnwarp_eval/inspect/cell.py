@@ -24,10 +24,6 @@ class Tap:
         column, row: column and row of the cell in the source's grid.
         weight: share of the warped feature, in [0, 1].
         point: (3,) surface point seen by the source at the cell's centre; NaN if none.
-
-    Example:
-        >>> Tap(3, 4, 0.25, np.zeros(3)).weight
-        0.25
     """
 
     column: int
@@ -54,15 +50,6 @@ class CellReport:
         label: label of the truth on this grid, "" without truth.
         true_xy: (2,) exact position in cells; NaN without truth.
         token: description of the carried label; "" if no run has labels.
-
-    Example:
-        >>> from attnwarp.warp import PRESETS
-        >>> from attnwarp_eval.world import world
-        >>> pair = Pair(world("spheres", 32), "yaw030", PRESETS["corrected"], None)
-        >>> row, column = pair.layer((8, 8)).mask.nonzero()[0].tolist()
-        >>> cell = cell_report(pair, (8, 8), column, row)
-        >>> cell.accepted, round(sum(tap.weight for tap in cell.taps), 6)
-        (True, 1.0)
     """
 
     column: int

@@ -25,10 +25,6 @@ class Verdict:
         margin: distance of the pixel to the other verdict, positive if it passes; NaN if
             the quantity is undefined.
         unit: unit of the margin.
-
-    Example:
-        >>> Verdict("in_front", passed=False, margin=-0.2, unit="scene units").passed
-        False
     """
 
     rule: str
@@ -47,10 +43,6 @@ class Exact:
         xy: (2,) source pixel coordinates of its surface point.
         z: depth of the point in the source camera.
         blocked_by: name of the object that the source sees instead, or "" if the way is free.
-
-    Example:
-        >>> Exact("hidden", "marble", np.array([3.5, 4.5]), 2.0, blocked_by="chrome").blocked_by
-        'chrome'
     """
 
     label: str
@@ -77,16 +69,6 @@ class PixelReport:
         seen_instead: (3,) point really seen by the source toward this point, if something occludes
             it; None if the way is free or unknown.
         exact: the truth, if available.
-
-    Example:
-        >>> from attnwarp.warp import PRESETS
-        >>> from attnwarp_eval.splats.surface import surface_splats
-        >>> from attnwarp_eval.world import world
-        >>> scene = world("spheres", 16)
-        >>> model = surface_splats(scene.scene, count=2000)
-        >>> pair = Pair(scene, "yaw030", PRESETS["corrected"], model)
-        >>> print(report(pair, 8, 12).lines()[0])
-        pixel (8, 12) marble: visible
     """
 
     column: int

@@ -62,11 +62,6 @@ class Subject:
         elsewhere: advice on the file to open for an edited view without pictures in the run; empty
             except for a run of edits.
         labels: labels of tokens that a probe of a run follows; None without one.
-
-    Example:
-        >>> subject = of_scene("spheres", 16)
-        >>> subject.pair("corrected", "yaw030").target
-        'yaw030'
     """
 
     scene: str

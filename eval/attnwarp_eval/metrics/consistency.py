@@ -53,16 +53,6 @@ class Disagreement:
         delta_e: (H, W) CIEDE2000 between the two colours (D65, 2 degree observer); NaN elsewhere.
         candidates: number of pixels considered; at exact correspondences, pixels that have
             a position.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp_eval.metrics import Disagreement
-        >>> counted = np.array([[True, False]])
-        >>> grey = np.array([[[0.1] * 3, [np.nan] * 3]])
-        >>> difference = Disagreement(counted, grey, grey, np.array([[4.0, np.nan]]), candidates=2)
-        >>> figures = difference.figures()
-        >>> figures["consistency.delta_e"], figures["consistency.share"]
-        (4.0, 0.5)
     """
 
     counted: Mask
@@ -204,14 +194,6 @@ class Flow:
         xy: (H, W, 2) source positions in pixels, centres at +0.5; NaN where there is no flow.
         accepted: (H, W) bool: inside the source picture and past the forward-backward check.
         method: name of the algorithm.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp_eval.metrics import Flow
-        >>> xy = np.array([[[0.5, 0.5], [1.5, 0.5]]])  # each pixel onto itself
-        >>> flow = Flow(xy, np.array([[True, True]]), "dis")
-        >>> flow.accepted.mean().item()
-        1.0
     """
 
     xy: Array

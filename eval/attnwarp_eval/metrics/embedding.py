@@ -28,13 +28,6 @@ class Similarity:
 
     Attributes:
         values: (N,) float64 in [-1, 1]; NaN where undefined.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp_eval.metrics import Similarity
-        >>> result = Similarity(np.array([0.5, 1.0, np.nan]))
-        >>> result.mean, result.defined, result.undefined
-        (0.75, 2, 1)
     """
 
     values: npt.NDArray[np.float64]

@@ -41,13 +41,6 @@ class Tsed:
             matches.
         matches: (P,) int, matches of each pair; 0 without a baseline.
         baseline: (P,) bool, whether the pair has two centres of projection.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp_eval.metrics import Tsed
-        >>> result = Tsed(np.array([0.3, 3.0, np.nan]), np.array([50, 40, 2]), np.full(3, True))
-        >>> result.share(1), result.share(4)  # a pair with 2 matches counts against
-        (0.3333333333333333, 0.6666666666666666)
     """
 
     medians: Array
@@ -181,12 +174,6 @@ class Keypoints:
     Attributes:
         xy: (N, 2) px, pixel centres at +0.5.
         descriptors: (N, 128) float32; None without keypoints.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp_eval.metrics import Keypoints
-        >>> len(Keypoints(np.zeros((0, 2)), None).xy)
-        0
     """
 
     xy: Array

@@ -21,10 +21,6 @@ class Margin:
     Attributes:
         absolute: margin in the metric's unit.
         relative: margin as a share of the baseline's value, added to ``absolute``.
-
-    Example:
-        >>> GATES["warp.epe_median"].around(2.0)  # 0.02 px and 2 %
-        0.06
     """
 
     absolute: float

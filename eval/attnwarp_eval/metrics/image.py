@@ -269,13 +269,6 @@ class EditPsnr:
             are not comparable by this figure: fewer edited views are easier to fit.
         mse: MSE of each view; NaN where undefined.
         psnr: PSNR of each view in dB; +inf for equal pictures, NaN where undefined.
-
-    Example:
-        >>> import math
-        >>> from attnwarp_eval.metrics import EditPsnr
-        >>> result = EditPsnr(("a", "b"), mse=(0.0, 0.002), psnr=(math.inf, 26.9897))
-        >>> result.pooled, result.mean_finite, result.identical  # of the mean error, 0.001
-        (30.0, 26.9897, 1)
     """
 
     views: tuple[str, ...]

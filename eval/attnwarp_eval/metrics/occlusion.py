@@ -172,14 +172,6 @@ class YawBin:
         views: number of views in the bin.
         counts: sums of the views' counts.
         scores: scores of the sums, NaN where undefined.
-
-    Example:
-        >>> from attnwarp_eval import metrics
-        >>> counts = dict.fromkeys(metrics.COUNTS, 0)
-        >>> counts |= {"visible_accepted": 3, "hidden_accepted": 1}
-        >>> near, far = metrics.by_yaw([(-10.0, counts)], edges=(0, 90, 180))
-        >>> near.views, near.scores["occlusion.precision"], far.views
-        (1, 0.75, 0)
     """
 
     low: float

@@ -33,11 +33,6 @@ class Reconstruction:
         points: number of the model's 3D points.
         track_length: mean number of views that see a point; NaN without a model.
         reprojection_error: mean over the points, in px; NaN without a model.
-
-    Example:
-        >>> from attnwarp_eval.metrics import Reconstruction
-        >>> Reconstruction(4, 3, 120, 2.5, 0.4).figures()["consistency.colmap_registered"]
-        0.75
     """
 
     views: int

@@ -49,12 +49,6 @@ class FirstPoints:
     Attributes:
         points: (P, 3) float64 world coordinates.
         colors: (P, 3) uint8 sRGB.
-
-    Example:
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> points = first_points(load_scene("spheres"), 20)
-        >>> points.points.shape, points.colors.dtype
-        ((20, 3), dtype('uint8'))
     """
 
     points: Array

@@ -45,13 +45,6 @@ class SurfaceSamples:
         normal: (N, 3) unit geometric normals, outward on closed shapes.
         primitive_id: (N,) int64.
         spacing: (N,) scene units: the square root of the area that each point represents.
-
-    Example:
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> geometry = Geometry(load_scene("spheres"))
-        >>> samples = sample_surface(geometry, 20, center=geometry.center, focus=2.0, seed=0)
-        >>> samples.point.shape, bool((samples.spacing > 0).all())
-        ((20, 3), True)
     """
 
     point: Array

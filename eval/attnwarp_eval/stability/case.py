@@ -33,10 +33,6 @@ class Way:
             else the module under test, such as ``raycast`` or ``metrics``.
         precision: type of the input: ``float64``, ``float32``, ``float16`` or ``bfloat16``.
         direction: the values, or their gradient.
-
-    Example:
-        >>> Way("cpu", "float32").name
-        'cpu float32 forward'
     """
 
     backend: str
@@ -85,10 +81,6 @@ class Bound:
         unit: unit of the error.
         tolerance: tolerance in that unit, or a function of the level.
         reason: reason for the tolerance.
-
-    Example:
-        >>> Bound("px", lambda offset: 1e-3 + 1e-16 * offset, "what float64 holds").at(1e6)
-        0.0010000001
     """
 
     unit: str
@@ -228,12 +220,6 @@ class Outcome:
         tolerance: tolerance in the same unit.
         refusal: message of the refusal, else empty.
         must_refuse: whether the input had to be refused.
-
-    Example:
-        >>> Outcome(1.0, True, 1e-7, 1e-5, "", False).verdict
-        'holds'
-        >>> Outcome(1.0, True, 1e-4, 1e-5, "", False).margin
-        -1.0
     """
 
     level: float

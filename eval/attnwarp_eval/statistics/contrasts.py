@@ -32,15 +32,6 @@ class Contrast:
         flips: the sign-flip test of ``by_scene``.
         student: Student's t on the same scale.
         plain: the sign-flip test of plain differences, the scale of bounds of shares.
-
-    Example:
-        >>> ours = {f"s{k}": {"v": 1.0 + k} for k in range(6)}
-        >>> theirs = {f"s{k}": {"v": 2.0 + 2 * k} for k in range(6)}
-        >>> value = contrast(theirs, ours, "ratio")
-        >>> value.flips.p, [round(bound, 3) for bound in value.shown()]
-        (0.03125, [0.5, 0.5, 0.5])
-        >>> value.verdict("lower"), value.verdict("higher")
-        ('better', 'worse')
     """
 
     scale: Scale

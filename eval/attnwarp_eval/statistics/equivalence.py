@@ -31,11 +31,6 @@ class Welch:
         error: standard error of the difference.
         freedom: Satterthwaite's degrees of freedom.
         p: two-sided probability of a difference this large if there were none.
-
-    Example:
-        >>> result = welch([1.0, 2.0, 3.0], [2.0, 4.0, 6.0])
-        >>> round(float(result.error) ** 2, 9), round(float(result.freedom), 3)  # 1/3 + 4/3
-        (1.666666667, 2.941)
     """
 
     difference: Array
@@ -154,11 +149,6 @@ class Equivalence:
     Attributes:
         difference, error: difference of the means, and its standard error, as shares of the mean.
         margin: the share that counts as equal.
-
-    Example:
-        >>> close, vague = (Equivalence(0.001, error, margin=0.02) for error in (0.001, 0.1))
-        >>> close.equal, vague.equal
-        (True, False)
     """
 
     difference: float
@@ -204,11 +194,6 @@ class PairedTest:
         difference, error: difference and standard error, as shares of the mean.
         p: two-sided p-value.
         pairs: number of pairs.
-
-    Example:
-        >>> result = paired_test([1.0, 2.0, 3.0], [1.5, 2.5, 3.6])
-        >>> result.pairs, result.p < 0.01
-        (3, True)
     """
 
     difference: float

@@ -34,11 +34,6 @@ class Interval:
         p: two-sided probability of a mean this far from 0 if the true mean is 0 (Student's t); NaN
             with fewer than two scenes.
         least, most: the lowest and the highest scene; NaN if nothing is defined.
-
-    Example:
-        >>> value = interval({"bear": [1.0, 3.0], "fence": [4.0]})
-        >>> value.mean, value.scenes, value.views
-        (3.0, 2, 3)
     """
 
     mean: float
@@ -203,13 +198,6 @@ class Ratio:
     Attributes:
         ratio: median over rounds of the ratio within a round, geometric mean over groups (scenes).
         low, high: 95 % interval; NaN if a group has fewer than :data:`FEWEST_ROUNDS`.
-
-    Example:
-        >>> value = time_ratio([[2.0, 4.0, 6.0, 8.0, 8.0, 8.0]], [[1.0, 2.0, 3.0, 4.0, 4.0, 4.0]])
-        >>> round(value.ratio, 9), round(value.low, 9), round(value.high, 9)
-        (2.0, 2.0, 2.0)
-        >>> time_ratio([[2.0, 4.0, 6.0]], [[1.0, 2.0, 3.0]]).bounded
-        False
     """
 
     ratio: float

@@ -36,15 +36,6 @@ class SignFlips:
     Attributes:
         differences: (n,) one per scene.
         rounding: size up to which differences count as 0.
-
-    Example:
-        >>> test = SignFlips(np.array([1.0, 2.0, 1.5, 1.0, 3.0, 2.5]))
-        >>> test.p  # of 64 patterns two are as far from 0
-        0.03125
-        >>> test.interval()
-        (1.0, 3.0)
-        >>> SignFlips(np.array([1.0, 2.0, 1.5])).interval()  # three scenes cannot tell at 95 %
-        (nan, nan)
     """
 
     differences: Array

@@ -22,13 +22,6 @@ class Cell:
         labels: variant names with this content.
         pictures: views whose pictures are saved.
         sources: locations of inputs that ``spec`` names by content, such as encoders.
-
-    Example:
-        >>> from attnwarp_eval.study import Cell
-        >>> a = Cell({"scene": "hash"}, "bear", "good", "depth", seed=0)
-        >>> b = Cell({"scene": "hash"}, "bear", "same", "depth", seed=0)
-        >>> a.title, a.id == b.id  # names are not in the spec
-        ('bear / good / depth', True)
     """
 
     spec: dict[str, Any]

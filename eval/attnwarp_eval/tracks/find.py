@@ -42,15 +42,6 @@ class Tracks:
         point: (N,) index of the point, 0 to P - 1.
         xy: (N, 2) float64 px of the camera, pixel centres at +0.5.
         started: (P,) bool, True for a fit's initial points, which are not judged.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp_eval.tracks.find import Tracks
-        >>> tracks = Tracks(
-        ...     np.array([0, 1]), np.array([0, 0]), np.zeros((2, 2)), np.array([False])
-        ... )
-        >>> tracks.shared(0, 1)
-        (array([0]), array([1]))
     """
 
     image: Index

@@ -191,12 +191,7 @@ def _truth(geometry: Geometry, view: WarpedView, at: Array, depth: Array) -> Tru
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure over the points of all pairs, with its bootstrap interval over target pictures.
-
-    Example:
-        >>> str(Figure(0.1234, 0.1, 0.2))
-        '0.12 (0.10 to 0.20)'
-    """
+    """A figure over the points of all pairs, with its bootstrap interval over target pictures."""
 
     value: float
     low: float

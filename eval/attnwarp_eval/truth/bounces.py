@@ -93,12 +93,6 @@ class Answer:
         fewer: light that one bounce fewer loses, in the view that refused it; None without such a
             view.
         made_by: Mitsuba's version and variant; None without a measurement.
-
-    Example:
-        >>> held = Shortfall(3, "source", 16, 0.004, 0.0005, 0.0053, 0.02)
-        >>> fewer = Shortfall(2, "yaw030", 16, 0.019, 0.001, 0.0216, 0.06)
-        >>> print(Answer(3, held, fewer, "3.9.1 llvm_ad_rgb").words)
-        3 leave out 0.40 % of a view's light (source; below 0.53 %), 2 leave out 1.90 % (yaw030)
     """
 
     bounces: Bounces

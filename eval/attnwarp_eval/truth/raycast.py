@@ -46,14 +46,6 @@ class RayHits:
         object_id: (N,) int32 index of the object in the scene, -1 on a miss.
         primitive_id: (N,) int64 triangle, sphere or rectangle within the geometry, -1 on a miss.
         valid: (N,) bool.
-
-    Example:
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> from attnwarp_eval.truth import Geometry
-        >>> geometry = Geometry(load_scene("spheres"))
-        >>> hits = geometry.trace_rays([[0, 0, 9], [0, 0, 9]], [[0, 0, -1], [0, 0, 1]])
-        >>> hits.valid.tolist(), hits.object_id[1].item()  # down meets something, up nothing
-        ([True, False], -1)
     """
 
     t: Array
