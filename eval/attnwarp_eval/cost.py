@@ -55,18 +55,16 @@ class Meter:
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
         self._stages: dict[str, float] = {}
-        self._cpu: dict[str, float] = {}
         self._views: list[float] = []
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Add the time spent inside to stage ``name``."""
-        start, start_cpu = time.perf_counter(), time.process_time()
+        start = time.perf_counter()
         try:
             yield
         finally:
-            self._stages[name] = self._stages.get(name, 0.0) + time.perf_counter() - start
-            self._cpu[name] = self._cpu.get(name, 0.0) + time.process_time() - start_cpu
+            self.add(name, time.perf_counter() - start)
 
     def add(self, name: str, seconds: float) -> None:
         """Add externally measured seconds to stage ``name``."""
@@ -84,16 +82,6 @@ class Meter:
     def count(self, **counters: int) -> None:
         """Add to the work counters, such as rays, pairs or taps."""
         self.counters.update({k: int(v) for k, v in counters.items()})
-
-    @property
-    def wall(self) -> dict[str, float]:
-        """Wall seconds by stage."""
-        return dict(self._stages)
-
-    @property
-    def cpu(self) -> dict[str, float]:
-        """CPU seconds of all threads of this process, by stage."""
-        return dict(self._cpu)
 
     def seconds(self) -> dict[str, float | None]:
         """Seconds by stage; ``warm`` is the first view's, ``steady`` the median of the others'

@@ -1,6 +1,4 @@
-"""Commands about scenes whose truth is exact: list, draw, show, render, export, calibrate,
-effects, cost.
-"""
+"""Commands about scenes whose truth is exact."""
 
 from __future__ import annotations
 
@@ -349,47 +347,3 @@ def accuracy(
             panels = list(measure(scenes or (), out=out, rounds=rounds, report=report))
         for path in write(panels, out):
             typer.echo(path)
-
-
-@app.command("time")
-def time_(
-    scenes: Annotated[
-        list[str] | None, typer.Argument(help="Scenes' names or paths; all if left out.")
-    ] = None,
-    views: Annotated[int, typer.Option(min=1, help="Views of each scene, the source first.")] = 8,
-    size: Annotated[int, typer.Option(min=16, max=4096, help="Of the pictures, px.")] = 256,
-    spp: Annotated[int, typer.Option(min=1, help="Samples a pixel.")] = 64,
-    geometry_size: Annotated[
-        int, typer.Option(min=16, max=4096, help="Of depth and ids, px.")
-    ] = 512,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="JSON, with every scene's stages.")
-    ] = False,
-) -> None:
-    """Time meshes, geometry and pictures from nothing (an empty cache)."""
-    import json
-
-    from rich.console import Console
-
-    with clear_errors():
-        from attnwarp_eval.document.write import terminal
-        from attnwarp_eval.experiments import suite
-        from attnwarp_eval.scene.file import list_scenes
-
-        times = []
-        with reporter() as report:
-            for taken in suite.measure(
-                scenes or list_scenes(),
-                views=views,
-                size=size,
-                spp=spp,
-                geometry_size=geometry_size,
-                report=report,
-            ):
-                times.append(taken)
-                # All scenes take minutes, so each is printed as soon as it is measured.
-                report.log(f"{taken.scene}: {sum(taken.wall.values()):.1f} s")
-    if as_json:
-        typer.echo(json.dumps(suite.to_dict(times), indent=1))
-        return
-    Console(width=160).print(terminal(suite.table(times)))

@@ -1,3 +1,1 @@
-"""Experiments about the instrument itself: what truth costs, what effects of light change, how long
-the suite takes.
-"""
+"""Experiments about the instrument itself: what truth costs, and what effects of light change."""

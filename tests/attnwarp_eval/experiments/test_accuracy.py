@@ -1,17 +1,15 @@
 """Measurement of the truth's own error and time, held to errors that are known."""
 
 import json
-import os
 from dataclasses import asdict
 
 import numpy as np
 import pytest
-from edit_folders import Watched
 from effect_scenes import FLOOR, PLAIN, SKY, SUN, ball, make
 from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
-from attnwarp_eval.experiments import accuracy, suite
+from attnwarp_eval.experiments import accuracy
 from attnwarp_eval.experiments.accuracy import geometry, point_visibility
 from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
 from attnwarp_eval.experiments.accuracy.write import write
@@ -158,47 +156,14 @@ def test_two_scenes_of_one_name_are_refused_and_one_named_twice_is_one(tmp_path)
     other = tmp_path / "opposed.yaml"
     other.write_text(text.replace("bounces: 1", "bounces: 2"))
     out = tmp_path / "out"
-    for command in (["accuracy", "--out", str(out)], ["time", "--json"]):
-        result = CliRunner().invoke(app, ["scenes", *command, "opposed", str(other)])
-        assert (result.exit_code, result.stdout) == (2, "") and not out.exists()
-        line = f"opposed and {other}: two scenes have the name 'opposed'"
-        assert line in " ".join(result.stderr.split())
+    command = ["scenes", "accuracy", "--out", str(out), "opposed", str(other)]
+    result = CliRunner().invoke(app, command)
+    assert (result.exit_code, result.stdout) == (2, "") and not out.exists()
+    line = f"opposed and {other}: two scenes have the name 'opposed'"
+    assert line in " ".join(result.stderr.split())
     assert [s.content_hash for s in distinct_scenes(["opposed", "fog", "opposed"])] == [
         load_scene(name).content_hash for name in ("opposed", "fog")
     ]
-
-
-def test_the_suites_time_is_that_of_an_empty_cache_and_leaves_the_cache_alone(
-    monkeypatch, tmp_path
-):
-    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path / "mine"))
-    told = []
-
-    def step(done, total, text, left=None):
-        assert (done, total) == (0, 1)
-        told.append(text)
-
-    (first,) = suite.measure(
-        ["spheres"], views=2, geometry_size=16, size=16, spp=1, report=Watched(step=step)
-    )
-    assert os.environ["ATTNWARP_CACHE"] == str(tmp_path / "mine")
-    assert (
-        first.views == 2
-        and set(first.wall) == set(suite.STAGES)
-        and all(v > 0 for v in first.wall.values())
-    )
-    assert told == [
-        "spheres: meshes",
-        "spheres: geometry of 2 views",
-        "spheres: picture 1 of 2",
-        "spheres: picture 2 of 2",
-    ]
-    # Only the first, unmeasured picture is in the person's own cache.
-    assert len(list((tmp_path / "mine" / "appearance").glob("*.npz"))) == 1
-    table = suite.table([first, first])
-    assert table.rows[-1][:2] == ["all", "4"] and len(table.rows[0]) == len(table.columns)
-    total = suite.to_dict([first, first])["total"]["wall"]["geometry"]
-    assert total == pytest.approx(2 * first.wall["geometry"])
 
 
 @pytest.mark.slow
