@@ -31,19 +31,10 @@ DOORS = [
     "attnwarp.methods",
     "attnwarp.render",
     "attnwarp.warp",
-    "attnwarp_eval.compare",
-    "attnwarp_eval.compare.write",
     "attnwarp_eval.document.charts",
     "attnwarp_eval.document.model",
     "attnwarp_eval.document.numbers",
     "attnwarp_eval.document.write",
-    "attnwarp_eval.effects.detect",
-    "attnwarp_eval.effects.proof",
-    "attnwarp_eval.effects.saving",
-    "attnwarp_eval.inspect.cell",
-    "attnwarp_eval.inspect.command",
-    "attnwarp_eval.inspect.pixel",
-    "attnwarp_eval.inspect.subject",
     "attnwarp_eval.metrics",
     "attnwarp_eval.report",
     "attnwarp_eval.scene.file",
@@ -57,7 +48,7 @@ DOORS = [
     "attnwarp_eval.study",
     "attnwarp_eval.truth",
 ]
-"""Modules that other code imports from: what ``__all__`` names, else their own public names."""
+"""Modules that users' code imports from: what ``__all__`` names, else their own public names."""
 
 
 def public(door):

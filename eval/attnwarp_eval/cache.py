@@ -27,9 +27,7 @@ def content_key(*parts: Any) -> str:
 
 
 SEAL = b"attnwarp sha256 "
-"""Precedes the checksum at a file's end. The preceding bytes are a plain npz, which NumPy also
-reads with the seal appended.
-"""
+"""Seal before the checksum at a file's end, which NumPy ignores when it reads the npz."""
 
 _warned: set[Path] = set()
 """Damaged files already reported by this process."""
@@ -90,9 +88,7 @@ def write_arrays(kind: str, key: str, arrays: Mapping[str, Any]) -> None:
 
 
 _unseen: float = float("inf")
-"""Bytes that this process has written since it last scanned the whole folder; it scans at its
-first write.
-"""
+"""Bytes written by this process since it scanned the folder; it scans at the first write."""
 
 
 def _keep_within(limit: int, written: int) -> None:

@@ -28,9 +28,7 @@ def to_srgb(linear: npt.ArrayLike) -> npt.NDArray[Any]:
 
 
 def to_linear(srgb: npt.ArrayLike) -> npt.NDArray[Any]:
-    """sRGB-encoded values in [0, 1] to linear ones; the inverse of :func:`to_srgb`. The float dtype
-    is kept.
-    """
+    """sRGB values in [0, 1] to linear, of the same float dtype; inverse of :func:`to_srgb`."""
     value = np.asarray(srgb)
     value = np.clip(value if value.dtype.kind == "f" else value.astype(np.float64), 0, 1)
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(

@@ -1,6 +1,4 @@
-"""Cost of a figure: seconds by stage, work counters, peak memory, and the machine that it was
-measured on.
-"""
+"""Cost of a figure: seconds by stage, work counters, peak memory, and the machine."""
 
 from __future__ import annotations
 
@@ -84,9 +82,7 @@ class Meter:
         self.counters.update({k: int(v) for k, v in counters.items()})
 
     def seconds(self) -> dict[str, float | None]:
-        """Seconds by stage; ``warm`` is the first view's, ``steady`` the median of the others'
-        (None without them).
-        """
+        """Seconds by stage; ``warm``: the first view, ``steady``: median of others, or None."""
         steady = statistics.median(self._views[1:]) if len(self._views) > 1 else None
         warm = self._views[0] if self._views else None
         return {**self._stages, "warm": warm, "steady": steady, "method": sum(self._views)}
@@ -130,8 +126,6 @@ def in_turn(
 
     Args:
         contestants: at least one; called with the number of the round, from 1.
-        rounds: number of rounds kept.
-        seed: seed of the order.
         before: untimed callback with the index of the next contestant.
 
     >>> turns = in_turn([lambda turn: "a", lambda turn: "b"], rounds=3)

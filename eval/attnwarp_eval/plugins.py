@@ -17,9 +17,7 @@ GROUP = "attnwarp_eval"
 """Group of entry points: each names a module of an installed package, such as the laboratory."""
 
 VARIABLE = "ATTNWARP_PLUGINS"
-"""Environment variable: modules to import as well, separated by commas. Workers of the same machine
-inherit it.
-"""
+"""Environment variable: modules to import too, by commas. Local workers inherit it."""
 
 
 @cache

@@ -46,7 +46,6 @@ class TwoView:
     """The exact relation of two views. H, W are the target's.
 
     Attributes:
-        source, target: the cameras.
         hits: hits of the target's pixels.
         xy: (H, W, 2) float64 source pixel coordinates of the same surface point; NaN where there is
             no surface or it is not in front of the source camera.
@@ -81,9 +80,7 @@ class TwoView:
 
     @property
     def outside(self) -> Mask:
-        """(H, W) bool: a surface, certainly not inside the source image (out of frame, or behind
-        the camera).
-        """
+        """(H, W) bool: a surface certainly out of the source's frame or behind its camera."""
         return self.hits.valid & (self.label == NONE)
 
     @property

@@ -39,8 +39,6 @@ class World:
 
     Attributes:
         content_hash: hash of the scene's file, as in a cell's spec.
-        source: the source camera.
-        targets: the target cameras by name.
         signed_yaw: degrees from the source in [-180, 180), by the target's name.
         yaw: the same folded to [0, 180].
     """
@@ -108,9 +106,7 @@ class World:
         return to_srgb(appearance(self.scene, self.camera(name), spp=spp, seed=0))
 
     def _features(self, name: str, size: int, channels: int, seed: int) -> Features:
-        """(C, h, w) the feature field on a view's grid; 0 on the source's background, NaN on a
-        target's.
-        """
+        """(C, h, w) feature field of a view; background 0 in the source, NaN in a target."""
         points = self.geometry.trace(self.camera(name).resize(size, size)).point
         background = 0.0 if name == self.source.name else np.nan
         return self._field(channels, seed).on_grid(points, background=background)
@@ -129,9 +125,7 @@ class World:
 
 
 def world(scene: str, size: int) -> World:
-    """The world of a scene (a name or a path) at an image size; the last one is cached while its
-    file is unchanged.
-    """
+    """The world of a scene (name or path) at an image size; the last unchanged one is cached."""
     return _world(scene, size, scene_file(scene).read_bytes())
 
 
@@ -142,9 +136,7 @@ def _world(scene: str, size: int, content: bytes) -> World:
 
 
 def turned(scene: Scene, yaw: float) -> Camera:
-    """The scene's source camera, rotated around its look-at point by ``yaw`` degrees, at the
-    same height.
-    """
+    """The source camera, turned about its look-at point by ``yaw`` degrees, level."""
     spec = scene.spec.cameras
     angle = np.radians(spec.source.yaw + yaw)
     position = (

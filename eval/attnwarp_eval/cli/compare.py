@@ -171,9 +171,7 @@ def _page(
 
 
 def _run(folder: Path) -> tuple[Snapshot, Pictures, list[str]]:
-    """Read a run, its pictures, and notes for the reader; the run's records, which are many
-    times as large, are freed.
-    """
+    """A run, its pictures, and notes for the reader; its records, far larger, are freed."""
     from attnwarp_eval.compare.pictures import pictures_of_run
     from attnwarp_eval.compare.snapshot import snapshot
     from attnwarp_eval.report import read_results

@@ -47,9 +47,7 @@ def doctor(
 
 
 def lines(check: Check) -> str:
-    """Text lines of a check: its state and name, then the finding, the cost, and the
-    remedy.
-    """
+    """Text lines of a check: its state and name, then the finding, the cost, and the remedy."""
     text = textwrap.wrap(
         f"{check.name}: {check.text}",
         WIDTH,

@@ -36,11 +36,8 @@ class Check:
     """Check of one ability of the machine.
 
     Attributes:
-        name: name of the ability.
         state: "lack": everything runs without it, at a cost; "broken": something needed fails.
-        text: finding.
         cost: cost of the lack, or the part that fails.
-        remedy: remedy.
     """
 
     name: str

@@ -30,12 +30,6 @@ def write_baseline(path: Path, snapshot: Snapshot) -> None:
 
     Raises:
         BaselineError: cells of the run are missing.
-
-    Example:
-        >>> from pathlib import Path
-        >>> write_baseline(Path("baseline.jsonl"), Snapshot("my", "0" * 64, ()))
-        >>> read_baseline(Path("baseline.jsonl")).study
-        'my'
     """
     if snapshot.missing:
         raise BaselineError(
@@ -86,15 +80,6 @@ def read_baseline(path: Path) -> Snapshot:
     Raises:
         BaselineError: the file is not a baseline, or was changed after it was written.
         OSError: the file cannot be read.
-
-    Example:
-        >>> from pathlib import Path
-        >>> _ = Path("baseline.jsonl").write_text("")
-        >>> try:
-        ...     read_baseline(Path("baseline.jsonl"))
-        ... except BaselineError as error:
-        ...     print(error)
-        baseline.jsonl: not a baseline (empty); take the file...
     """
     try:
         text = path.read_bytes().decode()

@@ -61,7 +61,6 @@ class Row:
     """The verdict on one metric of one variant over all scenes and views.
 
     Attributes:
-        probe, variant, metric: probe, variant and metric.
         verdict: verdict; "equal" only if shown within the margin.
         baseline, run: means over scenes of the means over the views defined on both sides.
         difference: run - baseline, paired on scene and view; of absolute values for a figure that
@@ -153,16 +152,6 @@ def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparis
         run: judged figures.
         common: whether to compare only common cells, seeds included. The rest is then no fault,
             and is listed in ``left_out``.
-
-    Example:
-        >>> from attnwarp_eval.compare.snapshot import Figure
-        >>> def measured(value):
-        ...     figures = {"depth.abs_rel": Figure(1, {"yaw010": value})}
-        ...     return Snapshot("my", "", (Measured("bear", "depth", ("a",), 0, "", {}, figures),))
-        >>> compare(measured(0.01), measured(0.01)).rows[0].verdict
-        'equal'
-        >>> compare(measured(0.01), measured(0.02)).rows[0].verdict
-        'worse'
     """
     left_out: list[str] = []
     if common and (seeds := baseline.seeds & run.seeds):
@@ -378,7 +367,6 @@ class _Group:
 
     Attributes:
         before, now: measured values.
-        difference: paired difference.
         gaps: whether any value of a view and seed is undefined.
         worsening: scene/view -> worsening of the run, in the metric's unit.
     """

@@ -24,7 +24,6 @@ class Change:
     """A view whose figures changed, and its pictures on both sides.
 
     Attributes:
-        scene, probe, variant, view: scene, probe, variant and view of the figures.
         metric: metric with the value that moved by the most margins.
         before, now: values of the metric.
         margins: size of the change in margins; infinite if only one side is defined.
@@ -96,9 +95,7 @@ def write_pictures(baseline: Path, pictures: Pictures) -> None:
 
 
 def _folder(pictures: Path, cell: str, seed: int, view: str) -> Path:
-    """Folder of the pictures of a view, which may have a slash in its name, such as
-    ``edit/yaw030``.
-    """
+    """Folder of the pictures of a view; its name may have a slash, as in ``edit/yaw030``."""
     return inside(pictures, f"{cell}-{seed}/{view.replace('/', '__')}")
 
 
@@ -109,13 +106,7 @@ def _views(cell: Measured) -> list[str]:
 def largest_changes(
     baseline: Snapshot, run: Snapshot, before: Pictures, after: Pictures, most: int = 6
 ) -> list[Change]:
-    """The pictured views whose figures changed by the most margins.
-
-    Example:
-        >>> from attnwarp_eval.compare import Snapshot
-        >>> largest_changes(Snapshot("my", "", ()), Snapshot("my", "", ()), {}, {})
-        []
-    """
+    """The pictured views whose figures changed by the most margins."""
     changes = [
         change
         for first, second, variant in _shared(baseline, run)

@@ -1,6 +1,4 @@
-"""Parts of a run that a comparison reads: gated figures view by view, counters, and definitions of
-the cells.
-"""
+"""Parts of a run that a comparison reads: gated figures by view, counters, definitions."""
 
 from __future__ import annotations
 
@@ -26,7 +24,6 @@ class Figure:
     """One gated metric of one cell.
 
     Attributes:
-        version: version of the metric.
         values: by view, to nine significant digits; NaN where undefined.
     """
 
@@ -39,7 +36,6 @@ class Measured:
     """One measured cell.
 
     Attributes:
-        scene, probe, seed: scene, probe and seed of the cell.
         variants: all names of its content in the study.
         definition: hash of all inputs of its figures except the seed.
         counters: counts of work.
@@ -67,7 +63,6 @@ class Snapshot:
     """One side of a comparison.
 
     Attributes:
-        study: name of the study.
         digest: hash of the resolved study.
         cells: sorted by their key.
         missing: expected cells without a record -> the reason.
@@ -89,16 +84,6 @@ def read_snapshot(store: Store) -> Snapshot:
 
     Raises:
         StoreError: the folder is not a run, or its study cannot be read.
-
-    Example:
-        >>> from attnwarp_eval.study import parse_study
-        >>> from attnwarp_eval.study.run import expected, plan
-        >>> content = dict(name="my", scenes=["spheres"], variants={"a": {}})
-        >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
-        >>> store = Store("run")
-        >>> store.write_study(expected(plan(study, store)))
-        >>> sorted(read_snapshot(store).missing)
-        [('spheres', 'calibration', 'calibration', 0), ('spheres', 'depth', 'a', 0)]
     """
     return snapshot(read_results(store))
 

@@ -35,12 +35,7 @@ LONGEST = 50
 
 
 def summary(comparison: Comparison) -> str:
-    """The outcome in one line.
-
-    Example:
-        >>> summary(Comparison("quick", True, 3, (), ()))
-        "nothing to compare: 0 worse, 0 can't tell, 0 better, 0 equal; 0 missing or changed"
-    """
+    """The outcome in one line."""
     counts = Counter[str](row.verdict for row in comparison.rows)
     text = ", ".join(f"{counts[name]} {name}" for name in ORDER)
     if comparison.incomplete:
@@ -57,12 +52,7 @@ def summary(comparison: Comparison) -> str:
 
 
 def document(comparison: Comparison, notes: Sequence[str] = ()) -> Report:
-    """The comparison as a document: faults first, then every verdict except "equal".
-
-    Example:
-        >>> document(Comparison("quick", True, 3, (), ())).title
-        'Comparison of study quick'
-    """
+    """The comparison as a document: faults first, then every verdict except "equal"."""
     lead = [f"**{summary(comparison)}**", *(f"**Note**: {n}." for n in notes), _method(comparison)]
     if comparison.too_little:
         lead.append(f"Too little to compare: {comparison.too_little}.")
@@ -95,15 +85,9 @@ def page(
     """The comparison as one HTML file, with every figure, and the pictures of the largest changes.
 
     Args:
-        comparison: comparison with the verdicts.
         changes: the pictured views that changed, the largest change first.
         why_none: reason for missing pictures if ``changes`` is empty.
         notes: sentences before the verdicts.
-
-    Example:
-        >>> text = page(Comparison("quick", True, 3, (), ()), [], "No figure changed.")
-        >>> "No figure changed." in text
-        True
     """
     report = document(comparison, notes)
     pictures = Section("Pictures of what changed most", [why_none] if not changes else [HOW])
@@ -149,12 +133,7 @@ def _sliders(change: Change) -> list[Slider]:
 
 
 def as_json(comparison: Comparison, notes: Sequence[str] = ()) -> dict[str, Any]:
-    """The whole comparison as JSON: null where undefined.
-
-    Example:
-        >>> as_json(Comparison("quick", True, 3, (), ()))["regressed"]
-        False
-    """
+    """The whole comparison as JSON: null where undefined."""
     return dict(
         without_nan(
             {

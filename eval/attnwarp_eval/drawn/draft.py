@@ -46,7 +46,6 @@ class Thing:
 
     Attributes:
         kind: a word of :data:`~attnwarp_eval.drawn.worlds.OBJECTS`.
-        instance: number of the shape.
         look: finish and colours; of the first thing, of its first part.
         objects: objects in the format of a scene file.
         reach: radius of the enclosing circle on the ground, and height.

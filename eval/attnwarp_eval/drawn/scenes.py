@@ -82,7 +82,6 @@ def draw(number: int, seed: int, axes: Mapping[str, float] | None = None) -> Dra
 
     Args:
         number: number of the scene, from 0.
-        seed: seed of the population.
         axes: fixed positions on axes; the others are drawn.
 
     Example:

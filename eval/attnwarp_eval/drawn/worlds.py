@@ -29,9 +29,7 @@ TWO_COLORED = ("striped", "checked")
 STATUES = ("golden", "silver", "bronze", "stone", "marble", "wooden")
 
 ATTRIBUTES = ("object", "finish", "color", "second", "ground", "time")
-"""Attributes that describe a picture, each an index into its words; -1 if it has none, or a caption
-does not mention it.
-"""
+"""Attributes of a picture, indices into their words; -1 if absent or not mentioned."""
 
 HSV: dict[str, tuple[float, float, float]] = {
     "red": (2, 0.82, 0.78), "orange": (25, 0.88, 0.93), "yellow": (51, 0.80, 0.94), "green": (122, 0.60, 0.55),
@@ -45,17 +43,13 @@ HELD_OUT_SHAPE = 100_000
 
 
 def held_out(thing: int, color: int) -> bool:
-    """Return True if an object in a colour is kept from training: one pair of ten, every object and
-    every colour alike.
-    """
+    """Return True for the pairs of object and colour kept from training: one of ten."""
     return (3 * thing + 7 * color) % 10 == 4
 
 
 @dataclass(frozen=True)
 class Look:
-    """Appearance of a world: indices into the words of each attribute, and a seed for shades and
-    light.
-    """
+    """Appearance of a world: indices into attributes' words, and a seed of shades and light."""
 
     finish: int
     color: int

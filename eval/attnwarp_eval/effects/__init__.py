@@ -1,3 +1,1 @@
-"""Light transport: effects that a scene needs, the cheapest plan that shows them, and its
-proof.
-"""
+"""Light transport: effects that a scene needs, the cheapest plan that shows them, its proof."""

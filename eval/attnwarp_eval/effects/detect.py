@@ -47,12 +47,6 @@ def detect(scene: Scene) -> dict[Effect, Finding]:
 
     Raises:
         SceneError: the sources disagree, so a plan from the file would be wrong.
-
-    Example:
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> findings = detect(load_scene("opposed"))
-        >>> findings["shadows"].needed, findings["refraction"].needed
-        (True, False)
     """
     spec_effects = transport.called_for(scene.spec)
     plugins, objects = graph(scene)
@@ -224,15 +218,7 @@ def _varies(texture: Any) -> bool:
 
 
 def report(scene: Scene, *, cost: Cost | None = None) -> dict[str, Any]:
-    """Report on a scene's effects as JSON: ``effects``, ``plan``, ``geometry``,
-    ``everything_on``, ``cost``.
-
-    Example:
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> about = report(load_scene("opposed"))
-        >>> about["effects"]["refraction"]["evidence"]
-        ('no glass; no BSDF that transmits',)
-    """
+    """Effects of a scene as JSON, with the plans and, if given, their cost."""
     out: dict[str, Any] = {
         "scene": scene.name,
         "content": scene.content_hash,
@@ -247,14 +233,7 @@ def report(scene: Scene, *, cost: Cost | None = None) -> dict[str, Any]:
 
 
 def describe(scene: Scene, about: dict[str, Any]) -> Iterator[str]:
-    """Text lines of :func:`report`.
-
-    Example:
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> scene = load_scene("opposed")
-        >>> next(describe(scene, report(scene)))
-        'opposed: Two sides of a wall'
-    """
+    """Text lines of :func:`report`."""
     yield f"{scene.name}: {scene.title}"
     yield ""
     for name, finding in about["effects"].items():

@@ -57,15 +57,7 @@ BLOCK = 8
 
 
 def blocks(pictures: npt.ArrayLike, size: int = BLOCK) -> Array:
-    """Means over blocks of ``size`` x ``size`` pixels: (n, H, W, C) to (n, ceil(H / size), ceil(W /
-    size), C).
-
-    Example:
-        >>> pictures = np.arange(16.0).reshape(1, 4, 4, 1)
-        >>> blocks(pictures, 2)[0, :, :, 0]
-        array([[ 2.5,  4.5],
-               [10.5, 12.5]])
-    """
+    """Means over blocks of ``size`` x ``size`` pixels, smaller at the border, of (n, H, W, C)."""
     data = np.asarray(pictures, np.float64)
     rows, columns = (np.arange(0, n, size) for n in data.shape[1:3])
     sums = np.add.reduceat(np.add.reduceat(data, rows, axis=1), columns, axis=2)
@@ -110,11 +102,6 @@ def levels(a: npt.ArrayLike, b: npt.ArrayLike, *, alpha: float = ALPHA) -> list[
     Args:
         a, b: (n, H, W, C) and (m, H, W, C) pictures of independent seeds. Channels, which share
             noise, are averaged.
-
-    Example:
-        >>> noise = np.random.default_rng(0).normal(1, 0.1, (2, 12, 8, 8, 3))
-        >>> [level.name for level in levels(noise[0], noise[1] + 0.02) if level.differs]
-        ['block', 'picture']
     """
     from scipy import stats
 
@@ -172,7 +159,6 @@ class Proof:
         not_simulated: effects that the scene needs and that neither side simulates.
         rungs: the tests, in order.
         detectable: the smallest detectable difference, as a share of the mean, by level.
-        seconds: seconds spent.
     """
 
     verdict: Verdict
@@ -233,16 +219,6 @@ def prove(
     Raises:
         ValueError: fewer than 10 seeds a side.
         SceneError: file and loaded scene disagree about the effects.
-
-    Example:
-        A plan that leaves out a light is refused before anything is rendered.
-
-        >>> from dataclasses import replace
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> scene = load_scene("opposed")
-        >>> whole = plan(scene)
-        >>> prove(scene, replace(whole, passes=whole.passes[:1])).verdict
-        'refused'
     """
     if seeds < 10:
         raise ValueError(f"seeds: got {seeds}, expected at least 10 a side")
@@ -282,9 +258,7 @@ def prove(
 
 
 Pictures = Callable[[int, int, int, int], Array]
-"""Pictures (count, H, W, C) of a side (0 the plan, 1 everything on), samples a pixel, first seed
-and count.
-"""
+"""Pictures (count, H, W, C) of a side (0 plan, 1 everything on), spp, first seed, count."""
 
 
 @dataclass(frozen=True)
@@ -316,13 +290,6 @@ def climb(
         seconds: time limit of Welch's pictures, which limits the samples a pixel.
         seed: the first seed; the rungs use the next ones.
         alpha: probability that two equal sides are refused.
-
-    Example:
-        >>> def pictures(side, spp, first, count):
-        ...     noise = np.random.default_rng((side, spp, first)).normal(size=(count, 8, 8, 3))
-        ...     return 1 + 0.1 * noise / np.sqrt(spp)
-        >>> climb(pictures).verdict
-        'certified'
     """
     from scipy import stats
 
@@ -392,9 +359,7 @@ def _with_spp(made: Plan, spp: int) -> Plan:
 
 
 def _samples(pictures: Pictures, seed: int, seeds: int, seconds: float) -> int:
-    """Samples a pixel at which 2.33 standard errors come to half the margin, or as many as the time
-    allows.
-    """
+    """Samples a pixel at which 2.33 standard errors are half the margin, as time allows."""
     trial, count = 4, 6
     start = time.perf_counter()
     means = [pictures(side, trial, seed + 100 * side, count).mean((1, 2, 3)) for side in (0, 1)]

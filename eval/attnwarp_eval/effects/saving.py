@@ -27,7 +27,6 @@ class Cap:
     """Loss due to a scene's cap on bounces, and cost of everything on.
 
     Attributes:
-        bounces: the cap.
         bias: mean light of the plan's pictures over that of everything on without a cap, less 1.
         bias_interval: 95 % interval of ``bias``, by Welch's test on the logarithms of the rounds'
             means; both None for a black picture.
@@ -85,9 +84,7 @@ class Cost:
 
     @property
     def at_equal_noise(self) -> float:
-        """Factor by which everything on takes longer for the same noise; infinite if the plan
-        has none.
-        """
+        """Factor by which everything on takes longer at equal noise; infinite without noise."""
         return (
             self.faster * self.variance[1] / self.variance[0]
             if self.variance[0] > 0
@@ -116,12 +113,6 @@ def measure(
     Args:
         size, spp: size in px and samples a pixel of the picture; by default large enough that
             tracing, not starting, takes most of the time.
-
-    Example:
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> cost = measure(load_scene("opposed"), size=8, spp=1, rounds=2)
-        >>> cost.rounds, cost.faster > 0
-        (2, True)
     """
     size, spp = size or (96 if variant() == LLVM else 48), spp or (64 if variant() == LLVM else 16)
     small = scene.with_size(size, size)
@@ -172,16 +163,12 @@ def measure(
 
 
 def _slower(ours: list[float], other: list[float]) -> float:
-    """Median of the ratios of rounds, consistent with :func:`_ratio_interval`: two rounds
-    are paired in time.
-    """
+    """Median of the ratios of rounds, paired in time as in :func:`_ratio_interval`."""
     return float(np.median(np.array(other) / np.array(ours)))
 
 
 def _cut(ours: Array, full: Array) -> tuple[float | None, tuple[float, float] | None]:
-    """Relative difference of two means with its 95 % interval, from the means of independent
-    pictures.
-    """
+    """Relative difference of two means, from independent pictures, with its 95 % interval."""
     if min(ours.min(), full.min()) <= 0 or len(ours) < 2:
         return None, None
     # Logarithms, which include the noise of the reference.
@@ -192,9 +179,7 @@ def _cut(ours: Array, full: Array) -> tuple[float | None, tuple[float, float] | 
 def _ratio_interval(
     ours: Array, other: Array, ours_seconds: list[float], other_seconds: list[float]
 ) -> tuple[float, float] | None:
-    """95 % of the ratio of variance times time, by resampling rounds; None if ``ours`` has no
-    noise.
-    """
+    """95 % of the ratio of variance times time, resampling rounds; None without noise."""
     rounds = len(ours)
     if not ours.var(0).any():
         return None

@@ -36,9 +36,7 @@ AMPLIFIED = 8.0
 """Factor that amplifies the shown difference of two pictures."""
 
 PICTURE_SIZE, PLAN_SAMPLES, FULL_SAMPLES = 160, 64, 256
-"""Width and samples of the pictures side by side. Enough samples for the difference to show more
-than noise.
-"""
+"""Width and samples of the pictures side by side; enough for more than noise to show."""
 
 
 @dataclass(frozen=True)
@@ -63,13 +61,6 @@ def measure_entry(scene: Scene, settings: Settings, report: Reporter = SILENT) -
 
     Args:
         settings: settings of the entry; :func:`side_by_side` makes the pictures.
-
-    Example:
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> settings = Settings(prove=False, rounds=0)
-        >>> entry = measure_entry(load_scene("opposed"), settings)
-        >>> entry["needed"]
-        ['geometry', 'direct', 'shadows', 'environment', 'textures']
     """
     from attnwarp_eval.effects.proof import prove
     from attnwarp_eval.truth.llvm import variant
@@ -130,14 +121,7 @@ def side_by_side(scene: Scene, path: Path) -> dict[str, Any]:
 
 
 def table(entries: Iterable[Mapping[str, Any]]) -> Table:
-    """The entries as a table: effects, plan, proof and times.
-
-    Example:
-        >>> planned = {"integrator": "direct", "sensor": {"type": "perspective"}}
-        >>> entry = {"scene": "a", "needed": ["direct"], "not_simulated": [], "plan": planned}
-        >>> table([entry]).rows[0][:5]
-        ['a', '–', '–', 'direct', 'not asked']
-    """
+    """The entries as a table: effects, plan, proof and times."""
     columns = [
         "scene",
         "beyond the usual",
@@ -167,25 +151,14 @@ def table(entries: Iterable[Mapping[str, Any]]) -> Table:
 
 
 def plan_words(planned: Mapping[str, Any]) -> str:
-    """A plan in a few words: integrator, and the camera unless it is a pinhole.
-
-    Example:
-        >>> plan_words({"integrator": "path", "sensor": {"type": "thinlens"}})
-        'path, thin lens'
-    """
+    """A plan in a few words: integrator, and the camera unless it is a pinhole."""
     return str(planned["integrator"]) + (
         ", thin lens" if planned["sensor"]["type"] == "thinlens" else ""
     )
 
 
 def proof_words(proof: Mapping[str, Any]) -> str:
-    """A verdict in a few words, with the comparison's verdict if an effect is not
-    simulated.
-
-    Example:
-        >>> proof_words({"verdict": "certified", "of_simulated": "certified"})
-        'certified'
-    """
+    """A verdict in a few words, with the comparison's if an effect is not simulated."""
     if proof["verdict"] == proof["of_simulated"]:
         return str(proof["verdict"])
     return f"{proof['verdict']} ({proof['of_simulated']} but for what is not simulated)"

@@ -41,7 +41,6 @@ class Capture:
 
     Attributes:
         near: near-plane depth in scene units, as in a fit and an edit.
-        source: the source camera.
         targets: all other cameras by the name of their file, without suffix.
         center: (3,) point nearest to all optical axes.
         up: (3,) mean of the cameras' upward axes.
@@ -83,9 +82,7 @@ class Capture:
         return self.source if name == self.source.name else self.targets[name]
 
     def surface(self, name: str, settings: WarpSettings) -> Surface:
-        """Surface of the splats in a view, rendered once for all settings that render
-        alike.
-        """
+        """Surface of the splats in a view, rendered once for all settings that render alike."""
         return self._rendered(name, settings.depth, settings.depth_statistic)
 
     def _render(self, name: str, depth: SplatDepth, depth_statistic: DepthStatistic) -> Surface:
@@ -111,8 +108,6 @@ class Edit:
 
     Attributes:
         path: folder of the edit.
-        instruction: instruction of the edit.
-        source: name of the source view.
         views: names of the edited target views.
         settings: settings of the edit's warp.
         steps: "before", the stages, and "edited" once the edit is done.
@@ -218,11 +213,6 @@ def one_of(value: str, choices: Sequence[str], name: str) -> None:
 
     Raises:
         InputError: ``value`` is none of ``choices``.
-
-    Example:
-        >>> one_of("papper", ["corrected", "paper"], "variant")
-        Traceback (most recent call last):
-        attnwarp.errors.InputError: variant: got 'papper'; did you mean 'paper'?; expected ...
     """
     if value not in choices:
         listed = ", ".join(choices[:12]) + (", ..." if len(choices) > 12 else "")

@@ -37,7 +37,6 @@ class CellReport:
     """Report on a cell of the target's feature grid.
 
     Attributes:
-        column, row: column and row of the cell.
         size: (h, w) of the target's grid.
         depth: depth at the cell's centre, along the target's axis; NaN if taps straddle an edge.
         point: (3,) surface point in the world; NaN without a depth.
@@ -95,12 +94,6 @@ def cell_of(pair: Pair, size: Size, column: int, row: int) -> tuple[int, int]:
 
     Args:
         size: (h, w) of the feature grid.
-
-    Example:
-        >>> from attnwarp.warp import PRESETS
-        >>> from attnwarp_eval.world import world
-        >>> cell_of(Pair(world("spheres", 32), "yaw030", PRESETS["corrected"], None), (8, 8), 31, 4)
-        (7, 1)
     """
     (height, width), (h, w) = pair.size, size
     return (2 * column + 1) * w // (2 * width), (2 * row + 1) * h // (2 * height)
@@ -114,13 +107,6 @@ def cell_report(pair: Pair, size: Size, column: int, row: int) -> CellReport:
 
     Raises:
         ValueError: the cell lies outside the grid.
-
-    Example:
-        >>> from attnwarp.warp import PRESETS
-        >>> from attnwarp_eval.world import world
-        >>> pair = Pair(world("spheres", 32), "yaw030", PRESETS["corrected"], None)
-        >>> cell_report(pair, (8, 8), 4, 6).lines()[0].startswith("cell (4, 6) of 8 x 8: ")
-        True
     """
     h, w = size
     if not (0 <= column < w and 0 <= row < h):

@@ -23,10 +23,6 @@ def inspect_command(
         seed: a seed of the run; by default the first.
         color: quantity that colours the surface; by default the command's choice.
         pixel: COLUMN,ROW of a target pixel to explain.
-
-    Example:
-        >>> inspect_command("runs/demo", "bear", "bounds only", "yaw060")
-        "attnwarp-eval inspect runs/demo --scene bear --variant 'bounds only' --view yaw060"
     """
     words = ["attnwarp-eval", "inspect", os.fspath(run), "--scene", scene]
     words += ["--variant", variant, "--view", view]

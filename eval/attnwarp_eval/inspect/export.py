@@ -1,6 +1,4 @@
-"""Export of the current view to a file to share: .glb for viewers, .vtp with every number, .html as
-a page.
-"""
+"""Export of the view to share: .glb for viewers, .vtp with every number, .html as a page."""
 
 from __future__ import annotations
 

@@ -60,9 +60,7 @@ COLORINGS = (
     EDIT_DISAGREEMENT,
     PART_LABELS,
 )
-"""Colourings of the target's visible surface; :attr:`Pair.colorings` has those that a pair can
-show.
-"""
+"""Colourings of the target's surface; :attr:`Pair.colorings` has those that a pair can show."""
 
 NEEDS_TRUTH = ("endpoint error", "depth error", "covered by")
 
@@ -495,7 +493,6 @@ class Pair:
 
         Args:
             layer: (h, w) of a feature grid, whose cells the warped pictures then have.
-            step: step of the edit.
         """
         source, target = self.images
         parts = {"source": source, "target": target}

@@ -20,11 +20,9 @@ class Verdict:
     """Verdict of a rule at one pixel.
 
     Attributes:
-        rule: name of the rule.
         passed: verdict of the rule.
         margin: distance of the pixel to the other verdict, positive if it passes; NaN if
             the quantity is undefined.
-        unit: unit of the margin.
     """
 
     rule: str
@@ -57,7 +55,6 @@ class PixelReport:
     """Report on a target pixel.
 
     Attributes:
-        column, row: column and row of the pixel.
         point: (3,) surface point in the world; NaN without a surface.
         depths: z along the target's axis, by definition.
         xy: (2,) source pixel coordinates of the warp.
@@ -121,16 +118,6 @@ def report(pair: Pair, column: int, row: int) -> PixelReport:
 
     Raises:
         ValueError: the pixel lies outside the target's image.
-
-    Example:
-        >>> from attnwarp.warp import PRESETS
-        >>> from attnwarp_eval.splats.surface import surface_splats
-        >>> from attnwarp_eval.world import world
-        >>> scene = world("spheres", 16)
-        >>> model = surface_splats(scene.scene, count=2000)
-        >>> pair = Pair(scene, "yaw030", PRESETS["corrected"], model)
-        >>> report(pair, 8, 12).endpoint_error < 1
-        True
     """
     height, width = pair.size
     if not (0 <= column < width and 0 <= row < height):

@@ -1,6 +1,4 @@
-"""One variant of a scene in a run's folder: the settings of its warp, its fitted splats, and
-pictures of edited views.
-"""
+"""One variant of a scene in a run: settings of its warp, fitted splats, edited views."""
 
 from __future__ import annotations
 
@@ -29,7 +27,6 @@ class RunEdit:
     Attributes:
         folder: path of the run.
         source, target: names of the views.
-        files: files by content.
         steps: "before" and "edited".
     """
 

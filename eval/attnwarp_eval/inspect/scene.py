@@ -68,7 +68,6 @@ def coarser_surface(seen: Seen, surface: pyvista.PolyData, faces: int) -> pyvist
 
     Args:
         surface: result of :func:`seen_surface`, for its colours.
-        faces: approximate number of faces.
     """
     colors = np.zeros((*seen.valid.shape, 3))
     colors.reshape(-1, 3)[surface.point_data["pixel"]] = surface.point_data["colors"] / 255
@@ -274,7 +273,6 @@ class State:
     """State of the window.
 
     Attributes:
-        variant, target: names of the variant and the target.
         coloring: one of the pair's colorings.
         layer: (h, w) of a feature grid; None for the image's pixels.
         step: step of the edit, "" without one.

@@ -51,7 +51,6 @@ class Subject:
         scene: name or path of the scene.
         size: size of the images, in pixels.
         spp: samples a pixel of the true pictures.
-        seed: seed of the splats.
         variants: splats by variant's name; None stands for the true depth, or for the user's
             splats.
         targets: names of the views.
@@ -123,9 +122,7 @@ class Subject:
 
     @property
     def preferred(self) -> str:
-        """The initial variant: the edit's, else "corrected", else the first with pictures
-        of an edit, else the first.
-        """
+        """The edit's variant, else "corrected", else the first with an edit's pictures, or any."""
         names = list(self.variants)
         edited = [name for name in names if name in self.measured and self.measured[name].edits]
         wanted = (EDIT_VARIANT, "corrected", *edited)
@@ -169,10 +166,6 @@ def of_scene(scene: str, size: int = SIZE) -> Subject:
 
     Raises:
         InputError: no such scene.
-
-    Example:
-        >>> sorted(of_scene("spheres", 16).variants)
-        ['corrected', 'paper', 'released', 'tolerant']
     """
     from attnwarp_eval.world import world
 
@@ -198,16 +191,6 @@ def of_run(
     Raises:
         InputError: the folder is not a run, a record is damaged, the run has no such scene or seed
             or no variants, or the scene has changed since.
-
-    Example:
-        >>> from attnwarp_eval.study import Store, parse_study
-        >>> from attnwarp_eval.study.run import expected, plan
-        >>> content = dict(name="my", scenes=["spheres"], size=16, variants={"a": {}})
-        >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
-        >>> store = Store("run")
-        >>> store.write_study(expected(plan(study, store)))
-        >>> of_run(store.root).scene
-        'spheres'
     """
     from attnwarp_eval.study.probe import probe
     from attnwarp_eval.study.run import stored_study
@@ -294,11 +277,6 @@ def of_capture(
 
     Raises:
         InputError: the folder has no edit, the splats are missing, or no such view exists.
-
-    Example:
-        >>> subject = of_capture(Path("scene.ply"), Path("my_capture"), size=32)
-        >>> subject.targets[:2], sorted(subject.variants)
-        (('1', '2'), ['corrected', 'paper', 'released', 'tolerant'])
     """
     # A camera without a picture is shown with a render.
     dataset = read_dataset(data, images=images, missing_images="none", points=False)

@@ -58,7 +58,6 @@ class Window:
     """A warp in 3D.
 
     Args:
-        state: initial state.
         off_screen: whether to draw without a display.
         size: size of the window, in pixels.
 
@@ -166,7 +165,6 @@ class Window:
 
         Args:
             show: called after each picture.
-            steps: number of pictures.
         """
         self.look_through(self.pair.cameras[0].name)
         for position, rotation in scene.fly(self.pair.cameras, self.subject.center, steps):
@@ -339,9 +337,7 @@ class Window:
         return plotter
 
     def _clear_the_view(self, renderer: Any, *_: Any) -> None:
-        """Hide the picture of a camera at the view's position: it is in front of everything the
-        camera sees.
-        """
+        """Hide the picture of a camera at the view's position, which would cover everything."""
         eye = np.array(renderer.GetActiveCamera().GetPosition())
         near = 0.5 * scene.frustum_depth(self.subject, self.pair.cameras[0])
         for name, camera in zip(("source", "target"), self.pair.cameras, strict=True):

@@ -1,6 +1,4 @@
-"""Helpers of checks and metrics: validation of arrays, and means that are NaN with nothing to
-average.
-"""
+"""Helpers of checks and metrics: validation of arrays, and means that may be NaN."""
 
 from __future__ import annotations
 
@@ -55,8 +53,6 @@ def quantiles(values: Array, qs: Sequence[float]) -> list[float]:
 
 
 def regions(edge: Mask | None, shape: tuple[int, ...]) -> dict[str, Mask]:
-    """Regions of figures, by suffix: everything and, if edges are known, the
-    interior and the band.
-    """
+    """Regions of figures, by suffix: everything and, with known edges, interior and band."""
     whole = np.ones(shape, dtype=bool)
     return {"": whole} if edge is None else {"": whole, ".interior": ~edge, ".edge": edge}

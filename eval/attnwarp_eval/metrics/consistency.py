@@ -34,9 +34,7 @@ FLOW_LEAST = 12
 """Smallest side in pixels that OpenCV's DIS takes; below it there is no flow."""
 
 FLOW_SLOPE, FLOW_SLACK = 0.01, 0.5
-"""The forward-backward check: |f + b|^2 <= 0.01 (|f|^2 + |b|^2) + 0.5 px^2 (Sundaram, Brox &
-Keutzer 2010, section 3).
-"""
+"""Forward-backward check: |f + b|^2 <= 0.01 (|f|^2 + |b|^2) + 0.5 px^2 (Sundaram 2010, 3)."""
 
 VIEW_DEPENDENT = 0.05
 """Tolerance of :func:`view_dependent` in linear light, above the noise of 8 samples a pixel."""
@@ -62,9 +60,7 @@ class Disagreement:
     candidates: int
 
     def figures(self, prefix: str = "") -> dict[str, float]:
-        """The ``consistency.*`` figures, with ``prefix`` before each name; NaN if no pixel was
-        counted.
-        """
+        """The ``consistency.*`` figures with ``prefix`` before each name; NaN without pixels."""
         linear, srgb, delta_e = (
             self.linear[self.counted],
             self.srgb[self.counted],
@@ -193,7 +189,6 @@ class Flow:
     Attributes:
         xy: (H, W, 2) source positions in pixels, centres at +0.5; NaN where there is no flow.
         accepted: (H, W) bool: inside the source picture and past the forward-backward check.
-        method: name of the algorithm.
     """
 
     xy: Array
@@ -285,9 +280,7 @@ def _pictures(source_srgb: Any, target_srgb: Any, pair: TwoView) -> tuple[Array,
 
 
 def has_taps(xy: Array, shape: tuple[int, ...]) -> Mask:
-    """Positions with all four bilinear taps in a picture of (H, W): not beyond the outermost pixel
-    centres; not NaN.
-    """
+    """Positions with four bilinear taps in (H, W): within outermost pixel centres, not NaN."""
     height, width = shape[:2]
     with np.errstate(invalid="ignore"):
         inside: Mask = (

@@ -285,7 +285,5 @@ def unit_rows(rows: npt.NDArray[np.float64], tiny: float = TINY_NORM) -> npt.NDA
 
 
 def _cosine(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Cosines of unit rows; a single row is broadcast. Rounding past 1 is clipped, NaN
-    stays.
-    """
+    """Cosines of unit rows; a single row is broadcast. Rounding past 1 is clipped, NaN stays."""
     return np.asarray(np.clip((a * b).sum(axis=1), -1, 1))

@@ -1,6 +1,4 @@
-"""Errors of edited pictures inside and outside the edited object, against the rendered
-truth of the edit.
-"""
+"""Errors of edited pictures inside and outside the object, against the edit's rendered truth."""
 
 from __future__ import annotations
 
@@ -141,9 +139,7 @@ def nearest_answer(
 
 
 def _shrunk(part: Mask) -> Mask:
-    """Part without the pixels that have one of their eight neighbours outside; the picture's border
-    is no outline.
-    """
+    """Part without pixels that have a neighbour of eight outside it, but in the picture."""
     from scipy.ndimage import binary_erosion
 
     inner: Mask = binary_erosion(part, np.ones((3, 3), dtype=bool), border_value=1)

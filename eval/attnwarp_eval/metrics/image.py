@@ -21,14 +21,10 @@ from attnwarp_eval.metrics._pictures import pair
 from attnwarp_eval.metrics.arrays import Array, Mask, mean, share
 
 Distance = Callable[[Array, Array], float]
-"""A perceptual distance of two (H, W, 3) sRGB pictures in [0, 1]: 0 when they are equal, a mean
-over places.
-"""
+"""Perceptual distance of two (H, W, 3) sRGB pictures in [0, 1]: a mean, 0 if equal."""
 
 WINDOW = 11
-"""Side of SSIM's window in pixels; equal to :data:`attnwarp.losses.SSIM_WINDOW`, which is not
-imported since it needs torch.
-"""
+"""Side of SSIM's window in px, as :data:`attnwarp.losses.SSIM_WINDOW`, without torch."""
 
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of the scales, finest first: Wang, Simoncelli & Bovik 2003, section 3.2."""
@@ -138,9 +134,7 @@ def ssim_map(image: Any, target: Any, mask: Any = None) -> Array:
 
 
 def whole_windows(mask: Mask) -> Mask:
-    """(H - 10, W - 10) bool: the 11 x 11 windows that lie wholly inside a mask of at least that
-    size.
-    """
+    """(H - 10, W - 10) bool: 11 x 11 windows wholly inside a mask of at least that size."""
     # A window is whole if it has no pixel outside: sums of an integral image are exact.
     outside = np.pad(np.cumsum(np.cumsum(~mask, axis=0), axis=1), ((1, 0), (1, 0)))
     columns: npt.NDArray[np.int64] = outside[WINDOW:] - outside[:-WINDOW]
@@ -277,16 +271,12 @@ class EditPsnr:
 
     @property
     def pooled(self) -> float:
-        """PSNR of the mean MSE over the views that have one, with equal weights; +inf if all of
-        them are equal, NaN without any.
-        """
+        """PSNR of the mean MSE of the views that have one: +inf if all are 0, NaN without any."""
         return psnr_of_mse(mean(np.array([error for error in self.mse if not math.isnan(error)])))
 
     @property
     def mean_finite(self) -> float:
-        """Mean of the finite PSNRs, without identical and undefined views, which are counted; NaN
-        without any.
-        """
+        """Mean of the finite PSNRs, so without identical and undefined views; NaN without any."""
         return mean(np.array([value for value in self.psnr if math.isfinite(value)]))
 
     @property
@@ -362,9 +352,7 @@ def _mse(image: Array, target: Array, inside: Mask) -> float:
 
 
 def psnr_of_mse(error: float) -> float:
-    """:func:`attnwarp.losses.psnr_of_mse`, +inf for 0, and NaN for NaN. To average views, average
-    the error.
-    """
+    """:func:`attnwarp.losses.psnr_of_mse`: +inf for 0, NaN for NaN. Views average the error."""
     from attnwarp import losses
 
     return losses.psnr_of_mse(error)

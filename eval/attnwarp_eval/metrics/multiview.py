@@ -140,7 +140,6 @@ def edit_fidelity(
             answer is decided inside the union of a view's masks, so that every answer is compared
             at the same pixels.
         originals: the views before the edit.
-        distance: a perceptual distance.
 
     Returns:
         The answer's name, None if nothing could be measured; and the figures of

@@ -169,7 +169,6 @@ class YawBin:
 
     Attributes:
         low, high: degrees.
-        views: number of views in the bin.
         counts: sums of the views' counts.
         scores: scores of the sums, NaN where undefined.
     """

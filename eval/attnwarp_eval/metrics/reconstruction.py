@@ -28,7 +28,6 @@ class Reconstruction:
     """Figures of COLMAP's largest model of a set of views.
 
     Attributes:
-        views: number of pictures.
         registered: number of pictures in the model; 0 without a model.
         points: number of the model's 3D points.
         track_length: mean number of views that see a point; NaN without a model.
@@ -42,9 +41,7 @@ class Reconstruction:
     reprojection_error: float = math.nan
 
     def figures(self) -> dict[str, float]:
-        """The ``consistency.colmap_*`` figures; a failure has no registered view and gives 1 for
-        ``colmap_failed``.
-        """
+        """The ``consistency.colmap_*`` figures; a failure registers no view."""
         return {
             "consistency.colmap_registered": share(self.registered, self.views),
             "consistency.colmap_points": self.points,

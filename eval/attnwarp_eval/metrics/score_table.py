@@ -23,7 +23,6 @@ def read_scores(path: Path, columns: Sequence[str], option: str) -> Scores:
     Args:
         path: file.
         columns: columns that name a pair.
-        option: name of the option, for errors.
 
     Returns:
         Scores by figure, such as "consistency.score_lower.MEt3R".

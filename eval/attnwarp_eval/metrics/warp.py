@@ -1,6 +1,4 @@
-"""Accuracy of a warp: endpoint error of its positions, and error of the features that it
-carries.
-"""
+"""Accuracy of a warp: endpoint error of positions, and error of the features it carries."""
 
 from __future__ import annotations
 

@@ -89,9 +89,7 @@ def linear_rgb(color: str) -> tuple[float, float, float]:
 
 
 class Spec(BaseModel):
-    """Base of all models of a scene file: unknown keys and numbers that are not finite are
-    refused.
-    """
+    """Base of all models of a scene file: unknown keys and infinite numbers are refused."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True

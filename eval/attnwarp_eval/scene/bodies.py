@@ -157,9 +157,7 @@ class ReliefSpec(Spec):
 
 
 class BodySpec(Spec):
-    """A body of blended parts (signed distances), meshed by marching cubes. ``mirror`` doubles a
-    part across y = 0.
-    """
+    """A body of blended parts, meshed by marching cubes. ``mirror`` doubles one across y = 0."""
 
     type: Literal["body"]
     parts: tuple[PartSpec, ...] = Field(min_length=1)

@@ -1,6 +1,4 @@
-"""Edits with truth: an instruction's effect on a scene, so that the edited scene can be rendered
-from everywhere.
-"""
+"""Edits with truth: an instruction's effect on a scene, which then renders anywhere."""
 
 from __future__ import annotations
 
@@ -132,9 +130,7 @@ def _colors(node: Any) -> list[str]:
 
 
 def _painted(texture: dict[str, Any], paint: str) -> dict[str, Any]:
-    """The texture in shades of one colour: each colour keeps its lightness relative to the
-    lightest.
-    """
+    """The texture in shades of one colour; lightness relative to the lightest stays."""
     colors = _colors(texture)
     light = {color: float(LUMINANCE @ np.array(linear_rgb(color))) for color in colors}
     brightest = max(light.values()) or 1.0

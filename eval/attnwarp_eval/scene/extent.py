@@ -85,9 +85,7 @@ def warn_of_strays(scene: Scene, shapes: Sequence[Shape]) -> None:
 
 
 def _beyond_few(values: Array, area: Array) -> float:
-    """The least value of a piece without the pieces of the lowest values, up to
-    :data:`FEW` of the area.
-    """
+    """The least value of a piece but for the lowest, up to :data:`FEW` of the area."""
     order = np.argsort(values)
     left_out = np.cumsum(area[order]) <= FEW * area.sum()
     return float(values[order][min(int(left_out.sum()), len(order) - 1)])

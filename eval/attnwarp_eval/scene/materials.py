@@ -18,9 +18,7 @@ from attnwarp_eval.scene.base import Color, Positive, Spec, Vector
 
 
 class DiffuseMaterial(Spec):
-    """Scatters light evenly; its colour is the object's texture. The default
-    material.
-    """
+    """Scatters light evenly, in the colour of the object's texture. The default material."""
 
     type: Literal["diffuse"] = "diffuse"
 
@@ -122,9 +120,7 @@ TEXTURED = (DiffuseMaterial, PlasticMaterial)
 
 
 class EmissionSpec(Spec):
-    """Uniform radiance emitted by a surface. Rectangles emit along their normal, closed
-    shapes outward.
-    """
+    """Uniform radiance of a surface: along a rectangle's normal, out of closed shapes."""
 
     radiance: Positive
     color: Color = "#ffffff"
@@ -135,9 +131,7 @@ class EmissionSpec(Spec):
 
 
 class PointSpec(Spec):
-    """A point lamp. ``intensity`` in power per solid angle: at distance d it gives intensity
-    / d^2.
-    """
+    """A point lamp. ``intensity`` in power per solid angle: intensity / d^2 at distance d."""
 
     type: Literal["point"]
     position: Vector
@@ -146,9 +140,7 @@ class PointSpec(Spec):
 
 
 class SpotSpec(Spec):
-    """A point lamp that shines into a cone about ``target``, falling off from ``beam`` to
-    ``cutoff`` degrees.
-    """
+    """A point lamp with a cone about ``target``, fading from ``beam`` to ``cutoff`` degrees."""
 
     type: Literal["spot"]
     position: Vector
@@ -178,9 +170,7 @@ class BoundsSpec(Spec):
 
 
 class MediumSpec(InteriorSpec):
-    """Homogeneous fog in a ``box``; without one it fills the smallest box about all objects, lamps
-    and cameras.
-    """
+    """Homogeneous fog in a ``box``, by default about all objects, lamps and cameras."""
 
     box: BoundsSpec | None = None
 
@@ -223,9 +213,7 @@ NOT_SIMULATED: tuple[Effect, ...] = ("motion", "polarisation", "dispersion")
 
 
 class EffectsSpec(Spec):
-    """``pin``: effects that must occur and are simulated. ``forbid``: effects that the scene
-    must not need.
-    """
+    """``pin``: effects that must occur and be simulated. ``forbid``: those that must not."""
 
     pin: tuple[Effect, ...] = ()
     forbid: tuple[Effect, ...] = ()

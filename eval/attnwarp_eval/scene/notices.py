@@ -54,9 +54,7 @@ def notices(scene: Scene) -> list[str]:
 
 
 def warn_of_lost_texture(item: ObjectSpec, mesh: Mesh) -> None:
-    """Warn (:class:`~attnwarp_eval.scene.shapes.MeshNotice`) of triangles too large for a texture
-    baked into vertices.
-    """
+    """Warn of triangles too large for a texture baked into vertices."""
     if not isinstance(item.material, TEXTURED) or item.emission:
         return
     corners = mesh.vertices[mesh.faces]

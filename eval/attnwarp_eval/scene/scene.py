@@ -39,9 +39,7 @@ from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
 Array = npt.NDArray[np.float64]
 
 SCENE_PROTOCOL = 1
-"""Version; raised when the same file would mean another world (shapes, lights, defaults); part
-of every content hash.
-"""
+"""Version, in every content hash; raised when the same file would mean another world."""
 
 
 class SceneError(InputError):
@@ -183,9 +181,7 @@ class Scene:
             raise SceneError(str(error), self.path) from error
 
     def with_size(self, width: int, height: int) -> Scene:
-        """Copy of the scene with images of ``width`` x ``height``; the vertical field of view
-        stays.
-        """
+        """Copy of the scene with images of another size; the vertical field of view stays."""
         cameras = self.spec.cameras.model_copy(update={"size": (int(width), int(height))})
         copy = Scene(self.spec.model_copy(update={"cameras": cameras}), self.path)
         if "_shapes" in self.__dict__:
@@ -281,9 +277,7 @@ class Scene:
 
     @functools.cached_property
     def world_hash(self) -> str:
-        """SHA-256 of everything that affects a camera's view: objects, mesh files, lights, fog,
-        protocol versions.
-        """
+        """SHA-256 of all that cameras see: objects, mesh files, lights, fog, protocols."""
         files = {
             item.shape.file: hashlib.sha256(self.mesh_path(item.shape).read_bytes()).hexdigest()
             for item in self.spec.objects

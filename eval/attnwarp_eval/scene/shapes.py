@@ -19,9 +19,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 DEGENERATE_AREA = 1e-12
-"""Triangles whose area is below this times their longest edge squared have no usable plane and are
-dropped.
-"""
+"""Triangles of less area than this times their longest edge squared are dropped."""
 
 MOST_DIVIDED = 5_000_000
 """Most triangles of a divided mesh."""
@@ -56,9 +54,7 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class Rectangle:
-    """A two-sided flat rectangle: ``center`` (3,) and the half edges ``u``, ``v`` (3,),
-    perpendicular.
-    """
+    """A two-sided rectangle: ``center`` (3,) and perpendicular half edges ``u``, ``v`` (3,)."""
 
     center: Array
     u: Array
@@ -115,9 +111,7 @@ class Box:
         return bool((np.abs((point - self.center) @ self.axes) < self.half).all())
 
     def rectangles(self) -> list[Rectangle]:
-        """The six faces, their normals (u x v) outward, in the order -x, +x, -y, +y, -z, +z of the
-        box's axes.
-        """
+        """The six faces, normals (u x v) outward: -x, +x, -y, +y, -z, +z of the box's axes."""
         faces = []
         for axis in range(3):
             for sign in (-1.0, 1.0):

@@ -23,9 +23,7 @@ Array = npt.NDArray[np.float64]
 Point = tuple[float, float, float]
 
 MESHING_PROTOCOL = 2
-"""Version; raised when the same description of a body would give other vertices; part of every
-cache key.
-"""
+"""Version, in every cache key; raised when a body's description gives other vertices."""
 
 MOST_POINTS = 10**9
 """Points of a lattice, 8 GB; a cube at the highest resolution has 140 million."""
@@ -130,9 +128,7 @@ def reach(part: Part) -> Array:
 
 
 def _row(part: Part) -> list[float]:
-    """Row for the kernels: kind, mode (0 sharp, 1 blended, 2 carved), width (negative for the
-    body's), shape.
-    """
+    """Row for kernels: kind, mode (sharp, blended, carved), width (-1: the body's), shape."""
     kind, _, _, shape = _measured(part)
     mode = 2.0 if part.carve else float(bool(part.blend))
     width = -1.0 if isinstance(part.blend, bool) else float(part.blend)

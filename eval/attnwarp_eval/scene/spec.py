@@ -52,9 +52,7 @@ class Repeat(Spec):
 
 
 class BoxSpec(Spec):
-    """A box of ``size`` (x, y, z), turned by ``yaw`` about the vertical and tilted by ``pitch``
-    about its local y.
-    """
+    """A box of ``size`` (x, y, z), turned by ``yaw`` about z, tilted by ``pitch`` about its y."""
 
     type: Literal["box"]
     center: Vector
@@ -121,9 +119,7 @@ class ObjectSpec(Spec):
 
 
 class SunSpec(Spec):
-    """Parallel light. ``irradiance`` on a surface that faces it; a white one then shows irradiance
-    / pi.
-    """
+    """Parallel light. ``irradiance`` on a facing surface; a white one shows irradiance / pi."""
 
     type: Literal["sun"]
     elevation: float = Field(gt=0, le=90)
@@ -133,9 +129,7 @@ class SunSpec(Spec):
 
 
 class SkySpec(Spec):
-    """Light from all directions, visible to cameras as the background: a ramp from ``horizon``
-    to ``zenith``.
-    """
+    """Light and background from all directions: a ramp from ``horizon`` to ``zenith``."""
 
     type: Literal["sky"]
     horizon: Color
@@ -161,9 +155,7 @@ class ViewSpec(Spec):
 
 
 class CamerasSpec(Spec):
-    """An orbit about the vertical through ``look_at``: horizontal ``radius``, vertical ``fov``, one
-    source, targets.
-    """
+    """An orbit about the vertical of ``look_at``: ``radius``, vertical ``fov``, views."""
 
     look_at: Vector
     radius: Positive

@@ -1,6 +1,4 @@
-"""Uneven ground, with small things on it: meshes generated from a few numbers and a
-seed.
-"""
+"""Uneven ground, with small things on it: meshes generated from a few numbers and a seed."""
 
 from __future__ import annotations
 
@@ -175,9 +173,7 @@ class ScatterSpec(Spec):
 
 
 Piece = tuple[Array, npt.NDArray[np.int64], Array]
-"""Vertices, faces and colours (one per vertex, or one for all) of a part of a thing at the
-origin.
-"""
+"""Vertices, faces and colours (one, or one per vertex) of a thing's part at the origin."""
 
 STEM = np.array(linear_rgb("#4d7a35"))
 HEART = np.array(linear_rgb("#e8b93a"))

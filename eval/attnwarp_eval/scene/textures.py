@@ -61,9 +61,7 @@ class Noise(_Texture):
 
 
 class Bricks(_Texture):
-    """Courses of bricks (``size``: length, height) with mortar between, for upright walls; offset
-    from row to row.
-    """
+    """Courses of bricks (``size``: length, height) with mortar, each row offset."""
 
     type: Literal["bricks"]
     colors: tuple[Color, ...] = Field(min_length=1)
@@ -73,9 +71,7 @@ class Bricks(_Texture):
 
 
 class Rings(_Texture):
-    """Rings of the given colours, each ``size`` wide, about the vertical through ``center``: the
-    year rings of wood.
-    """
+    """Rings of colours, each ``size`` wide, about the vertical of ``center``, as in wood."""
 
     type: Literal["rings"]
     colors: tuple[Color, ...] = Field(min_length=2)
@@ -211,9 +207,7 @@ def _lattice(ix: Any, iy: Any, iz: Any, seed: Any) -> Any:
 
 @numba.njit(cache=CACHE, nogil=True)
 def lattice_noise(points: Array, seed: int) -> Array:
-    """(N,) white noise in [0, 1): one value for each integer cell that the (N, 3) ``points`` fall
-    into.
-    """
+    """(N,) white noise in [0, 1): a value for each integer cell of the (N, 3) ``points``."""
     out = np.empty(points.shape[0])
     for i in range(points.shape[0]):
         x, y, z = np.floor(points[i, 0]), np.floor(points[i, 1]), np.floor(points[i, 2])
@@ -228,7 +222,6 @@ def fractal_noise(points: Array, octaves: int, seed: int) -> Array:
     Args:
         points: (N, 3), in units of the coarsest feature.
         octaves: at least 1.
-        seed: seed of the noise.
 
     Returns:
         (N,) float64, with a mean of about one half.

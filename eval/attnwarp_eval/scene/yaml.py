@@ -47,9 +47,7 @@ for _kind, _pattern, _first in (
 if yaml.__with_libyaml__:
 
     class _Quick(Composer, yaml.CSafeLoader):
-        """libyaml's parser, four times as fast, with PyYAML's composer: libyaml's aborts the
-        process if a text is nested too deep.
-        """
+        """libyaml's parser, four times as fast, with PyYAML's composer, which no depth aborts."""
 
         yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
 
@@ -187,9 +185,7 @@ def _bare_color(text: str) -> str:
 
 
 def line_of(lines: dict[Place, Line], loc: Sequence[int | str]) -> Line:
-    """Line (from 1) of the deepest key path of ``loc``; the tags of unions in a loc
-    are skipped.
-    """
+    """Line (from 1) of the deepest key path of ``loc``, whose tags of unions are skipped."""
     place: Place = ()
     for step in loc:
         if (*place, step) in lines:

@@ -30,7 +30,6 @@ def sampling_matrix(xy: Extended, height: int, width: int) -> Extended:
     Args:
         xy: (..., 2) positions in pixels of the grid; beyond the border the border's value is taken,
             and NaN reads nothing.
-        height, width: height and width of the grid.
 
     Example:
         >>> xy = np.array([[1.0, 0.5], [np.nan, 0.5]], np.longdouble)

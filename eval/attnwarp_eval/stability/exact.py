@@ -50,7 +50,6 @@ class ExactSplats:
 
     Args:
         gaussians: few splats; their stored values are taken as exact.
-        camera: camera of the picture.
         near: near-plane depth.
         antialiased: screen filter of 3D splats.
         depth: the mode, as in :func:`attnwarp.render.render`.

@@ -35,7 +35,6 @@ class Shot:
 
     Attributes:
         gaussians: in float64; a way converts them.
-        camera: camera of the picture.
         pixels: (row, column) of each pixel.
         options: options of :func:`attnwarp.render.render` besides the backend: ``near``,
             ``antialiased`` and ``depth``.

@@ -26,7 +26,6 @@ class Contrast:
 
     Attributes:
         scale: scale of the differences; those of ``ratio`` and ``odds`` are logarithms.
-        views: number of pairs of views.
         undefined: number of views present or defined on only one side.
         by_scene: mean over a scene's views; scenes without a pair are left out.
         flips: the sign-flip test of ``by_scene``.

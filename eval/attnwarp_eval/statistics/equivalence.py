@@ -74,9 +74,7 @@ def welch(a: npt.ArrayLike, b: npt.ArrayLike) -> Welch:
 
 
 def _beyond(difference: Array, error: Array, rounding: Array) -> Array:
-    """Part of a difference that noise must explain: all of it, or only the excess over rounding
-    if the noise is smaller.
-    """
+    """Part of a difference left to noise: what exceeds rounding if the noise is smaller."""
     return np.where(
         error > rounding, np.abs(difference), np.maximum(np.abs(difference) - rounding, 0.0)
     )
@@ -157,9 +155,7 @@ class Equivalence:
 
     @property
     def bound(self) -> float:
-        """|difference| + 2.33 standard errors: with 99 % on either side the true difference is
-        smaller.
-        """
+        """|difference| + 2.33 standard errors: above the true one with 99 % on either side."""
         return abs(self.difference) + ONE_SIDED * self.error
 
     @property
@@ -193,7 +189,6 @@ class PairedTest:
     Attributes:
         difference, error: difference and standard error, as shares of the mean.
         p: two-sided p-value.
-        pairs: number of pairs.
     """
 
     difference: float

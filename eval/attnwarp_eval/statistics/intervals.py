@@ -27,7 +27,6 @@ class Interval:
     Attributes:
         mean: mean over scenes of the mean over views; NaN if nothing is defined.
         low, high: the interval; NaN with fewer than two scenes.
-        scenes, views: numbers of scenes and of views.
         undefined: number of NaN values, which are left out.
         detectable: the smallest difference with a power of 80 % at 5 %; NaN with under two
             scenes.
@@ -49,9 +48,7 @@ class Interval:
 
     @property
     def bounded(self) -> bool:
-        """True if both bounds are finite: one scene, or a few equal differences, give no
-        interval.
-        """
+        """True if both bounds are finite: one scene or few equal differences give none."""
         return bool(np.isfinite(self.low) and np.isfinite(self.high))
 
 

@@ -28,8 +28,6 @@ def compared(
     - ``share`` and ``plain``: b - a. A sign-flip interval of shares never leaves -1 to 1.
 
     Args:
-        a, b: the figures.
-        scale: scale of their metric.
         floor: smallest meaningful error, above 0, for ``ratio``.
         counts: denominators of the shares, for ``odds``.
 

@@ -331,9 +331,7 @@ def _closed(resource: Any) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Shield threads started inside, and their worker processes, from Ctrl-C: the main thread
-    receives it and ends them.
-    """
+    """Shield threads and workers started inside from Ctrl-C, which the main thread handles."""
     # Threads and processes inherit blocked signals. multiprocessing's tracker, started by the first
     # process, would unblock SIGINT.
     resource_tracker.ensure_running()
@@ -556,9 +554,7 @@ class _Runner:
 
 
 class _Queue:
-    """Cells by scene. A worker stays with the scene whose truth it has computed, then helps with
-    the scene that has most left.
-    """
+    """Cells by scene. A worker stays with its scene, then helps where most is left."""
 
     def __init__(self, cells: list[Cell]) -> None:
         self.scenes: dict[str, deque[Cell]] = {}

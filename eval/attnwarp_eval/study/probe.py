@@ -52,7 +52,6 @@ class InTurn:
     Attributes:
         names: names of the contestants; the first is the baseline.
         seconds: stage -> contestant -> round; the baseline's second run comes last.
-        rounds, threads: number of rounds and of threads.
         of: description of each contestant's task.
     """
 
@@ -94,7 +93,6 @@ class Work:
     """State of a cell during computation: a probe's inputs, and its results.
 
     Attributes:
-        cell: cell to compute.
         root: the run's folder.
         scene_world: world of the scene at the study's size; None for a probe that needs no
             scenes.
@@ -291,9 +289,7 @@ class Probe(ABC, Generic[E]):
         return self.metrics[key]
 
     def repeatable(self, record: Record[E]) -> bool:
-        """Return True if another machine gives the same figures; comparisons of runs skip other
-        records.
-        """
+        """Return True if another machine gives the same figures; comparisons skip others."""
         return True
 
     def in_turn(self, cell: Outcome, record: Record[E]) -> InTurn | None:

@@ -1,6 +1,4 @@
-"""Result of a cell, typed from probe to report. JSON appears only in ``to_json`` and
-``from_json``.
-"""
+"""Result of a cell, typed from probe to report; JSON only in ``to_json``, ``from_json``."""
 
 from __future__ import annotations
 
@@ -64,7 +62,6 @@ class PictureFile:
     """A picture of one view in the run's folder.
 
     Attributes:
-        view: name of the view.
         content: content, such as ``mask``.
         path: relative to the run's folder.
         sha256: sha256 of the file.
@@ -99,7 +96,6 @@ class Cost:
         counters: counts of work, such as pixels or pairs.
         peak_memory_mb: peak memory of the process during the cell, MiB, including memory it held
             before; of the whole process so far if the system cannot reset the peak (not Linux).
-        threads: threads of the renderer.
     """
 
     seconds: Mapping[str, float | None]
@@ -177,9 +173,7 @@ class Record(Generic[E]):
 
     Attributes:
         id, spec: id and spec of the cell; see :class:`attnwarp_eval.study.cell.Cell`.
-        views: views with their figures.
         pictures: picture files in the run's folder.
-        cost, environment: cost and environment of the computation.
         extra: entries specific to this probe.
     """
 

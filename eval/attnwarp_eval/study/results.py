@@ -20,7 +20,6 @@ class Outcome:
     """An expected cell of a run.
 
     Attributes:
-        id, title, scene, probe, seed: id, title, scene, probe and seed of the cell.
         variants: all names of its content in the study.
         record: record; None if the cell is not done.
     """
@@ -50,7 +49,6 @@ class Shared:
         tables: variant -> scene -> view (and seed) -> value, without NaN.
         apart: variants with too few views, whose tables are over all of their views.
         views: number of views that the others share.
-        of: number of all views.
     """
 
     tables: dict[str, dict[str, dict[str, float]]]
@@ -96,7 +94,6 @@ class Results:
     """The finished cells of a run.
 
     Attributes:
-        study: the resolved study.
         cells: one entry for each expected cell, in the study's order.
         failures: the table of failed cells.
         notices: notices to the reader, by scene.
@@ -109,9 +106,7 @@ class Results:
 
     @property
     def layer(self) -> int:
-        """The feature grid shown in tables: an eighth of the image, as in a diffusion UNet, or the
-        next smaller grid.
-        """
+        """Feature grid of tables: an eighth of the image, as in a UNet, or the next smaller."""
         size, sizes = self.study.size, self.study.feature_sizes
         return (
             size // 8
@@ -146,9 +141,7 @@ class Results:
 
     @cached_property
     def _by_variant(self) -> dict[tuple[str, str], list[tuple[str, int, Record[Any]]]]:
-        """Index of the records: a search through all cells for every variant of a table would take
-        the number of cells squared.
-        """
+        """Index of the records, since a search for every variant would be quadratic."""
         table: dict[tuple[str, str], list[tuple[str, int, Record[Any]]]] = {}
         for name, cells in self._by_probe.items():
             for cell, record in cells:
@@ -165,7 +158,6 @@ class Results:
         at its first view, whether or not the edit succeeded.
 
         Args:
-            probe, variant: probe and variant of the records.
             yaw: closed range of views' yaws from the source, in degrees; any if None.
         """
         table: dict[str, dict[str, float]] = {}

@@ -175,7 +175,6 @@ class Stored:
     """Contents of ``study.json`` of a run.
 
     Attributes:
-        study: resolved study.
         cells: cells of a complete run.
         notices: notices of :class:`Plan`.
     """

@@ -162,7 +162,6 @@ class AnswerPictures(Part):
         scene: scene of the pictures; the first one with pictures if this has none.
         first: label of a leading row -> its content, the same for all variants.
         content: content of the variants' rows.
-        variants: variants, one for each row.
     """
 
     caption: str

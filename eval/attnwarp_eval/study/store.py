@@ -121,9 +121,7 @@ class Store:
             remove_abandoned(folder)
 
     def write_study(self, study: dict[str, Any]) -> None:
-        """Write the resolved study and its expected cells with their checksum. Cells of another
-        study stay.
-        """
+        """Write the resolved study, its cells and a checksum; cells of another study stay."""
         # Keep the study's order: seconds are taken on a scene's first edit.
         write_json(self.root / "study.json", _sealed(study), sort_keys=False)
 
@@ -236,9 +234,7 @@ class Store:
             ) from None
 
     def whole(self, cell_id: str, read: Callable[[dict[str, Any]], T]) -> T | None:
-        """Apply ``read`` to the record of a cell; None where the record or one of its pictures is
-        missing or damaged.
-        """
+        """Apply ``read`` to a cell's record; None if it or a picture is missing or damaged."""
         with contextlib.suppress(StoreError):
             result, pictures = self.read_as(cell_id, lambda r: (read(r), r.get("pictures", [])))
             if not self.damaged_pictures(pictures):
@@ -246,9 +242,7 @@ class Store:
         return None
 
     def keep_picture(self, path: Path, **about: str) -> dict[str, str]:
-        """Entry of a record for a picture written below the folder: ``about``, the path and the
-        SHA-256.
-        """
+        """Entry of a record for a picture below the folder: ``about``, path and SHA-256."""
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         return {**about, "path": path.relative_to(self.root).as_posix(), "sha256": sha256}
 

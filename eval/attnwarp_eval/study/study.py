@@ -359,7 +359,6 @@ def _parsed(data: dict[str, Any], inherited: Callable[[str], bool]) -> tuple[Stu
     """Parse a study; also return its data without inherited tables of unmeasured variants.
 
     Args:
-        data: data of the study.
         inherited: predicate of keys that come from an extended study.
     """
     try:
@@ -491,7 +490,6 @@ def explain_errors(error: ValidationError, model: type[BaseModel] | None = None)
 
     Args:
         error: validation error of a study or of a part.
-        model: model of the part.
     """
     model = model or _models(tuple(probes()))[0]
     problems = error.errors(include_url=False)

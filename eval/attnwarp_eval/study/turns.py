@@ -30,9 +30,7 @@ class Timed:
         return self.turns[0].names[0]
 
     def rounds(self, name: str | None) -> list[list[float]]:
-        """Seconds of a contestant: a list of rounds for each cell with the contestant; None gives
-        the baseline's second run.
-        """
+        """Seconds of a contestant, cell by round; None gives the baseline's second run."""
         return [
             turn.seconds[self.stage][-1 if name is None else turn.names.index(name)]
             for turn in self.turns
@@ -86,9 +84,7 @@ class Timed:
         return seconds
 
     def judge(self, ratio: Ratio) -> str:
-        """Verdict "faster" or "slower" only outside the band of the baseline against itself, and
-        from enough rounds for a band.
-        """
+        """Verdict "faster" or "slower", outside the band of the baseline against itself."""
         noise = self.noise
         if not (noise.bounded and ratio.bounded):
             return f"can't tell ({min(turn.rounds for turn in self.turns)} rounds)"

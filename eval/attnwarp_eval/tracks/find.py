@@ -50,9 +50,7 @@ class Tracks:
     started: Mask
 
     def shared(self, a: int, b: int) -> tuple[Index, Index]:
-        """Rows of judged points visible in both images ``a`` and ``b``: of each in ``a``, and in
-        ``b``.
-        """
+        """Rows of judged points visible in images ``a`` and ``b``: of ``a``, and of ``b``."""
         rows = [np.flatnonzero((self.image == k) & ~self.started[self.point]) for k in (a, b)]
         _, first, second = np.intersect1d(
             self.point[rows[0]], self.point[rows[1]], return_indices=True
@@ -156,7 +154,6 @@ def halve(dataset: Dataset, tracks: Tracks, folder: Path) -> int:
 
     Args:
         dataset: as in :func:`find_tracks`.
-        tracks: tracks of the capture.
         folder: receives transforms.json, the points, and tracks.npz.
     """
     points = world_points(tracks, dataset.cameras)

@@ -225,7 +225,6 @@ def summarise(pairs: Sequence[Pair], seed: int = 0) -> dict[str, Figure]:
 
     Args:
         pairs: at least one.
-        seed: seed of the draws.
     """
     targets = sorted({pair.target for pair in pairs})
     parts = [

@@ -58,8 +58,6 @@ class Shortfall:
     """Light that a number of bounces loses, in the least certain view.
 
     Attributes:
-        bounces: number of bounces.
-        view: name of the view.
         spp: samples a pixel.
         difference, error: light with unlimited bounces minus that of the pictures, and its standard
             error, as shares of the mean.

@@ -1,6 +1,4 @@
-"""Exact correspondences between two views: each target pixel's position in the source, and its
-visibility there.
-"""
+"""Exact correspondences of two views: each target pixel's source position and visibility."""
 
 from __future__ import annotations
 

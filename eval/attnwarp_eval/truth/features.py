@@ -1,6 +1,4 @@
-"""Solid feature field: features are a function of the 3D point, so that the exact result of every
-warp is known.
-"""
+"""Solid feature field, a function of the 3D point, so that every warp's result is known."""
 
 from __future__ import annotations
 
@@ -27,7 +25,6 @@ class SolidField:
     Args:
         center: (3,) middle of the scene, world coordinates; subtracted in float64.
         extent: size of the scene in world units.
-        channels: number of channels, C.
         cycles: bandwidth: the highest spatial frequency, in cycles per ``extent``. At the default
             4, a scene that fills an image has wavelengths of at least 16 px on its 64 grid, where
             bilinear sampling at the worst place (half way between two taps) errs by 1 - cos(pi/16)

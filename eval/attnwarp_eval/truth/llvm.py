@@ -22,9 +22,7 @@ OLDEST = 16
 """LLVMs before this are not tried: 14 is refused by Dr.Jit and 15 aborts in its code generator."""
 
 TRIES = 3
-"""Most libraries that are tried: each costs a process start, and a machine where all LLVMs fail
-is rare.
-"""
+"""Most libraries that are tried, each at the cost of a process start."""
 
 PLACES = (
     "{prefix}/lib/libLLVM*",  # conda
@@ -116,9 +114,7 @@ def version(path: str) -> tuple[int, ...] | None:
 
 
 def works(library: str | None) -> bool:
-    """Return True if a child process rendered a known picture with ``library`` (None: Dr.Jit's
-    choice) without crashing.
-    """
+    """Return True if a child renders with ``library`` (None: Dr.Jit's choice), not crashing."""
     environment = os.environ | ({"DRJIT_LIBLLVM_PATH": library} if library else {})
     try:
         tried = subprocess.run(

@@ -73,9 +73,7 @@ class Pass:
 
 @dataclass(frozen=True)
 class Lens:
-    """A thin lens: radius and focus distance in scene units; ``focus`` None means the depth of
-    the scene's ``cameras.look_at``.
-    """
+    """A thin lens in scene units; ``focus`` None means the depth of ``cameras.look_at``."""
 
     aperture: float
     focus: float | None
@@ -89,7 +87,6 @@ class Plan:
         passes: the renderings to add up; none if ray casting suffices.
         media: whether fog and interiors are rendered.
         lens: None for a pinhole.
-        reasons: reasons in words.
     """
 
     passes: tuple[Pass, ...]
@@ -99,9 +96,7 @@ class Plan:
 
     @property
     def integrator(self) -> str:
-        """The integrators in use, such as "direct" or "path + ptracer"; "raycast" if nothing is
-        rendered.
-        """
+        """The integrators, such as "direct" or "path + ptracer"; "raycast" if none renders."""
         return " + ".join(dict.fromkeys(step.integrator for step in self.passes)) or "raycast"
 
     @property
@@ -135,9 +130,7 @@ made fog too bright by 1.2 % ± 0.1, independent ones did not; 6 and more agree 
 
 
 def sampler(integrator: Integrator, spp: int) -> str:
-    """Stratified samples if ``spp`` fits Mitsuba's grid; otherwise Mitsuba would
-    render more.
-    """
+    """Stratified samples if ``spp`` fits Mitsuba's grid; otherwise it would render more."""
     # Light paths land in pixels at random, so there is nothing to
     # stratify.
     if integrator == "ptracer" or (integrator == "volpath" and spp < FEWEST_STRATIFIED):
@@ -302,9 +295,7 @@ def plan_passes(
 
 
 def convex(scene: Scene) -> bool:
-    """Return True if a scene is a single convex surface, which never lights itself. Glass does:
-    light passes through it.
-    """
+    """Return True if a scene is one convex surface other than glass: it never lights itself."""
     alone = len(scene.spec.objects) == 1 and not isinstance(
         scene.spec.objects[0].material, materials.GlassMaterial
     )
@@ -313,18 +304,14 @@ def convex(scene: Scene) -> bool:
 
 
 def small_lights(scene: Scene) -> str | None:
-    """Names of lights too small to be hit by chance through smooth glass or a mirror; None if
-    none.
-    """
+    """Names of lights too small to be hit by chance through glass or a mirror; None if none."""
     names: list[str] = [light.type for light in scene.spec.lights if light.type != "sky"]
     names += [f"object {scene.spec.objects[k].name!r}" for k in small_lamps(scene)]
     return ", ".join(names) or None
 
 
 def small_lamps(scene: Scene) -> list[int]:
-    """Indices of lamps too small to be hit by chance through smooth glass
-    or a mirror.
-    """
+    """Indices of lamps too small to be hit by chance through smooth glass or a mirror."""
     small: list[int] = []
     lamps = [k for k, item in enumerate(scene.spec.objects) if item.emission]
     if lamps:
@@ -346,9 +333,7 @@ def small_lamps(scene: Scene) -> list[int]:
 
 
 BEAM_MARGIN = 1.05
-"""Factor by which a beam on the smooth objects is wider than the sphere about them; Mitsuba's
-spots fall off at their rim.
-"""
+"""Factor by which a beam exceeds the smooth objects' sphere: spots fade at their rim."""
 
 
 def beam(scene: Scene, light: int) -> tuple[Array, float] | None:
@@ -372,9 +357,7 @@ def beam(scene: Scene, light: int) -> tuple[Array, float] | None:
 
 
 def smooth_objects(scene: Scene) -> list[int]:
-    """Indices of the objects that reflect or refract without scattering: mirrors, polished metal,
-    clear glass.
-    """
+    """Indices of objects that bend light sharply: mirrors, polished metal, clear glass."""
     kinds = materials.MirrorMaterial | materials.MetalMaterial | materials.GlassMaterial
     return [
         k

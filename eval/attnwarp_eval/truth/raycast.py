@@ -138,9 +138,7 @@ class Geometry:
         self._traced: dict[bytes, Hits] = {}
 
     def flat_patches(self) -> tuple[Array, npt.NDArray[np.int64]]:
-        """All flat surfaces as triangles: (T, 3, 3) world corners and (T,) primitive ids; a
-        rectangle is two of them.
-        """
+        """Flat surfaces as triangles, two a rectangle: (T, 3, 3) world corners, primitive ids."""
         q = self._rectangles
         c, u, v = q[:, None, 0:3], q[:, None, 3:6], q[:, None, 6:9]
         halves = np.concatenate(
@@ -167,9 +165,7 @@ class Geometry:
         return np.where(primitive_id >= 0, self._object[primitive_id], -1).astype(np.int32)
 
     def tint(self, points: Array, primitive_id: npt.NDArray[np.int64]) -> Array:
-        """(N, 3) vertex colours of the meshes (linear), interpolated at surface points; 1 if
-        absent.
-        """
+        """(N, 3) linear vertex colours of the meshes at surface points; 1 if absent."""
         tint = np.ones((len(points), 3))
         face = np.flatnonzero((primitive_id >= 0) & (primitive_id < len(self._faces)))
         if self._tint is None or not face.size:

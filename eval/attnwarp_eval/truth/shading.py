@@ -171,9 +171,7 @@ def _lamp_irradiance(
 
 
 def _spread(shape: Sphere | Rectangle | Mesh, count: int) -> tuple[Array, Array, float]:
-    """(count, 3) points spread evenly over a lamp, their directions of emission, and the lamp's
-    area.
-    """
+    """(count, 3) points spread evenly over a lamp, their directions, and the lamp's area."""
     first = (np.arange(count) + 0.5) / count
     second = np.array([int(f"{k:032b}"[::-1], 2) / 2**32 for k in range(count)])
     if isinstance(shape, Rectangle):

@@ -112,9 +112,7 @@ def render_views(
 
 
 def depth_picture(depth: npt.NDArray[np.float64]) -> Image:
-    """Depth in colour, near bright, on a scale of 1 / z between the view's extremes; grey where
-    undefined.
-    """
+    """Depth in colour, near bright, on a scale of 1 / z within the view; grey if undefined."""
     import matplotlib
 
     near = 1 / depth
@@ -127,8 +125,6 @@ def depth_picture(depth: npt.NDArray[np.float64]) -> Image:
 
 
 def normal_picture(normal: npt.NDArray[np.float64], camera: Camera) -> Image:
-    """Normals in the camera's axes (x right, y up, z toward the camera) as red, green, blue; grey
-    where undefined.
-    """
+    """Normals (x right, y up, z toward the camera) as red, green, blue; grey if undefined."""
     local = normal @ camera.rotation.T * np.array([1, -1, -1])
     return np.where(np.isfinite(local), 0.5 + 0.5 * np.nan_to_num(local), 0.5)

@@ -118,7 +118,6 @@ class _View:
 
     Attributes:
         edited, original: (H, W, 3) at full size; the original, or None.
-        camera: camera of that size.
     """
 
     edited: Picture

@@ -119,8 +119,6 @@ class Measured:
     """The figures of a user's pictures, and reasons for missing ones.
 
     Attributes:
-        inputs: measured inputs.
-        rows: the figures.
         missing: title of a missing figure -> reason.
         encoders: kind -> description of the encoder.
         unpaired: sentence for each group of pictures without partners.
@@ -316,9 +314,7 @@ def _as_spelled(pictures: dict[str, Path], renders: Mapping[str, Path]) -> dict[
 
 
 def normal_maps(folder: Path) -> list[str]:
-    """File names of normal maps: NAME.normal.png next to NAME.png, as ``attnwarp render --normal``
-    writes them.
-    """
+    """Names of the normal maps of ``attnwarp render --normal``: NAME.normal.png by NAME.png."""
     maps = folder.glob("*.normal.png")
     return sorted(p.name for p in maps if (folder / f"{p.name[:-11]}.png").is_file())
 
@@ -332,7 +328,6 @@ def read_picture(
     pixels are laid over ``background``. A picture is rotated by its EXIF tag, as in viewers.
 
     Args:
-        path: picture.
         background: sRGB in [0, 1].
         beside: picture of the corresponding pose, which may be the same picture; see
             :func:`attnwarp.io.read_upright`.
@@ -504,9 +499,7 @@ class _Gathered:
     own: dict[str, dict[str, float]] = field(default_factory=dict)  # by the figure's key
 
     def to_json(self) -> dict[str, Any]:
-        """Values as JSON, where an undefined number is null; an infinite PSNR follows from its MSE,
-        0.
-        """
+        """Values as JSON, undefined ones as null; an infinite PSNR follows from its MSE, 0."""
         return {
             "errors": without_nan({name: mse for name, (mse, _) in self.errors.items()}),
             "psnr": without_nan({name: psnr for name, (_, psnr) in self.errors.items()}),

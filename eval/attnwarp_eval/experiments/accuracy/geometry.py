@@ -61,9 +61,7 @@ def every_triangle(origins: Array, directions: Array, corners: Array, limit: Arr
 
 
 def triangles(scene: Scene) -> list[Mesh]:
-    """The scene's triangles only: spheres and rectangles are closed forms, with nothing
-    to refine.
-    """
+    """The scene's triangles only: spheres and rectangles need no refinement."""
     meshes = [shape.mesh() if isinstance(shape, Box) else shape for shape in scene.shapes()]
     meshed = [shape for shape in meshes if isinstance(shape, Mesh)]
     if not meshed:

@@ -21,7 +21,6 @@ class Contestant:
         name: name for display.
         error: error in the panel's unit, with a 95 % interval if rounds differ (bootstrap over
             rounds), else the same value three times.
-        seconds: seconds of each round.
         more: further figures by name.
     """
 
@@ -38,7 +37,6 @@ class Panel:
     Attributes:
         question: "pictures", "depth" or "visibility".
         scene: name of the scene.
-        unit: unit of the error.
         contestants: the baseline first; none if the scene has nothing to measure.
         again: seconds of the baseline's second run of each round.
         squares: squared error of each round, by contestant ("pictures" only).
@@ -52,9 +50,7 @@ class Panel:
     squares: tuple[tuple[float, ...], ...] = ()
 
     def ratio(self, index: int | None) -> Ratio:
-        """Seconds of a contestant (None: the baseline's second run) over the baseline's, paired by
-        round.
-        """
+        """Seconds of a contestant over the baseline's by round; None: the baseline's second run."""
         seconds = self.again if index is None else self.contestants[index].seconds
         return time_ratio([seconds], [self.contestants[0].seconds])
 

@@ -46,7 +46,6 @@ class MeshFile:
     """A mesh with statistics of its file.
 
     Attributes:
-        mesh: the triangles.
         polygons: number of polygons in the file.
         crossed: number of polygons dropped because they cross themselves.
         flat: number of triangles dropped because they have no area.

@@ -105,9 +105,7 @@ def _outside(share: float, way: Way) -> float:
 
 
 class Unet(torch.nn.Module):
-    """Minimal UNet for hooks: an attention module with the right name, called with latents and a
-    timestep.
-    """
+    """Minimal UNet for hooks: a named attention module, called with latents and a timestep."""
 
     def __init__(self, channels: int, dtype: torch.dtype) -> None:
         super().__init__()
@@ -125,9 +123,7 @@ class Unet(torch.nn.Module):
 
 
 def one_view_tokens(count: int, way: Way) -> tuple[Unet, torch.Tensor]:
-    """The network of ``one_view``, and (count + 1, C, H, W) latents: of the targets, and of the
-    source.
-    """
+    """The network of ``one_view``, and (count + 1, C, H, W) latents, the source's last."""
     generator = torch.Generator().manual_seed(1)
     shape = (count + 1, CHANNELS, SIZE, SIZE)
     latents = torch.randn(shape, generator=generator, dtype=torch.float64)
@@ -147,9 +143,7 @@ def exact_tokens(unet: Unet, latents: torch.Tensor) -> Extended:
 
 
 def _views_of_a_batch(views: float, way: Way) -> float:
-    """Error of a view's features, injected with others and alone, in steps of the type at the
-    largest token.
-    """
+    """Error of a view's features, injected with others or alone, in steps of the type."""
     count = int(views)
     unet, latents = one_view_tokens(count, way)
     layer = Layer("attn1", "self", 0, CHANNELS)

@@ -1,6 +1,4 @@
-"""Hard cases of the metrics: nothing to measure, no differences, lengths without a
-direction.
-"""
+"""Hard cases of the metrics: nothing to measure, no differences, lengths without direction."""
 
 from __future__ import annotations
 

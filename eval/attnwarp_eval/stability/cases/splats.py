@@ -175,9 +175,7 @@ def _opaque_stack(opacity: float, way: Way) -> float:
 
 
 def _permuted(count: float, way: Way) -> float:
-    """Error of the colour of splats of equal depth; infinite where it depends on their order in
-    memory.
-    """
+    """Error of the colour of splats of equal depth; infinite if memory order decides it."""
     n, depth, camera = int(count), 4.0, front_camera()
     rng = np.random.default_rng(n)
     means = np.c_[rng.uniform(-1, 1, (n, 2)), np.full(n, depth)]

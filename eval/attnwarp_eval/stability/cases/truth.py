@@ -73,9 +73,7 @@ def _ties(gap: float, way: Way) -> float:
 
 
 def _tangent(gap: float, way: Way) -> float:
-    """Error of the distance of a sphere of radius 0.7 along a ray that almost misses it, in units
-    of its tolerance.
-    """
+    """Error of the distance of a sphere that a ray almost misses, in its tolerance."""
     radius, distance = 0.7, 3.0
     direction = np.array([1.0, 1e-3, -2e-3])
     side = np.cross(direction, [0.3, 0.2, 0.9])

@@ -48,7 +48,6 @@ class Pair:
     """Two cameras and the target's depth.
 
     Attributes:
-        source, target: the cameras.
         depth: (H, W) of the target, float64.
         exact: the poses (world to camera) that the oracle reads, those of the cameras if None.
     """
@@ -324,9 +323,7 @@ def _opposed(yaw: float, way: Way) -> float:
 
 
 def _rules_of_scale(exponent: float, way: Way) -> tuple[tuple[Camera, Surface], ...]:
-    """Source and target, each with its view: a sphere in front of a wall, in other units, with a
-    hole in each depth map.
-    """
+    """Source and target with views of a sphere before a wall, in other units, with holes."""
     size = 2.0**exponent
     views = []
     for camera in (orbit(0, height=1, size=48), orbit(40, height=1, size=48)):

@@ -33,7 +33,6 @@ class DriftPart(Part):
 
         Args:
             picture: (H, W, C) the picture before the edit.
-            seed: seed of the cell.
         """
         own = digest(np.asarray(picture, dtype=np.float32))
         draw = np.random.default_rng([seed, int(own[:8], 16)])
@@ -78,8 +77,6 @@ def drifting(editor: Any, drift: DriftPart, seed: int) -> Any:
 
     Args:
         editor: an :class:`attnwarp.editing.editor.Editor`.
-        drift: the drift.
-        seed: seed of the cell.
     """
 
     class Drifting(type(editor)):  # type: ignore[misc]

@@ -32,8 +32,6 @@ class EditFigures:
 
     Attributes:
         world: the scene.
-        truth: truth of the edit.
-        source: name of the source view.
         pictures: (H, W, 3) sRGB in [0, 1] by view.
         judged: judgement of the source's edit; without an edit there is nothing to agree with.
         kind: end of the figures' names.
@@ -72,9 +70,7 @@ class EditFigures:
         return row | self._agreement(name)
 
     def _agreement(self, name: str) -> dict[str, float]:
-        """Agreement of a target with the source; NaN if the target was not edited or the source's
-        edit failed.
-        """
+        """Agreement of a target with the source; NaN if either lacks a successful edit."""
         kind, answer, truth = self.kind, self.fidelity[0], self.truth
         row = dict.fromkeys(
             [
@@ -99,9 +95,7 @@ class EditFigures:
         return row
 
     def next_to(self, other: str, name: str) -> float:
-        """Return a target's disagreement with another view inside the edited object; NaN without
-        either edit.
-        """
+        """A target's disagreement with a view inside the object; NaN without either edit."""
         answer = self.fidelity[0]
         both = other in self.pictures and name in self.pictures
         if not self.judged.done or answer is None or not both:
@@ -110,9 +104,7 @@ class EditFigures:
         return self.above(other, name, mask)["multiview.delta_e_above"]
 
     def above(self, first: str, second: str, mask: Any) -> dict[str, float]:
-        """Compute the disagreement of two views above its floor; NaN if fewer than
-        :data:`LEAST_PIXELS` are compared.
-        """
+        """Disagreement of two views above its floor; NaN below :data:`LEAST_PIXELS`."""
         answer = self.fidelity[0]
         assert answer is not None
         true = self.truth.answers[answer]

@@ -194,9 +194,7 @@ def _edit_truth(
 
 
 def neighbours(of: World, views: Sequence[str]) -> dict[str, str]:
-    """Neighbour of each target: the nearest by yaw among the source and the targets that are nearer
-    to the source.
-    """
+    """Neighbour of each target: the nearest by yaw of the source and targets nearer to it."""
     yaw = {of.source.name: 0.0, **of.signed_yaw}
     ordered = [of.source.name, *sorted(views, key=lambda view: of.yaw[view])]
 

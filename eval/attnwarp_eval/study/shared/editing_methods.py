@@ -36,9 +36,7 @@ SOURCE_WORDS = "{source}"
 
 
 def needs_source_words(settings: Mapping[str, Any]) -> bool:
-    """Return True if a method's settings have a place for the words that describe the scene
-    before.
-    """
+    """Return True if a method's settings take the words that describe the scene before."""
     return SOURCE_WORDS in (settings.get("source_prompt") or "")
 
 
@@ -89,7 +87,6 @@ class Job:
             source's.
         segments: (H, W) share of each view that is edited, outside which nothing may change; None
             for everywhere.
-        source: number of the source view.
         report: receives how the method stands.
         load: gives encoders, as :func:`attnwarp.encoders.load_encoder`.
     """
@@ -152,7 +149,6 @@ class Method:
         settings: complete settings as JSON, from a preset's name (None where the study names none),
             the fields of a study and a variant, and the seed. ValueError: an unknown field or a
             value out of range.
-        run: the method.
         takes_budget: whether it can be cut short by a budget.
         edited: how many of a number of views it edits at most with these settings; None where that
             is not known.
@@ -196,9 +192,7 @@ def _attention_warping(job: Job) -> EditedScene:
 
 
 def _with_features_of(job: Job, donor: Donor) -> EditedScene:
-    """Attention warping whose targets take the features of the donor's source, edited under the
-    same words, settings and noise.
-    """
+    """Attention warping of targets with features of the donor's source, edited alike."""
     from attnwarp.methods import AttentionWarpingSettings
     from attnwarp.methods.attention_warping import AttentionWarping
     from attnwarp.methods.base import ViewEdit, run

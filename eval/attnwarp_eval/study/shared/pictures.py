@@ -183,9 +183,7 @@ def mask_against_truth(mask: npt.NDArray[np.bool_], truth: TwoView, target: Imag
 
 
 def endpoint_map(xy: npt.NDArray[np.float64], truth: TwoView) -> Image:
-    """Endpoint error of truly visible pixels on a logarithmic scale; grey elsewhere, red where
-    there is no position.
-    """
+    """Endpoint error of visible pixels, logarithmic; grey elsewhere, red without a position."""
     import matplotlib
 
     error = np.linalg.norm(xy - truth.xy, axis=-1)

@@ -56,9 +56,7 @@ def surface_meaning(study: Study, variant: Variant) -> tuple[Any, ...]:
 
 
 def is_fitted(spec: Mapping[str, Any]) -> bool:
-    """Return True if a cell's splats are fitted: a fit's seconds are in the fit's folder, in no
-    cell.
-    """
+    """Return True if a cell's splats are fitted; a fit's seconds are in its folder alone."""
     return "fit" in spec
 
 

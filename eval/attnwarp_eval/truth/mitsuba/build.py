@@ -47,21 +47,15 @@ AT_ONCE = 1 << 14
 """Texels baked at a time, so that intermediate results stay in a core's cache."""
 
 SKY_ROWS = 256
-"""Rows of the sky's environment map; its ramp is linear in the sine of the elevation, so
-few suffice.
-"""
+"""Rows of the sky's environment map; few suffice, linear in the sine of the elevation."""
 
 TEXEL_SIZE = 0.5
-"""Size of a texel as a share of a pixel's footprint at the cameras' distance from the
-scene's middle.
-"""
+"""Size of a texel as a share of a pixel's footprint at the distance of the scene's middle."""
 
 
 @contextlib.contextmanager
 def at_most_texels(number: int) -> Iterator[None]:
-    """Bake textures of at most ``number`` texels along the longer side, for pictures too small to
-    show more.
-    """
+    """Bake textures of at most ``number`` texels along the longer side, for small pictures."""
     global TEXELS
     former, TEXELS = TEXELS, min(number, TEXELS)
     try:
@@ -274,9 +268,7 @@ everything on, in two variants.
 
 
 def cached(key: Any, make: Callable[[], Any]) -> Any:
-    """Cached result of ``make``, with the last few others: a scene's views are rendered one after
-    another.
-    """
+    """Cached result of ``make``, with the last few others, for the views of a scene."""
     if key not in _loaded:
         while len(_loaded) >= CACHED:
             _loaded.pop(next(iter(_loaded)))
@@ -687,9 +679,7 @@ def load_sensor(
 
 
 def focus_distance(scene: Scene, camera: Camera) -> float:
-    """Distance along the optical axis of the cameras' look-at point; the orbit's radius if
-    it is behind.
-    """
+    """Depth of the cameras' look-at point, or the orbit's radius if it is behind."""
     depth = float((camera.world_to_camera @ np.array([*scene.center, 1.0]))[2])
     return depth if depth > 0 else scene.spec.cameras.radius
 

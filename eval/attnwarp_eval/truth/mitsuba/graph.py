@@ -24,9 +24,7 @@ from attnwarp_eval.truth.passes import plan_passes
 
 
 def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
-    """Mitsuba's graph of the whole scene: (path, plugin name) as parsed, and (path, object) as
-    loaded.
-    """
+    """Mitsuba's graph of the scene: (path, plugin name) as parsed, (path, object) as loaded."""
     mi = library(variant())
     everything = tuple(range(len(scene.spec.lights)))
     world, center, fog = load_world(scene, everything, True, True)

@@ -134,9 +134,7 @@ def transport_of(scene: Scene) -> Transport:
 
 
 def _mitsuba_agrees(world: World, truth: TwoView) -> float:
-    """Share of a view's pixels where Mitsuba's ray tracer finds the same surface point as the ray
-    caster, or both find none.
-    """
+    """Share of pixels where Mitsuba's ray tracer and the ray caster find the same point."""
     position, _ = position_and_shape(world.scene, truth.target)
     error = np.linalg.norm(position - truth.hits.point, axis=-1)
     distance = np.linalg.norm(truth.hits.point - truth.target.position, axis=-1)

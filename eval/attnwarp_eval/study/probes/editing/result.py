@@ -35,14 +35,12 @@ class EditResult:
     """Entries of a cell's record besides the figures of its views.
 
     Attributes:
-        name, instruction: name and instruction of the edit.
         source: content description of the source's edit.
         alone: the same for all edited views together, the source included.
         answers: nearest answer by "edit" or "render", then by view; None if none of the object is
             visible.
         overall: by "edit" and "render", the nearest answer to all views together.
         edit_psnr: dB, edited views against renders, pooled over pixels with a surface.
-        edited: number of edited views.
         injected: mean share of the targets' pixels with injected features; 0 without a warp.
         budget: budget of the method, None without one.
     """

@@ -24,9 +24,7 @@ class Point:
     """One evaluation of a fit; NaN where undefined.
 
     Attributes:
-        iteration: iterations done.
         seconds, cpu_seconds: time of the iterations, without evaluations and files.
-        splats: number of splats.
         loss: loss of the last iterations, smoothed.
         psnr, psnr_pooled: mean PSNR over the held-out views, and PSNR of their mean MSE; dB.
         measures: further figures over the held-out views.
@@ -48,9 +46,7 @@ class Point:
 
     @classmethod
     def from_json(cls, data: Json) -> Point:
-        """Rebuild from :meth:`to_json`, or from an evaluation's attributes, None where
-        undefined.
-        """
+        """Rebuild from :meth:`to_json` or an evaluation's attributes, None where undefined."""
         numbers = with_nan({name: data[name] for name in ("loss", "psnr", "psnr_pooled")})
         return cls(**{**data, **numbers, "measures": with_nan(data["measures"])})
 
