@@ -78,9 +78,7 @@ class Bound:
     """Largest allowed error.
 
     Attributes:
-        unit: unit of the error.
         tolerance: tolerance in that unit, or a function of the level.
-        reason: reason for the tolerance.
     """
 
     unit: str
@@ -104,14 +102,11 @@ class Case:
     Attributes:
         number: number in the report of reports/stability; several cases may share one.
         name: name in commands and records.
-        title: title in one line.
-        input: description of the input.
         oracle: description of the reference result, computed without code under test.
         hardness: swept quantity, with its unit.
         levels: levels of hardness, the easiest first.
         required: the last level whose values must hold; later levels are meant to break.
         quick: the levels of a short sweep.
-        bounds: bounds by direction.
         ways: the implementations under test.
         measure: error of a way at a level, in the bound's unit; raises ValueError if the
             input is refused.
@@ -156,15 +151,6 @@ class Case:
     required_backward: float | None = None
     limit: str = ""
     version: int = 1
-
-    def __post_init__(self) -> None:
-        ends = (self.required, self._required("backward"))
-        for level in (*ends, *self.quick):
-            if level not in self.levels:
-                raise ValueError(f"{self.name}: {level:g} is none of its levels")
-        for way in self.ways:
-            if way.direction not in self.bounds:
-                raise ValueError(f"{self.name}: no bound for {way.name}")
 
     def is_required(self, level: float, direction: Direction = "forward") -> bool:
         """Return True if this level must hold."""
@@ -214,7 +200,6 @@ class Outcome:
     """Outcome of one way at one level.
 
     Attributes:
-        level: level of hardness.
         required: whether the level must hold.
         error: error in the bound's unit; infinite if the result is not finite, NaN if refused.
         tolerance: tolerance in the same unit.
