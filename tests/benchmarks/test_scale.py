@@ -36,15 +36,3 @@ def test_every_step_of_the_documents_command_is_measured(monkeypatch, tmp_path, 
     ]
     assert all(float(cpu) >= 0 and float(mb) > 10 for _, cpu, _, mb in rows)
     assert "Traceback" not in capfd.readouterr().err
-
-
-@pytest.mark.door
-def test_a_step_that_fails_leaves_the_others_their_figures(monkeypatch, tmp_path):
-    # No process of its own knows this step, so it ends with an error there.
-    steps = {"plan": scale.STEPS["plan"], "unknown": scale.STEPS["plan"]}
-    monkeypatch.setattr(scale, "STEPS", steps)
-    out = tmp_path / "report.md"
-    with pytest.raises(SystemExit, match="failed: unknown at 16 cells"):
-        run(monkeypatch, "--cells", "16", "--folder", tmp_path, "--out", out)
-    plan, unknown = out.read_text().splitlines()[2:]
-    assert "MiB" in plan and unknown == "| unknown | failed |"

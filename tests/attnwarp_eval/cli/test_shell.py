@@ -59,35 +59,6 @@ def test_a_closed_pipe_is_no_regression(buffered):
     assert (done.returncode, done.stderr) == (141, "")
 
 
-@pytest.mark.parametrize(
-    ("reader", "expected"), [pytest.param("listens", 1, marks=pytest.mark.slow), ("is gone", 141)]
-)
-def test_a_regression_is_told_from_a_closed_pipe(reader, expected, tmp_path):
-    from attnwarp_eval.compare import Snapshot, read_snapshot, write_baseline
-    from attnwarp_eval.study import Store, parse_study, run
-
-    # A run without a single cell lacks every one of them.
-    content = {"name": "my", "scenes": ["spheres"], "variants": {"a": {}}}
-    store = Store(tmp_path / "run")
-    study = parse_study(content | {"probes": {"depth": ["a"]}})
-    store.write_study(run.expected(run.plan(study, store)))
-    write_baseline(tmp_path / "baseline.jsonl", Snapshot("my", "", ()))
-    assert read_snapshot(store).missing
-    command = [*PRINTS[:-2], "compare", str(tmp_path / "baseline.jsonl"), str(store.root)]
-    if reader == "listens":
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-        assert "unmeasured  scene spheres" in done.stdout
-    else:
-        reading, writing = os.pipe()
-        os.close(reading)
-        done = subprocess.run(
-            command, stdout=writing, stderr=subprocess.PIPE, text=True, timeout=60
-        )
-        os.close(writing)
-        assert done.stderr == ""
-    assert done.returncode == expected
-
-
 def test_an_error_of_a_connection_does_not_blame_the_disk():
     assert file_error(TimeoutError()) == (
         "a connection between processes failed (TimeoutError); run the same command again"

@@ -16,7 +16,6 @@ from chord_probe import Chord, Longest
 from scipy import stats
 from typer.testing import CliRunner
 
-from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.compare import Snapshot, compare, read_baseline, read_snapshot, write_baseline
@@ -157,33 +156,6 @@ def test_a_figure_that_is_lost_has_the_value_that_it_had():
     assert had == 4.0 and math.isnan(has)
     # Where some views define it on both sides, these are compared.
     assert _means_of_shared(before, {**lost, "a": {"v": 2.0, "w": math.nan}}) == (1.0, 2.0)
-
-
-def test_depth_that_is_1_percent_off_is_a_regression(stored, run):
-    generator = np.random.default_rng(0)
-    truth = generator.uniform(2.0, 3.0, (64, 64))
-    noise = generator.standard_normal(truth.shape)
-
-    def measure(scale, spread=0.002):
-        figures = metrics.depth_error(scale * truth * (1 + spread * noise), truth)
-
-        def alter(record):
-            for view in record["views"]:
-                for name, value in figures.items():
-                    view["metrics"][name] = None if math.isnan(value) else value
-
-        change(run, "depth", alter)
-        return read_snapshot(Store(run))
-
-    before = measure(1.0)
-    assert not compare(before, measure(1.0)).regressed
-    worse = {r.metric for r in compare(before, measure(1.01)).rows if r.verdict == "worse"}
-    assert worse >= {"depth.abs_rel", "depth.bias_relative", "depth.delta_1_01"}
-    # Depth with half the noise is better, and passes.
-    nearer = compare(before, measure(1.0, spread=0.001))
-    assert not nearer.regressed
-    better = {row.metric for row in nearer.rows if row.verdict == "better"}
-    assert better == {"depth.abs_rel"}  # the bias of the noise is within its margin
 
 
 @pytest.mark.parametrize("damage", ["removed", "truncated"])
@@ -372,14 +344,10 @@ def malformed(text):
     return {
         "empty": "",
         "truncated": text[: len(text) // 2],
-        "a line lost": "".join(lines[:-1]),
         "an edited value": "".join(edited),
         "another study's name": text.replace('"study":"stored"', '"study":"quick"', 1),
-        "no JSON": "# a baseline\n",
         "no object": "[]\n",
-        "another file": '{"scene":"bear"}\n',
         "another layout": text.replace('"baseline":1', '"baseline":9', 1),
-        "two lines swapped": "".join([lines[0], lines[2], lines[1], *lines[3:]]),
         "bytes": "\ud800",
     }
 
@@ -434,7 +402,6 @@ def more(stored, folder, **parts):
     ("parts", "told"),
     [
         ({"scene": ["stump", "garden"]}, "scenes garden, stump"),
-        ({"scene": ["garden"]}, "scene garden"),
         ({"variants": ["blurred", "sharp"]}, "variants blurred, sharp"),
     ],
 )

@@ -210,24 +210,6 @@ def test_a_pick_on_a_feature_grid_explains_its_cell(window):
     assert window.picked is None
 
 
-@pytest.mark.door
-def test_every_key_that_is_listed_changes_the_picture(window):
-    window.look_from_outside()
-    actions = window.actions()
-    listed = {key for keys in KEYS for key in keys.split(" / ")} - {"click", "q"}
-    assert {key.replace("question", "?") for key in actions} == listed
-    before = window.plotter.screenshot(return_img=True)
-    for key, action in actions.items():
-        if key in ("e", "f"):  # no edit here; the flight has a test of its own
-            continue
-        action()
-        after = window.plotter.screenshot(return_img=True)
-        assert (before != after).any(), key
-        before = after
-    window.show(target="yaw060", variant="corrected", coloring="mask", layer=None, splats=False,
-                surface=False)  # fmt: skip
-
-
 def test_a_variant_is_explained_anew_and_another_view_is_not(window):
     window.pick(30, 40)
     window.show(variant="released")
@@ -412,12 +394,9 @@ def test_the_command_refuses_by_name(tmp_path, folders, monkeypatch):
     (hostile / "study.json").write_text('{"study": {"scenes": ["../../../etc"]}}')
     for arguments, message in (
         ((*small, "--view", "yaw06"), "view: got 'yaw06'; did you mean 'yaw060'?"),
-        ((*small, "--variant", "papper"), "variant: got 'papper'; did you mean 'paper'?"),
         ((*small, "--color", "maks"), "--color: got 'maks'; did you mean 'mask'?"),
         ((*small, "--color", "edit disagreement"), "--color: got 'edit disagreement'"),
-        ((*small, "--pixel", "30"), "--pixel: got '30', expected COLUMN,ROW"),
         ((*small, "--pixel", "64,3"), "--pixel: got (64, 3)"),
-        ((*small, "--layer", "7"), "--layer: got '7', expected WIDTHxHEIGHT"),
         ((*small, "--layer", "7x7"), "--layer: got '7x7'; expected one of 16x16, 8x8"),
         ((*small, "--scene", "bear"), "so --scene has no meaning"),
         ((*small, "--ply", splats), "--ply: only goes with --data"),

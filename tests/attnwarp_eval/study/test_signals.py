@@ -76,37 +76,6 @@ def finish(folder, run):
     return list(lines(read_results(store), timings=False))
 
 
-STARTS_WORKERS = """
-from attnwarp_eval.study.cluster import _local_client
-if __name__ == "__main__":
-    with _local_client(16):
-        print("started")
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seconds", [0, 1, 3])
-def test_ctrl_c_ends_workers_that_are_many_and_still_start_within_five_seconds(tmp_path, seconds):
-    (tmp_path / "starts.py").write_text(STARTS_WORKERS)
-    process = subprocess.Popen(
-        [sys.executable, "starts.py"], cwd=tmp_path, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
-    )  # fmt: skip
-    started = set()
-    while not started and process.poll() is None:
-        started.update(workers(process.pid))
-        time.sleep(0.01)
-    time.sleep(seconds)
-    started.update(workers(process.pid))
-    begin = time.monotonic()
-    os.killpg(process.pid, signal.SIGINT)
-    out, errors = process.communicate(timeout=120)
-    assert time.monotonic() - begin < 5
-    assert out == "" and errors.splitlines()[-1].startswith("KeyboardInterrupt")
-    assert errors.count("Traceback") == 1  # none of a worker
-    assert started and not any(map(is_worker, started))
-
-
 @pytest.mark.parametrize(
     ("moment", "send", "number"),
     [

@@ -81,22 +81,6 @@ def test_the_report_tells_a_warp_without_rules_from_one_with_them(tmp_path):
 
 
 @pytest.mark.door
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (
-            {"labels": {"grids": [7]}},
-            "labels.grids: got 7, expected divisors of the image size, 64",
-        ),
-        ({"labels": {"parts": [1]}}, "labels.parts"),
-    ],
-)
-def test_labels_that_cannot_be_measured_are_refused(tmp_path, changes, message):
-    with pytest.raises(StudyError, match=message):
-        load(tmp_path, **changes)
-
-
-@pytest.mark.door
 def test_a_thing_that_the_scene_lacks_is_refused(tmp_path):
     scenes = {"spheres": load_scene("spheres")}
     with pytest.raises(StudyError, match="things.spheres: no object 'melone'.*'melon'"):

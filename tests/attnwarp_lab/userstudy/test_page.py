@@ -3,7 +3,6 @@
 import base64
 import io
 import json
-import re
 from html.parser import HTMLParser
 
 import numpy as np
@@ -186,22 +185,6 @@ def test_one_name_is_one_method_in_all_runs(tmp_path, changes, message):
     assert done.exit_code == 2 and done.stderr.count("\n") == 1
     assert done.stderr.startswith(f"attnwarp-eval: {other.root}: ")
     assert message.format(first=first.root) in done.stderr
-
-
-@pytest.mark.door
-def test_a_folder_that_is_no_run_and_a_missing_picture_are_one_line(run, tmp_path):
-    done = build(tmp_path, "--out", tmp_path / "a")
-    assert done.exit_code == 2 and "not a run's folder" in done.stderr
-    path = next(run.root.glob("pictures/*/*/*render.jpg"))
-    data = path.read_bytes()
-    path.unlink()
-    try:
-        done = build(run.root, "--out", tmp_path / "a")
-    finally:
-        path.write_bytes(data)
-    assert done.exit_code == 2 and re.search(
-        r"render\.jpg: No such file.*run the study again", done.stderr
-    )
 
 
 def pixels_of(address):
