@@ -126,23 +126,10 @@ def test_a_run_with_a_plugin_that_is_not_here_names_it(tmp_path):
 
 
 @pytest.mark.door
-def test_a_plugin_that_cannot_be_imported_is_no_damage_of_a_run(tmp_path):
-    store = Store(tmp_path / "run")
-    content = {"name": "own", "scenes": ["spheres"], "variants": {"a": {}}}
-    store.write_study(expected(plan(parse_study(content | {"probes": {"depth": ["a"]}}), store)))
-    done = subprocess.run(
-        [sys.executable, "-m", "attnwarp_eval", "verify", "run"], cwd=tmp_path,
-        env={**os.environ, "ATTNWARP_PLUGINS": "nope"}, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 2 and "the plugin 'nope' cannot be imported" in done.stderr
-
-
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("text", "says"),
     [
         (None, "ATTNWARP_PLUGINS: the plugin 'my_broken' cannot be imported: ModuleNotFoundError"),
-        ("1 / 0", "the plugin 'my_broken' cannot be imported: ZeroDivisionError: division by zero"),
         ("raise SystemExit(1)", "the plugin 'my_broken' cannot be imported: SystemExit: 1"),
     ],
 )

@@ -14,7 +14,6 @@ from effect_scenes import (
     GLASS,
     LAMP,
     MIRROR,
-    POINT,
     SCENES,
     SKY,
     SUN,
@@ -258,16 +257,6 @@ GLOBE = {
             "object 'lamp', a lamp, shines in no pass",
         ),
         (
-            lambda: make([FLOOR, ball()], [SUN, POINT]),
-            lambda p: p[1:],
-            r"lights\[0\], a sun, shines in no pass",
-        ),
-        (
-            lambda: make([FLOOR, ball()], [SKY], "unlimited"),
-            lambda p: [replace(p[0], max_depth=9)],
-            "needs no end",
-        ),
-        (
             lambda: make([FLOOR, ball(MIRROR)], [SKY], 6),
             lambda p: [replace(p[0], max_depth=6)],
             "specular.* needs 7 edges",
@@ -277,7 +266,6 @@ GLOBE = {
             lambda p: [replace(p[0], integrator="direct")],
             "direct have 2 edges",
         ),
-        (SCENES["caustics"], lambda p: p[1:], "shines in no pass"),
         (SCENES["caustics"], lambda p: p[:2], "taken away and no paths from the light put it back"),
         (
             lambda: make([FLOOR, ball(GLASS), GLOBE], [], 8),

@@ -202,12 +202,6 @@ def test_a_highlight_of_the_truth_is_found_and_texture_is_not(spheres):
 def test_wrong_input_is_refused_by_name(spheres):
     pair = pair_of(spheres, 30, 32)
     flat = np.full((32, 32, 3), 0.5)
-    with pytest.raises(
-        ValueError, match=r"source_srgb: got 31 x 32 pixels \(H x W\), expected 32 x 32"
-    ):
-        metrics.cross_view(flat[1:], flat, pair)
-    with pytest.raises(ValueError, match="target_srgb: 2 at row 0"):
-        metrics.cross_view(flat, flat * 4, pair)
     with pytest.raises(ValueError, match="exclude: got int64, expected bool"):
         metrics.cross_view(flat, flat, pair, exclude=np.zeros((32, 32), np.int64))
     with pytest.raises(ValueError, match="tolerance: got -1"):

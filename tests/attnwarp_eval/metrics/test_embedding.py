@@ -126,12 +126,10 @@ def test_an_encoder_s_nan_is_refused_and_not_taken_for_undefined(bad):
 @pytest.mark.parametrize(
     "call, complaint",
     [
-        (lambda: clip_similarity(E[0], E[0]), r"images: got shape \(4,\), expected \(N, D\)"),
         (
             lambda: clip_similarity(E, np.ones(3)),
             r"text: got shape \(1, 3\), expected \(4,\), \(1, 4\) or \(4, 4\)",
         ),
-        (lambda: clip_similarity(E, E[:2]), r"text: got shape \(2, 4\)"),
         (
             lambda: clip_similarity(E.astype(complex), E[0]),
             "images: got complex128, expected real numbers",
@@ -140,7 +138,6 @@ def test_an_encoder_s_nan_is_refused_and_not_taken_for_undefined(bad):
             lambda: directional_similarity(E[:3], E, E[0], E[1]),
             r"images_before: got shape \(3, 4\), expected \(4, 4\)",
         ),
-        (lambda: image_similarity(E[:3], E), r"source_edit: got shape \(3, 4\)"),
     ],
 )
 def test_shapes_that_do_not_fit_are_named(call, complaint):

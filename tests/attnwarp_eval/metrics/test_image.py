@@ -231,24 +231,17 @@ def test_values_that_are_no_picture_are_refused_with_their_place():
         ValueError, match="target: nan at row 3, column 4, channel 1; 1 values are NaN or outside"
     ):
         metrics.mse(image, spoiled)
-    spoiled[3, 4, 1] = 1.01
-    with pytest.raises(ValueError, match="image: 1.01 at row 3"):
-        metrics.ssim(spoiled, target)
     with pytest.raises(
         ValueError,
         match=r"image: got uint8, expected float32 or float64 in \[0, 1\]; divide by 255",
     ):
         metrics.psnr(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4, 3)))
-    with pytest.raises(ValueError, match="target: got float16"):
-        metrics.psnr(np.zeros((4, 4, 3)), np.zeros((4, 4, 3), np.float16))
     with pytest.raises(ValueError, match=r"target: got 40 x 51 pixels \(H x W\), expected 40 x 52"):
         metrics.mse(image, target[:, 1:])
     with pytest.raises(ValueError, match=r"image: got shape \(40, 52\), expected \(H, W, 3\)"):
         metrics.mse(image[..., 0], target[..., 0])
     with pytest.raises(ValueError, match="mask: got float64, expected bool"):
         metrics.mse(image, target, np.ones((40, 52)))
-    with pytest.raises(ValueError, match=r"mask: got shape \(52, 40\), expected \(40, 52\)"):
-        metrics.mse(image, target, np.ones((52, 40), bool))
     with pytest.raises(ValueError, match="image_srgb: -0.1 at row 0"):
         metrics.image_error(image - image - 0.1, target)
 

@@ -11,7 +11,7 @@ from scipy import fft
 from attnwarp import Camera
 from attnwarp.warp import correspond_at, sample
 from attnwarp_eval import metrics
-from attnwarp_eval.metrics.registry import METRICS, metric
+from attnwarp_eval.metrics.registry import metric
 from attnwarp_eval.truth.features import SolidField
 
 
@@ -190,34 +190,3 @@ def test_an_exact_warp_of_the_field_errs_by_bilinear_interpolation_alone(size, b
     # It rounds positions to 1/32 px.
     assert ours <= cv * 1.05
     assert cv - ours < 2 * math.pi * 4 / size / 64 + 0.05 * ours
-
-
-@pytest.mark.door
-def test_every_figure_is_registered_and_named_whatever_stands_behind_it():
-    mask = np.ones((2, 2), bool)
-    xy = np.zeros((2, 2, 2))
-    figures = (
-        metrics.endpoint_error(xy, xy, mask, mask)
-        | metrics.feature_error(np.ones((1, 2, 2)), np.ones((1, 2, 2)), mask, mask, mask)
-        | metrics.mask_error(mask, np.ones((2, 2), int), mask, ~mask, mask)
-        | metrics.depth_error(
-            np.ones((2, 2)),
-            np.ones((2, 2)),
-            normal=np.ones((2, 2, 3)),
-            true_normal=np.ones((2, 2, 3)),
-        )
-    )
-    # Calibration and fits have figures of their own, which no check gives.
-    registered = {name for name in METRICS if name.split(".")[0] in ("warp", "occlusion", "depth")}
-    assert {".".join(name.split(".")[:2]) for name in figures} == registered
-    for name, value in metrics.at_size(figures, 64).items():
-        assert name.endswith(".64")
-        spec = metric(name)
-        assert name.startswith(spec.name)
-        assert spec.direction in ("higher", "lower", "zero", "none")
-        assert spec.atol >= 0
-        assert spec.rtol >= 0
-        assert isinstance(value, float | int)
-    for name in ("warp.nothing", "nothing", "warp", "depth.biased.edge"):
-        with pytest.raises(KeyError):
-            metric(name)

@@ -202,9 +202,7 @@ p 1
         ("a.obj", "v 0 0\n", "line 1: a vertex has 2 numbers"),
         ("a.obj", "v 0 0 0\nf 1 2\n", "line 2: a face has 2 corners"),
         ("a.obj", "v 0 0 0\nf 1 2 3\n", "a face names vertex 2, but there are 1"),
-        ("a.obj", "v 0 0 0\nf 0 1 1\n", "line 2: a face names vertex '0'"),
         ("a.obj", "v 0 0 1_0\n", "line 1: got '1_0', expected a finite number"),
-        ("a.obj", "v 0 0 nan\n", "line 1: got 'nan', expected a finite number"),
         ("a.obj", "w 0 0 0\n", "line 1: got the keyword 'w', which OBJ does not have"),
         (
             "a.obj",
@@ -221,25 +219,13 @@ p 1
             "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n4 0 1 2\n",
             "line 6: a face announces 4 corners, and 3",
         ),
-        (
-            "a.off",
-            "OFF\n3 1 0\n0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
-            "line 3: a vertex has 2 numbers, expected 3",
-        ),
         ("a.off", "4OFF\n", "4OFF of another dimension"),
         ("a.off", "OFFER\n", "begins with 'OFFER', expected OFF"),
-        ("a.off", "", "begins with nothing, expected OFF"),
-        (
-            "a.off",
-            "OFF 3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n",
-            "a face names vertex 3, but there are 3",
-        ),
         (
             "a.stl",
             "solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n",
             "ends before endsolid",
         ),
-        ("a.stl", "solid x\nfacet normal 0 0 1\nvertex", "line 3: got 'vertex', expected outer"),
         ("a.stl", "x" * 90, "announces 2021161080 triangles"),
         (
             "a.ply",
@@ -304,14 +290,6 @@ def test_an_obj_in_utf_16_is_refused_by_name(tmp_path, encoding):
     (tmp_path / "box.obj").write_bytes(text.encode(encoding))
     with pytest.raises(ValueError, match=r"box.obj: is text in UTF-16.*save it as UTF-8"):
         read_mesh(tmp_path / "box.obj")
-
-
-@pytest.mark.door
-def test_a_mesh_at_the_end_of_the_world_is_refused_by_name(tmp_path):
-    with pytest.raises(
-        ValueError, match=r"vertex 2 lies 1e\+30 from the origin, expected at most 1e\+09"
-    ):
-        read_text(tmp_path, "far.obj", "v 0 0 0\nv 1e30 0 0\nv 0 1 0\nf 1 2 3\n")
 
 
 # glTF
@@ -462,9 +440,7 @@ def accessor(key, value):
             lambda d: d["accessors"][1].update(count=3, componentType=5125),
             "a face names vertex 196610, but its part has 24",
         ),
-        (accessor("count", 10**6), "repair or export"),
         (accessor("sparse", {}), "accessor 0 is sparse, which is not read"),
-        (accessor("type", "VEC2"), "accessor 0 is VEC2, expected VEC3"),
         (accessor("count", True), "accessors.0.count: Input should be a valid integer"),
         (lambda d: d["nodes"][0].update(mesh=7), "names what it does not hold"),
         (lambda d: d["nodes"][0].update(children=[0]), "node 0 is reached twice"),
@@ -473,10 +449,6 @@ def accessor(key, value):
         (
             lambda d: d.update(extensionsRequired=["KHR_draco_mesh_compression"]),
             "'KHR_draco_mesh_compression'",
-        ),
-        (
-            lambda d: d.update(extensionsUsed=["EXT_mesh_gpu_instancing"]),
-            "'EXT_mesh_gpu_instancing'",
         ),
     ],
 )

@@ -99,25 +99,12 @@ MISTAKES = [
     ),
     (
         "lights:\n",
-        "appearance: {bounces: 65}\nlights:\n",
-        13,
-        r"appearance.bounces: got 65, but input should be less than or equal to 64",
-    ),
-    (
-        "lights:\n",
         "appearance: {bounces: auto}\nlights:\n",
         13,
         r"appearance.bounces: got 'auto', expected 1 to 64 or unlimited; take it out, and .* calibrate",
     ),
     ("radius: 0.5", "radius: .nan", 11, r"objects\[1\].shape.radius: got nan, but .*finite"),
-    ("radius: 0.5", "radius: big", 11, r"objects\[1\].shape.radius: got 'big', but .*valid number"),
     ("      radius: 0.5\n", "", 8, r"objects\[1\].shape.radius: is missing"),
-    (
-        "type: sphere",
-        "type: spere",
-        9,
-        r"objects\[1\].shape.type: got 'spere'; did you mean 'sphere'\?",
-    ),
     ("type: sphere", "kind: sphere", 8, r"objects\[1\].shape: says no type"),
     (
         "color: '#c04020'",
@@ -143,8 +130,6 @@ MISTAKES = [
         7,
         r"objects\[1\].name: 'floor' is also the name of objects\[0\]; rename one",
     ),
-    ("title: A", "titel: A", 2, "titel: unknown key 'titel'; did you mean 'title'"),
-    ("    - {yaw: 30, height: 1}\n", "    []\n", 19, "cameras.targets: got .* at least 1 item"),
     (
         "{yaw: 30, height: 1}",
         "{yaw: 0, height: 1, name: source}",
@@ -177,15 +162,6 @@ MISTAKES = [
         "  radius: 3\n  size: [0, 512]\n",
         18,
         r"cameras.size: got \[0, 512\], expected at least",
-    ),
-    (
-        "  - {type: sun",
-        (
-            "  - {type: sky, horizon: '#fff0ff', zenith: '#0000ff'}\n  - {type: sky, horizon:"
-            " '#ffffff', zenith: '#0000ff'}\n  - {type: sun"
-        ),
-        15,
-        r"lights\[1\]: a second sky",
     ),
     (
         "  - {type: sun",
@@ -291,11 +267,6 @@ def test_an_own_mesh_is_read_relative_to_the_file_and_its_bytes_are_part_of_the_
             r"there is no file .*scans/bal.obj; did you mean 'ball.obj'\?; the path counts",
         ),
         (
-            "ball.obj",
-            "ball.fbx",
-            r"'scans/ball.fbx' is not of a known mesh format; one of .ply, .obj",
-        ),
-        (
             "position: [0, 0, 0.5]",
             "position: [3, 0, 1.5]",
             r"the camera 'source' at .* is inside the object 'ball'",
@@ -319,7 +290,6 @@ def test_what_is_wrong_with_an_own_mesh_is_told_with_its_line(tmp_path, old, new
             "radii: [1.0e-3, 1.0e-3, 1.0e-3]}]",
             "blend 0.1 .* lattice points, more than 1,000,000,000",
         ),
-        ("radii: [1, 1, 1]}], relief: {depth: 100, size: 1}", "relief 100 deep .* make blend"),
     ],
 )
 def test_a_body_that_cannot_be_meshed_is_told_with_its_name_and_remedy(tmp_path, body, says):

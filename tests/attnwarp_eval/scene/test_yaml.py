@@ -52,16 +52,11 @@ edits:
     ("text", "line", "message"),
     [
         ("a: 1\n[b, c]: 2\n", 2, "a key is a list or a mapping"),
-        ("a: 1\n? {b: c}\n: 2\n", 2, "a key is a list or a mapping"),
         ("a: 1\nb: {c: 1, c: 2}\n", 2, "the key 'c' stands here and on line 2"),
         ("a: 1\nb: !!int 'x'\n", 2, "'x' is no int"),
-        ("a: !!float 'x'\n", 1, "'x' is no float"),
-        ("a: !!bool 'x'\n", 1, "'x' is no bool"),
-        ("a: !!timestamp 'x'\n", 1, "the tag 'tag:yaml.org,2002:timestamp' means nothing here"),
         ("a: !!python/object:os.system x\n", 1, "the tag .*os.system' means nothing here"),
         ("a: 1\nb: {<<: 3}\n", 2, "<<: expected keys with values"),
         ("a: *x\n", 1, "found undefined alias 'x'"),
-        ('a: "\\UFFFFFFFF"\n', None, "not valid YAML"),
         ("a: \x07\n", None, "not valid YAML: .*special characters"),
         ("a: [1\nb: 2\n", 2, "check indentation and quotes"),
         ("", None, "the file is empty"),
@@ -122,12 +117,8 @@ def test_a_place_has_its_line_through_what_is_merged_and_what_a_union_adds():
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("radius: 3", "radius: yes", "small.yaml:19: cameras.radius: got 'yes', but"),
         ("radius: 3", "radius: true", "small.yaml:19: cameras.radius: got true, expected a number"),
-        ("radius: 3", "radius: 1e30", r"small.yaml:19: cameras.radius: got 1e\+30, but input"),
         ("source: {yaw: 0", "source: {yaw: 1:30", "small.yaml:22: .*source.yaw: got '1:30', but"),
-        ("size: [64, 64]", "size: [0x40, 64]", r"small.yaml:21: .*size\[0\]: got '0x40', but"),
-        ("radius: 3", "radius: !!int x", "small.yaml:19: 'x' is no int"),
         ("radius: 3", f"radius: [{'1, ' * 5000}1]", r"radius: got \[1, 1, 1, 1, 1, 1, \.\.\.\]"),
     ],
 )

@@ -396,11 +396,9 @@ def children(pid):
         (("run", "quik"), "did you mean 'quick'"),
         (("run", "study.yaml", "--scenes", "sphere"), "did you mean 'spheres'"),
         (("run", "study.yaml", "--seeds", "0,one"), "--seeds: got '0,one', expected whole numbers"),
-        (("run", "study.yaml", "--seeds", ","), "--seeds: got ',', expected whole numbers"),
         (("run", "study.yaml", "--jobs", "0"), "jobs"),
         (("run", "study.yaml", "--out", "study.yaml"), "study.yaml: is a file, expected a run"),
         (("verify", "nowhere"), "attnwarp-eval run"),
-        (("report", "nowhere"), "attnwarp-eval run"),
         (("scenes", "show", "nothing.yaml"), "no such scene file"),
     ],
 )

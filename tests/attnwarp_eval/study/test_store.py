@@ -76,16 +76,6 @@ def test_a_folder_of_others_results_or_the_current_one_with_other_things_is_refu
     Store("").refuse_strangers()
 
 
-@pytest.mark.door
-def test_a_file_in_place_of_a_runs_folder_is_named_and_left_alone(tmp_path):
-    path = tmp_path / "study.yaml"
-    path.write_text("name: mine")
-    message = "study.yaml: is a file, expected a run's folder"
-    with pytest.raises(StoreError, match=message), Store(path).lock():
-        pass
-    assert path.read_text() == "name: mine"
-
-
 def test_a_record_reads_back_as_written(tmp_path):
     store = Store(tmp_path)
     store.write(record())
@@ -183,12 +173,6 @@ def test_study_json_carries_the_sha256_of_its_content(tmp_path):
     path.write_text(json.dumps(content))
     with pytest.raises(StoreError, match=r"study\.json: made by an older version; run it again$"):
         store.read_study()
-
-
-@pytest.mark.door
-def test_a_folder_that_is_not_a_run_says_how_to_make_one(tmp_path):
-    with pytest.raises(StoreError, match="attnwarp-eval run"):
-        Store(tmp_path).verify()
 
 
 @pytest.mark.door
