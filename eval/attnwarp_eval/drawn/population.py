@@ -36,15 +36,17 @@ class _Scenes(Spec, ABC):
         check_axes(self.axes, self.stratify)
         return self
 
-    @property
-    @abstractmethod
-    def count(self) -> int:
-        """Number of scenes."""
+    word: ClassVar[str]
+    """First word of the scenes' names."""
+
+    _number: ClassVar[str]
+    """Key with the number of scenes."""
 
     @property
-    @abstractmethod
-    def word(self) -> str:
-        """First word of the scenes' names."""
+    def count(self) -> int:
+        """Number of scenes."""
+        number: int = getattr(self, self._number)
+        return number
 
     @abstractmethod
     def scene(self, number: int) -> Drawn:
@@ -84,8 +86,6 @@ class _Scenes(Spec, ABC):
         """Copy of the population with another number of scenes."""
         return self.model_copy(update={self._number: count})
 
-    _number: ClassVar[str]
-
     def paths(self) -> dict[str, Path]:
         """Files of the scenes by name, some of which may not be drawn yet."""
         kept = self.model_dump(mode="json")
@@ -122,17 +122,8 @@ class DrawnScenes(_Scenes):
     """
 
     drawn: Count
+    word: ClassVar[str] = "drawn"
     _number: ClassVar[str] = "drawn"
-
-    @property
-    def count(self) -> int:
-        """Number of scenes."""
-        return self.drawn
-
-    @property
-    def word(self) -> str:
-        """First word of the scenes' names."""
-        return "drawn"
 
     def _what(self) -> str:
         return f"{self.drawn} scenes drawn"
@@ -154,17 +145,8 @@ class MeshScenes(_Scenes):
     meshes: str
     n: Count
     up: Literal["y", "z"] | None = None
+    word: ClassVar[str] = "mesh"
     _number: ClassVar[str] = "n"
-
-    @property
-    def count(self) -> int:
-        """Number of scenes."""
-        return self.n
-
-    @property
-    def word(self) -> str:
-        """First word of the scenes' names."""
-        return "mesh"
 
     @property
     def _paths(self) -> list[Path]:

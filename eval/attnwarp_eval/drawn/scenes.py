@@ -309,7 +309,7 @@ class SceneDraft(Draft):
             ]
             texture = {
                 "type": "plain",
-                "color": _hue(rng, SATURATED[index(rng, len(SATURATED))]),
+                "color": shade(SATURATED[index(rng, len(SATURATED))], rng),
                 "variation": 0.2,
                 "grain": 0.05,
             }
@@ -351,7 +351,7 @@ class SceneDraft(Draft):
         rng = self.stream("ground")
         texture = dict(self.look.floor)
         if rng.random() < self.axes.texture * 0.6:
-            colors = [_hue(rng, self.accent), _hue(rng, "white")]
+            colors = [shade(self.accent, rng), shade("white", rng)]
             size = round(between(rng, 0.3, 0.6) * (1.4 - 0.7 * self.axes.texture), 2)
             texture = {
                 "type": "checker", "colors": colors, "size": size, "variation": 0.1, "grain": 0.05,
@@ -394,11 +394,11 @@ class SceneDraft(Draft):
         color = SATURATED[index(rng, len(SATURATED))]
         if rng.random() > 0.3 + self.axes.texture:
             kind = "plain"
-        first, second = _hue(rng, color), _hue(rng, "white" if rng.random() < 0.5 else "grey")
+        first, second = shade(color, rng), shade("white" if rng.random() < 0.5 else "grey", rng)
         size = round(between(rng, 0.3, 0.6), 2)
         match kind:
             case "bricks":
-                return {"type": "bricks", "colors": [first, _hue(rng, color)], "mortar": second,
+                return {"type": "bricks", "colors": [first, shade(color, rng)], "mortar": second,
                         "size": [size, round(0.4 * size, 2)], "variation": 0.2}  # fmt: skip
             case "checker":
                 return {
@@ -439,10 +439,6 @@ def _own_bounces(spec: SceneSpec, edit: Any, answer: Any, own: Any, entry: dict[
     number = likely_bounces(apply(spec, edit, answer))
     if number != own:
         entry["bounces"] = number
-
-
-def _hue(rng: np.random.Generator, color: str) -> str:
-    return shade(color, rng)
 
 
 def _reach(shapes: Sequence[dict[str, Any]]) -> tuple[float, float]:

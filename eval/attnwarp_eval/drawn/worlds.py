@@ -37,6 +37,19 @@ HSV: dict[str, tuple[float, float, float]] = {
     "black": (0, 0.05, 0.10), "white": (40, 0.03, 0.95), "grey": (0, 0.02, 0.50),
 }  # fmt: skip
 
+Range = tuple[float, float]
+
+SUNS: dict[str, tuple[Range, Range, str]] = {
+    "day": ((30, 65), (2.4, 3.2), "#fff1dc"), "sunset": ((8, 20), (2.8, 4.2), "#ff9a4a"), "night": ((30, 55), (0.7, 1.3), "#9fb8f0"),
+}  # fmt: skip
+"""Elevation in degrees, irradiance and colour of the sun by the time of day; none if cloudy."""
+
+SKIES: dict[str, tuple[str, str, Range]] = {
+    "day": ("#d6e2ee", "#6c9fdb", (0.7, 1.0)), "sunset": ("#f0a878", "#5a6fb0", (0.6, 1.0)),
+    "night": ("#34466e", "#141d3c", (0.8, 1.3)), "cloudy": ("#d4d8dc", "#aeb6c0", (0.8, 1.1)),
+}  # fmt: skip
+"""Horizon, zenith and radiance of the sky by the time of day."""
+
 TRAIN_SHAPES = 40
 """Training instances of each object; held-out ones count from :data:`HELD_OUT_SHAPE`."""
 HELD_OUT_SHAPE = 100_000
@@ -111,21 +124,10 @@ class Look:
         if finish == "stone":
             base = rng.uniform(0.34, 0.55)
             tones = [_hex((base * k * 1.02, base * k, base * k * 0.95)) for k in (0.7, 1.0, 1.25)]
-            return {
-                "texture": {
-                    "type": "noise",
-                    "colors": tones,
-                    "size": 0.12,
-                    "octaves": 6,
-                    "variation": 0.5,
-                    "grain": 0.02,
-                }
-            }
+            return {"texture": _noise(tones, 0.12, 0.5, 0.02, octaves=6)}
         veins = ["#f4f2ee", "#eceae6", "#f8f7f4", "#8b8d92", "#f1efec", "#e6e4e0"]
         size = round(float(rng.uniform(0.35, 0.7)), 2)
-        return {
-            "texture": {"type": "noise", "colors": veins, "size": size, "octaves": 5, "variation": 0.05, "grain": 0.05}
-        }
+        return {"texture": _noise(veins, size, 0.05, 0.05, octaves=5)}
 
     @cached_property
     def floor(self) -> dict[str, Any]:
@@ -142,14 +144,7 @@ class Look:
             colors = [_scaled(c, bright) for c in tones[kind]]
             variation = {"snow": 0.1, "road": 0.45}.get(kind, 0.4)
             size = round(float(rng.uniform(0.4, 0.9)), 2)
-            return {
-                "type": "noise",
-                "colors": colors,
-                "size": size,
-                "octaves": 5,
-                "variation": variation,
-                "grain": 0.05,
-            }
+            return _noise(colors, size, variation, 0.05, octaves=5)
         if kind == "boards":
             colors = [_scaled(c, bright) for c in ("#b98a58", "#a97a4a", "#c29664", "#9c6f42")]
             angle = rng.uniform(0, np.pi)
@@ -176,64 +171,18 @@ class Look:
         """Sun and sky of the time of day, in the format of a scene file."""
         rng = np.random.default_rng([self.seed, 3])
         azimuth = round(float(rng.uniform(0, 360)), 1)
-        match TIMES[self.time]:
-            case "day":
-                return [
-                    {
-                        "type": "sun",
-                        "elevation": round(float(rng.uniform(30, 65)), 1),
-                        "azimuth": azimuth,
-                        "irradiance": round(float(rng.uniform(2.4, 3.2)), 2),
-                        "color": "#fff1dc",
-                    },
-                    {
-                        "type": "sky",
-                        "horizon": "#d6e2ee",
-                        "zenith": "#6c9fdb",
-                        "radiance": round(float(rng.uniform(0.7, 1.0)), 2),
-                    },
-                ]
-            case "sunset":
-                return [
-                    {
-                        "type": "sun",
-                        "elevation": round(float(rng.uniform(8, 20)), 1),
-                        "azimuth": azimuth,
-                        "irradiance": round(float(rng.uniform(2.8, 4.2)), 2),
-                        "color": "#ff9a4a",
-                    },
-                    {
-                        "type": "sky",
-                        "horizon": "#f0a878",
-                        "zenith": "#5a6fb0",
-                        "radiance": round(float(rng.uniform(0.6, 1.0)), 2),
-                    },
-                ]
-            case "night":
-                return [
-                    {
-                        "type": "sun",
-                        "elevation": round(float(rng.uniform(30, 55)), 1),
-                        "azimuth": azimuth,
-                        "irradiance": round(float(rng.uniform(0.7, 1.3)), 2),
-                        "color": "#9fb8f0",
-                    },
-                    {
-                        "type": "sky",
-                        "horizon": "#34466e",
-                        "zenith": "#141d3c",
-                        "radiance": round(float(rng.uniform(0.8, 1.3)), 2),
-                    },
-                ]
-            case _:
-                return [
-                    {
-                        "type": "sky",
-                        "horizon": "#d4d8dc",
-                        "zenith": "#aeb6c0",
-                        "radiance": round(float(rng.uniform(0.8, 1.1)), 2),
-                    }
-                ]
+        time = TIMES[self.time]
+        lights: list[dict[str, Any]] = []
+        if time in SUNS:
+            elevation, irradiance, color = SUNS[time]
+            lights.append({
+                "type": "sun", "elevation": round(float(rng.uniform(*elevation)), 1), "azimuth": azimuth,
+                "irradiance": round(float(rng.uniform(*irradiance)), 2), "color": color,
+            })  # fmt: skip
+        horizon, zenith, radiance = SKIES[time]
+        radiance_drawn = round(float(rng.uniform(*radiance)), 2)
+        lights.append({"type": "sky", "horizon": horizon, "zenith": zenith, "radiance": radiance_drawn})
+        return lights
 
 
 def shade(color: str, rng: np.random.Generator) -> str:
@@ -244,6 +193,11 @@ def shade(color: str, rng: np.random.Generator) -> str:
     saturation = np.clip(saturation * rng.uniform(0.88, 1.12), 0, 1)
     value = np.clip(value * rng.uniform(0.88, 1.1), 0, 1)
     return _hex(colorsys.hsv_to_rgb(hue, float(saturation), float(value)))
+
+
+def _noise(colors: list[str], size: float, variation: float, grain: float, **octaves: int) -> dict[str, Any]:
+    """Noise as a texture, in the format of a scene file."""
+    return {"type": "noise", "colors": colors, "size": size, **octaves, "variation": variation, "grain": grain}
 
 
 def _hex(rgb: tuple[float, ...]) -> str:
@@ -332,13 +286,7 @@ class World:
             else:
                 shape = body(str(kind), int(rng.integers(8)), resolution=40)
                 if kind == "tree":
-                    texture = {
-                        "type": "noise",
-                        "colors": ["#2f4a1c", "#5c7a34", "#7d9648"],
-                        "size": 0.15,
-                        "variation": 0.4,
-                        "grain": 0.05,
-                    }
+                    texture = _noise(["#2f4a1c", "#5c7a34", "#7d9648"], 0.15, 0.4, 0.05)
                     place = [round(1.4 * place[0], 2), round(1.4 * place[1], 2), 0.0]
             scale = round(float(rng.uniform(2.0, 3.5) if kind == "tree" else rng.uniform(0.35, 0.7)), 2)
             items.append(
@@ -352,13 +300,7 @@ class World:
                 "size": [round(float(rng.uniform(2, 8)), 2), 0.6, round(float(high), 2)], "yaw": round(float(np.degrees(angle)) + 90, 1),
             }  # fmt: skip
             if rng.uniform() < 0.6:
-                texture = {
-                    "type": "noise",
-                    "colors": ["#24391a", "#46652c", "#5f7f3a"],
-                    "size": 0.3,
-                    "variation": 0.5,
-                    "grain": 0.08,
-                }
+                texture = _noise(["#24391a", "#46652c", "#5f7f3a"], 0.3, 0.5, 0.08)
             else:
                 texture = {
                     "type": "bricks",
