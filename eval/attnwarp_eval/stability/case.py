@@ -256,7 +256,7 @@ def hard(
     measure: Callable[[float, Way], float],
     ways: tuple[Way, ...],
     *,
-    bounds: Mapping[Direction, Bound],
+    bounds: Bound | Mapping[Direction, Bound],
     must_refuse: Callable[[float, Way], bool] = lambda level, way: False,
     package: str = "attnwarp_eval.stability",
 ) -> Case:
@@ -264,15 +264,18 @@ def hard(
 
     Args:
         name: row of the table.
-        measure, ways, bounds, must_refuse: as in :class:`Case`.
+        measure, ways, must_refuse: as in :class:`Case`.
+        bounds: as in :class:`Case`, or one for every direction.
         package: package whose cases.yaml has the row.
 
     Example:
         >>> from attnwarp_eval.stability.case import exact, hard, ways
-        >>> bounds = {"forward": exact("hidden pixels accepted")}
-        >>> hard("opposed_views", lambda level, way: 0.0, ways("cpu"), bounds=bounds).required
+        >>> bound = exact("hidden pixels accepted")
+        >>> hard("opposed_views", lambda level, way: 0.0, ways("cpu"), bounds=bound).required
         180
     """
+    if isinstance(bounds, Bound):
+        bounds = dict.fromkeys([way.direction for way in ways], bounds)
     return Case(
         name=name, measure=measure, ways=ways, bounds=bounds, must_refuse=must_refuse,
         **_rows(package)[name],

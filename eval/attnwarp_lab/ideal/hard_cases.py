@@ -77,22 +77,17 @@ def _ideal(tokens: int, alpha: float, way: Way) -> float:
 IDEAL = Bound("of 1", 1e-3, "a quarter of a step of an 8-bit picture is 1e-3")
 
 CASES = [
-    hard(
-        "ideal_alpha_bar",
-        lambda alpha, way: _ideal(16, alpha, way),
-        ways("ideal"),
-        bounds={"forward": IDEAL},
-    ),
+    hard("ideal_alpha_bar", lambda alpha, way: _ideal(16, alpha, way), ways("ideal"), bounds=IDEAL),
     hard(
         "part_of_one_token",
         lambda tokens, way: _ideal(int(tokens), 0.01, way),
         ways("ideal"),
-        bounds={"forward": IDEAL},
+        bounds=IDEAL,
     ),
     hard(
         "visible_tokens",
         _visible_tokens,
         (Way("metrics"),),
-        bounds={"forward": Bound("of 1", 1e-12, "a fraction of whole numbers")},
+        bounds=Bound("of 1", 1e-12, "a fraction of whole numbers"),
     ),
 ]

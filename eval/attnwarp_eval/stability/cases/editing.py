@@ -286,37 +286,26 @@ def _step_terms(prediction: str, x: float, out: float, then: float, now: float) 
 
 
 CASES = [
-    hard(
-        "half_attention",
-        _magnitude,
-        ways("reference", "cpu", precisions=HALVES),
-        bounds={"forward": ROUNDED},
-    ),
+    hard("half_attention", _magnitude, ways("reference", "cpu", precisions=HALVES), bounds=ROUNDED),
     hard(
         "blend_weight",
         _weight,
         tuple(way for way in EVERY_TYPE if way.precision != "float64"),
-        bounds={
-            "forward": Bound(
-                "steps of the type", 4, "four taps and two products, each rounded in float32"
-            )
-        },
+        bounds=Bound("steps of the type", 4, "four taps and two products, each rounded in float32"),
     ),
-    hard("empty_mask_of_tokens", _outside, EVERY_TYPE, bounds={"forward": exact("changed values")}),
-    hard("one_view", _views_of_a_batch, ways("reference", "cpu"), bounds={"forward": ONE_VIEW}),
-    hard("views_apart", _apart, EVERY_TYPE, bounds={"forward": exact("wrong tokens")}),
+    hard("empty_mask_of_tokens", _outside, EVERY_TYPE, bounds=exact("changed values")),
+    hard("one_view", _views_of_a_batch, ways("reference", "cpu"), bounds=ONE_VIEW),
+    hard("views_apart", _apart, EVERY_TYPE, bounds=exact("wrong tokens")),
     hard(
         "one_latent",
         _latents,
         EVERY_TYPE,
-        bounds={"forward": Bound("px of the layer", 1e-4, "numerics of the warp")},
+        bounds=Bound("px of the layer", 1e-4, "numerics of the warp"),
     ),
     hard(
         "alpha_bar",
         _step,
         ways("schedule", precisions=("float64", "float32", *HALVES)),
-        bounds={
-            "forward": Bound("steps of the type", 4, "eight roundings of its terms, each by half")
-        },
+        bounds=Bound("steps of the type", 4, "eight roundings of its terms, each by half"),
     ),
 ]

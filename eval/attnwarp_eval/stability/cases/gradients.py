@@ -249,37 +249,31 @@ WARPED = Bound(STEPS, 3.5, "three roundings of a weight, one of its product, thr
 BLENDED = Bound(STEPS, 4, "as for a warp, and the product with a")
 
 CASES = [
-    hard("gradient_of_taps", _taps, WHOLE, bounds={"backward": WARPED}),
-    hard("half_gradient", _magnitude, HALF, bounds={"backward": ROUNDED_ONCE}),
+    hard("gradient_of_taps", _taps, WHOLE, bounds=WARPED),
+    hard("half_gradient", _magnitude, HALF, bounds=ROUNDED_ONCE),
     hard(
         "many_readers",
         _readers,
         HALF,
-        bounds={
-            "backward": Bound(
-                STEPS,
-                lambda count: 0.5 + (count + 1) * 2.0**-14,
-                "rounded once, after as many sums in float32, each off by 2^-14 steps of float16",
-            )
-        },
+        bounds=Bound(
+            STEPS,
+            lambda count: 0.5 + (count + 1) * 2.0**-14,
+            "rounded once, after as many sums in float32, each off by 2^-14 steps of float16",
+        ),
     ),
-    hard("gradient_of_holes", _holes, WHOLE + HALF, bounds={"backward": WARPED}),
-    hard("blend_gradient", _blend_weight, WHOLE, bounds={"backward": BLENDED}),
-    hard("half_blend_gradient", _blend_weight, HALF, bounds={"backward": ROUNDED_ONCE}),
-    hard("gradient_of_masks", _mask, WHOLE + HALF, bounds={"backward": BLENDED}),
-    hard(
-        "gradient_near_equal_depth", _near_equal_depth, WHOLE + HALF, bounds={"backward": BLENDED}
-    ),
+    hard("gradient_of_holes", _holes, WHOLE + HALF, bounds=WARPED),
+    hard("blend_gradient", _blend_weight, WHOLE, bounds=BLENDED),
+    hard("half_blend_gradient", _blend_weight, HALF, bounds=ROUNDED_ONCE),
+    hard("gradient_of_masks", _mask, WHOLE + HALF, bounds=BLENDED),
+    hard("gradient_near_equal_depth", _near_equal_depth, WHOLE + HALF, bounds=BLENDED),
     hard(
         "injected_gradient",
         _injected,
         WHOLE,
-        bounds={
-            "backward": Bound(
-                "steps of the type at the sum of magnitudes",
-                2.5,
-                "1 - a, its product, the product with the matrix, the sum of three channels",
-            )
-        },
+        bounds=Bound(
+            "steps of the type at the sum of magnitudes",
+            2.5,
+            "1 - a, its product, the product with the matrix, the sum of three channels",
+        ),
     ),
 ]

@@ -139,8 +139,8 @@ WAYS = ways("cpu")
 FAR = exact("pixels more than 3 px off")
 
 CASES = [
-    hard("lifted_touching", _touching, WAYS, bounds={"forward": FAR}),
-    hard("lifted_thin", _thin, WAYS, bounds={"forward": FAR}),
-    hard("lifted_size", _size, WAYS, bounds={"forward": FAR}),
-    hard("lifted_part", _part, WAYS, bounds={"forward": FAR}),
+    hard("lifted_touching", _touching, WAYS, bounds=FAR),
+    hard("lifted_thin", _thin, WAYS, bounds=FAR),
+    hard("lifted_size", _size, WAYS, bounds=FAR),
+    hard("lifted_part", _part, WAYS, bounds=FAR),
 ]

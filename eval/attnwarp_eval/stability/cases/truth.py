@@ -109,37 +109,33 @@ CASES = [
         "grazing_plane",
         _grazing,
         BOTH,
-        bounds={
-            "forward": Bound(
-                "relative",
-                lambda incidence: 1e-6 / math.cos(math.radians(incidence)),
-                "1e-6 over the cosine: a hair's height moves the hit that far",
-            )
-        },
+        bounds=Bound(
+            "relative",
+            lambda incidence: 1e-6 / math.cos(math.radians(incidence)),
+            "1e-6 over the cosine: a hair's height moves the hit that far",
+        ),
     ),
     hard(
         "coplanar",
         _coplanar,
         BOTH,
-        bounds={"forward": Bound("relative", 1e-6, "which of the two is hit does not show")},
+        bounds=Bound("relative", 1e-6, "which of the two is hit does not show"),
     ),
-    hard("coplanar_ties", _ties, BOTH, bounds={"forward": exact("wrong owners")}),
+    hard("coplanar_ties", _ties, BOTH, bounds=exact("wrong owners")),
     hard(
         "tangent_ray",
         _tangent,
         RAYS,
-        bounds={
-            "forward": Bound(
-                "scene",
-                lambda gap: 1e-4 * 0.7 * math.sqrt(2 * gap) + 3e-13,
-                "1e-4 of half the chord, and 1e-13 of the distance",
-            )
-        },
+        bounds=Bound(
+            "scene",
+            lambda gap: 1e-4 * 0.7 * math.sqrt(2 * gap) + 3e-13,
+            "1e-4 of half the chord, and 1e-13 of the distance",
+        ),
     ),
     hard(
         "shared_edge",
         _shared_edge,
         (Way("embree"),),
-        bounds={"forward": Bound("m", 3e-6, "1e-6 of the distance")},
+        bounds=Bound("m", 3e-6, "1e-6 of the distance"),
     ),
 ]

@@ -489,90 +489,81 @@ def _nan_positions(share: float, way: Way) -> float:
 HALVES = ("float16", "bfloat16")
 
 CASES = [
-    hard("behind_the_camera", _behind, WARPS, bounds={"forward": exact("wrong labels")}),
-    hard(
-        "undefined_depth",
-        _undefined_depth,
-        WARPS,
-        bounds={"forward": exact("wrong labels or values")},
-    ),
-    hard("zero_baseline", position_error(_same_view), WARPS, bounds={"forward": LOOSE}),
+    hard("behind_the_camera", _behind, WARPS, bounds=exact("wrong labels")),
+    hard("undefined_depth", _undefined_depth, WARPS, bounds=exact("wrong labels or values")),
+    hard("zero_baseline", position_error(_same_view), WARPS, bounds=LOOSE),
     hard(
         "zero_baseline_features",
         _identity_bits,
         ways("reference", "cpu", precisions=("float64", "float32", *HALVES)),
-        bounds={"forward": exact("changed values")},
+        bounds=exact("changed values"),
     ),
-    hard("tiny_baseline_far", position_error(_baseline_far), WARPS, bounds={"forward": LOOSE}),
-    hard("opposed_views", _opposed, WARPS, bounds={"forward": exact("hidden pixels accepted")}),
-    hard("far_world", position_error(_far), WARPS, bounds={"forward": LOOSE}),
-    hard("scene_scale", position_error(_scaled), WARPS, bounds={"forward": POSITION}),
+    hard("tiny_baseline_far", position_error(_baseline_far), WARPS, bounds=LOOSE),
+    hard("opposed_views", _opposed, WARPS, bounds=exact("hidden pixels accepted")),
+    hard("far_world", position_error(_far), WARPS, bounds=LOOSE),
+    hard("scene_scale", position_error(_scaled), WARPS, bounds=POSITION),
     hard(
         "scene_scale_rules",
         _scaled_rules,
         WARPS,
-        bounds={"forward": exact("wrong labels", "a power of two rounds nothing")},
+        bounds=exact("wrong labels", "a power of two rounds nothing"),
     ),
-    hard("principal_point", position_error(_principal_point), WARPS, bounds={"forward": POSITION}),
-    hard("skew", position_error(_skew), WARPS, bounds={"forward": POSITION}),
-    hard("small_picture", position_error(_small_picture), WARPS, bounds={"forward": POSITION}),
+    hard("principal_point", position_error(_principal_point), WARPS, bounds=POSITION),
+    hard("skew", position_error(_skew), WARPS, bounds=POSITION),
+    hard("small_picture", position_error(_small_picture), WARPS, bounds=POSITION),
     hard(
         "not_a_rotation",
         position_error(_no_rotation),
         WARPS,
-        bounds={
-            "forward": Bound("px", 1e-3, "the deviation allowed, over a picture of 8 px, twice")
-        },
+        bounds=Bound("px", 1e-3, "the deviation allowed, over a picture of 8 px, twice"),
         must_refuse=lambda level, way: level > 1e-5,
     ),
     hard(
         "angle_near_0",
         _angle(0),
         ways("reference"),
-        bounds={"forward": Bound("relative", 1e-5, "an arccosine would return 0 below 1e-8")},
+        bounds=Bound("relative", 1e-5, "an arccosine would return 0 below 1e-8"),
     ),
     hard(
         "angle_near_180",
         _angle(180),
         ways("reference"),
-        bounds={"forward": Bound("degrees", 4e-5, "two steps of a float32 of 180")},
+        bounds=Bound("degrees", 4e-5, "two steps of a float32 of 180"),
     ),
-    hard("taps_across_an_edge", _step, WARPS, bounds={"forward": exact("depths on neither side")}),
+    hard("taps_across_an_edge", _step, WARPS, bounds=exact("depths on neither side")),
     hard(
         "slanted_depth",
         _slanted,
         WARPS,
-        bounds={"forward": Bound("relative", 1e-6, "float32 depths are stored to 6e-8")},
+        bounds=Bound("relative", 1e-6, "float32 depths are stored to 6e-8"),
     ),
     hard(
         "feature_size",
         _ramp,
         WARPS,
-        bounds={"forward": Bound("share of the image", 1e-5, "u' = u s; 1/200 px at 512")},
+        bounds=Bound("share of the image", 1e-5, "u' = u s; 1/200 px at 512"),
     ),
     hard(
         "half_features",
         _half,
         ways("reference", "cpu", precisions=HALVES),
-        bounds={
-            "forward": Bound(
-                "steps of the type", 0.51, "rounded once: half a step, and float32's own rounding"
-            )
-        },
+        bounds=Bound(
+            "steps of the type", 0.51, "rounded once: half a step, and float32's own rounding"
+        ),
     ),
     hard(
         "grid_type",
         _grid_type,
         ways("reference", precisions=("float64", "float32", *HALVES)),
-        bounds={"forward": Bound("px", 1e-2, "a hundredth of a pixel of the grid")},
+        bounds=Bound("px", 1e-2, "a hundredth of a pixel of the grid"),
         must_refuse=lambda level, way: way.precision in HALVES,
     ),
     hard(
         "nan_positions",
         _nan_positions,
         ways("reference", "cpu", precisions=("float64", "float32", "float16")),
-        bounds={"forward": exact("changed values")},
+        bounds=exact("changed values"),
     ),
-    hard("tiny_baseline", position_error(_baseline), WARPS, bounds={"forward": LOOSE}),
-    hard("focal_length", position_error(_focal), WARPS, bounds={"forward": POSITION}),
+    hard("tiny_baseline", position_error(_baseline), WARPS, bounds=LOOSE),
+    hard("focal_length", position_error(_focal), WARPS, bounds=POSITION),
 ]
