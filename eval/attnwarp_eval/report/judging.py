@@ -12,7 +12,7 @@ from typing import Literal
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number, spread
 from attnwarp_eval.metrics.multiview import ABOVE_FLOOR, BELOW_FLOOR
-from attnwarp_eval.report.claims import Claim, Measured, load_claims
+from attnwarp_eval.report.claims import Claim, Measured
 from attnwarp_eval.report.compared import difference_text, in_words, no_verdict, scene_texts
 from attnwarp_eval.report.controls import HALF, share_text
 from attnwarp_eval.statistics.contrasts import EQUAL_LEVEL, Contrast
@@ -28,11 +28,9 @@ from attnwarp_eval.statistics.planning import MOST_SCENES
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.results import Results
 
-Verdict = Literal[
-    "holds", "the opposite holds", "equal", "can't tell", "blind", "depends on the editor"
-]
+Verdict = Literal["holds", "the opposite holds", "equal", "can't tell", "blind"]
 
-Here = Literal["seen", "seen where defined", "mixed", "not seen", "depends on the editor"]
+Here = Literal["seen", "seen where defined", "mixed", "not seen"]
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,7 @@ class JudgedClaim:
     """A claim, its measurement in a run, and the verdict.
 
     Attributes:
-        claim: claim, for one editor if it has several.
+        claim: claim.
         measured: measurement of the run.
         agreement: numbers of views with the expected sign, and of all views.
         here: result on the run's scenes.
@@ -160,8 +158,6 @@ def judge(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
     """Every claim that the run has measurements for; claims that its study judges have a verdict,
     adjusted over them.
 
-    A claim about the editor's mechanism is judged for each of its editors; :func:`together` makes
-    one verdict of them.
     """
     return decided(found(results, claims))
 
@@ -169,7 +165,7 @@ def judge(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
 def found(results: Results, claims: Sequence[Claim]) -> list[JudgedClaim]:
     """Every claim that the run has measurements for, before a verdict."""
     judged = []
-    for claim in (one for entry in claims for one in entry.of_each_editor()):
+    for claim in claims:
         measured = claim.measure(results)
         if measured is None or not measured.contrast.by_scene:
             continue
@@ -234,25 +230,6 @@ def of_comparisons(judged: Iterable[JudgedClaim]) -> dict[Comparison, JudgedClai
     }
 
 
-def together(
-    findings: Sequence[JudgedClaim], editors: Sequence[str]
-) -> tuple[Here, Verdict | None]:
-    """Merge the findings of a claim about the editor's mechanism into one verdict.
-
-    A verdict requires that all editors were measured and agree; otherwise it depends on the editor,
-    or cannot be told from the measured editors.
-    """
-    here, verdicts = {f.here for f in findings}, {f.verdict for f in findings}
-    seen: Here = next(iter(here)) if len(here) == 1 else "depends on the editor"
-    if here == {"seen", "seen where defined"}:
-        seen = "seen where defined"
-    if verdicts == {None}:
-        return seen, None
-    if len(findings) < len(editors):
-        return seen, "can't tell"
-    return seen, next(iter(verdicts)) if len(verdicts) == 1 else "depends on the editor"
-
-
 def _here(claim: Claim, measured: Measured, scenes: int) -> Here:
     """Describe whether the mean difference has the expected sign in every scene.
 
@@ -279,7 +256,6 @@ OUTCOMES = {
     "holds": "As expected",
     "the opposite holds": "The opposite of what was expected",
     "equal": "No difference, within a bound",
-    "depends on the editor": "One way with one editor, another way with another",
     "can't tell": "Cannot be told",
     "blind": "No verdict, since the control failed",
 }
@@ -310,12 +286,6 @@ def claims_section(results: Results, judged: Sequence[JudgedClaim]) -> Section |
         ' a half on of which the claim is blind. "Can\'t tell" does not mean equal.',
     ]
     rows = [list(one.row) for one in own]
-    for claim in load_claims():
-        alike = [one for one in own if one.claim.id == claim.id]
-        if claim.editors and alike:
-            _, verdict = together(alike, claim.editors)
-            text_of_both = f"**{claim.text}: both editors together**"
-            rows.append([text_of_both, str(verdict), *["–"] * (len(COLUMNS) - 2)])
     return Section("Claims", text, [Table(list(COLUMNS), rows)])
 
 

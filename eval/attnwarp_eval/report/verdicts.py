@@ -33,7 +33,7 @@ class Judged:
     """Claim with its verdict over all studies.
 
     Attributes:
-        claim: claim, for one editor if it has several.
+        claim: claim.
         judged: judged claim; None if its study has no raw results, or lacks a side.
         time: ratio of the last side's seconds to the first one's, taken in turn; a dash without.
         report: folder of the report.
@@ -77,8 +77,7 @@ def verdicts(folder: Path) -> list[Judged]:
         if one.judges
     )
     by_text = {one.claim.text: one for one in judged}
-    every = [one for claim in load_claims() for one in claim.of_each_editor()]
-    return [_judged(claim, by_text.get(claim.text), studies) for claim in every]
+    return [_judged(claim, by_text.get(claim.text), studies) for claim in load_claims()]
 
 
 def _judged(

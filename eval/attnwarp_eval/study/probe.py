@@ -257,13 +257,6 @@ class Probe(ABC, Generic[E]):
         """Key that two variants share if they mean the same to a claim about this probe."""
         return variant.settings(), variant.geometry, study.splats_of(variant)
 
-    def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:
-        """Return True if a variant is of the same kind as ``wanted``, for a claim about kinds.
-
-        A probe of methods ignores a method's settings, except those that ``wanted`` names.
-        """
-        return self.meaning(study, variant) == self.meaning(study, wanted)
-
     def token_labels(
         self, study: Study, world: World, targets: Sequence[str]
     ) -> TokenLabels | None:

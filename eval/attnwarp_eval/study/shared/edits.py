@@ -176,26 +176,6 @@ class MethodProbe(Probe[E]):
             editor_of(study, variant), own.budget, own.control, own.drift,
         )  # fmt: skip
 
-    def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:
-        """Return True if method, editor, splats, warp and budget are equal, and those of the
-        method's other settings that ``wanted`` names.
-        """
-        if variant.part(VariantPart).method != wanted.part(VariantPart).method:
-            return False  # the study's options may not fit the other method
-        counts = {"warp", *wanted.part(VariantPart).options}
-
-        def kind(of: Variant) -> list[Any]:
-            return [
-                {k: v for k, v in part.items() if k in counts} if isinstance(part, dict) else part
-                for part in self.meaning(study, of)
-            ]
-
-        try:
-            asked = kind(wanted)
-        except ValueError:  # ``wanted`` conflicts with the study's options
-            return False
-        return kind(variant) == asked
-
 
 def scene_seed(study: Study, scene: str, seed: int) -> int:
     """Seed of a scene's noise: the study's seed, offset for each drawn scene.
