@@ -26,8 +26,8 @@ POOLED = (
     " scenes, with those of the ends of its interval; equal pictures have error 0."
 )
 
-UNDEFINED = re.compile(r" \(\d+ undefined\)$")
-"""Note behind a mean."""
+NOTE = re.compile(r" \((?:\d+ undefined)?(?:, )?(?:(\d+) of \d+ scenes)?\)$")
+"""Note behind a mean: values and scenes that are missing."""
 
 MOST_LINES = 70
 """Largest number of lines of short tables on a page; the tables after them are folded."""
@@ -98,7 +98,8 @@ def differences(results: Results, compared: Sequence[Sequence[Row]]) -> list[Sec
             "Behind a mean and its 95 % interval stands the verdict on its difference from the"
             " table's first row, paired on scene and view: `better`, `worse`, `equal`, `blind` if"
             " features from a wrong place do as well, or nothing if it can't be told. Flipped signs"
-            " of the scenes decide, adjusted over a table, or over the claims.",
+            " of the scenes decide, adjusted over a table, or over the claims. In brackets: the"
+            " scenes that have a value, if not all.",
         )
     if folded := [table.caption for table in section.tables if table.folded]:
         section.text.append(f"Folded, as they would not fit on a page: {'; '.join(folded)}.")
@@ -140,9 +141,10 @@ def _main(results: Results, ablation: Ablation, compared: Sequence[Row]) -> Tabl
         means = [mean_values(results, own.name, name, [metric])[0] for name in names]
         if set(means) == {"–"}:
             continue
-        if len(notes := {(UNDEFINED.search(mean) or [""])[0] for mean in means}) == 1:
-            note = notes.pop()
-            means, title = [mean.removesuffix(note) for mean in means], title + note
+        if len(notes := {(NOTE.search(mean) or [""])[0] for mean in means}) == 1:
+            title += notes.pop()
+            means = [NOTE.sub("", mean) for mean in means]
+        means = [NOTE.sub(lambda m: f" ({m[1]} scenes)" if m[1] else "", mean) for mean in means]
         words = (told.get((name, metric), "") for name in names)
         table[title] = [f"{mean} {word}".strip() for mean, word in zip(means, words, strict=True)]
     cells = [list(row) for row in zip(*table.values(), strict=True)]

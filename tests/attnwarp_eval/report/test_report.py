@@ -230,9 +230,9 @@ def test_a_baseline_that_was_not_measured_stays_in_the_table_and_is_named():
 
 
 def test_a_variant_measured_on_fewer_scenes_says_so():
-    (section,) = tabulated(
-        results({"good": CLEAR["good"], "slipped": [[0.6, 0.6], None, [0.6, 0.6]]})
-    )
+    run = results({"good": CLEAR["good"], "slipped": [[0.6, 0.6], None, [0.6, 0.6]]})
+    assert differences(run, compared_of(run, []))[0].tables[0].rows[1][1] == "0.600 (2 scenes)"
+    (section,) = tabulated(run)
     column = section.tables[0].columns.index("EPE on 64, layer px")
     assert section.tables[0].rows[1][column] == "0.600 (2 of 3 scenes)"
 
