@@ -11,7 +11,7 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.metrics.registry import Metric, Registry
 from attnwarp_eval.study.probe import Probe, Work
-from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
+from attnwarp_eval.study.probe_report import Layout, ProbeReport, register_report
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Part, Study, Variant
@@ -86,11 +86,11 @@ class ChordReport(ProbeReport):
     columns: ClassVar[Mapping[str, str]] = {"chord": CHORD.name}
     contrasts = (CHORD.name,)
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         rows = [
             [cell.variants[0], record.extra.target, number(record.extra.chord)]
             for cell, record in results.finished(self.name)
         ]
         if rows:
             table = Table(["variant", "target", "chord"], rows)
-            yield Place.RESULT, Section("Longest chords", [], [table])
+            yield Section("Longest chords", [], [table])

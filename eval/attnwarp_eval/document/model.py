@@ -108,6 +108,7 @@ class Section:
     """A heading with text, grids, tables, figures and galleries, in this order.
 
     A ``folded`` section is collapsed until a reader opens it, and is left out of short Markdown.
+    One that ``leads`` comes right after a report's answer.
 
     Example:
         >>> section = Section("Depth", ["Against exact depth."], [Table(["AbsRel"], [["0.01"]])])
@@ -121,6 +122,7 @@ class Section:
     figures: list[Picture] = field(default_factory=list)
     gallery: Gallery | None = None
     folded: bool = False
+    leads: bool = False
     grids: list[Grid] = field(default_factory=list)
 
 

@@ -14,7 +14,7 @@ from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.galleries import galleries
 from attnwarp_eval.report.judging import claims_in_detail, claims_section, judge
 from attnwarp_eval.report.measured import failures, meanings, measured
-from attnwarp_eval.study.probe_report import Layout, Place, reports
+from attnwarp_eval.study.probe_report import Layout, reports
 from attnwarp_eval.study.results import Results
 
 
@@ -28,10 +28,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
     layout = Layout(root, timings)
     judged = judge(results, load_claims())
     compared = compared_of(results, judged)
-    of_probes: dict[Place, list[Section]] = {place: [] for place in Place}
-    for own in reports():
-        for place, section in own.sections(results, layout):
-            of_probes[place].append(section)
+    of_probes = [section for own in reports() for section in own.sections(results, layout)]
     claims, answered = claims_section(results, judged), answer(results, timings, pictures)
     if answered is None:
         answered, claims = (
@@ -39,19 +36,17 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
             None,
         )
     sections = [
-        *of_probes[Place.ANSWER],
+        *(section for section in of_probes if section.leads),
         *([] if claims is None else [claims]),
         *differences(results, compared),
-        *of_probes[Place.INSTRUMENT],
         *controls(results),
         *claims_in_detail(results, judged),
         *in_detail(results, compared),
-        *of_probes[Place.RESULT],
+        *(section for section in of_probes if not section.leads),
         *(fronts(results, layout) if timings else []),
         *failures(results),
         measured(results),
         *(galleries(results) if pictures else []),
-        *of_probes[Place.APPENDIX],
         meanings(results, timings),
     ]
     sections.sort(key=lambda section: section.folded)

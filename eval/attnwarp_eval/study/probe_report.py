@@ -10,7 +10,6 @@ import importlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,22 +22,6 @@ from attnwarp_eval.study.record import Record, View
 from attnwarp_eval.study.results import Results
 
 K = TypeVar("K", bound="type[ProbeReport]")
-
-
-class Place(IntEnum):
-    """Place of a probe's section in the report; probes of one place keep their order."""
-
-    ANSWER = -1
-    """First of all, after the study's own answer."""
-
-    INSTRUMENT = 0
-    """Before the tables of variants: checks of the instrument."""
-
-    RESULT = 1
-    """After the tables of variants."""
-
-    APPENDIX = 2
-    """After all measurements."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +99,7 @@ class ProbeReport:
         """Faults of the instrument found in this probe's records, one line each."""
         return []
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """Sections of the report; none if the run has no record of this probe."""
         return iter(())
 
@@ -138,7 +121,7 @@ class PlainReport(ProbeReport):
 
     tabulates_all = True
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """The table, if the probe has figures."""
         columns = self.columns_at(results.layer)
         measured = dict.fromkeys(
@@ -146,10 +129,7 @@ class PlainReport(ProbeReport):
         )
         rows = [[v, *mean_values(results, self.name, v, columns.values())] for v in measured]
         if rows and columns:
-            yield (
-                Place.RESULT,
-                Section(f"Figures of {self.name}", [], [Table(["variant", *columns], rows)]),
-            )
+            yield Section(f"Figures of {self.name}", [], [Table(["variant", *columns], rows)])
 
 
 _registered: dict[str, type[ProbeReport]] = {}

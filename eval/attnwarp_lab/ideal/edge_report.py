@@ -187,4 +187,5 @@ def edge_section(
                 place, series, x=x, y="share that is right", title="", share=True, apart=0.05
             )
     picture = Picture(f"figures/{path.name}", "Right tokens by distance to a depth edge")
-    return Section("Do carried features err at depth edges?", [TEXT], found.tables(), [picture])
+    title = "Do carried features err at depth edges?"
+    return Section(title, [TEXT], found.tables(), [picture], leads=True)

@@ -733,7 +733,7 @@ def test_an_instrument_that_is_off_is_reported(tmp_path, changes, says):
     assert problems(calibrated()) == []
     (problem,) = problems(calibrated(**changes))
     assert says in problem
-    (_, section), *_ = report_of("calibration").sections(calibrated(**changes), Layout(tmp_path))
+    section, *_ = report_of("calibration").sections(calibrated(**changes), Layout(tmp_path))
     assert section.tables[0].rows[0][1] == "FAILED"
     told = build(calibrated(**changes), tmp_path).answer.text[0]
     assert "not calibrated" in told and says in told

@@ -152,7 +152,7 @@ def test_the_calibration_says_where_the_pictures_are_small(tmp_path, size, small
     data = written_runs.record([])
     cell = written_runs.outcome("calibration", "a", ["calibration"], data)
     made = report_of("calibration").sections(written_runs.results(study, [cell]), Layout(tmp_path))
-    (section,) = [section for _, section in made if section.title == "Calibration"]
+    (section,) = [section for section in made if section.title == "Calibration"]
     words = f"The pictures are small: at {size} px, "
     assert sum(text.startswith(words) for text in section.text) == small
     assert ("The pictures are small" in "".join(section.text)) == small

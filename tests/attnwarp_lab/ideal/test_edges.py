@@ -157,7 +157,7 @@ def test_a_method_that_is_not_measured_is_refused(tmp_path):
 
 
 def test_the_report_has_the_sections_of_planted_errors(tmp_path):
-    ((_, section),) = report_of("labels").sections(planted(), Layout(tmp_path))
+    (section,) = report_of("labels").sections(planted(), Layout(tmp_path))
     table, _ = section.tables
     assert [row[-1] for row in table.rows if row[0] in METHODS] == [
         "does not hold: equal", "holds", "the opposite holds",

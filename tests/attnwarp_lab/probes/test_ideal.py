@@ -139,9 +139,7 @@ def test_the_twins_page_says_what_holds_by_construction(records, tmp_path, cross
     ideal = {**data["spec"]["editor"]["ideal"], "cross": cross}
     data = {**data, "spec": {**data["spec"], "editor": {"ideal": ideal}}}
     one = written_runs.outcome("ideal", "spheres", ["full"], data, "one")
-    ((_, section),) = report_of("ideal").sections(
-        written_runs.results(STUDY, [one]), Layout(tmp_path)
-    )
+    (section,) = report_of("ideal").sections(written_runs.results(STUDY, [one]), Layout(tmp_path))
     assert ("it says by construction" in " ".join(section.text)) == (cross == "joint")
 
 
@@ -270,7 +268,7 @@ def test_an_editor_that_drifts_moves_what_it_edits_and_a_cell_measures_it(tmp_pa
     ]
     said = {**STUDY, "variants": variants, "probes": {"ideal": list(variants)}}
     made = written_runs.results(said, outcomes)
-    sections = [section for _, section in report_of("ideal").sections(made, Layout(tmp_path))]
+    sections = list(report_of("ideal").sections(made, Layout(tmp_path)))
     (table,) = sections[-1].tables
     assert table.columns == ["method", "0 px", "4 px"]
     ((method, *shown),) = table.rows

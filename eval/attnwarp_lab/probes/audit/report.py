@@ -15,7 +15,7 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.metrics.registry import metric
 from attnwarp_eval.statistics.intervals import Interval, interval
-from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
+from attnwarp_eval.study.probe_report import Layout, ProbeReport, register_report
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.shared.encoders import encoders_named
@@ -216,18 +216,18 @@ class AuditReport(ProbeReport):
     name = "audit"
     measures = "which flaws of an edit each consistency metric sees"
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """The answer in one table; real edits, settings, yaws, sizes, and all figures."""
         records = [(cell.scene, record) for cell, record in results.finished(self.name)]
         if not records:
             return
         pairs = Pairs(records)
-        yield Place.ANSWER, _answer(results, pairs)
+        yield _answer(results, pairs)
         if pairs.arms:
-            yield Place.INSTRUMENT, _real(pairs)
-        yield Place.INSTRUMENT, _settings(pairs)
-        yield Place.INSTRUMENT, _sizes(pairs)
-        yield Place.APPENDIX, _everything(pairs)
+            yield _real(pairs)
+        yield _settings(pairs)
+        yield _sizes(pairs)
+        yield _everything(pairs)
 
 
 def area_text(value: Auroc, intervals: bool = True) -> str:
@@ -358,7 +358,7 @@ def _answer(results: Results, pairs: Pairs) -> Section:
     if pairs.scenes < len(results.study.scenes):
         text.insert(0, f"**Measured on {pairs.scenes} of {len(results.study.scenes)} scenes.**")
     tables = [Table(columns, table, timed=("seconds",))]
-    return Section("Which consistency metric can be believed", text, tables)
+    return Section("Which consistency metric can be believed", text, tables, leads=True)
 
 
 def _real(pairs: Pairs) -> Section:

@@ -9,7 +9,7 @@ from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import spread
 from attnwarp_eval.statistics.intervals import interval
-from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
+from attnwarp_eval.study.probe_report import Layout, ProbeReport, register_report
 from attnwarp_eval.study.results import Results
 from attnwarp_lab.ideal.edge_report import edge_section
 from attnwarp_lab.ideal.edges import edges_of
@@ -65,7 +65,7 @@ class IdealReport(ProbeReport):
             for (scene, fault), names in sorted(variants.items())
         ]
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """The editor by scene: share of signal, settling of answers, statistics alone; figures by
         planted drift; errors at depth edges.
         """
@@ -82,7 +82,7 @@ class IdealReport(ProbeReport):
             }
             section = edge_section(results, layout, self.name, metrics, stages, "stage of the edit")
             if section is not None:
-                yield Place.ANSWER, section
+                yield section
         found: dict[tuple[object, ...], dict[str, dict[str, list[float]]]] = {}
         for cell, record in results.finished(self.name):
             ideal, extra, steps = (
@@ -123,12 +123,9 @@ class IdealReport(ProbeReport):
                 "With joint attention it judges geometry alone: what it says of blocks, keys or"
                 " positions it says by construction."
             )
-        yield (
-            Place.INSTRUMENT,
-            Section("The ideal editor", text, [Table(columns, rows)], folded=True),
-        )
+        yield Section("The ideal editor", text, [Table(columns, rows)], folded=True)
         if any("drift" in record.spec for _, record in results.finished(self.name)):
-            yield Place.ANSWER, _drift(results, layout)
+            yield _drift(results, layout)
 
 
 def _drift(results: Results, layout: Layout) -> Section:
@@ -163,4 +160,5 @@ def _drift(results: Results, layout: Layout) -> Section:
         f" own; pictures are of {results.study.size} px. Warps assume that it stays."
     )
     picture = Picture("figures/drift.svg", "Agreement by the drift of the editor.")
-    return Section("How much drift does each method stand?", [text], tables, [picture])
+    title = "How much drift does each method stand?"
+    return Section(title, [text], tables, [picture], leads=True)

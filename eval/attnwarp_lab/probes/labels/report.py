@@ -8,7 +8,6 @@ from typing import ClassVar
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.study.probe_report import (
     Layout,
-    Place,
     ProbeReport,
     mean_values,
     register_report,
@@ -37,7 +36,7 @@ class LabelReport(ProbeReport):
     contrasts = ("labels.right", "labels.painted_hidden")
     stage = "pair"
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """Errors at depth edges, from the source and from view to view."""
         edges = edges_of(results.study, self.name)
         if edges is None:
@@ -55,7 +54,7 @@ class LabelReport(ProbeReport):
                 ]
         section = edge_section(results, layout, self.name, metrics, beside, "links of a chain")
         if section is not None:
-            yield Place.ANSWER, section
+            yield section
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
         """Right labels by grid and number of parts."""

@@ -210,7 +210,7 @@ def test_the_front_has_the_seconds_of_one_pass_in_turn_where_they_are_there(tmp_
 def test_few_rounds_call_nothing_faster_and_say_how_few_they_are(tmp_path):
     for rounds in (3, 5):
         run = results(VARIANTS, drift=DRIFT[:rounds])
-        ((_, section),) = report_of("timing").sections(run, Layout(tmp_path))
+        (section,) = report_of("timing").sections(run, Layout(tmp_path))
         (front,) = fronts(run, Layout(tmp_path))
         for table in (section.tables[0], front.tables[0]):
             verdicts = {row[0]: row[table.columns.index("verdict")] for row in table.rows}
@@ -228,7 +228,7 @@ def test_one_pass_has_means_over_scenes_of_the_seconds_of_their_edits_in_the_fro
 
 
 def test_the_section_of_seconds_holds_medians_spreads_and_ratios(tmp_path):
-    ((_, section),) = report_of("timing").sections(results(VARIANTS), Layout(tmp_path))
+    (section,) = report_of("timing").sections(results(VARIANTS), Layout(tmp_path))
     table = section.tables[0]
     rows = {row[0]: dict(zip(table.columns, row, strict=True)) for row in table.rows}
     fast = rows["fast"]

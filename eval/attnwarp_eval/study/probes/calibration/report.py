@@ -10,7 +10,7 @@ from attnwarp.warp import TAP_SPREAD
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.effects.table import plan_words
-from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
+from attnwarp_eval.study.probe_report import Layout, ProbeReport, register_report
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
 
@@ -65,12 +65,12 @@ class CalibrationReport(ProbeReport):
                     lines.append(f"{cell.scene}: {metric} is undefined in every view")
         return lines
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """Sections on the calibration, and on the light transport of the scenes."""
         if not results.study.scenes:
             return
-        yield Place.INSTRUMENT, self._calibration(results)
-        yield from ((Place.APPENDIX, section) for section in self._transport(results))
+        yield self._calibration(results)
+        yield from self._transport(results)
 
     def _calibration(self, results: Results) -> Section:
         sizes = results.study.feature_sizes

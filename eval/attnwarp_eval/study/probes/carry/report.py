@@ -9,7 +9,6 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.study.probe_report import (
     Layout,
-    Place,
     ProbeReport,
     in_degrees,
     register_report,
@@ -32,7 +31,7 @@ class CarryReport(ProbeReport):
     cost_of = "an edit"
     cost_text = "Seconds are those of the source's edit, the warps and the views' edits."
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """Table of each view's difference from the source."""
         rows, views = [], dict[str, None]()
         for cell, record in results.finished(self.name):
@@ -50,7 +49,7 @@ class CarryReport(ProbeReport):
                 " the thing by exact depth. A dash: the two share no 16 pixels of it, or the source"
                 f" changed by less than {LEAST_CHANGE:g} dE00, so that there is no edit to carry."
             )
-            yield Place.RESULT, Section("An edit carried", [text], [Table(columns, table)])
+            yield Section("An edit carried", [text], [Table(columns, table)])
 
     def gallery(self, results: Results) -> Section | None:
         """Pictures of each scene."""

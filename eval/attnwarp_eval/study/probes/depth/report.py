@@ -8,7 +8,6 @@ from typing import ClassVar
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.study.probe_report import (
     Layout,
-    Place,
     ProbeReport,
     mean_values,
     register_report,
@@ -50,7 +49,7 @@ class DepthReport(ProbeReport):
     )
     stage = "render"
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """Section on views without depth, whose figures are unexplained dashes; none if every view
         has a depth.
         """
@@ -66,7 +65,7 @@ class DepthReport(ProbeReport):
                 "No splat is drawn on any surface, so depth is undefined, in"
                 f" {'; '.join(dict.fromkeys(places))}. That is {empty} of {views} views."
             )
-            yield Place.RESULT, Section("Views without depth", [text])
+            yield Section("Views without depth", [text])
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
         """Tables for the inside of surfaces and for edges."""

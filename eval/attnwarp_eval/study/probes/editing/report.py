@@ -10,7 +10,6 @@ from attnwarp_eval.document.numbers import number
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe_report import (
     Layout,
-    Place,
     ProbeReport,
     in_degrees,
     register_report,
@@ -62,18 +61,18 @@ class EditingReport(ProbeReport):
         "Seconds are those of one whole edit of a scene: source, warps, edited views and tuning."
     )
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """Sections on the source edits, the editor's abilities, and budgets."""
         if not results.finished(self.name):
             return
-        yield Place.RESULT, source_edits(results, self.name)
+        yield source_edits(results, self.name)
         able = abilities(results, self.name)
         spec = results.finished(self.name)[0][1].spec
         if "encoders" in spec:
             able.text.append(encoders_named(results.study, spec))
-        yield Place.INSTRUMENT, able
+        yield able
         if (section := budgets(results, self.name)) is not None:
-            yield Place.RESULT, section
+            yield section
 
     def gallery(self, results: Results) -> Section | None:
         """Edited views side by side."""

@@ -12,7 +12,7 @@ from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.splats import export
 from attnwarp_eval.statistics.intervals import Interval, interval
-from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
+from attnwarp_eval.study.probe_report import Layout, ProbeReport, register_report
 from attnwarp_eval.study.probes.fit.measure import Curve, Point
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
@@ -59,7 +59,7 @@ class FitReport(ProbeReport):
         "depth.normal_median",
     )
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """Sections on the result of each fit, and its curves."""
         by_content: dict[str, str] = {}
         for cell, record in results.finished(self.name):
@@ -68,7 +68,7 @@ class FitReport(ProbeReport):
             by_content.setdefault(content, cell.variants[0])
         names = list(dict.fromkeys(by_content.values()))
         if names:
-            yield Place.RESULT, self._fits(results, layout, names)
+            yield self._fits(results, layout, names)
 
     def _fits(self, results: Results, layout: Layout, names: list[str]) -> Section:
         rows = [

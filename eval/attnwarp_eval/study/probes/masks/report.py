@@ -11,7 +11,6 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.study.probe_report import (
     Layout,
-    Place,
     ProbeReport,
     in_degrees,
     register_report,
@@ -49,7 +48,7 @@ class MasksReport(ProbeReport):
     cost_of = "a lift"
     cost_text = "Seconds are those of one call of `lift_masks`, for all of its masks."
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """Tables of medians over scenes by yaw."""
         names = results.study.probes.get(self.name, [])
         tables = [self._by_yaw(results, names, title, metric) for title, metric in PARTS.items()]
@@ -62,7 +61,7 @@ class MasksReport(ProbeReport):
                 " has none there; `of` says how many scenes are left. With several masks, some"
                 " targets lie close to a view that has one."
             )
-            yield Place.RESULT, Section("Lifted masks by yaw", [text], tables)
+            yield Section("Lifted masks by yaw", [text], tables)
 
     def _by_yaw(self, results: Results, names: list[str], title: str, metric: str) -> Table:
         rows, views = [], dict[str, None]()

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.stability import DECADES, Bound, Outcome, level_name
-from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
+from attnwarp_eval.study.probe_report import Layout, ProbeReport, register_report
 from attnwarp_eval.study.probes.stability.measure import Swept, read_sweeps
 from attnwarp_eval.study.results import Results
 
@@ -25,11 +25,11 @@ class StabilityReport(ProbeReport):
     name = "stability"
     measures = "hard cases of the numerics"
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """The verdicts, and every error."""
         if swept := read_sweeps(results):
-            yield Place.RESULT, _verdicts(swept)
-            yield Place.APPENDIX, _every_error(swept)
+            yield _verdicts(swept)
+            yield _every_error(swept)
 
 
 def verdict_lines(swept: Sequence[Swept]) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, ratio_text
 from attnwarp_eval.statistics.intervals import RATIO_INTERVAL
-from attnwarp_eval.study.probe_report import Layout, Place, ProbeReport, register_report
+from attnwarp_eval.study.probe_report import Layout, ProbeReport, register_report
 from attnwarp_eval.study.probes.timing.measure import COUNTERS
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.shared.method_run import PARTS, WHOLE
@@ -21,11 +21,11 @@ class TimingReport(ProbeReport):
 
     name = "timing"
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """Seconds of each contestant, their spread, and ratios to the first."""
         timed = timed_in_turn(results, WHOLE)
         if layout.timings and timed is not None:
-            yield Place.RESULT, self._section(results, timed)
+            yield self._section(results, timed)
 
     def _section(self, results: Results, timed: Timed) -> Section:
         counted = next(record for _, record in results.finished(self.name) if record.extra.work)

@@ -14,7 +14,6 @@ from attnwarp_eval.metrics.occlusion import COUNTS, YawBin, by_yaw
 from attnwarp_eval.statistics.intervals import Interval, over_scenes
 from attnwarp_eval.study.probe_report import (
     Layout,
-    Place,
     ProbeReport,
     mean_values,
     register_report,
@@ -81,12 +80,12 @@ class WarpReport(ProbeReport):
         caption = "Feature error by grid size (the floor stands under Calibration)"
         return [Table(["variant", "over", *map(str, sizes)], rows, caption)]
 
-    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+    def sections(self, results: Results, layout: Layout) -> Iterator[Section]:
         """Section on masks by yaw, if the study asks for them."""
         wanted = results.study.part(StudyPart).yaw.variants
         names = [name for name in wanted if results.records(self.name, name)]
         if names:
-            yield Place.ANSWER, self._by_yaw(results, layout, names)
+            yield self._by_yaw(results, layout, names)
 
     def _by_yaw(self, results: Results, layout: Layout, names: list[str]) -> Section:
         columns = ["variant", *(f"{low}–{high}°" for low, high in itertools.pairwise(YAW_EDGES))]
@@ -129,7 +128,7 @@ class WarpReport(ProbeReport):
             "figures/masks-by-yaw.svg",
             "What masks accept, by yaw; means and 95 % intervals over scenes.",
         )
-        return Section("Masks by yaw", text, tables, [drawn])
+        return Section("Masks by yaw", text, tables, [drawn], leads=True)
 
     def _counts(self, results: Results, variant: str) -> list[tuple[float, dict[str, int]]]:
         """(yaw, confusion counts) of every view."""
