@@ -95,6 +95,14 @@ def groups(model: torch.nn.Module, decay: float) -> list[dict[str, Any]]:
     return [{"params": matrices, "weight_decay": decay}, {"params": others, "weight_decay": 0.0}]
 
 
+def descend(optimizer: torch.optim.Optimizer, model: torch.nn.Module, loss: Tensor) -> None:
+    """Take a step along a loss whose gradient is cut to a length of 1."""
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+    optimizer.step()
+
+
 def settings(module: Mapping[str, Any], *splits: str) -> dict[str, Any]:
     """Settings of a recipe: its constants, by their upper-case names, and its pictures.
 

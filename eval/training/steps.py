@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from training.common import Run, groups
+from training.common import Run, descend, groups
 
 EMA = 0.999
 WARM = 500
@@ -176,9 +176,7 @@ class Stepper:
         """One step, kernel by kernel."""
         self.optimizer.zero_grad(set_to_none=True)
         loss, parts = self.tasks[index].loss(inputs)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
-        self.optimizer.step()
+        descend(self.optimizer, self.net, loss)
         with torch.no_grad():
             for own, new in zip(
                 self.average.module.parameters(), self.net.parameters(), strict=True

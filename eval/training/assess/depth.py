@@ -100,15 +100,7 @@ def assess_depth(editor: Any, prompts: Prompts) -> list[tuple[Figure, Figure]]:
 
 def draw(editor: Any, prompts: Prompts, row: Row, prompt: str, *, seed: int) -> Image:
     """A picture by the depth map of a row."""
-    depth = depth_of(prompts, row)
-    return edit(editor, [depth], prompt, steps=STEPS, seed=seed).images[0]
-
-
-def depth_of(prompts: Prompts, row: Row) -> npt.NDArray[np.float32]:
-    """(S, S) depth map of a row."""
-    y, x, n = row.corner
-    depth = prompts.worlds.depth[row.world, row.view]
-    return depth[y : y + n * prompts.size, x : x + n * prompts.size][n // 2 :: n, n // 2 :: n]
+    return edit(editor, [prompts.depth(row)], prompt, steps=STEPS, seed=seed).images[0]
 
 
 def prompt_of(editor: Any, prompts: Prompts, row: Row, rng: np.random.Generator) -> str:

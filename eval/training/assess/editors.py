@@ -190,19 +190,21 @@ def assess_editor(
     size = editor.own_size
     own: list[Figure] = []
     control: list[Figure] = []
+
+    def ask(label: str, tests: Worlds, size: int, **how: Any) -> None:
+        for results, answer in ((own, answers_of(editor)), (control, unedited)):
+            figures = assess(answer, tests, size=size, **how)
+            results += [replace(f, what=label + f.what) for f in figures]
+
     tested = 0
     splits = {"edit-test": "", "parts-test": "of a part: "}
     for name, label in splits.items() if facts["parts"] else [("edit-test", "")]:
         tests = load_pairs(data, name, count=worlds)
         tested += len(tests)
-        for results, answer in ((own, answers_of(editor)), (control, unedited)):
-            figures = assess(answer, tests, size=size)
-            results += [replace(f, what=label + f.what) for f in figures]
-    if facts["large"]:
+        ask(label, tests, size)
+    if large := facts["large"]:
         tests = load_pairs(data, "edit-test", count=LARGE_WORLDS)
-        for results, answer in ((own, answers_of(editor)), (control, unedited)):
-            figures = assess(answer, tests, size=facts["large"], kinds=("color",), noises=0)
-            results += [replace(f, what=f"at {facts['large']} px: {f.what}") for f in figures]
+        ask(f"at {large} px: ", tests, large, kinds=("color",), noises=0)
 
     def millions(net: Any) -> float:
         return float(sum(p.numel() for p in net.parameters()) / 1e6)

@@ -27,7 +27,7 @@ from attnwarp_eval.drawn.worlds import (
     captioned,
     sentence,
 )
-from training.common import Run, channels_last, crops, groups, rate, settings
+from training.common import Run, channels_last, crops, descend, groups, rate, settings
 from training.encoders import naming
 from training.encoders.byte_pairs import learn_byte_pairs, tokens_of
 from training.encoders.naming import Heads, pictures_of, scrambled, warm_start
@@ -286,11 +286,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             sentences = functional.normalize(sentences.float(), dim=-1)
             apart = contrast(model, embedded[torch.from_numpy(whole)], sentences, truth)
             named = naming_loss(model, embedded, attributes, tokenizer, rng)
-            loss = apart + named + guessed
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-            optimizer.step()
+            descend(optimizer, model, apart + named + guessed)
             sums += [float(part.detach()) for part in (apart, named, guessed)]
         return dict(zip(("contrast", "names", "heads"), sums / each, strict=True))
 

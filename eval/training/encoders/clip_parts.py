@@ -32,7 +32,7 @@ from attnwarp_eval.drawn.worlds import (
     one_of,
     sentence,
 )
-from training.common import Run, channels_last, groups, placed_crops, rate, settings
+from training.common import Run, channels_last, descend, groups, placed_crops, rate, settings
 from training.encoders import clip, naming
 from training.encoders.byte_pairs import tokens_of
 from training.encoders.clip import contrast, naming_loss
@@ -322,10 +322,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             chosen = [flat[k] for k in rng.choice(len(flat), SINGLE, replace=False)]
             losses = batch_losses(model, pictures, rows, singles, chosen, tokenizer, rng)
             loss = losses[0] + losses[1] + losses[2] + losses[3] + DENSE * losses[4]
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-            optimizer.step()
+            descend(optimizer, model, loss)
             sums += [float(part.detach()) for part in losses]
         names = ("contrast", "single", "whole", "parts", "places")
         return dict(zip(names, sums / STEPS, strict=True))

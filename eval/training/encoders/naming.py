@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from attnwarp.encoders.nets import ClipSmall
 from attnwarp_eval.drawn.worlds import COLORS, FINISHES, GROUNDS, OBJECTS, TIMES
-from training.common import Run, channels_last, crops, groups, rate, settings
+from training.common import Run, channels_last, crops, descend, groups, rate, settings
 from training.worlds.data import Pictures, load
 
 SEED = 4
@@ -160,10 +160,7 @@ def warm_start(sets: list[Part], out: Path, *, epochs: int = EPOCHS) -> Path:
             attributes[is_scrambled, 1:] = -1
             with torch.autocast("cpu", torch.bfloat16):
                 loss = heads(pool.features(vision(images)[-1]), attributes)
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(vision.parameters(), 1.0)
-            optimizer.step()
+            descend(optimizer, vision, loss)
             total += float(loss.detach())
         return {"heads": total / each, **_held_out_accuracy(sets, model, heads)}
 

@@ -17,7 +17,7 @@ import torch
 from torch.nn import functional
 
 from attnwarp.encoders.nets import PerceptualSmall
-from training.common import Run, channels_last, rate, settings
+from training.common import Run, channels_last, descend, rate, settings
 from training.encoders.distort import MARGIN, TRAIN_KINDS, distorted, draw_pair
 from training.worlds.data import load
 
@@ -148,10 +148,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             # So that the number itself reads as a strength: 1 is ruined.
             reads = ((d + 1e-6).sqrt() - strengths.T.reshape(-1) / 5).square().mean()
             loss = order + reads
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-            optimizer.step()
+            descend(optimizer, model, loss)
             total += float(loss.detach())
             right += int((far > near).sum())
         return {"loss": total / STEPS, "ordered": right / (STEPS * BATCH)}

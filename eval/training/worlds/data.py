@@ -5,7 +5,7 @@ workers.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -197,6 +197,16 @@ def render_missing(
     return list(files)
 
 
+def joined(files: Sequence[Path]) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of files of one kind, one file after the other."""
+    columns: dict[str, list[npt.NDArray[Any]]] = {}
+    for path in files:
+        with np.load(path) as stored:
+            for key in stored.files:
+                columns.setdefault(key, []).append(stored[key])
+    return {key: np.concatenate(parts) for key, parts in columns.items()}
+
+
 def make(folder: Path, name: str, workers: int = 2, *, worlds: int | None = None) -> list[Path]:
     """Render the missing files of a split's first ``worlds`` (all if left out); they are returned in order."""
     split = SPLITS[name]
@@ -210,9 +220,4 @@ def make(folder: Path, name: str, workers: int = 2, *, worlds: int | None = None
 
 def load(folder: Path, name: str, workers: int = 2, *, worlds: int | None = None) -> Pictures:
     """The pictures of a split's first ``worlds`` (all if left out), rendered where they are missing."""
-    columns: dict[str, list[npt.NDArray]] = {}
-    for path in make(folder, name, workers, worlds=worlds):
-        with np.load(path) as stored:
-            for key in stored.files:
-                columns.setdefault(key, []).append(stored[key])
-    return Pictures(**{key: np.concatenate(parts) for key, parts in columns.items()})
+    return Pictures(**joined(make(folder, name, workers, worlds=worlds)))

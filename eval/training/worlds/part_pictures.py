@@ -7,7 +7,6 @@ the ground or in the light.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ import numpy.typing as npt
 from attnwarp.io.file import write_atomically
 from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS, Assembly, draw_assembly
 from attnwarp_eval.drawn.worlds import OBJECTS, Look, draw_look, held_out
-from training.worlds.data import SIZE, render_missing
+from training.worlds.data import SIZE, joined, render_missing
 
 PARTS_PROTOCOL = 1
 """Raised whenever the same seed would give other pictures."""
@@ -227,13 +226,6 @@ def make(folder: Path, name: str, workers: int = 2) -> list[Path]:
     return render_missing(f"pictures: {name}", files, render, workers)
 
 
-def shards(files: list[Path]) -> Iterator[dict[str, npt.NDArray[Any]]]:
-    """The arrays of each file."""
-    for path in files:
-        with np.load(path) as stored:
-            yield {key: stored[key] for key in stored.files}
-
-
 def shares_of(ids: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
     """(N, P) share of each (S, S) picture that every part covers."""
     counts = [np.bincount(one.ravel(), minlength=256)[: len(PARTS)] for one in ids]
@@ -242,11 +234,7 @@ def shares_of(ids: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
 
 def load(folder: Path, name: str, workers: int = 2) -> PartPictures:
     """The pictures of a split, rendered where they are missing."""
-    columns: dict[str, list[npt.NDArray[Any]]] = {}
-    for shard in shards(make(folder, name, workers)):
-        for key, values in shard.items():
-            columns.setdefault(key, []).append(values)
-    table = {key: np.concatenate(parts) for key, parts in columns.items()}
+    table = joined(make(folder, name, workers))
     worlds = len(table["kind"])
     world, view, look = (v.ravel() for v in np.indices((worlds, VIEWS, LOOKS)))
     ids = table["ids"].reshape(-1, SIZE, SIZE)
