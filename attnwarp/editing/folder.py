@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from attnwarp.devices import device_of
-from attnwarp.encoders._weights import reason_of
+from attnwarp.encoders._weights import not_finite, reason_of, silent_transformers
 from attnwarp.errors import InputError, install_command
 from attnwarp.io.text import read_text
 
@@ -186,32 +186,22 @@ def load_controlnet(folder: str | Path, *, device: str = "cpu", dtype: torch.dty
 def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> Any:
     """Load a network of diffusers or transformers from its folder."""
     from transformers import PreTrainedModel
-    from transformers.utils import logging
 
-    # A progress bar for a second of loading would clutter the command's output.
-    bars = logging.is_progress_bar_enabled()
-    logging.disable_progress_bar()
     # Without accelerate, diffusers uses plain loading and warns unless this is requested.
     how: dict[str, Any] = {} if issubclass(kind, PreTrainedModel) else {"low_cpu_mem_usage": False}
     if _variants(folder) == ["fp16"]:
         how["variant"] = "fp16"
-    try:
-        with readable(folder):
-            # Silently random values for missing tensors would look like a bad editor.
-            loaded = kind.from_pretrained(
-                folder, local_files_only=True, torch_dtype=dtype, output_loading_info=True, **how
-            )
-    finally:
-        if bars:
-            logging.enable_progress_bar()
-    network, report = loaded
+    with readable(folder), silent_transformers():
+        # Silently random values for missing tensors would look like a bad editor.
+        network, report = kind.from_pretrained(
+            folder, local_files_only=True, torch_dtype=dtype, output_loading_info=True, **how
+        )
     if report["missing_keys"]:
         lost = sorted(report["missing_keys"])
         raise InputError(
             f"{folder}: its weights lack {lost[0]} and {len(lost) - 1} more; fetch the model again"
         )
-    damaged = [name for name, v in network.state_dict().items() if not bool(v.isfinite().all())]
-    if damaged:
+    if damaged := not_finite(network):
         raise InputError(
             f"{folder}: its weights have NaN or infinite values in {damaged[0]}"
             f"{f' and {len(damaged) - 1} more' if len(damaged) > 1 else ''}; fetch the model again"

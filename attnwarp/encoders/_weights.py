@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -51,6 +52,27 @@ def reason_of(error: Exception) -> str:
     if "weights_only" in text or "Unsupported operand" in text:
         return "it holds other objects than tensors, which could run code"
     return (text.splitlines() or [type(error).__name__])[0]
+
+
+def not_finite(network: torch.nn.Module) -> list[str]:
+    """List the tensors of a network that hold NaN or infinite values."""
+    return [name for name, v in network.state_dict().items() if not bool(v.isfinite().all())]
+
+
+@contextmanager
+def silent_transformers() -> Iterator[None]:
+    """Silence transformers' progress bar and advice; checks of what was loaded replace them."""
+    from transformers import utils
+
+    level, bars = utils.logging.get_verbosity(), utils.logging.is_progress_bar_enabled()
+    utils.logging.set_verbosity(logging.CRITICAL)
+    utils.logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        utils.logging.set_verbosity(level)
+        if bars:
+            utils.logging.enable_progress_bar()
 
 
 @contextmanager

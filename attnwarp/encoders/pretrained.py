@@ -9,9 +9,7 @@ Three mistakes give plausible figures in transformers and are refused here:
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -22,7 +20,13 @@ import numpy.typing as npt
 import torch
 
 from attnwarp.devices import device_of
-from attnwarp.encoders._weights import full_float32, reason_of, sha256_of
+from attnwarp.encoders._weights import (
+    full_float32,
+    not_finite,
+    reason_of,
+    sha256_of,
+    silent_transformers,
+)
 from attnwarp.encoders.base import EncoderInfo, Image, Kind, checked_image, checked_texts
 from attnwarp.encoders.preprocess import Preprocessing, read_json, read_preprocessing
 from attnwarp.errors import InputError, optional_imports
@@ -307,7 +311,7 @@ def _load(
 ) -> tuple[Any, list[Path]]:
     files = _weight_files(folder, name, kind)
     try:
-        with _silent():
+        with silent_transformers():
             model, loading_info = model_class.from_pretrained(
                 str(folder), local_files_only=True, output_loading_info=True, dtype=torch.float32,
                 use_safetensors=files[0].suffix == ".safetensors",
@@ -325,29 +329,9 @@ def _load(
             f"{name}: {files[0]} lacks {len(missing)} tensors that config.json calls for,"
             f" {missing[0]} first; the files are not of one model. {_how(kind, folder)}"
         )
-    bad = next(
-        (key for key, value in model.state_dict().items() if not bool(torch.isfinite(value).all())),
-        None,
-    )
-    if bad is not None:
-        raise InputError(f"{name}: {bad} in {files[0]} is NaN or infinite; fetch the file again")
+    if bad := not_finite(model):
+        raise InputError(f"{name}: {bad[0]} in {files[0]} is NaN or infinite; fetch the file again")
     return model.to(device).eval().requires_grad_(False), files
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Silence transformers' progress bar and advice; the checks here replace them."""
-    from transformers import utils
-
-    level, bars = utils.logging.get_verbosity(), utils.logging.is_progress_bar_enabled()
-    utils.logging.set_verbosity(logging.CRITICAL)
-    utils.logging.disable_progress_bar()
-    try:
-        yield
-    finally:
-        utils.logging.set_verbosity(level)
-        if bars:
-            utils.logging.enable_progress_bar()
 
 
 def _tokenizer(folder: Path, name: str) -> Any:

@@ -99,11 +99,10 @@ class Fit:
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp import Camera
         >>> from attnwarp.fit import FitSettings, Views, fit, from_points
-        >>> camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=16, height=16, fov_y=40)
+        >>> from attnwarp.trial import view
         >>> start = from_points(np.eye(3), kind="3d", sh_degree=0)
-        >>> grey = Views([camera], [np.full((16, 16, 3), 0.5)])
+        >>> grey = Views([view(side=16)], [np.full((16, 16, 3), 0.5)])
         >>> result = fit(start, grey, FitSettings(kind="3d", iterations=2, sh_degree=0))
         >>> result.stopped, [record.iteration for record in result.history]
         ('iterations', [0, 2])
@@ -185,11 +184,10 @@ def fit(
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp import Camera
         >>> from attnwarp.fit import FitSettings, Views, fit, from_points
-        >>> camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=16, height=16, fov_y=40)
+        >>> from attnwarp.trial import view
         >>> start = from_points(np.eye(3), kind="3d", sh_degree=0)
-        >>> grey = Views([camera], [np.full((16, 16, 3), 0.5)])
+        >>> grey = Views([view(side=16)], [np.full((16, 16, 3), 0.5)])
         >>> fit(start, grey, FitSettings(kind="3d", iterations=2, sh_degree=0)).iteration
         2
     """

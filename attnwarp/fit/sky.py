@@ -56,11 +56,9 @@ def with_sky(start: Gaussians, views: Views) -> Gaussians:
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp import Camera
         >>> from attnwarp.fit import Views, from_points, with_sky
-        >>> eyes = ((3, 0, 0), (0, 3, 0))
-        >>> cameras = [Camera.look_at(e, (0, 0, 0), width=16, height=16, fov_y=40) for e in eyes]
-        >>> blue = Views(cameras, [np.full((16, 16, 3), [0, 0, 1.0])] * 2)
+        >>> from attnwarp.trial import view
+        >>> blue = Views([view(side=16), view(3, 0, 16)], [np.full((16, 16, 3), [0, 0, 1.0])] * 2)
         >>> start = with_sky(from_points(np.eye(3), kind="3d"), blue)
         >>> start.far > 100, start.sh[-1, 0].sign().tolist()
         (True, [-1.0, -1.0, 1.0])

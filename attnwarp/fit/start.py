@@ -55,11 +55,9 @@ def extent_of(cameras: Sequence[Camera], points: Array | None = None) -> float:
             is 1 if points are missing or lie at that place too.
 
     Example:
-        >>> from attnwarp import Camera
         >>> from attnwarp.fit import extent_of
-        >>> view = dict(width=64, height=48, fov_y=40)
-        >>> cameras = [Camera.look_at((x, 0, 0), (0, 5, 0), **view) for x in (-3, 3)]
-        >>> round(extent_of(cameras), 6)  # 1.1 * 3
+        >>> from attnwarp.trial import view
+        >>> round(extent_of([view(-3), view(3)]), 6)  # 1.1 * 3
         3.3
     """
     centers = np.stack([camera.position for camera in cameras])
@@ -177,10 +175,8 @@ def within_reach(points: Array, cameras: Sequence[Camera]) -> npt.NDArray[np.boo
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp import Camera
-        >>> from attnwarp.fit.start import within_reach
-        >>> camera = Camera.look_at((0, -3, 0), (0, 0, 0), width=64, height=48, fov_y=40)
-        >>> within_reach(np.array([[0, 0, 0], [1, 0, 0], [0, 0, 9e3]]), [camera]).tolist()
+        >>> from attnwarp.trial import view
+        >>> within_reach(np.array([[0, 0, 0], [1, 0, 0], [0, 0, 9e3]]), [view()]).tolist()
         [True, True, False]
     """
     with np.errstate(over="ignore"):
@@ -194,10 +190,8 @@ def usual_distance(points: Array, cameras: Sequence[Camera]) -> float:
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp import Camera
-        >>> from attnwarp.fit.start import usual_distance
-        >>> camera = Camera.look_at((0, -3, 0), (0, 0, 0), width=64, height=48, fov_y=40)
-        >>> usual_distance(np.array([[0.0, 0, 0], [0, 1, 0], [0, 2, 0]]), [camera])
+        >>> from attnwarp.trial import view
+        >>> usual_distance(np.array([[0.0, 0, 0], [0, 0, -1], [0, 0, -2]]), [view()])
         4.0
     """
     return max(float(np.median(_distances(points, cameras))), extent_of(cameras, points))
@@ -235,11 +229,10 @@ def first_splats(
         views: fitted pictures, which give the sky its colours; None begins without a sky.
 
     Example:
-        >>> from attnwarp import Camera
         >>> from attnwarp.fit import FitSettings, first_splats
         >>> from attnwarp.io import Dataset
-        >>> view = dict(width=64, height=48, fov_y=40)
-        >>> cameras = [Camera.look_at(eye, (0, 0, 0), **view) for eye in ((3, 0, 0), (0, 3, 0))]
+        >>> from attnwarp.trial import view
+        >>> cameras = [view(0), view(3, 0)]
         >>> data = Dataset(cameras, ["a.png", "b.png"])
         >>> splats = first_splats(data, cameras, FitSettings(), random=50)
         >>> len(splats), splats.kind
@@ -297,11 +290,9 @@ def random_points(
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp import Camera
         >>> from attnwarp.fit import random_points
-        >>> view = dict(width=64, height=48, fov_y=40)
-        >>> cameras = [Camera.look_at(eye, (0, 0, 0), **view) for eye in ((3, 0, 0), (0, 3, 0))]
-        >>> points, colors = random_points(cameras, 100)
+        >>> from attnwarp.trial import view
+        >>> points, colors = random_points([view(0), view(3, 0)], 100)
         >>> points.shape, bool((np.abs(points) <= 3 + 1e-9).all()), colors.dtype
         ((100, 3), True, dtype('uint8'))
     """

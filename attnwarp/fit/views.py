@@ -95,10 +95,9 @@ class Views:
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp import Camera
         >>> from attnwarp.fit import Views
-        >>> camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=4, height=3, fov_y=40)
-        >>> len(Views([camera], [np.zeros((3, 4, 3), np.uint8)]))
+        >>> from attnwarp.trial import view
+        >>> len(Views([view(side=4)], [np.zeros((4, 4, 3), np.uint8)]))
         1
     """
 
@@ -234,16 +233,14 @@ def load_views(
     Example:
         >>> from pathlib import Path
         >>> import numpy as np
-        >>> from attnwarp import Camera
         >>> from attnwarp.fit import load_views
         >>> from attnwarp.io import Dataset
         >>> from attnwarp.io.images import encode_png
         >>> path = Path("a.png")
-        >>> _ = path.write_bytes(encode_png(np.full((48, 64, 3), 255, np.uint8)))
-        >>> camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=64, height=48, fov_y=40)
-        >>> views = load_views(Dataset([camera], [path]), max_size=32)
-        >>> views.cameras[0].width, views.cameras[0].height
-        (32, 24)
+        >>> _ = path.write_bytes(encode_png(np.full((64, 64, 3), 255, np.uint8)))
+        >>> from attnwarp.trial import view
+        >>> load_views(Dataset([view(side=64)], [path]), max_size=32).cameras[0].width
+        32
     """
     cameras, readers, masks = [], [], []
     seen: set[Path] = set()

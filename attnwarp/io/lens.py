@@ -221,10 +221,10 @@ def undistorted_camera(camera: Camera, lens: Lens) -> Camera:
         ValueError: the coefficients fold the picture over, so that no inverse exists.
 
     Example:
-        >>> from attnwarp import Camera
         >>> from attnwarp.io import Lens, undistorted_camera
-        >>> camera = Camera.look_at((0, 5, 0), (0, 0, 0), width=64, height=48, fov_y=40)
-        >>> pinhole = undistorted_camera(camera, Lens("brown", (-0.2,)))  # a barrel shows more
+        >>> from attnwarp.trial import view
+        >>> camera = view(side=64)
+        >>> pinhole = undistorted_camera(camera, Lens("brown", (-0.5,)))  # a barrel shows more
         >>> pinhole.width > 64, bool(pinhole.K[0, 0] == camera.K[0, 0])
         (True, True)
     """
@@ -280,11 +280,10 @@ def undistorted_image(
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp import Camera
         >>> from attnwarp.io import Lens, undistorted_camera, undistorted_image
-        >>> camera = Camera.look_at((0, 5, 0), (0, 0, 0), width=64, height=48, fov_y=40)
-        >>> lens = Lens("brown", (-0.2,))
-        >>> grey = np.full((48, 64, 3), 128, np.uint8)
+        >>> from attnwarp.trial import view
+        >>> camera, lens = view(), Lens("brown", (-0.2,))
+        >>> grey = np.full((32, 32, 3), 128, np.uint8)
         >>> image = undistorted_image(grey, camera, lens, undistorted_camera(camera, lens))
         >>> np.unique(image).tolist()  # grey everywhere, no blank border
         [128]

@@ -119,7 +119,8 @@ def lift_masks(
         A wall of two colours: the mask of its left half, seen from the front, from the side.
 
         >>> import numpy as np, torch
-        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp import Gaussians
+        >>> from attnwarp.trial import view
         >>> from attnwarp.warp import lift_masks
         >>> x, y = torch.meshgrid(*[torch.linspace(-1, 1, 40)] * 2, indexing="ij")
         >>> place = torch.stack([x, y, 0 * x], dim=-1).reshape(-1, 3)
@@ -127,8 +128,7 @@ def lift_masks(
         >>> wall = Gaussians("2d", place, torch.tensor([[1.0, 0, 0, 0]]).repeat(1600, 1),
         ...                  torch.full((1600, 2), 0.04), torch.full((1600,), 0.99),
         ...                  Gaussians.sh_from_rgb(color))
-        >>> view = dict(width=32, height=32, fov_y=40, up=(0, 1, 0))
-        >>> front, side = (Camera.look_at(p, (0, 0, 0), **view) for p in ((0, 0, 3), (2, 0, 2.5)))
+        >>> front, side = view(0), view(2, 2.5)
         >>> left = np.arange(32) < 16
         >>> lifted = lift_masks(wall, [front], [np.broadcast_to(left, (32, 32))])
         >>> seen_from_side = lifted.render(side) > 0.5

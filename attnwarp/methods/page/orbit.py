@@ -69,10 +69,8 @@ def degrees_apart(one: Camera, other: Camera, middle: Array) -> float:
 
     Example:
         >>> import numpy as np
-        >>> from attnwarp import Camera
-        >>> view = dict(width=8, height=8, fov_y=40)
-        >>> east, north = (Camera.look_at(p, (0, 0, 1), **view) for p in ((3, 0, 1), (0, 5, 1)))
-        >>> round(degrees_apart(east, north, np.array([0, 0, 1])))
+        >>> from attnwarp.trial import view
+        >>> round(degrees_apart(view(), view(3, 0), np.zeros(3)))
         90
     """
     cosine = _unit(middle - one.position) @ _unit(middle - other.position)
