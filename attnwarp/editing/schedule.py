@@ -141,12 +141,7 @@ class DDIM:
         return self.prediction == "sample"
 
     def timesteps(self, steps: int, size: Size | None = None) -> list[int]:
-        """Compute steps from pure noise, spaced by the model's scheduler: see :class:`Schedule`.
-
-        Example:
-            >>> DDIM(torch.linspace(0.99, 0.01, 1000), "epsilon", 1.0).timesteps(4)
-            [999, 749, 499, 249]
-        """
+        """Compute steps from pure noise, spaced by the model's scheduler: see :class:`Schedule`."""
         count = len(self.alphas)
         check.number(steps, 1, count, "steps", whole=True)
         if self.spacing is None:
@@ -311,12 +306,7 @@ class Flow:
         return list(self.spacing(steps, size))
 
     def published(self, start: int, steps: int, grid: Grid = "even") -> list[float]:
-        """Compute shares that leave as much of the picture: see :meth:`Schedule.published`.
-
-        Example:
-            >>> [round(share, 3) for share in Flow().published(980, 2)]
-            [0.929, 0.609]
-        """
+        """Compute shares that leave as much of the picture: see :meth:`Schedule.published`."""
         alphas = published_alphas(start, steps, grid)
         noise, signal = (1 - alphas).sqrt(), alphas.sqrt()
         return list((noise / (noise + signal)).tolist())

@@ -41,14 +41,6 @@ def alone_in(folder: str | os.PathLike[str]) -> Iterator[None]:
     Raises:
         InputError: another run holds the folder.
         FileExistsError: the path is a file.
-
-    Example:
-        >>> from attnwarp.io.lock import alone_in
-        >>> with alone_in("results"):
-        ...     with alone_in("results"):
-        ...         pass
-        Traceback (most recent call last):
-        attnwarp.errors.InputError: results: another run writes to this folder; ...
     """
     folder = Path(folder)
     made = not folder.exists()

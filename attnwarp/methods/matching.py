@@ -31,14 +31,6 @@ def matches(tokens: Tensor, key_tokens: Tensor, excluded: Tensor | None = None) 
         key_tokens: (M, C).
         excluded: (L, M) bool of the excluded pairs. A token with all pairs excluded is matched
             among all key tokens.
-
-    Example:
-        >>> import torch
-        >>> keys = torch.tensor([[1.0, 0], [0, 1], [1, 1]])
-        >>> matches(torch.tensor([[2.0, 1.9]]), keys).tolist()
-        [2]
-        >>> matches(torch.tensor([[2.0, 1.9]]), keys, torch.tensor([[False, False, True]])).tolist()
-        [0]
     """
     cosine = _unit(tokens) @ _unit(key_tokens).T
     if excluded is not None:

@@ -75,14 +75,6 @@ def disagreement(
     Returns:
         Mean absolute difference as a share of the full range, by kind of picture; a kind without
         two views of one point has no entry.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp.trial import disc, view
-        >>> cameras = {k: view(z=3 + k, side=8) for k in (0, 1)}
-        >>> grey = {k: np.full((8, 8, 3), 51 * k, np.uint8) for k in cameras}
-        >>> round(disagreement(disc(9.0), cameras, {"grey": grey})["grey"], 3)  # 51 of 255
-        0.2
     """
     near = near_of(list(cameras.values()), gaussians)
     settings = preset("corrected")
