@@ -97,14 +97,21 @@ def interrupt(*_: Any) -> None:
 
 
 @contextmanager
-def stops_interrupt() -> Iterator[None]:
-    """Make SIGTERM and SIGHUP raise KeyboardInterrupt inside the block, like Ctrl-C."""
-    handlers = {number: signal.signal(number, interrupt) for number in heeded(STOPS)}
+def _handled(numbers: tuple[int, ...], handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Handle the signals that this process heeds while the block runs."""
+    before = {number: signal.signal(number, handler) for number in heeded(numbers)}
     try:
         yield
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+        for number, own in before.items():
+            signal.signal(number, own)
+
+
+@contextmanager
+def stops_interrupt() -> Iterator[None]:
+    """Make SIGTERM and SIGHUP raise KeyboardInterrupt inside the block, like Ctrl-C."""
+    with _handled(STOPS, interrupt):
+        yield
 
 
 @contextmanager
@@ -120,9 +127,5 @@ def asked_to_stop(report: Reporter = SILENT) -> Iterator[Callable[[], bool]]:
         asked = True
         report.log("stopping after this iteration; press Ctrl-C again to leave at once")
 
-    handlers = {number: signal.signal(number, note) for number in heeded((signal.SIGINT, *STOPS))}
-    try:
+    with _handled((signal.SIGINT, *STOPS), note):
         yield lambda: asked
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import functools
-import io
 import warnings
 from pathlib import Path
-from typing import Annotated, BinaryIO
+from typing import Annotated
 
 import typer
 
@@ -87,11 +86,8 @@ def render(
                 seen = seen or bool(view.alpha.any())
                 write_image(out / f"{name}.png", view.color.clamp(0, 1).numpy())
                 if depth:
-                    buffer = io.BytesIO()
-                    np.save(buffer, view.median_depth.numpy())
-                    write_atomically(
-                        out / f"{name}.depth.npy", functools.partial(_put, data=buffer.getvalue())
-                    )
+                    write = functools.partial(np.save, arr=view.median_depth.numpy())
+                    write_atomically(out / f"{name}.depth.npy", write)
                 if normal:
                     write_image(out / f"{name}.normal.png", (view.normal.numpy() + 1) / 2)
                 report.step(number, len(views), name if number < len(views) else "done")
@@ -102,10 +98,6 @@ def render(
                 stacklevel=1,
             )
         typer.echo(f"{out}: {len(views)} views of {len(splats)} splats")
-
-
-def _put(stream: BinaryIO, data: bytes) -> None:
-    stream.write(data)
 
 
 def _color(text: str) -> list[float]:

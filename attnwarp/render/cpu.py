@@ -376,17 +376,7 @@ def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:
 def render(inputs: Inputs) -> Outputs:
     """Render on the CPU; see :func:`attnwarp.render.render`."""
     kept: list[_Drawn] = []
-    tensors = _Composite.apply(
-        inputs,
-        kept,
-        inputs.means,
-        inputs.quats,
-        inputs.scales,
-        inputs.opacities,
-        inputs.values,
-        inputs.pose,
-        inputs.background,
-    )
+    tensors = _Composite.apply(inputs, kept, *inputs.leaves)
     (drawn,) = kept
     return outputs_of(
         inputs,

@@ -401,10 +401,7 @@ def _gradients(
 def render(inputs: Inputs) -> Outputs:
     """Render on the splats' device; see :func:`attnwarp.render.render`."""
     kept: list[_Drawn] = []
-    tensors = _Composite.apply(
-        inputs, kept, inputs.means, inputs.quats, inputs.scales, inputs.opacities, inputs.values,
-        inputs.pose, inputs.background,
-    )  # fmt: skip
+    tensors = _Composite.apply(inputs, kept, *inputs.leaves)
     (drawn,) = kept
     return outputs_of(
         inputs,

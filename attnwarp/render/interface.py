@@ -37,6 +37,12 @@ class Inputs:
     ndc: tuple[float, float]
 
     @property
+    def leaves(self) -> tuple[Tensor, ...]:
+        """Tensors that may require gradients."""
+        splats = (self.means, self.quats, self.scales, self.opacities, self.values)
+        return (*splats, self.pose, self.background)
+
+    @property
     def channels(self) -> int:
         """Number of channels of the rendered colour."""
         return 3 if self.harmonic else int(self.values.shape[1])
