@@ -233,26 +233,20 @@ def render(
     check.instance(gaussians, Gaussians, "gaussians", "attnwarp.Gaussians")
     check.instance(camera, Camera, "camera", "attnwarp.Camera")
     check.one_of(backend, BACKENDS, "backend")
+    given: dict[str, Any] = {
+        "depth": depth,
+        "background": background,
+        "features": features,
+        "sh_degree": sh_degree,
+        "near": near,
+        "antialiased": antialiased,
+        "pose": pose,
+        "ndc": ndc,
+    }
     if math.isfinite(gaussians.far):
-        given = dict(
-            backend=backend, depth=depth, background=background, features=features,
-            sh_degree=sh_degree, near=near, antialiased=antialiased, pose=pose, ndc=ndc,
-        )  # fmt: skip
-        return _before_sky(gaussians, camera, given)
+        return _before_sky(gaussians, camera, {"backend": backend, **given})
     chosen = ("gpu" if gaussians.means.is_cuda else "cpu") if backend == "auto" else backend
-    inputs = _prepare(
-        gaussians,
-        camera,
-        depth,
-        background,
-        features,
-        sh_degree,
-        near,
-        antialiased,
-        pose,
-        ndc,
-        on_cpu=chosen != "gpu",
-    )
+    inputs = _prepare(gaussians, camera, **given, on_cpu=chosen != "gpu")
     # A backend is imported on first use, since numba and Warp are slow to import.
     if chosen == "cpu":
         from attnwarp.render import cpu
