@@ -312,13 +312,10 @@ def everything(data):
     return [camera.to_dict() for camera in data.cameras], data.points.tolist(), data.colors.tolist()
 
 
-def test_an_empty_text_file_of_points_holds_none_and_an_empty_binary_one_is_damaged(tmp_path):
+def test_an_empty_text_file_of_points_holds_none(tmp_path):
     (write_text(tmp_path / "text") / "points3D.txt").write_bytes(b"")
     data = read_dataset(tmp_path / "text", missing_images="none")
     assert data.points.shape == (0, 3) and data.colors.shape == (0, 3)
-    (write_binary(tmp_path / "binary") / "points3D.bin").write_bytes(b"")
-    with pytest.raises(FileFormatError, match=r"points3D\.bin: the file is empty"):
-        read_dataset(tmp_path / "binary", missing_images="none")
 
 
 @pytest.mark.parametrize("write", [write_binary, write_text])
