@@ -3,6 +3,7 @@ import os
 import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import typer.testing
@@ -36,6 +37,17 @@ def stops_are_forgotten():
     yield
     if process := sys.modules.get("attnwarp.process"):
         process.interrupted = False
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """The seconds that progress reads, which a test sets."""
+    import attnwarp.reporting
+
+    now = SimpleNamespace(seconds=0.0)
+    fake = SimpleNamespace(perf_counter=lambda: now.seconds)
+    monkeypatch.setattr(attnwarp.reporting, "time", fake)
+    return now
 
 
 @pytest.fixture(scope="module")

@@ -2,21 +2,12 @@
 
 import io
 import math
-import types
 
 import pytest
 from rich.console import Console
 
 import attnwarp.reporting
 from attnwarp.reporting import Part, reporter
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    now = types.SimpleNamespace(seconds=1000.0)
-    fake = types.SimpleNamespace(perf_counter=lambda: now.seconds)
-    monkeypatch.setattr(attnwarp.reporting, "time", fake)
-    return now
 
 
 def lines(clock, steps, total, seconds):

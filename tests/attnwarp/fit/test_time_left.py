@@ -1,12 +1,10 @@
 """The time left of a fit whose iterations grow dearer. Oracle: the clock of fits that were run."""
 
 import math
-import types
 
 import numpy as np
 import pytest
 
-import attnwarp.reporting
 from attnwarp.fit import FitSettings
 from attnwarp.fit.time_left import TimeLeft
 
@@ -18,14 +16,6 @@ PHOTOGRAPHS = [
     (3000, 434.8, 112562),
 ]  # fmt: skip
 """Iteration, CPU seconds and splats of a fit to eleven photographs of 256 x 256 px."""
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    now = types.SimpleNamespace(seconds=0.0)
-    fake = types.SimpleNamespace(perf_counter=lambda: now.seconds)
-    monkeypatch.setattr(attnwarp.reporting, "time", fake)
-    return now
 
 
 def told(clock, rows, settings, pixels):

@@ -2,19 +2,17 @@
 
 import numpy as np
 import pytest
+from small_trainings import draw_pairs
 
 from training.assess import editors as editor_assess
 from training.assess.editors import assess, editor_card, unedited
 from training.assess.judge import nearest, outside_psnr
-from training.worlds import editing_pairs
 from training.worlds.editing_pairs import GROUPS, load_pairs
 
 
 @pytest.fixture(scope="module")
 def worlds(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("pairs")
-    for index in (0, 1):
-        editing_pairs._make(editing_pairs._path(folder, "edit-test", index), index, "edit-test")
+    folder = draw_pairs(tmp_path_factory.mktemp("pairs"), "edit-test")
     return load_pairs(folder, "edit-test", count=2)
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from small_trainings import draw_pairs, stopped_at
 
 from training import steps
 from training.editors import recipe
@@ -11,7 +12,6 @@ from training.editors.joint import JOINT_STAGES, JointNet
 from training.editors.net import scheduler
 from training.editors.pool import PairPool
 from training.editors.recipe import make_tokenizer, train_stage
-from training.worlds import editing_pairs
 from training.worlds.editing_pairs import load_pairs
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")
@@ -48,9 +48,7 @@ def test_it_is_small_and_predicts_the_clean_end_of_a_flow():
 
 @pytest.mark.slow
 def test_a_stopped_training_goes_on_to_the_same_bits(tmp_path, monkeypatch):
-    for number in range(2):
-        path = editing_pairs._path(tmp_path, "edit-train", number)
-        editing_pairs._make(path, number, "edit-train")
+    draw_pairs(tmp_path)
     words = make_tokenizer(400, worlds=10)
     pool = PairPool(load_pairs(tmp_path, "edit-train", count=2), words, sentences=4)
     monkeypatch.setattr(steps, "STEPS_AN_EPOCH", 1)
@@ -62,23 +60,8 @@ def test_a_stopped_training_goes_on_to_the_same_bits(tmp_path, monkeypatch):
         out.mkdir()
         words.save(str(out / "tokenizer.json"))
         if name == "cut":
-            with monkeypatch.context() as patch:
-                patch.setattr(steps.Stepper, "step", stopped_after(2, steps.Stepper.step))
-                with pytest.raises(KeyboardInterrupt):
-                    train_stage("joint", tmp_path, out, stage=stage, pool=pool)
+            with stopped_at(steps.Stepper, "step", 2):
+                train_stage("joint", tmp_path, out, stage=stage, pool=pool)
         train_stage("joint", tmp_path, out, stage=stage, pool=pool)
         found.append(recipe.weights_of(out, "joint"))
     assert all(torch.equal(value, found[1][key]) for key, value in found[0].items())
-
-
-def stopped_after(count, step):
-    """A step that is interrupted after some."""
-    done = []
-
-    def limited(self, *arguments):
-        if len(done) == count:
-            raise KeyboardInterrupt
-        done.append(None)
-        return step(self, *arguments)
-
-    return limited

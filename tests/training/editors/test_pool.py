@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from picked_answers import picked
+from small_trainings import draw_pairs
 
 from training.assess.pictures import Pictures, Row
 from training.editors.answers import KIND_NAMES, codes, settled
@@ -19,9 +20,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWa
 
 @pytest.fixture(scope="module")
 def pool(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("pairs")
-    for index in range(2):
-        editing_pairs._make(editing_pairs._path(folder, "edit-train", index), index, "edit-train")
+    folder = draw_pairs(tmp_path_factory.mktemp("pairs"))
     return PairPool(
         load_pairs(folder, "edit-train", count=2), make_tokenizer(400, worlds=10), sentences=4
     )

@@ -9,6 +9,7 @@ import pytest
 import torch
 from diffusers import StableDiffusionInstructPix2PixPipeline
 from picked_answers import picked
+from small_trainings import draw_pairs, stopped_at
 from typer.testing import CliRunner
 
 import attnwarp_eval
@@ -49,10 +50,7 @@ TINY = Stage(64, 4, 1e-3, 2, batch=2)
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("pairs")
-    for index in range(2):
-        editing_pairs._make(editing_pairs._path(folder, "edit-train", index), index, "edit-train")
-    return folder
+    return draw_pairs(tmp_path_factory.mktemp("pairs"))
 
 
 @pytest.fixture(scope="module")
@@ -172,18 +170,9 @@ def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(
         (tmp_path / name).mkdir()
         tokenizer.save(str(tmp_path / name / "tokenizer.json"))
     train_stage("drawn", data, tmp_path / "whole", stage=TINY)
-    original = steps.falling_rate
-
-    def stop(step, *more):
-        if step == 3:
-            raise KeyboardInterrupt
-        return original(step, *more)
-
-    monkeypatch.setattr(steps, "falling_rate", stop)
-    with pytest.raises(KeyboardInterrupt):
+    with stopped_at(steps, "falling_rate", 3):
         train_stage("drawn", data, tmp_path / "halves", stage=TINY)
     assert checkpoint(tmp_path / "halves")["epoch"] == 1
-    monkeypatch.setattr(steps, "falling_rate", original)
     train_stage("drawn", data, tmp_path / "halves", stage=TINY)
     one, other = checkpoint(tmp_path / "whole"), checkpoint(tmp_path / "halves")
     for part in ("net", "average"):

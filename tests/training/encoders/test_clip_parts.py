@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from small_trainings import stopped_at
 
 from attnwarp.encoders.nets import ClipSmall
 from attnwarp_eval.drawn.assemblies import KINDS, PART_NOUNS, WHOLE_NOUNS
@@ -164,21 +165,12 @@ def small(monkeypatch, tmp_path):
     return tmp_path
 
 
-def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(small, monkeypatch):
+def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(small):
     for name in ("whole", "halves"):
         (small / name).mkdir()
     clip_parts.train(small, small / "whole", epochs=2)
-    original = clip_parts.learning_rate
-
-    def stop(step, *more):
-        if step == 1:
-            raise KeyboardInterrupt
-        return original(step, *more)
-
-    monkeypatch.setattr(clip_parts, "learning_rate", stop)
-    with pytest.raises(KeyboardInterrupt):
+    with stopped_at(clip_parts, "learning_rate", 1):
         clip_parts.train(small, small / "halves", epochs=2)
-    monkeypatch.setattr(clip_parts, "learning_rate", original)
     clip_parts.train(small, small / "halves", epochs=2)
     one, other = (
         torch.load(small / n / "clip-parts.pt", weights_only=True)["model"]
