@@ -55,6 +55,7 @@ class Claim:
         """Bound of equality as :meth:`Contrast.verdict` takes it; None without one.
 
         Example:
+            >>> from dataclasses import replace
             >>> side = {"preset": "corrected"}
             >>> claim = Claim("c", "", "warp", "warp.epe_median", side, "lower", b=side)
             >>> round(replace(claim, equal_within="10 %").bound, 4)  # of a ratio: log(1.1)

@@ -103,13 +103,7 @@ class WarpReport(ProbeReport):
         rows = [[name, *(_both(bins[name][i]) for i in seen)] for name in names]
         heads = ["variant", *(columns[i + 1] for i in seen)]
         tables.insert(0, Table(heads, rows, f"{' / '.join(CURVES.values())}, %".capitalize()))
-        text = [
-            (
-                "Counts of all scenes' views summed in bins of the yaw between source and target. A"
-                " dash: nothing to measure, such as a view in which the source shows nothing at"
-                " all."
-            ),
-        ]
+        text = ["Counts of all scenes' views are summed, by the yaw between source and target."]
         with charts.drawing(layout.figure("masks-by-yaw.svg"), columns=2) as (left, right):
             for axes, (metric, title) in zip((left, right), CURVES.items(), strict=True):
                 series = [charts.Line(name, *self._curve(results, name, metric)) for name in names]
