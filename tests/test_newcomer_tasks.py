@@ -100,6 +100,7 @@ subprocess.run([sys.executable, "-m", "attnwarp_eval", "run", "own.yaml", "--out
 rows = [row for row in map(json.loads, open("run/results.jsonl")) if row["variant"] == "plain"]
 found = {row["metric"]: row["value"] for row in rows if row["metric"].startswith("warp.epe_")}
 assert found["warp.epe_max"] >= found["warp.epe_p95"] > 0
+subprocess.run([sys.executable, "-m", "attnwarp_eval", "report", "run", "--long"], check=True)
 lines = [line.split("|") for line in open("run/report.md")]
 (head,) = [k for k, cells in enumerate(lines) if " EPE max " in cells]
 shown = lines[head + 2][lines[head].index(" EPE max ")].split()[0]

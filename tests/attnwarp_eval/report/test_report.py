@@ -649,6 +649,20 @@ def test_a_study_that_judges_claims_begins_with_their_verdicts():
     assert claims_section(results(CLEAR), judge(results(CLEAR), claims)) is None
 
 
+def test_groups_that_would_not_fit_on_a_page_are_folded_and_named():
+    many = [f"v{k}" for k in range(48)]
+    groups = {"Few": ["slipped"], "Many": many, "Last": ["slipped"]}
+    run = results(
+        CLEAR,
+        variants={**study()["variants"], **{name: {} for name in many}},
+        probes={"warp": ["good", "slipped", *many]},
+        ablations=[{"title": t, "baseline": "good", "variants": v} for t, v in groups.items()],
+    )
+    (section,) = differences(run, compared_of(run, []))
+    assert [table.folded for table in section.tables] == [False, True, True]
+    assert section.text[-1].endswith("Many; Last.")
+
+
 def test_a_short_table_has_each_main_figure_with_the_verdict_on_its_difference():
     """Oracle: means by hand; of eight scenes of one sign p is 2 / 256, of half of them 1."""
     table = {"good": [[0.1] * 8], "slipped": [[0.2 + 0.01 * k for k in range(8)]]}

@@ -192,7 +192,7 @@ def finished(tmp_path_factory):
     planned = plan(study, store)
     summary = execute(planned, store)
     assert summary.complete, summary.failures
-    write_report(store)
+    write_report(store, long=True)
     return planned, store
 
 
