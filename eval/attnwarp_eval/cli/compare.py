@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from attnwarp.cli.options import option
 from attnwarp.cli.shell import fail, log, warn
 from attnwarp_eval.cli.shell import (
     TOO_LITTLE,
@@ -37,24 +38,22 @@ def compare(
     ],
     run: Annotated[Path, typer.Argument(help="The run's folder.")],
     markdown: Annotated[
-        Path | None, typer.Option(help="Write the comparison here, for the summary of a CI.")
+        Path | None, option("Write the comparison here, for the summary of a CI.")
     ] = None,
-    json: Annotated[
-        Path | None, typer.Option(help="Write every verdict here, for a program.")
-    ] = None,
+    json: Annotated[Path | None, option("Write every verdict here, for a program.")] = None,
     html: Annotated[
-        Path | None,
-        typer.Option(help="Write a page here, with pictures before and after of what changed."),
+        Path | None, option("Write a page here, with pictures before and after of what changed.")
     ] = None,
     common: Annotated[
         bool,
-        typer.Option(
+        option(
+            "Compare what both have; exit code 3 if something is left out. Not for a gate.",
+            None,
             "--common",
-            help="Compare what both have; exit code 3 if something is left out. Not for a gate.",
         ),
     ] = False,
     update: Annotated[
-        bool, typer.Option("--update", help="Rewrite the baseline's file from the run.")
+        bool, option("Rewrite the baseline's file from the run.", None, "--update")
     ] = False,
 ) -> None:
     """Did my change make anything worse?
@@ -141,13 +140,13 @@ def _check_outputs(
             " first, then update"
         )
     first: dict[Path, str] = {}
-    for option, path in named.items():
+    for name, path in named.items():
         check_other(path, baseline, "the baseline")
         for folder in (baseline, run):
             check_not_of_run(path, folder)
-        other = first.setdefault(path.resolve(), option)
-        if other != option:
-            raise InputError(f"{option}: {path} is that of {other} too; name another file")
+        other = first.setdefault(path.resolve(), name)
+        if other != name:
+            raise InputError(f"{name}: {path} is that of {other} too; name another file")
 
 
 def _page(

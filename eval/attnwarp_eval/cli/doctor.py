@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from attnwarp.cli.options import option
 from attnwarp.cli.shell import USAGE, fail
 from attnwarp_eval.cli.shell import clear_errors
 
@@ -18,7 +19,7 @@ WIDTH = 79
 
 
 def doctor(
-    json: Annotated[bool, typer.Option("--json", help="Every check as JSON.")] = False,
+    json: Annotated[bool, option("Every check as JSON.", None, "--json")] = False,
 ) -> None:
     """Check what this machine has, and tell what each lack costs.
 

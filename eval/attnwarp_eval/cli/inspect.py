@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from attnwarp.cli.options import option
 from attnwarp_eval.cli.shell import clear_errors
 
 if TYPE_CHECKING:
@@ -26,52 +27,46 @@ def inspect(
         ),
     ],
     data: Annotated[
-        Path | None,
-        typer.Option(help="Cameras of your own scene: transforms.json, its folder, or COLMAP's."),
+        Path | None, option("Cameras of your own scene: transforms.json, its folder, or COLMAP's.")
     ] = None,
     ply: Annotated[
-        Path | None, typer.Option(help="Splats before the edit, as given to attnwarp edit.")
+        Path | None, option("Splats before the edit, as given to attnwarp edit.")
     ] = None,
-    images: Annotated[Path | None, typer.Option(help="Pictures of a COLMAP model.")] = None,
+    images: Annotated[Path | None, option("Pictures of a COLMAP model.")] = None,
     source: Annotated[
-        str | None, typer.Option(help="Source view of your own scene; the first if left out.")
+        str | None, option("Source view of your own scene; the first if left out.")
     ] = None,
-    scene: Annotated[str | None, typer.Option(help="Of a run; its first if left out.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of a run; its first if left out.")] = None,
+    scene: Annotated[str | None, option("Of a run; its first if left out.")] = None,
+    seed: Annotated[int | None, option("Of a run; its first if left out.")] = None,
     variant: Annotated[
-        str | None, typer.Option(help="Of the run, or a preset; corrected if left out.")
+        str | None, option("Of the run, or a preset; corrected if left out.")
     ] = None,
     view: Annotated[
-        str | None,
-        typer.Option(help="Target view, or EDIT/VIEW of a run of edits; the first if left out."),
+        str | None, option("Target view, or EDIT/VIEW of a run of edits; the first if left out.")
     ] = None,
-    pixel: Annotated[str | None, typer.Option(help="Target pixel COLUMN,ROW to explain.")] = None,
+    pixel: Annotated[str | None, option("Target pixel COLUMN,ROW to explain.")] = None,
     layer: Annotated[
-        str | None, typer.Option(help="Feature grid, such as 64x64; --pixel then picks its cell.")
+        str | None, option("Feature grid, such as 64x64; --pixel then picks its cell.")
     ] = None,
-    step: Annotated[
-        str | None, typer.Option(help="Of an edit: before, 'stage 1', ..., edited.")
-    ] = None,
+    step: Annotated[str | None, option("Of an edit: before, 'stage 1', ..., edited.")] = None,
     color: Annotated[
         str,
-        typer.Option(
-            help="picture, mask, rules, incidence; with truth: endpoint error, depth error,"
+        option(
+            "picture, mask, rules, incidence; with truth: endpoint error, depth error,"
             " covered by; of an edit: edit disagreement; of a run with labels: labels."
         ),
     ] = "mask",
-    splats: Annotated[bool, typer.Option(help="Draw the splats as discs.")] = False,
-    size: Annotated[int | None, typer.Option(min=16, max=4096, help="Image size in px.")] = None,
-    screenshot: Annotated[
-        Path | None, typer.Option(help="Write a PNG instead of opening a window.")
-    ] = None,
+    splats: Annotated[bool, option("Draw the splats as discs.")] = False,
+    size: Annotated[int | None, option("Image size in px.", min=16, max=4096)] = None,
+    screenshot: Annotated[Path | None, option("Write a PNG instead of opening a window.")] = None,
     export: Annotated[
-        Path | None, typer.Option(help="Write .html, .glb or .vtp instead of opening a window.")
+        Path | None, option("Write .html, .glb or .vtp instead of opening a window.")
     ] = None,
-    web: Annotated[bool, typer.Option("--web", help="Serve the window to a browser.")] = False,
+    web: Annotated[bool, option("Serve the window to a browser.", None, "--web")] = False,
     host: Annotated[
-        str, typer.Option(help="Address for --web; 0.0.0.0 lets other machines in.")
+        str, option("Address for --web; 0.0.0.0 lets other machines in.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port for --web; 0: a free one.")] = 0,
+    port: Annotated[int, option("Port for --web; 0: a free one.", min=0, max=65535)] = 0,
 ) -> None:
     """Open a warp in 3D: surface, cameras, mask against truth, and a pixel's numbers."""
     with clear_errors(), _quick_start():

@@ -7,94 +7,81 @@ from typing import Annotated, Any
 
 import typer
 
+from attnwarp.cli.options import option
 from attnwarp.cli.shell import fail
 from attnwarp.reporting import reporter
 from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, resumable
 
 
 def metrics(
-    renders: Annotated[
-        Path | None, typer.Option(help="Folder: renders of the edited scene.")
-    ] = None,
+    renders: Annotated[Path | None, option("Folder: renders of the edited scene.")] = None,
     edited: Annotated[
-        Path | None, typer.Option(help="Folder: the edited pictures, named as the renders.")
+        Path | None, option("Folder: the edited pictures, named as the renders.")
     ] = None,
     originals: Annotated[
-        Path | None, typer.Option(help="Folder: the views before the edit, named alike.")
+        Path | None, option("Folder: the views before the edit, named alike.")
     ] = None,
-    source_edit: Annotated[
-        Path | None, typer.Option(help="Picture: the edited source view.")
-    ] = None,
-    prompt: Annotated[str | None, typer.Option(help="What the edited scene should show.")] = None,
-    source_prompt: Annotated[str | None, typer.Option(help="What the scene showed before.")] = None,
+    source_edit: Annotated[Path | None, option("Picture: the edited source view.")] = None,
+    prompt: Annotated[str | None, option("What the edited scene should show.")] = None,
+    source_prompt: Annotated[str | None, option("What the scene showed before.")] = None,
     clip: Annotated[
-        str | None,
-        typer.Option(
-            help="clip-small, clip:FOLDER or none; clip-small if left out.", metavar="NAME"
-        ),
+        str | None, option("clip-small, clip:FOLDER or none; clip-small if left out.", "NAME")
     ] = None,
     dino: Annotated[
-        str | None,
-        typer.Option(
-            help="dino-small, dinov2:FOLDER or none; dino-small if left out.", metavar="NAME"
-        ),
+        str | None, option("dino-small, dinov2:FOLDER or none; dino-small if left out.", "NAME")
     ] = None,
     perceptual: Annotated[
         str | None,
-        typer.Option(
-            help="perceptual-small, lpips:FILE_OR_FOLDER or none; perceptual-small if left out.",
-            metavar="NAME",
+        option(
+            "perceptual-small, lpips:FILE_OR_FOLDER or none; perceptual-small if left out.", "NAME"
         ),
     ] = None,
     mask: Annotated[
         Path | None,
-        typer.Option(
-            help=(
-                "Folder: masks named as the renders; white counts for Edit PSNR and the perceptual"
-                " distance. The others "
-                "see whole pictures."
-            )
+        option(
+            "Folder: masks named as the renders; white counts for Edit PSNR and the perceptual"
+            " distance. The others "
+            "see whole pictures."
         ),
     ] = None,
     consistency: Annotated[
         Path | None,
-        typer.Option(
-            help="transforms.json, its folder, or a COLMAP folder: do neighbouring views agree? Its"
+        option(
+            "transforms.json, its folder, or a COLMAP folder: do neighbouring views agree? Its"
             " pictures are the edited ones, or with --renders those before the edit.",
-            metavar="DATA",
+            "DATA",
         ),
     ] = None,
     ply: Annotated[
-        Path | None,
-        typer.Option(help="Splats before the edit, for --consistency at rendered depth."),
+        Path | None, option("Splats before the edit, for --consistency at rendered depth.")
     ] = None,
     depth: Annotated[
-        Path | None,
-        typer.Option(help="Folder of NAME.npy, (H, W) depths, for it in place of rendered ones."),
+        Path | None, option("Folder of NAME.npy, (H, W) depths, for it in place of rendered ones.")
     ] = None,
     scores: Annotated[
         Path | None,
-        typer.Option(
-            help="CSV with first, second and columns such as 'MEt3R lower': scores of neighbours by"
+        option(
+            "CSV with first, second and columns such as 'MEt3R lower': scores of neighbours by"
             " a network of yours."
         ),
     ] = None,
     colmap: Annotated[
         bool,
-        typer.Option(
+        option(
+            "With --consistency, COLMAP's reconstruction of all views too (attnwarp[colmap]).",
+            None,
             "--colmap",
-            help="With --consistency, COLMAP's reconstruction of all views too (attnwarp[colmap]).",
         ),
     ] = False,
     background: Annotated[
-        str, typer.Option(help="Behind transparent pixels: black, white, or r,g,b in [0, 1].")
+        str, option("Behind transparent pixels: black, white, or r,g,b in [0, 1].")
     ] = "black",
-    device: Annotated[str, typer.Option(help="cpu or cuda, for real encoders.")] = "cpu",
-    out: Annotated[
-        Path, typer.Option(help="Folder for metrics.json, metrics.md and metrics.html.")
-    ] = Path("runs/metrics"),
+    device: Annotated[str, option("cpu or cuda, for real encoders.")] = "cpu",
+    out: Annotated[Path, option("Folder for metrics.json, metrics.md and metrics.html.")] = Path(
+        "runs/metrics"
+    ),
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print metrics.json instead of a table.")
+        bool, option("Print metrics.json instead of a table.", None, "--json")
     ] = False,
 ) -> None:
     """Edit PSNR, CLIP, DINO and perceptual figures of your own pictures, or their consistency.
@@ -173,7 +160,7 @@ def _color(text: str) -> tuple[float, float, float]:
 
 def encoders(
     name: Annotated[str | None, typer.Argument(help="Load this one and say what it is.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="JSON.")] = False,
+    as_json: Annotated[bool, option("JSON.", None, "--json")] = False,
 ) -> None:
     """The encoders that metrics can use.
 

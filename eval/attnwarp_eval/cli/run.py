@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from attnwarp.cli.options import option
 from attnwarp.cli.shell import fail, log, warn
 from attnwarp.reporting import reporter
 from attnwarp_eval.cli.shell import (
@@ -33,33 +34,30 @@ def run(
     study: Annotated[
         str, typer.Argument(help="A study that ships (quick) or the path of a study's YAML.")
     ] = "quick",
-    out: Annotated[
-        Path | None, typer.Option(help="The run's folder; runs/<study> if left out.")
-    ] = None,
+    out: Annotated[Path | None, option("The run's folder; runs/<study> if left out.")] = None,
     jobs: Annotated[
-        int, typer.Option("--jobs", "-j", min=1, help="Worker processes, at most one a core.")
+        int, option("Worker processes, at most one a core.", None, "--jobs", "-j", min=1)
     ] = 1,
     scheduler: Annotated[
         str | None,
-        typer.Option(
-            metavar="ADDRESS|FILE",
-            help="A dask scheduler, tcp://HOST:PORT or its file, whose workers compute.",
+        option(
+            "A dask scheduler, tcp://HOST:PORT or its file, whose workers compute.", "ADDRESS|FILE"
         ),
     ] = None,
     scenes: Annotated[
-        str | None, typer.Option(help="Only these scenes (comma-separated names or paths).")
+        str | None, option("Only these scenes (comma-separated names or paths).")
     ] = None,
     seeds: Annotated[
-        str | None, typer.Option(help="Only these seeds (comma-separated whole numbers).")
+        str | None, option("Only these seeds (comma-separated whole numbers).")
     ] = None,
     size: Annotated[
-        int | None, typer.Option(min=16, max=4096, help="Image size in px, not the study's.")
+        int | None, option("Image size in px, not the study's.", min=16, max=4096)
     ] = None,
     keep_going: Annotated[
-        bool, typer.Option("--keep-going/--fail-fast", help="After a failed cell.")
+        bool, option("After a failed cell.", None, "--keep-going/--fail-fast")
     ] = True,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Count what would be measured, and plan the rest.")
+        bool, option("Count what would be measured, and plan the rest.", None, "--dry-run")
     ] = False,
 ) -> None:
     """Run a study and write its report.
@@ -286,20 +284,18 @@ def report(
     run: Annotated[
         Path, typer.Argument(help="The run's folder, or one of raw results (results*.jsonl.xz).")
     ],
-    timings: Annotated[bool, typer.Option(help="Without: no seconds, to compare runs.")] = True,
-    pictures: Annotated[bool, typer.Option(help="Without: tables and figures alone.")] = True,
+    timings: Annotated[bool, option("Without: no seconds, to compare runs.")] = True,
+    pictures: Annotated[bool, option("Without: tables and figures alone.")] = True,
     long: Annotated[
-        bool, typer.Option("--long", help="Every table in report.md, not one page of them.")
+        bool, option("Every table in report.md, not one page of them.", None, "--long")
     ] = False,
     out: Annotated[
-        Path | None,
-        typer.Option(help="Folder of the report, without pictures of views; by default RUN."),
+        Path | None, option("Folder of the report, without pictures of views; by default RUN.")
     ] = None,
     raw: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER|FILE",
-            help="Write the raw results here too, compressed, for attnwarp-eval verdicts.",
+        option(
+            "Write the raw results here too, compressed, for attnwarp-eval verdicts.", "FOLDER|FILE"
         ),
     ] = None,
 ) -> None:
@@ -350,7 +346,7 @@ def verdicts(
     ] = Path("reports"),
     write: Annotated[
         list[Path] | None,
-        typer.Option(help="Document whose marked table and lines are made anew; may be repeated."),
+        option("Document whose marked table and lines are made anew; may be repeated."),
     ] = None,
 ) -> None:
     """Judge every claim by the raw results of its study, all adjusted together.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from attnwarp.cli.options import option
 from attnwarp.cli.shell import fail, log
 from attnwarp.reporting import reporter
 from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, names, resumable
@@ -53,15 +54,11 @@ def show(
 def render(
     scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
     out: Annotated[
-        Path | None, typer.Option(help="Folder for the PNG files; runs/scenes/<scene> if left out.")
+        Path | None, option("Folder for the PNG files; runs/scenes/<scene> if left out.")
     ] = None,
-    views: Annotated[
-        str | None, typer.Option(help="Only these cameras (comma-separated names).")
-    ] = None,
-    size: Annotated[int, typer.Option(min=16, max=4096, help="Image size in px.")] = 256,
-    spp: Annotated[
-        int | None, typer.Option(min=1, help="Samples a pixel, not the scene's.")
-    ] = None,
+    views: Annotated[str | None, option("Only these cameras (comma-separated names).")] = None,
+    size: Annotated[int, option("Image size in px.", min=16, max=4096)] = 256,
+    spp: Annotated[int | None, option("Samples a pixel, not the scene's.", min=1)] = None,
 ) -> None:
     """Render a scene's truth from its cameras: pictures, depth, normals, one sheet of all."""
     with clear_errors():
@@ -81,17 +78,15 @@ def export(
     scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
     out: Annotated[Path, typer.Argument(help="Folder; an export in it is overwritten.")],
     views: Annotated[
-        int, typer.Option(min=1, help="Views around the scene; every 8th is of the split 'test'.")
+        int, option("Views around the scene; every 8th is of the split 'test'.", min=1)
     ] = 64,
-    size: Annotated[int, typer.Option(min=16, max=4096, help="Image size in px.")] = 256,
-    spp: Annotated[int, typer.Option(min=1, help="Samples a pixel.")] = 16,
-    points: Annotated[
-        int, typer.Option(min=10, help="Points scattered about the surfaces.")
-    ] = 5000,
+    size: Annotated[int, option("Image size in px.", min=16, max=4096)] = 256,
+    spp: Annotated[int, option("Samples a pixel.", min=1)] = 16,
+    points: Annotated[int, option("Points scattered about the surfaces.", min=10)] = 5000,
     noise: Annotated[
-        float, typer.Option(min=0, max=1e6, help="How far, in spacings between the points.")
+        float, option("How far, in spacings between the points.", min=0, max=1e6)
     ] = 0.5,
-    seed: Annotated[int, typer.Option(min=0, help="Of the points.")] = 0,
+    seed: Annotated[int, option("Of the points.", min=0)] = 0,
 ) -> None:
     """Write a scene as transforms.json, images and points, which `attnwarp fit` reads."""
     with clear_errors():
@@ -112,21 +107,21 @@ def export(
 @app.command()
 def draw(
     count: Annotated[int, typer.Argument(min=1, help="How many scenes.")],
-    seed: Annotated[int, typer.Option(min=0, help="Of the population.")],
-    out: Annotated[Path, typer.Option(help="Folder for the YAML files.")],
+    seed: Annotated[int, option("Of the population.", min=0)],
+    out: Annotated[Path, option("Folder for the YAML files.")],
     axis: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE",
-            help="Fix an axis of difficulty from 0 to 1: occlusion, thin, grazing, texture,"
+        option(
+            "Fix an axis of difficulty from 0 to 1: occlusion, thin, grazing, texture,"
             " highlights; or the number of things, 2 to 6. May be repeated.",
+            "NAME=VALUE",
         ),
     ] = None,
     meshes: Annotated[
-        Path | None, typer.Option(help="Folder of meshes (OBJ, PLY, STL, GLB, OFF) to put there.")
+        Path | None, option("Folder of meshes (OBJ, PLY, STL, GLB, OFF) to put there.")
     ] = None,
     stratify: Annotated[
-        str | None, typer.Option(help="Axes spread evenly over the scenes (comma-separated).")
+        str | None, option("Axes spread evenly over the scenes (comma-separated).")
     ] = None,
 ) -> None:
     """Draw scenes that no one made by hand, with cameras, edits and bounces.
@@ -199,7 +194,7 @@ def _check_no_capture(folder: Path) -> None:
 def edits(
     scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
     as_json: Annotated[
-        bool, typer.Option("--json", help="JSON, with the content hash of each result.")
+        bool, option("JSON, with the content hash of each result.", None, "--json")
     ] = False,
 ) -> None:
     """The edits that a scene names, with what each one asks for and does."""
@@ -252,24 +247,19 @@ def effects(
         str | None, typer.Argument(help="A scene's name, or the path of its YAML.")
     ] = None,
     as_json: Annotated[
-        bool,
-        typer.Option("--json", help="JSON: effects, plan, geometry, everything_on, cost, proof."),
+        bool, option("JSON: effects, plan, geometry, everything_on, cost, proof.", None, "--json")
     ] = False,
     prove: Annotated[
-        bool, typer.Option("--prove", help="Hold the plan against a rendering with everything on.")
+        bool, option("Hold the plan against a rendering with everything on.", None, "--prove")
     ] = False,
     budget: Annotated[
-        float | None, typer.Option(min=1, help="Seconds that a proof may render; 60 if left out.")
+        float | None, option("Seconds that a proof may render; 60 if left out.", min=1)
     ] = None,
     every: Annotated[
         bool,
-        typer.Option(
-            "--all", help="A table and pictures of every scene; goes on where it was left."
-        ),
+        option("A table and pictures of every scene; goes on where it was left.", None, "--all"),
     ] = False,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of --all; runs/effects if left out.")
-    ] = None,
+    out: Annotated[Path | None, option("Folder of --all; runs/effects if left out.")] = None,
 ) -> None:
     """Show which light transport a scene needs, what leaving out the rest saves, and a proof."""
     import json
@@ -333,10 +323,10 @@ def accuracy(
             " garden, far for geometry)."
         ),
     ] = None,
-    out: Annotated[
-        Path, typer.Option(help="Folder for the report, accuracy.json and the figures.")
-    ] = Path("runs/accuracy"),
-    rounds: Annotated[int, typer.Option(min=3, help="Of every timing.")] = 7,
+    out: Annotated[Path, option("Folder for the report, accuracy.json and the figures.")] = Path(
+        "runs/accuracy"
+    ),
+    rounds: Annotated[int, option("Of every timing.", min=3)] = 7,
 ) -> None:
     """Error of the truth itself against time, by samples, variant, refinement, visibility."""
     with clear_errors():

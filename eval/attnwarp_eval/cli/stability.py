@@ -7,22 +7,20 @@ from typing import Annotated, Any
 
 import typer
 
+from attnwarp.cli.options import option
 from attnwarp.cli.shell import log
 from attnwarp_eval.cli.shell import Regression
 
 
 def stability(
-    case: Annotated[
-        list[str] | None, typer.Option(help="Sweep this case alone; may be repeated.")
-    ] = None,
-    list_: Annotated[bool, typer.Option("--list", help="Name the cases, and run none.")] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="Three levels of each case.")] = False,
+    case: Annotated[list[str] | None, option("Sweep this case alone; may be repeated.")] = None,
+    list_: Annotated[bool, option("Name the cases, and run none.", None, "--list")] = False,
+    quick: Annotated[bool, option("Three levels of each case.", None, "--quick")] = False,
     out: Annotated[
-        Path | None,
-        typer.Option(help="The run's folder; runs/stability, with what is chosen, if left out."),
+        Path | None, option("The run's folder; runs/stability, with what is chosen, if left out.")
     ] = None,
     jobs: Annotated[
-        int, typer.Option("--jobs", "-j", min=1, help="Worker processes; 1 stays in this one.")
+        int, option("Worker processes; 1 stays in this one.", None, "--jobs", "-j", min=1)
     ] = 1,
 ) -> None:
     """Sweep numerically hard inputs until the numerics break. Exit code 1 if one breaks too early.

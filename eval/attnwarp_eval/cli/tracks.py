@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from attnwarp.cli.files import read_splats, read_views
-from attnwarp.cli.options import DataArgument, Reading, options_of
+from attnwarp.cli.options import DataArgument, Reading, option, options_of
 from attnwarp.cli.shell import log
 from attnwarp.reporting import reporter
 from attnwarp_eval.cli.shell import clear_errors
@@ -18,38 +18,28 @@ from attnwarp_eval.cli.shell import clear_errors
 def tracks(
     data: DataArgument,
     ply: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="SPLATS", help="Splats fitted to it; may be repeated."),
+        list[Path] | None, option("Splats fitted to it; may be repeated.", "SPLATS")
     ] = None,
     preset: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Warp settings; paper and corrected if left out."),
+        list[str] | None, option("Warp settings; paper and corrected if left out.", "NAME")
     ] = None,
     apart: Annotated[
-        list[int] | None,
-        typer.Option(min=1, help="Views between a pair, plus 1; 1, 3 and 6 if left out."),
+        list[int] | None, option("Views between a pair, plus 1; 1, 3 and 6 if left out.", min=1)
     ] = None,
     max_size: Annotated[
-        int, typer.Option(min=16, metavar="N", help="Measure in pictures of this many px at most.")
+        int, option("Measure in pictures of this many px at most.", "N", min=16)
     ] = 256,
     model: Annotated[
-        Path | None,
-        typer.Option(help="COLMAP's sparse model with tracks; made by pycolmap if left out."),
+        Path | None, option("COLMAP's sparse model with tracks; made by pycolmap if left out.")
     ] = None,
     truth: Annotated[
-        str | None,
-        typer.Option(metavar="SCENE", help="The scene that DATA is an export of: exact geometry."),
+        str | None, option("The scene that DATA is an export of: exact geometry.", "SCENE")
     ] = None,
     halve: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Write DATA there with half of the points to fit from; the others judge.",
-        ),
+        option("Write DATA there with half of the points to fit from; the others judge.", "FOLDER"),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for tracks.json and tracks.html.")] = Path(
-        "runs/tracks"
-    ),
+    out: Annotated[Path, option("Folder for tracks.json and tracks.html.")] = Path("runs/tracks"),
     *,
     reading: Reading,
 ) -> None:
