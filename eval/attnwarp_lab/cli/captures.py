@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from attnwarp.cli.options import Marking, MaxSizeOption, options_of
+from attnwarp.cli.options import Marking, MaxSizeOption, option, options_of
 from attnwarp.cli.shell import fail
 from attnwarp.errors import InputError
 from attnwarp.reporting import reporter
@@ -30,38 +30,23 @@ class One:
 
     data: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DATA",
-            help="transforms.json, its folder, or one of COLMAP or BlendedMVS.",
-            rich_help_panel=ONE,
-        ),
+        option("transforms.json, its folder, or one of COLMAP or BlendedMVS.", "DATA", panel=ONE),
     ] = None
     instruction: Annotated[
-        str | None, typer.Option(help="The edit, for editors that take pictures.",
-                                 rich_help_panel=ONE)
-    ] = None  # fmt: skip
+        str | None, option("The edit, for editors that take pictures.", panel=ONE)
+    ] = None
     target_prompt: Annotated[
         str | None,
-        typer.Option(
-            help="What the edited scene shows, for CLIP and editors that take depth maps.",
-            rich_help_panel=ONE,
+        option(
+            "What the edited scene shows, for CLIP and editors that take depth maps.", panel=ONE
         ),
     ] = None
     source_prompt: Annotated[
-        str | None,
-        typer.Option(
-            help="What it shows before, for CLIP and methods that invert.", rich_help_panel=ONE
-        ),
+        str | None, option("What it shows before, for CLIP and methods that invert.", panel=ONE)
     ] = None
-    ply: Annotated[
-        Path | None, typer.Option(help="Its splats; fitted if left out.", rich_help_panel=ONE)
-    ] = None
-    images: Annotated[
-        Path | None, typer.Option(help="Images of a COLMAP model.", rich_help_panel=ONE)
-    ] = None
-    scale: Annotated[
-        int, typer.Option(metavar="N", help="2, 4 or 8 reads images_N.", rich_help_panel=ONE)
-    ] = 1
+    ply: Annotated[Path | None, option("Its splats; fitted if left out.", panel=ONE)] = None
+    images: Annotated[Path | None, option("Images of a COLMAP model.", panel=ONE)] = None
+    scale: Annotated[int, option("2, 4 or 8 reads images_N.", "N", panel=ONE)] = 1
     max_size: MaxSizeOption = None
 
     @property
@@ -121,47 +106,42 @@ def captures(
             show_default=False,
         ),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="The run's folder; in runs/captures if left out.")
-    ] = None,
+    out: Annotated[Path | None, option("The run's folder; in runs/captures if left out.")] = None,
     variant: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Only this one of the manifest's; may be repeated."),
+        list[str] | None, option("Only this one of the manifest's; may be repeated.", "NAME")
     ] = None,
     editor: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME|FOLDER|BASE,CONTROLNET",
-            help="In place of the editors of its kind, whose variants alone run; may be repeated.",
+        option(
+            "In place of the editors of its kind, whose variants alone run; may be repeated.",
+            "NAME|FOLDER|BASE,CONTROLNET",
         ),
     ] = None,
     seeds: Annotated[
-        str | None, typer.Option(help="Only these seeds (comma-separated whole numbers).")
+        str | None, option("Only these seeds (comma-separated whole numbers).")
     ] = None,
     device: Annotated[
         str,
-        typer.Option(
-            metavar="DEVICE[,DEVICE...]",
-            help="cpu, cuda, or several such as cuda:0,cuda:1: one process each.",
+        option(
+            "cpu, cuda, or several such as cuda:0,cuda:1: one process each.", "DEVICE[,DEVICE...]"
         ),
     ] = "cpu",
     jobs: Annotated[
-        int | None, typer.Option("--jobs", "-j", min=1, help="Processes; one a device if left out.")
+        int | None, option("Processes; one a device if left out.", None, "--jobs", "-j", min=1)
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(
-            metavar="ADDRESS|FILE",
-            help="A dask scheduler, whose workers see this folder and the manifest's.",
+        option(
+            "A dask scheduler, whose workers see this folder and the manifest's.", "ADDRESS|FILE"
         ),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="One scene, one edit, one seed, two variants.")
+        bool, option("One scene, one edit, one seed, two variants.", None, "--quick")
     ] = False,
     dry_run: Annotated[
         bool,
-        typer.Option(
-            "--dry-run", help="Check everything, tell hours, disk and memory, and run nothing."
+        option(
+            "Check everything, tell hours, disk and memory, and run nothing.", None, "--dry-run"
         ),
     ] = False,
     *,

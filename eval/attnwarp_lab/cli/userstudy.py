@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from attnwarp.cli.options import option
 from attnwarp.cli.shell import fail
 from attnwarp_eval.cli.shell import TOO_LITTLE, check_not_of_run, clear_errors, names
 
@@ -21,22 +22,18 @@ def build(
     runs: Annotated[
         list[Path], typer.Argument(metavar="RUN...", help="Folders of runs that edited scenes.")
     ],
-    out: Annotated[Path, typer.Option(help="The page.")] = Path("userstudy.html"),
+    out: Annotated[Path, option("The page.")] = Path("userstudy.html"),
     methods: Annotated[
-        str | None,
-        typer.Option(help="Only these variants (comma-separated); else all with pictures."),
+        str | None, option("Only these variants (comma-separated); else all with pictures.")
     ] = None,
     questions: Annotated[
-        str | None,
-        typer.Option(help="Of instruction, consistency, quality (comma-separated); else all."),
+        str | None, option("Of instruction, consistency, quality (comma-separated); else all.")
     ] = None,
-    choices: Annotated[int, typer.Option(min=1, help="Choices of a person.")] = 30,
-    checks: Annotated[int, typer.Option(min=0, help="Attention checks of a person.")] = 3,
-    plans: Annotated[
-        int, typer.Option(min=1, help="Different draws; each person gets one at random.")
-    ] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="Of what is drawn.")] = 0,
-    title: Annotated[str, typer.Option(help="Of the page.")] = "Which edit do you prefer?",
+    choices: Annotated[int, option("Choices of a person.", min=1)] = 30,
+    checks: Annotated[int, option("Attention checks of a person.", min=0)] = 3,
+    plans: Annotated[int, option("Different draws; each person gets one at random.", min=1)] = 20,
+    seed: Annotated[int, option("Of what is drawn.", min=0)] = 0,
+    title: Annotated[str, option("Of the page.")] = "Which edit do you prefer?",
 ) -> None:
     """Make one self-contained page of two-way choices between the methods of runs.
 
@@ -70,9 +67,7 @@ def score(
     answers: Annotated[
         list[Path], typer.Argument(metavar="ANSWERS...", help="Files that people saved.")
     ],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for preferences.json, .md and .html.")
-    ] = None,
+    out: Annotated[Path | None, option("Folder for preferences.json, .md and .html.")] = None,
 ) -> None:
     """Preferences with intervals, agreement between people, and who failed attention checks."""
     import json
