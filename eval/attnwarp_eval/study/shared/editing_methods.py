@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.encoders import load_encoder
-from attnwarp.methods.settings import PRESETS, CarriedSettings, SourceSettings
+from attnwarp.methods.settings import (
+    PRESETS,
+    AttentionWarpingSettings,
+    CarriedSettings,
+    SourceSettings,
+)
 from attnwarp.reporting import SILENT, Reporter
 
 if TYPE_CHECKING:
@@ -162,38 +168,14 @@ class Method:
     needs_truth: bool = False
 
 
-def _attention_warping_settings(
-    name: str | None, fields: dict[str, Any], seed: int
-) -> dict[str, Any]:
-    from attnwarp.methods import preset
-
-    return dict(preset("attention_warping", name, **fields, seed=seed).to_dict())
-
-
 def _attention_warping(job: Job) -> EditedScene:
-    """:func:`attnwarp.methods.attention_warping`."""
-    from attnwarp.methods import AttentionWarpingSettings, attention_warping
-
     if job.donor is not None:
         return _with_features_of(job, job.donor)
-    return _edited(
-        attention_warping(
-            job.gaussians,
-            job.cameras,
-            job.images,
-            job.editor,
-            job.instruction,
-            AttentionWarpingSettings.from_dict(job.settings),
-            source=job.source,
-            warps=job.warps,
-            **job.options,
-        )
-    )
+    return _edited_by("attention_warping", job)
 
 
 def _with_features_of(job: Job, donor: Donor) -> EditedScene:
     """Attention warping of targets with features of the donor's source, edited alike."""
-    from attnwarp.methods import AttentionWarpingSettings
     from attnwarp.methods.attention_warping import AttentionWarping
     from attnwarp.methods.base import ViewEdit, run
 
@@ -242,7 +224,6 @@ def _true_pictures(job: Job) -> EditedScene:
     Raises:
         ValueError: a budget or a donor, neither of which means anything here.
     """
-    from attnwarp.methods import AttentionWarpingSettings
     from attnwarp.methods.attention_warping import AttentionWarping
     from attnwarp.methods.base import ViewEdit, run
 
@@ -275,7 +256,6 @@ def _true_pictures(job: Job) -> EditedScene:
 
 def _warped_views(settings: Mapping[str, Any], views: int) -> int:
     """The sources, and the views that the stages draw."""
-    from attnwarp.methods import AttentionWarpingSettings
     from attnwarp.methods.stages import draw_stages
 
     s = AttentionWarpingSettings.from_dict(dict(settings))
@@ -293,45 +273,45 @@ def _drawn_views(settings: Mapping[str, Any], views: int) -> int:
     return min(views, settings["views"] * len(rounds))
 
 
-def _baseline(name: str) -> Method:
-    """A method of :mod:`attnwarp.methods`; those that carry edits take the job's warps."""
-    kind = type(next(iter(PRESETS[name].values())))
+def _method(name: str) -> Method:
+    """A method of :mod:`attnwarp.methods`."""
 
     def settings(wanted: str | None, fields: dict[str, Any], seed: int) -> dict[str, Any]:
         from attnwarp.methods import preset
 
         return dict(preset(name, wanted, **fields, seed=seed).to_dict())
 
-    def run(job: Job) -> EditedScene:
-        from attnwarp import methods
+    return Method(settings, partial(_edited_by, name), takes_budget=True, edited=_drawn_views)
 
-        given: dict[str, Any] = {**job.options}
-        given |= {"warps": job.warps} if issubclass(kind, CarriedSettings) else {}
-        given |= {"source": job.source} if issubclass(kind, SourceSettings) else {}
-        return _edited(
-            methods.METHODS[name](
-                job.gaussians,
-                job.cameras,
-                job.images,
-                job.editor,
-                job.instruction,
-                kind.from_dict(job.settings),
-                **given,
-            )
+
+def _edited_by(name: str, job: Job) -> EditedScene:
+    """A method that starts at a source gets the job's; one that carries edits, its warps too."""
+    from attnwarp import methods
+
+    kind = type(next(iter(PRESETS[name].values())))
+    given: dict[str, Any] = {**job.options}
+    if issubclass(kind, CarriedSettings | AttentionWarpingSettings):
+        given["warps"] = job.warps
+    if issubclass(kind, SourceSettings | AttentionWarpingSettings):
+        given["source"] = job.source
+    return _edited(
+        methods.METHODS[name](
+            job.gaussians, job.cameras, job.images, job.editor, job.instruction,
+            kind.from_dict(job.settings), **given,
         )
+    )  # fmt: skip
 
-    return Method(settings, run, takes_budget=True, edited=_drawn_views)
 
+_BY_NAME = {name: _method(name) for name in PRESETS}
 
 EDITING_METHODS: dict[str, Method] = {
-    "attention_warping": Method(
-        _attention_warping_settings,
-        _attention_warping,
-        takes_budget=True,
-        edited=_warped_views,
+    **_BY_NAME,
+    "attention_warping": replace(
+        _BY_NAME["attention_warping"], run=_attention_warping, edited=_warped_views
     ),
-    "true pictures": Method(_attention_warping_settings, _true_pictures, needs_truth=True),
-    **{name: _baseline(name) for name in PRESETS if name != "attention_warping"},
+    "true pictures": Method(
+        _BY_NAME["attention_warping"].settings, _true_pictures, needs_truth=True
+    ),
 }
 """Every method by name, as in :mod:`attnwarp.methods`. ``attention_warping`` with ``a0: 0`` is the
 control."""
