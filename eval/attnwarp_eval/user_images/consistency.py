@@ -41,6 +41,7 @@ from attnwarp_eval.user_images.measure import (
     Row,
     load_encoders,
     natural,
+    of_views,
     pictures_in,
     read_picture,
 )
@@ -181,7 +182,7 @@ def measure_consistency(
             values[figure][f"{one} to {two}"] = found[figure.key]
     for figure in wanted:
         row = values[figure]
-        value = _over(figure, row)
+        value = of_views(row, np.median if figure is _DISTANCE else np.mean)
         if figure in _TSED and np.isnan(list(values[_DISTANCE].values())).all():
             value = float("nan")  # no pair has enough matches
         done.rows.append(Row(figure.key, figure.title, value, row, figure.encoder))
@@ -208,18 +209,8 @@ def _scores(path: Path, pairs: Sequence[tuple[str, str]]) -> list[Row]:
     rows = []
     for key, of_pair in read_scores(path, ("first", "second"), "--scores").items():
         own = {f"{one} to {two}": of_pair.get((one, two), float("nan")) for one, two in pairs}
-        defined = [value for value in own.values() if not np.isnan(value)]
-        value = float(np.mean(defined)) if defined else float("nan")
-        rows.append(Row(key, key.split(".", 2)[2], value, own))
+        rows.append(Row(key, key.split(".", 2)[2], of_views(own), own))
     return rows
-
-
-def _over(figure: Figure, values: Mapping[str, float]) -> float:
-    """The figure of all pairs: a median or a mean, by its definition."""
-    defined = [value for value in values.values() if not np.isnan(value)]
-    if not defined:
-        return float("nan")
-    return float(np.median(defined) if figure is _DISTANCE else np.mean(defined))
 
 
 def _installed(package: str) -> bool:

@@ -657,17 +657,14 @@ def _rows(
             _edit_rows(gathered.errors, done)
             continue
         if figure is _PERCEPTUAL:
-            defined = [value for value in gathered.distances.values() if not np.isnan(value)]
-            value = float(np.mean(defined)) if defined else float("nan")
+            value = of_views(gathered.distances)
             done.rows.append(
                 Row(figure.key, figure.title, value, gathered.distances, figure.encoder)
             )
             continue
         if figure not in _OF_PAPER:
             values = {name: gathered.own[name][figure.key] for name in names}
-            defined = [value for value in values.values() if not np.isnan(value)]
-            value = float(np.mean(defined)) if defined else float("nan")
-            done.rows.append(Row(figure.key, figure.title, value, values))
+            done.rows.append(Row(figure.key, figure.title, of_views(values), values))
             continue
         if figure is _CLIP:
             similarity = metrics.clip_similarity(_stack(gathered.clip, names), texts["prompt"])
@@ -690,6 +687,12 @@ def _rows(
             )
         values = dict(zip(names, map(float, similarity.values), strict=True))
         done.rows.append(Row(figure.key, figure.title, similarity.mean, values, figure.encoder))
+
+
+def of_views(values: Mapping[str, float], over: Callable[..., Any] = np.mean) -> float:
+    """The mean, or another figure, of the defined values; NaN without one."""
+    defined = [value for value in values.values() if not np.isnan(value)]
+    return float(over(defined)) if defined else float("nan")
 
 
 def _function(figure: Figure) -> Callable[..., float]:
