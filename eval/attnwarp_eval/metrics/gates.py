@@ -53,6 +53,7 @@ GATES: Mapping[str, Margin] = {
     "masks.back": Margin(0.02),
     # One part of a view that changes its answer changes these by a tenth.
     "parts.seen": Margin(0.1),
+    "parts.fill": Margin(0.1),
     "parts.through": Margin(0.1),
     "parts.bleed": Margin(0.05, 0.05),
     "parts.delta_e": Margin(0.5, 0.1),

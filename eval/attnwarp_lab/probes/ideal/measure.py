@@ -165,8 +165,8 @@ class IdealProbe(MethodProbe[IdealResult]):
                 pictures["render"] = _renders(world, names, before, result.gaussians)
             answers = part_answers(edited[names[0]], thing.truth(names[0]), thing.parts)
             stages = {names[v]: n for n, part in enumerate(result.rounds, 1) for v in part.views}
-            shown = {v: part_answers(edited[v], thing.truth(v), thing.parts) for v in names[1:]}
-            fill = fill_figures(shown, answers)
+            answered = {v: part_answers(edited[v], thing.truth(v), thing.parts) for v in names[1:]}
+            fill = fill_figures(answered, answers)
             for name in names[1:]:
                 row = self._figures(world, thing, name, pictures, answers, "edges" in spec)
                 row |= {f"{key}.edit": value for key, value in fill[name].items()}
