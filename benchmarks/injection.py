@@ -4,7 +4,7 @@ An edit, an edit that is recorded, and edits with the recorded features injected
 along a warp, take turns in one process. CPU seconds are of all threads of the process, so another
 process adds less to them than to seconds of the clock.
 
-    python -m benchmarks.injection --editor small-plain small --out reports/editing/cost.md
+    python -m benchmarks.injection --editor small-plain --out reports/editing/cost.md
 """
 
 from __future__ import annotations
