@@ -178,13 +178,14 @@ def bounded(value: Interval, figure: str, sign: str = "") -> str:
 
 def table(scores: Sequence[Score]) -> Table:
     """The figures by edit: means over scenes, see :func:`bounded`."""
-    rows = []
-    for edit in dict.fromkeys(score.edit for score in scores):
-        own = [score for score in scores if score.edit == edit]
-        over = {name: interval({s.scene: [s.figures[name]] for s in own}) for name in FIGURES}
-        cells = [bounded(value, name) for name, value in over.items()]
-        rows.append([edit, str(len(own)), *cells])
-    return Table(["edit", "scenes", *FIGURES.values()], rows)
+    edits: dict[str, list[Score]] = {}
+    for score in scores:
+        edits.setdefault(score.edit, []).append(score)
+    rows = [["scenes", *(str(len(those)) for those in edits.values())]]
+    for name, head in FIGURES.items():
+        over = (interval({s.scene: [s.figures[name]] for s in those}) for those in edits.values())
+        rows.append([head, *(bounded(value, name) for value in over)])
+    return Table(["figure", *edits], rows)
 
 
 def compare(results: Sequence[Result]) -> Report:
@@ -194,12 +195,12 @@ def compare(results: Sequence[Result]) -> Report:
     of the same editor, else with the first of all.
 
     Raises:
-        ValueError: results of two benches.
+        InputError: results of two benches.
     """
     first = results[0]
     for result in results:
         if result.bench != first.bench:
-            raise ValueError(
+            raise InputError(
                 f"{result.method.name}: was scored on another bench than {first.method.name};"
                 " score both on one"
             )

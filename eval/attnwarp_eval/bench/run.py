@@ -62,13 +62,16 @@ def run(
         report: receiver of progress.
 
     Raises:
-        InputError: the folder has another method's pictures, or the bench is damaged.
-        ValueError: an unknown method, or a wrong setting.
+        InputError: an unknown method, a wrong setting, another method's pictures in the folder, or
+            a damaged bench.
     """
     load_plugins()
-    check.one_of(method, list(EDITING_METHODS), "method")
-    bench, of = Suite.read(suite), EDITING_METHODS[method]
-    settings = of.settings(None, dict(options or {}), seed)
+    bench = Suite.read(suite)
+    try:
+        of = EDITING_METHODS[check.one_of(method, list(EDITING_METHODS), "method")]
+        settings = of.settings(None, dict(options or {}), seed)
+    except ValueError as error:
+        raise InputError(str(error)) from None
     told = Method(
         name=method, editor=editor, track=SAME, settings=settings,
         editor_sha256="" if editor in EDITORS else files_digest(editor), seconds=0.0,

@@ -100,7 +100,7 @@ def test_methods_are_ordered_by_their_track_and_paired_by_scene(tmp_path):
     # Undefined in one scene: behind, though its mean is less.
     assert [row[0] for row in other] == ["ours", "best", "own", "named"]
     moved = read(tmp_path, made("b", [1.0], bench=BENCH | {"seed": 32}))
-    with pytest.raises(ValueError, match="another bench"):
+    with pytest.raises(InputError, match="another bench"):
         result.compare([ours, moved])
 
 
@@ -112,6 +112,9 @@ def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path):
     options = {"steps": 4, "iterations": 0, "stages": 1}
     told = run.run(bench, out, editor="ideal", options=options)
     assert told.track == result.SAME and told.seconds > 0
+    for method, wrong in (("foo", {}), ("by_view", {"foo": 1})):
+        with pytest.raises(InputError, match="'foo', expected one of"):
+            run.run(bench, out, method, options=wrong)
     (one,) = (s for s in score.score(bench, out, tmp_path / "score") if s.edit == "colour")
     # The ideal editor knows the only answer, and leaves the rest alone to the width of a token.
     assert one.figures["done"] == 1 and one.figures["outside"] < 1 and one.remarks == []
