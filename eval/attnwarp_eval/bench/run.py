@@ -56,7 +56,7 @@ def run(
         method: name of the method.
         editor: bundled editor, a folder in diffusers' format, or a key of
             :data:`attnwarp_eval.bench.EDITORS`.
-        options: fields of the method's settings.
+        options: fields of the method's settings, or its ``preset``.
         seed: seed of the first scene's noise.
         key: folder of a sealed bench's key, for editors and methods that need the truth.
         report: receiver of progress.
@@ -66,14 +66,16 @@ def run(
             a damaged bench.
     """
     load_plugins()
-    bench = Suite.read(suite)
+    bench, fields = Suite.read(suite), dict(options or {})
+    preset = fields.pop("preset", None)
     try:
         of = EDITING_METHODS[check.one_of(method, list(EDITING_METHODS), "method")]
-        settings = of.settings(None, dict(options or {}), seed)
+        settings = of.settings(preset, fields, seed)
     except ValueError as error:
         raise InputError(str(error)) from None
     told = Method(
-        name=method, editor=editor, track=SAME, settings=settings,
+        name=f"{method}, {preset}" if preset else method,
+        editor=editor, track=SAME, settings=settings,
         editor_sha256="" if editor in EDITORS else files_digest(editor), seconds=0.0,
     )  # fmt: skip
     path = out / "method.json"

@@ -109,9 +109,10 @@ def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path):
     assert "ideal" in EDITORS
     bench, out = tmp_path / "bench", tmp_path / "out"
     suite.export(bench, count=1, seed=9, size=32, spp=1, targets=1)
-    options = {"steps": 4, "iterations": 0, "stages": 1}
+    options = {"preset": "extended", "steps": 4, "iterations": 0, "stages": 1}
     told = run.run(bench, out, editor="ideal", options=options)
     assert told.track == result.SAME and told.seconds > 0
+    assert told.name == "attention_warping, extended" and told.settings["decay"] == "late"
     for method, wrong in (("foo", {}), ("by_view", {"foo": 1})):
         with pytest.raises(InputError, match="'foo', expected one of"):
             run.run(bench, out, method, options=wrong)
