@@ -62,17 +62,14 @@ def run(
         report: receiver of progress.
 
     Raises:
-        InputError: an unknown method, a wrong setting, another method's pictures in the folder, or
-            a damaged bench.
+        InputError: the folder has another method's pictures, or the bench is damaged.
+        ValueError: an unknown method, a wrong setting, or an editor that the method isn't made for.
     """
     load_plugins()
     bench, fields = Suite.read(suite), dict(options or {})
     preset = fields.pop("preset", None)
-    try:
-        of = EDITING_METHODS[check.one_of(method, list(EDITING_METHODS), "method")]
-        settings = of.settings(preset, fields, seed)
-    except ValueError as error:
-        raise InputError(str(error)) from None
+    of = EDITING_METHODS[check.one_of(method, list(EDITING_METHODS), "method")]
+    settings = of.settings(preset, fields, seed)
     told = Method(
         name=f"{method}, {preset}" if preset else method,
         editor=editor, track=SAME, settings=settings,

@@ -61,7 +61,8 @@ def run(
     key: Annotated[Path | None, typer.Option(help="Folder of a sealed bench's truth.")] = None,
 ) -> None:
     """Edit the scenes by a method of ours, or of a plugin, with an editor of ours."""
-    with clear_errors(), reporter(title=out.name) as report:
+    # As in "attnwarp edit", a method's ValueError is about the input.
+    with clear_errors(strict=False), reporter(title=out.name) as report:
         from attnwarp.cli.shell import assignments
         from attnwarp_eval.bench.run import run as edit
 

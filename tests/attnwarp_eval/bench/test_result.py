@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from attnwarp.errors import InputError
 from attnwarp.io import read_image
 from attnwarp_eval.bench import EDITORS, result, run, score, suite
+from attnwarp_eval.cli.main import app
 from attnwarp_eval.plugins import load_plugins
 
 REPORTS = Path(__file__).parents[3] / "reports" / "bench"
@@ -113,9 +115,23 @@ def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path):
     told = run.run(bench, out, editor="ideal", options=options)
     assert told.track == result.SAME and told.seconds > 0
     assert told.name == "attention_warping, extended" and told.settings["decay"] == "late"
-    for method, wrong in (("foo", {}), ("by_view", {"foo": 1})):
-        with pytest.raises(InputError, match="'foo', expected one of"):
-            run.run(bench, out, method, options=wrong)
+    for wrong, said in (
+        (["foo"], "one of"),
+        (["gaussctrl"], "made for a depth"),
+        (["by_view", "--set", "foo=1"], "one of"),
+    ):
+        call = [
+            "bench",
+            "run",
+            str(bench),
+            str(tmp_path / "no"),
+            "--editor",
+            "small-plain",
+            "--method",
+            *wrong,
+        ]
+        done = CliRunner().invoke(app, call)
+        assert done.exit_code == 2 and said in done.stderr
     (one,) = (s for s in score.score(bench, out, tmp_path / "score") if s.edit == "colour")
     # The ideal editor knows the only answer, and leaves the rest alone to the width of a token.
     assert one.figures["done"] == 1 and one.figures["outside"] < 1 and one.remarks == []
