@@ -88,6 +88,13 @@ class JudgedClaim:
         return self.verdict in ("holds", "the opposite holds", "equal")
 
     @property
+    def one_computation(self) -> bool:
+        """True if the sides do not differ in the last digit anywhere: what parts them had no effect,
+        so nothing was tried.
+        """
+        return not any(self.contrast.by_scene.values())
+
+    @property
     def in_words(self) -> str:
         """The verdict; for "can't tell", also the scenes needed to tell; for fewer than six scenes,
         the number that agree; for a claim of another study, that study's name.
@@ -102,6 +109,8 @@ class JudgedClaim:
             return self.verdict
         if self.measured.control == "not measured":
             return "can't tell: its control was not measured"
+        if self.one_computation:
+            return "can't tell: both sides are equal to the last digit"
         needed = self.contrast.needed(self.p, self.claim.bound)
         return f"can't tell: {count_of(needed)} scenes would"
 
@@ -200,7 +209,7 @@ def decided(claims: Iterable[JudgedClaim]) -> list[JudgedClaim]:
 
 def _verdict(judged: JudgedClaim, p: float) -> Verdict:
     claim, control = judged.claim, judged.measured.control
-    if control == "not measured":
+    if control == "not measured" or judged.one_computation:
         return "can't tell"
     told = judged.contrast.verdict(claim.expect, adjusted_p=p, bound=claim.bound)
     if control == "not seen":

@@ -18,7 +18,7 @@ from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import read_results
 from attnwarp_eval.report.claims import load_claims
-from attnwarp_eval.report.judging import decided, found
+from attnwarp_eval.report.judging import decided, found, judge
 from attnwarp_eval.report.raw import PARTS, read_parts, read_raw, together
 from attnwarp_eval.report.results import lines
 from attnwarp_eval.report.verdicts import filled, headlines, table, verdicts
@@ -183,6 +183,11 @@ def test_the_table_has_verdict_difference_and_time_and_parts_of_a_study_are_read
     assert text.startswith("a\n<!-- verdicts -->\n") and text.endswith("<!-- /verdicts -->\nb\n")
     assert "| holds |" in text and "\nold\n" not in text
     assert text == filled(text, judged, tmp_path)
+
+
+def test_sides_that_are_equal_to_the_last_digit_were_not_tried(tmp_path, slip_declared):
+    (one,) = judge(read_results(written(tmp_path / "run", SCENES, [1.0] * 8)), load_claims())
+    assert one.in_words == "can't tell: both sides are equal to the last digit"
 
 
 def test_parts_of_other_studies_and_two_runs_of_one_are_refused(tmp_path):
