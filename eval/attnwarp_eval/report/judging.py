@@ -89,7 +89,7 @@ class JudgedClaim:
 
     @property
     def one_computation(self) -> bool:
-        """True if the sides do not differ in the last digit anywhere: what parts them had no effect,
+        """True if the sides are equal to the last digit everywhere: what parts them had no effect,
         so nothing was tried.
         """
         return not any(self.contrast.by_scene.values())
