@@ -30,7 +30,7 @@ from attnwarp_eval.report.judging import (
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import Layout, report_of
-from attnwarp_eval.study.probes.editing.report import abilities, source_edits
+from attnwarp_eval.study.probes.editing.report import abilities, published, source_edits
 from attnwarp_eval.study.probes.editing.result import EditResult
 from attnwarp_eval.study.shared.edit_truth import EditTruth, Judgement
 from attnwarp_eval.study.study import load_study, parse_variant
@@ -882,3 +882,24 @@ def test_text_of_a_page_is_escaped_before_it_is_set():
         == 'a &lt; b <code>c&lt;d</code> <strong>e</strong> <span class="swatch"'
         ' style="background:#ff0000"></span>'
     )
+
+
+def test_figures_that_papers_report_stand_in_one_table_with_rows_and_seconds():
+    """Oracle: means of two scenes by hand."""
+    source = Judgement("red", True, 30.0, 10.0, 10.0)
+    extra = EditResult("red", "paint it red", source, source, {}, {}, 30.0, 2, 0.0)
+    cells = []
+    for scene, psnr, rows, seconds in (("one", 20.0, 100, 3.0), ("two", 22.0, 300, 5.0)):
+        data = written_runs.record(
+            [("red/v0", 15.0, {"image.psnr.edit_render": psnr})],
+            spec={"method": "attention_warping", "settings": {}},
+            cost={"seconds": {"whole": seconds}, "counters": {"network_rows": rows}},
+            **extra.to_json(),
+        )
+        cells.append(written_runs.outcome("editing", scene, ["mine"], data, scene))
+    content = study(
+        scenes=["one", "two"], variants={"mine": {}}, probes={"editing": ["mine"]}, ablations=[]
+    )
+    (table,) = published(written_runs.results(content, cells), "editing").tables
+    dashes = ["–"] * 3
+    assert table.rows == [["mine", "21.0 (20.0 to 22.0)", *dashes, "200", "4.00"]]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from statistics import median
 from typing import Any, ClassVar
 
 from attnwarp_eval.document.model import Grid, Picture, Section, Table
-from attnwarp_eval.document.numbers import number
-from attnwarp_eval.statistics.intervals import interval
+from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.statistics.intervals import interval, over_scenes
 from attnwarp_eval.study.probe_report import (
     Layout,
     ProbeReport,
@@ -69,6 +70,7 @@ class EditingReport(ProbeReport):
         able = abilities(results, self.name)
         spec = results.finished(self.name)[0][1].spec
         if "encoders" in spec:
+            yield published(results, self.name)
             able.text.append(encoders_named(results.study, spec))
         yield able
         if (section := budgets(results, self.name)) is not None:
@@ -138,6 +140,46 @@ def source_edits(results: Results, probe: str) -> Section:
     told = "; ".join(f"{done} of {of}: {', '.join(n)}" for (done, of), n in counts.items())
     text = f"Only edits whose source view shows a right answer have figures. Done: {told}."
     return Section("Source edits", [text])
+
+
+PUBLISHED: Mapping[str, str] = {
+    "Edit PSNR, dB": "image.psnr.edit_render",
+    "CLIP direction": "embedding.clip_directional.render",
+    "CLIP image": "embedding.clip_image.render",
+    "DINO image": "embedding.dino_image.render",
+}
+"""Figures of the paper's table of methods, by column."""
+
+
+def published(results: Results, probe: str) -> Section:
+    """Section on the figures that papers report, by variant, without verdicts."""
+    rows = []
+    for name in results.study.variants:
+        own = [record for _, _, record in results.records(probe, name)]
+        if not own:
+            continue
+        costs = [record.cost for record in own]
+        network = [cost.counters["network_rows"] for cost in costs]
+        seconds = [cost.seconds.get("whole") for cost in costs]
+        rows.append(
+            [
+                name,
+                *(
+                    spread(over_scenes(results.views(probe, name, key)))
+                    for key in PUBLISHED.values()
+                ),
+                number(sum(network) / len(network)),
+                number(median(s for s in seconds if s is not None)),
+            ]
+        )
+    text = (
+        "Described, without verdicts. Edit PSNR holds renders against the edited views, so it"
+        " rewards edits that change little, and blur. CLIP and DINO look at one view, so they see"
+        " no disagreement. Which figure can be believed: docs/measuring/which-metric. Seconds are"
+        " of one edit, medians of one pass."
+    )
+    columns = ["variant", *PUBLISHED, "rows through the network", "seconds"]
+    return Section("Figures that papers report", [text], [Table(columns, rows, timed=("seconds",))])
 
 
 def controls(results: Results, probe: str) -> list[str]:
