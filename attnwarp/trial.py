@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import torch
 
@@ -20,14 +22,15 @@ def disc(size: float = 0.5) -> Gaussians:
         >>> disc().normals().tolist()
         [[0.0, 0.0, 1.0]]
     """
-    quats = torch.tensor([[1.0, 0, 0, 0]])
+    numbers = partial(torch.full, dtype=torch.float32)
+    quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float32)
     return Gaussians(
         "2d",
-        torch.zeros(1, 3),
+        numbers((1, 3), 0.0),
         quats,
-        torch.full((1, 2), size),
-        torch.ones(1),
-        torch.zeros(1, 1, 3),
+        numbers((1, 2), size),
+        numbers((1,), 1.0),
+        numbers((1, 1, 3), 0.0),
     )
 
 
