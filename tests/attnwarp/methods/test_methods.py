@@ -1,7 +1,6 @@
 # ruff: noqa: F811  (fixtures that are imported)
 """Oracles: the editor's own loop, view by view itself, renders of the splats, counts of draws."""
 
-import importlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -162,8 +161,7 @@ def test_igs2gs_edits_every_view_in_every_round_from_the_render_as_tuned(
         edits.append((args[1][0], kwargs["start"], kwargs["pictures"][0]))
         return edit(*args, **kwargs)
 
-    # The package's own name of the module is the function.
-    monkeypatch.setattr(importlib.import_module("attnwarp.methods.igs2gs"), "edit", noted)
+    monkeypatch.setattr(methods.work, "edit", noted)
     settings = IGS2GSSettings(steps=1, iterations=7, every=3)
     result = run("igs2gs", settings, folder=tmp_path)
     assert len(edits) == 3 * 3  # after 0, 3 and 6 iterations
