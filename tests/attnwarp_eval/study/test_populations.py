@@ -137,9 +137,14 @@ def test_a_population_that_cannot_be_is_refused_with_its_line(study_file, scenes
     assert message in str(error.value) and f"{study_file}:3: scenes: " in str(error.value)
 
 
-def test_each_drawn_scene_has_noise_of_its_own_and_methods_share_it():
+def test_each_drawn_scene_has_noise_of_its_own_and_methods_share_it(tmp_path):
     """The seeds in the cells themselves; a scene's are equal but for the control with another."""
-    study = load_study("ablation", scenes=["drawn-2", "drawn-5"])
+    (tmp_path / "my.yaml").write_text(
+        "extends: ablation\nname: my\nvariants: {another seed: {control: another seed}}\n"
+        "probes: {editing: [corrected, each view alone, another seed]}\nablations: []\n"
+        "fronts: []\npictures: null\n"
+    )
+    study = load_study(str(tmp_path / "my.yaml"), scenes=["drawn-2", "drawn-5"])
     seeds = defaultdict(set)
     for cell in cells_of(study, {name: load_scene(name) for name in scene_files(study)}):
         if cell.probe == "editing":

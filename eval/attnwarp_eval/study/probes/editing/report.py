@@ -159,8 +159,8 @@ def published(results: Results, probe: str) -> Section:
         if not own:
             continue
         costs = [record.cost for record in own]
-        network = [cost.counters["network_rows"] for cost in costs]
-        seconds = [cost.seconds.get("whole") for cost in costs]
+        network = [cost.counters.get("network_rows", 0) for cost in costs]
+        seconds = [s for cost in costs if (s := cost.seconds.get("whole")) is not None]
         rows.append(
             [
                 name,
@@ -169,7 +169,7 @@ def published(results: Results, probe: str) -> Section:
                     for key in PUBLISHED.values()
                 ),
                 number(sum(network) / len(network)),
-                number(median(s for s in seconds if s is not None)),
+                number(median(seconds)) if seconds else "–",
             ]
         )
     text = (
