@@ -199,67 +199,6 @@ def _plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def heatmap(
-    axes: Axes,
-    values: npt.NDArray[np.float64],
-    *,
-    rows: Sequence[str],
-    columns: Sequence[str],
-    framed: npt.NDArray[np.bool_],
-    title: str,
-) -> None:
-    """Shares as coloured cells with their numbers: blue toward 1, white at 0.5, red toward 0;
-    undefined ones grey.
-
-    Args:
-        values: (R, C) in [0, 1], NaN where undefined.
-        rows, columns: R and C titles.
-        framed: (R, C) cells that get a frame.
-
-    Example:
-        >>> from pathlib import Path
-        >>> import numpy as np
-        >>> shares = np.array([[0.0, 0.5, np.nan]])
-        >>> with drawing(Path("shares.svg")) as (axes,):
-        ...     names = {"rows": ["bear"], "columns": ["a", "b", "c"], "title": "Wins"}
-        ...     heatmap(axes, shares, framed=shares > 0.4, **names)
-    """
-    import matplotlib
-    from matplotlib.patches import Rectangle
-
-    axes.grid(False)
-    colors = matplotlib.colormaps["RdBu"].with_extremes(bad="#d0d0d0")
-    axes.pcolormesh(
-        np.ma.masked_invalid(values), cmap=colors, vmin=0, vmax=1, edgecolors="white", linewidth=1
-    )
-    for (i, j), value in np.ndenumerate(values):
-        text = f"{value:.2f}" if np.isfinite(value) else "–"
-        dark = np.isfinite(value) and abs(value - 0.5) > 0.33
-        axes.text(
-            j + 0.5,
-            i + 0.5,
-            text,
-            ha="center",
-            va="center",
-            fontsize=8,
-            color="white" if dark else "black",
-        )
-        if framed[i, j]:
-            axes.add_patch(
-                Rectangle(
-                    (j + 0.04, i + 0.06), 0.92, 0.88, fill=False, linewidth=1.1, edgecolor="black"
-                )
-            )
-    axes.set_xticks(
-        np.arange(len(columns)) + 0.5, [_plain(name) for name in columns], rotation=30, ha="right"
-    )
-    axes.set_yticks(np.arange(len(rows)) + 0.5, [_plain(name) for name in rows])
-    axes.tick_params(length=0)
-    axes.spines[["left", "bottom"]].set_visible(False)
-    axes.invert_yaxis()
-    axes.set_title(_wrapped(title, 62), loc="left", fontsize=9.5)
-
-
 MOST_NAMES = 12
 """Largest number of named points in a figure of a front; more names would cover one another's
 bars."""

@@ -96,9 +96,6 @@ def test_dollars_in_a_name_stand_for_themselves(tmp_path) -> None:
         charts.lines(axes, [charts.Line(name, [0.0, 1.0], [one, one])], x=title, y="y", title=title)
     with charts.drawing(tmp_path / "front.svg") as (axes,):
         charts.cost_front(axes, {name: (one, one)}, x="x", y="y", title=title)
-    with charts.drawing(tmp_path / "cells.svg") as (axes,):
-        shares = np.array([[0.5]])
-        charts.heatmap(axes, shares, rows=[name], columns=[name], framed=shares > 1, title=title)
-    for file in ("lines", "front", "cells"):
+    for file in ("lines", "front"):
         drawn = (tmp_path / f"{file}.svg").read_text()
         assert f"<!-- {name} -->" in drawn and f"<!-- {title} -->" in drawn
