@@ -71,7 +71,7 @@ class IdealReport(ProbeReport):
         """
         edges = edges_of(results.study, self.name)
         if edges is not None:
-            own = "parts.right.{}.edit", "", "parts.through.{}.edit"
+            own = "parts.right.{}.edit", "parts.through.{}.edit"
             metrics = {name: (name, *own) for name in edges.named}
             stages = {
                 name: [

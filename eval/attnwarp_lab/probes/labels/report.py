@@ -16,7 +16,7 @@ from attnwarp_eval.study.results import Results
 from attnwarp_lab.ideal.edge_report import edge_section
 from attnwarp_lab.ideal.edges import edges_of
 
-RIGHT, WRONG, HIDDEN = (f"labels.{name}.{{}}" for name in ("right", "wrong", "painted_hidden"))
+RIGHT, HIDDEN = "labels.right.{}", "labels.painted_hidden.{}"
 """Figures of a row on depth edges."""
 
 
@@ -41,12 +41,12 @@ class LabelReport(ProbeReport):
         edges = edges_of(results.study, self.name)
         if edges is None:
             return
-        metrics = {name: (name, RIGHT, WRONG, HIDDEN) for name in edges.named}
+        metrics = {name: (name, RIGHT, HIDDEN) for name in edges.named}
         most = max((len(r.views) for _, r in results.finished(self.name)), default=0)
         links, beside = range(1, most + 1), {}
         for name in edges.methods:
             chain = f"{name}, from view to view"
-            metrics[chain] = name, f"{RIGHT}.chain", f"{WRONG}.chain", f"{HIDDEN}.chain"
+            metrics[chain] = name, f"{RIGHT}.chain", f"{HIDDEN}.chain"
             for title, metric in ((name, "link{}"), (chain, "link{}.chain")):
                 beside[title] = [
                     (link, results.views(self.name, name, f"labels.right.{metric.format(link)}"))
