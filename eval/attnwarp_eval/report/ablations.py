@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
@@ -29,7 +29,7 @@ POOLED = (
 NOTE = re.compile(r" \((?:\d+ undefined)?(?:, )?(?:(\d+) of \d+ scenes)?\)$")
 """Note behind a mean: values and scenes that are missing."""
 
-MOST_LINES = 50
+MOST_LINES = 60
 """Largest number of lines of short tables on a page; the tables after them are folded."""
 
 CLAIMED = "†"
@@ -78,17 +78,16 @@ class Row:
 
 def differences(results: Results, compared: Sequence[Sequence[Row]]) -> list[Section]:
     """The section with one short table for each ablation of the study; none without any."""
-    ablations = results.study.ablations
-    if not ablations:
+    if not compared:
         return []
     section, lines = Section("Differences"), 0
-    for ablation, rows in zip(ablations, compared, strict=True):
+    for (own, ablation), rows in zip(_tabled(results), compared, strict=True):
         names = _names(ablation)
-        table = _main(results, ablation, rows)
+        table = _main(own, ablation, rows)
         lines += len(table.rows) + 5
         table.folded = lines > MOST_LINES
         section.tables.append(table)
-        missing = [n for n in names if not results.records(ablation.probe, n)]
+        missing = [n for n in names if not own.records(ablation.probe, n)]
         if missing:
             section.text.append(f"**{ablation.title}: not measured: {', '.join(missing)}.**")
         section.text += [f"{ablation.title}: {ablation.note}"] if ablation.note else []
@@ -118,6 +117,15 @@ def glossary(results: Results) -> str:
         + f" ({m.direction} is better)" * (m.direction in ("higher", "lower"))
         for title, m in meanings.items()
     )
+
+
+def _tabled(results: Results) -> list[tuple[Results, Ablation]]:
+    """Each table of the study, once for each of its edits, with the results that it is of."""
+    return [
+        (own, ablation.model_copy(update={"title": f"{ablation.title}{name and ': '}{name}"}))
+        for ablation in results.study.ablations
+        for name, own in results.by_edit(ablation.probe).items()
+    ]
 
 
 def _names(ablation: Ablation) -> list[str]:
@@ -153,7 +161,8 @@ def _main(results: Results, ablation: Ablation, compared: Sequence[Row]) -> Tabl
 
 def in_detail(results: Results, compared: Sequence[Sequence[Row]]) -> list[Section]:
     """Folded sections, one for each ablation of the study."""
-    return list(map(partial(_section, results), results.study.ablations, compared))
+    tables = zip(_tabled(results), compared, strict=True)
+    return [_section(own, ablation, rows) for (own, ablation), rows in tables]
 
 
 def _section(results: Results, ablation: Ablation, compared: Sequence[Row]) -> Section:
@@ -194,7 +203,10 @@ def _section(results: Results, ablation: Ablation, compared: Sequence[Row]) -> S
 def compared_of(results: Results, judged: Sequence[JudgedClaim]) -> list[list[Row]]:
     """Rows of each table of variants of the study, from :func:`rows_of`."""
     claimed = of_comparisons(judged)
-    return [rows_of(results, ablation, claimed) for ablation in results.study.ablations]
+    return [
+        rows_of(own, ablation, claimed if own is results else {})
+        for own, ablation in _tabled(results)
+    ]
 
 
 def rows_of(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from statistics import median
 from typing import Any
@@ -149,6 +149,23 @@ class Results:
                     entry = (cell.scene, cell.seed, record)
                     table.setdefault((name, variant), []).append(entry)
         return table
+
+    def by_edit(self, probe: str) -> dict[str, Results]:
+        """Name of each edit -> results without the probe's cells of the others, for a probe of
+        several edits; else all results under an empty name.
+
+        An edit with one right answer and one with several are different populations.
+        """
+        names = {
+            id(cell): (record.spec.get("edit") or {}).get("name", "")
+            for cell, record in self.finished(probe)
+        }
+        if len(set(names.values())) < 2:
+            return {"": self}
+        return {
+            name: replace(self, cells=[c for c in self.cells if names.get(id(c), name) == name])
+            for name in dict.fromkeys(names.values())
+        }
 
     def views(
         self, probe: str, variant: str, metric: str, yaw: tuple[float, float] | None = None

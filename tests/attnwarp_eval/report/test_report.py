@@ -902,4 +902,4 @@ def test_figures_that_papers_report_stand_in_one_table_with_rows_and_seconds():
     )
     (table,) = published(written_runs.results(content, cells), "editing").tables
     dashes = ["–"] * 3
-    assert table.rows == [["mine", "21.0 (20.0 to 22.0)", *dashes, "200", "4.00"]]
+    assert table.rows == [["mine", "2", "21.0 (20.0 to 22.0)", *dashes, "200", "4.00"]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from statistics import median
 from typing import Any, ClassVar
 
@@ -152,7 +153,19 @@ PUBLISHED: Mapping[str, str] = {
 
 
 def published(results: Results, probe: str) -> Section:
-    """Section on the figures that papers report, by variant, without verdicts."""
+    """Section on the figures that papers report, by edit and variant, without verdicts."""
+    text = (
+        "Described, without verdicts; rows stand on different scenes, so compare none directly."
+        " Edit PSNR holds renders against the edited views, so it rewards edits that change"
+        " little, and blur. CLIP and DINO look at one view, so they see no disagreement. Which"
+        " figure can be believed: docs/measuring/which-metric. Seconds are of one edit, medians of"
+        " one pass."
+    )
+    tables = [_published(own, probe, edit) for edit, own in results.by_edit(probe).items()]
+    return Section("Figures that papers report", [text], tables)
+
+
+def _published(results: Results, probe: str, edit: str) -> Table:
     rows = []
     for name in results.study.variants:
         own = [record for _, _, record in results.records(probe, name)]
@@ -161,25 +174,16 @@ def published(results: Results, probe: str) -> Section:
         costs = [record.cost for record in own]
         network = [cost.counters.get("network_rows", 0) for cost in costs]
         seconds = [s for cost in costs if (s := cost.seconds.get("whole")) is not None]
-        rows.append(
-            [
-                name,
-                *(
-                    spread(over_scenes(results.views(probe, name, key)))
-                    for key in PUBLISHED.values()
-                ),
-                number(sum(network) / len(network)),
-                number(median(seconds)) if seconds else "–",
-            ]
-        )
-    text = (
-        "Described, without verdicts. Edit PSNR holds renders against the edited views, so it"
-        " rewards edits that change little, and blur. CLIP and DINO look at one view, so they see"
-        " no disagreement. Which figure can be believed: docs/measuring/which-metric. Seconds are"
-        " of one edit, medians of one pass."
-    )
-    columns = ["variant", *PUBLISHED, "rows through the network", "seconds"]
-    return Section("Figures that papers report", [text], [Table(columns, rows, timed=("seconds",))])
+        means = [over_scenes(results.views(probe, name, key)) for key in PUBLISHED.values()]
+        rows.append([
+            name,
+            str(max(mean.scenes for mean in means)),
+            *(spread(replace(mean, undefined=0)) for mean in means),
+            number(sum(network) / len(network)),
+            number(median(seconds)) if seconds else "–",
+        ])  # fmt: skip
+    columns = ["variant", "scenes", *PUBLISHED, "rows through the network", "seconds"]
+    return Table(columns, rows, edit, timed=("seconds",))
 
 
 def controls(results: Results, probe: str) -> list[str]:
