@@ -159,20 +159,19 @@ def _in_turn(results: Results, asked: Answer) -> dict[str, float]:
 
 
 def _advice(results: Results, asked: Answer, leaders: list[str]) -> str:
-    """The variant to use, by the deciding column; for fewer than six scenes, the best one."""
+    """The best variant by the deciding column."""
     if not leaders:
         return f"No variant is better than the others in {asked.decides}."
     column = asked.columns[asked.decides]
     value, key = _figure(results, column, leaders[0])
     figure = in_words(value.mean, probe(column.probe).metric(key), key)
     several = " or ".join(f"`{name}`" for name in leaders)
-    if len(results.study.scenes) < FEWEST_SCENES:
-        return f"Of these variants {several} has the best {asked.decides} here: {figure}."
-    return f"Use {several} because of these variants it has the best {asked.decides}: {figure}."
+    here = " here" * (len(results.study.scenes) < FEWEST_SCENES)
+    return f"Of these variants {several} has the best {asked.decides}{here}: {figure}."
 
 
 def _costs(results: Results, asked: Answer, leaders: list[str]) -> Iterator[str]:
-    """Sentences on seconds: of the variant to use, and of the pictures' variants."""
+    """Sentences on seconds: of the best variant, and of the pictures' variants."""
     own = report_of(asked.columns[asked.decides].probe)
     taken = _in_turn(results, asked)
     cheapest = min(taken, key=lambda name: taken[name], default="")

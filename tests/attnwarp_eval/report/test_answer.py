@@ -79,7 +79,7 @@ def test_views_without_a_value_are_counted_and_not_averaged_in():
 
 def test_the_variant_that_is_best_where_it_decides_is_recommended_from_six_scenes_on():
     advice = answer(run([f"scene{k}" for k in range(6)])).text[2]
-    assert advice.startswith("Use `masked` because of these variants it has the best feature error")
+    assert advice.startswith("Of these variants `masked` has the best feature error:")
     advice = answer(run()).text[2]
     assert advice.startswith("Of these variants `masked` has the best feature error here: 20 %.")
     assert "brackets hold those of one, two, three, in this order." in advice
