@@ -44,6 +44,7 @@ class Claim:
     source: str = ""
     headline: int = 0
     plain: str = ""
+    context: str = ""
 
     @property
     def sign(self) -> int:

@@ -66,14 +66,19 @@ def control_share(method: ByView, control: ByView, alone: ByView, *, sign: int =
 
 
 def share_text(share: Share) -> str:
-    """A control's share in percent, with its interval.
+    """A control's share in percent, with its interval; in words if it falls below both sides, as
+    features from a wrong place do beside features from a right one.
 
     Example:
         >>> share_text((0.08, 0.05, 0.12)), share_text((float("nan"),) * 3)
         ('8.0 % (5.0 to 12 %)', 'no gain')
+        >>> share_text((-35.1, -59.1, -22.5))
+        'worse than both sides'
     """
     if not np.isfinite(share[0]):
         return "no gain"
+    if share[2] < 0:
+        return "worse than both sides"
     mean, low, high = (number(100 * value, 2) for value in share)
     return f"{mean} % ({low} to {high} %)"
 

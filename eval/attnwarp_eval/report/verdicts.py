@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -14,14 +15,15 @@ from attnwarp_eval.document.numbers import number as rounded
 from attnwarp_eval.document.numbers import ratio_text
 from attnwarp_eval.document.write import markdown_table
 from attnwarp_eval.report.claims import Claim, load_claims
-from attnwarp_eval.report.compared import difference_text
+from attnwarp_eval.report.compared import difference_text, in_words
 from attnwarp_eval.report.judging import COLUMNS, JudgedClaim, decided, found
 from attnwarp_eval.report.raw import PARTS, read_raw, together
 from attnwarp_eval.statistics.contrasts import contrast
-from attnwarp_eval.statistics.intervals import time_ratio
+from attnwarp_eval.statistics.intervals import over_scenes, time_ratio
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import FIGURE
 from attnwarp_eval.study.turns import Timed, timed_in_turn
 
 TABLE, LINES = "verdicts", "headlines"
@@ -39,6 +41,7 @@ class Judged:
         report: folder of the report.
         by_answers: description of the difference for edits with several right answers and with one,
             if the study has both.
+        context: the claim's sentence on other variants, filled in.
     """
 
     claim: Claim
@@ -46,6 +49,7 @@ class Judged:
     time: str = "–"
     report: Path | None = None
     by_answers: str = ""
+    context: str = ""
 
 
 def verdicts(folder: Path) -> list[Judged]:
@@ -86,7 +90,18 @@ def _judged(
     if one is None:
         return Judged(claim)
     folder, results = studies[claim.study]
-    return Judged(claim, one, _time(results, one), folder, _by_answers(results, one))
+    answers, context = _by_answers(results, one), _context(results, claim)
+    return Judged(claim, one, _time(results, one), folder, answers, context)
+
+
+def _context(results: Results, claim: Claim) -> str:
+    """Fill ``{metric|variant}`` by means over the scenes, in the claim's yaw."""
+
+    def mean(place: re.Match[str]) -> str:
+        table = results.views(claim.probe, place[2], place[1], claim.yaw)
+        return in_words(over_scenes(table).mean, probe(claim.probe).metric(place[1]), place[1])
+
+    return FIGURE.sub(mean, claim.context)
 
 
 def _by_answers(results: Results, one: JudgedClaim) -> str:
@@ -161,7 +176,8 @@ def headlines(judged: list[Judged]) -> list[str]:
             each.by_answers or f"{_plainly(each.judged)}, over {each.judged.contrast.scenes} scenes"
         )
         text = each.claim.plain or each.claim.text
-        lines.append(f"{number}. **{text}.** {verdict[0].upper()}{verdict[1:]}{needed}: {told}.")
+        line = f"{number}. **{text}.** {verdict[0].upper()}{verdict[1:]}{needed}: {told}."
+        lines.append(f"{line} {each.context}".strip())
     return lines
 
 
