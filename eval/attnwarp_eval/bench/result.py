@@ -8,20 +8,31 @@ A track has one order, fixed before any method was scored:
 - own editor: ``apart``, disagreement above the floor plus change outside the mask. Pictures that
   are unedited, copied or smoothed agree without any merit: a remark names them, and ``apart`` is
   undefined. A method with such a scene stands behind those without.
+- warps: ``wrong``, what is accepted wrongly or not kept, see
+  :func:`attnwarp_eval.bench.warps.figures`. A missing view has no answer anywhere, which is 1.
 
-Less is better in both.
+Less is better in all. Behind the others, too, stands a method that left scenes out.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
+import numpy as np
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 from pydantic.dataclasses import dataclass
 
 from attnwarp.errors import InputError
@@ -37,6 +48,7 @@ PROTOCOL: Final = 2
 
 SAME: Final = "same editor"
 OWN: Final = "own editor"
+WARPS: Final = "warps"
 
 FIGURES = {
     "error": "error, dE00",
@@ -49,11 +61,23 @@ FIGURES = {
     "drift": "drift, px",
     "render_error": "error of the splats, dE00",
 }
-"""Figures by key, with their heads."""
+"""Figures of an edit by key, with their heads."""
+
+WARP_FIGURES = {
+    "wrong": "wrong or not kept",
+    "warp.epe_median": "end-point error, px",
+    "warp.epe_p95": "its 95th percentile, px",
+    "warp.below_1px": "visible within 1 px",
+    "warp.coverage": "visible with a position",
+    "occlusion.recall": "visible kept",
+    "occlusion.hidden_share": "hidden, of what is kept",
+    "occlusion.precision": "visible, of what is kept",
+}
+"""Figures of warps by key, with their heads."""
 
 SHARES = ("done", "seen")
 
-ORDER = {SAME: "error", OWN: "apart"}
+ORDER = {SAME: "error", OWN: "apart", WARPS: "wrong"}
 """Figure that orders the methods of each track."""
 
 Figure = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
@@ -62,28 +86,40 @@ _STRICT = ConfigDict(extra="forbid", allow_inf_nan=True)
 
 @dataclass(frozen=True, config=_STRICT)
 class Score:
-    """Score of one edit of one scene.
+    """Score of one edit of one scene, or of its warps.
 
     Attributes:
-        scene, edit: names.
-        figures: values of :data:`FIGURES`; NaN if undefined.
+        scene, edit: names; the edit of warps is :data:`WARPS`.
+        figures: values of :func:`heads_of` the edit; NaN if undefined.
         by_view: figures of each target in the names of studies, such as
             ``fidelity.psnr.edit_inside``.
-        remarks: faults of the pictures, in words.
+        remarks: faults of what was handed in, in words.
     """
 
     scene: str
     edit: str
-    figures: dict[Literal[*FIGURES], Figure]  # type: ignore[valid-type]
+    figures: dict[str, Figure]
     by_view: dict[str, dict[str, Figure]]
     remarks: list[str]
 
     @field_validator("figures")
     @classmethod
-    def _complete(cls, figures: dict[str, float]) -> dict[str, float]:
-        if missing := [name for name in FIGURES if name not in figures]:
+    def _complete(cls, figures: dict[str, float], info: ValidationInfo) -> dict[str, float]:
+        heads = heads_of(info.data.get("edit", ""))
+        if missing := [name for name in heads if name not in figures]:
             raise ValueError(f"lacks {', '.join(missing)}")
         return figures
+
+
+def heads_of(edit: str) -> dict[str, str]:
+    """Heads of an edit's figures by their keys."""
+    return WARP_FIGURES if edit == WARPS else FIGURES
+
+
+def mean(values: Iterable[float]) -> float:
+    """Mean of the defined values; NaN without any."""
+    defined = [value for value in values if not math.isnan(value)]
+    return float(np.mean(defined)) if defined else math.nan
 
 
 class Method(BaseModel):
@@ -95,9 +131,9 @@ class Method(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    name: str = "the pictures"
+    name: str = "a method without a name"
     editor: str = ""
-    track: Literal["same editor", "own editor"] = "own editor"
+    track: Literal["same editor", "own editor", "warps"] = "own editor"
     seconds: float | None = Field(default=None, ge=0)
     url: str = ""
     editor_sha256: str = ""
@@ -111,6 +147,25 @@ class Method(BaseModel):
             InputError: an unknown key or a value of another kind.
         """
         return _validated(cls, path) if path.is_file() else cls()
+
+    def begun(self, out: Path) -> Method:
+        """Write the declaration to a folder to hand in; return the one that is there already.
+
+        Raises:
+            InputError: the folder has another method's files.
+        """
+        path = out / "method.json"
+        if not path.is_file():
+            self.write(out)
+            return self
+        before = Method.read(path)
+        if before.model_copy(update={"seconds": self.seconds}) != self:
+            raise InputError(f"{out}: has files of another method; name another folder")
+        return before
+
+    def write(self, out: Path) -> None:
+        """Write as the folder's ``method.json``."""
+        write_atomic(out / "method.json", self.model_dump_json(indent=1).encode())
 
 
 class Result(BaseModel):
@@ -170,9 +225,10 @@ def bounded(value: Interval, figure: str, sign: str = "") -> str:
     """
     if math.isnan(value.mean):
         return ""
-    text = format(value.mean, f"{sign}.2f")
+    form = f"{sign}.{3 if figure in WARP_FIGURES else 2}f"
+    text = format(value.mean, form)
     if value.bounded and value.scenes >= FEWEST_SCENES and figure not in SHARES:
-        text += f" [{value.low:{sign}.2f}, {value.high:{sign}.2f}]"
+        text += f" [{value.low:{form}}, {value.high:{form}}]"
     return text + (f" ({value.undefined} undefined)" if value.undefined else "")
 
 
@@ -182,7 +238,7 @@ def table(scores: Sequence[Score]) -> Table:
     for score in scores:
         edits.setdefault(score.edit, []).append(score)
     rows = [["scenes", *(str(len(those)) for those in edits.values())]]
-    for name, head in FIGURES.items():
+    for name, head in heads_of(scores[0].edit).items():
         over = (interval({s.scene: [s.figures[name]] for s in those}) for those in edits.values())
         rows.append([head, *(bounded(value, name) for value in over)])
     return Table(["figure", *edits], rows)
@@ -191,8 +247,8 @@ def table(scores: Sequence[Score]) -> Table:
 def compare(results: Sequence[Result]) -> Report:
     """Compare methods on one bench, by track and edit.
 
-    The own editor's tables have every method; differences are paired by scene with the first one
-    of the same editor, else with the first of all.
+    The own editor's tables have every method of pictures; differences are paired by scene with the
+    first one of the same editor, else with the first of all.
 
     Raises:
         InputError: results of two benches.
@@ -204,16 +260,24 @@ def compare(results: Sequence[Result]) -> Report:
                 f"{result.method.name}: was scored on another bench than {first.method.name};"
                 " score both on one"
             )
-    tracks = {track: [r for r in results if track in (r.method.track, OWN)] for track in ORDER}
+    tracks = {
+        track: [r for r in results if r.method.track in ((SAME, OWN) if track == OWN else (track,))]
+        for track in ORDER
+    }
     sections = [
-        Section(f"{track.capitalize()}: {edit}", tables=[_compared(those, track, edit)])
+        Section(
+            ": ".join(dict.fromkeys((track, edit))).capitalize(),
+            ["Of shares of what is visible, more is better."] if track == WARPS else [],
+            tables=[_compared(those, track, edit)],
+        )
         for track, those in tracks.items()
         if any(result.method.track == track for result in those)
-        for edit in first.edits
+        for edit in dict.fromkeys(edit for result in those for edit in result.edits)
     ]
     remarks = [
-        f"- {r.method.name}, {r.method.editor}: {s.scene}, {s.edit}: {text}"
+        f"- {', '.join(filter(None, told))}: {s.scene}, {s.edit}: {text}"
         for r in results
+        for told in [(r.method.name, r.method.editor)]
         for s in r.scores
         for text in s.remarks
     ]
@@ -241,7 +305,8 @@ def _bench(of: Mapping[str, Any]) -> str:
 
 def _compared(results: Sequence[Result], track: str, edit: str) -> Table:
     figure = ORDER[track]
-    keys = [figure, *(key for key in FIGURES if key != figure)]
+    heads = heads_of(edit)
+    keys = [figure, *(key for key in heads if key != figure)]
     ranked = []
     for result in results:
         if edit not in result.edits:
@@ -254,12 +319,16 @@ def _compared(results: Sequence[Result], track: str, edit: str) -> Table:
         seconds = "" if told.seconds is None else f"{told.seconds:.0f}"
         row = [told.name, told.editor, str(len(values)), *means, seconds]
         row.append("" if first is result else bounded(gain, figure, "+"))
-        undefined = any(math.isnan(value) for value in values.values())
-        ranked.append((undefined, _over(values).mean, row))
+        behind = any(math.isnan(value) for value in values.values()) or any(
+            name.endswith(f"/{edit}") for name in result.missing
+        )
+        ranked.append((behind, _over(values).mean, row))
     ranked.sort(key=lambda one: (one[0], math.isnan(one[1]), one[1]))
-    heads = [FIGURES[key] for key in keys]
-    columns = ["method", "editor", "scenes", *heads, "seconds", f"{figure}, difference"]
-    return Table(columns, [row for *_, row in ranked], timed=("seconds",))
+    columns = ["method", "editor", "scenes", *(heads[key] for key in keys), "seconds"]
+    columns.append(f"{figure}, difference")
+    shown = [k for k, column in enumerate(columns) if column != "editor" or track != WARPS]
+    rows = [[row[k] for k in shown] for *_, row in ranked]
+    return Table([columns[k] for k in shown], rows, timed=("seconds",))
 
 
 def _over(values: Mapping[str, float]) -> Interval:

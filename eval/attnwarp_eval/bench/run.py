@@ -17,15 +17,14 @@ from typing import Any
 import numpy as np
 
 from attnwarp import check
-from attnwarp.errors import InputError
 from attnwarp.io import read_dataset, read_image, read_ply, write_ply
 from attnwarp.io.text import read_text
 from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.reporting import SILENT, Part, Reporter
-from attnwarp_eval.bench import EDITORS
+from attnwarp_eval.bench import EDITORS, warps
 from attnwarp_eval.bench.result import SAME, Method
 from attnwarp_eval.bench.suite import Suite, to_bytes
-from attnwarp_eval.files import write_atomic, write_picture
+from attnwarp_eval.files import write_picture
 from attnwarp_eval.plugins import load_plugins
 from attnwarp_eval.study.shared.controls import SCENE_STEP
 from attnwarp_eval.study.shared.edit_figures import full_size
@@ -33,6 +32,8 @@ from attnwarp_eval.study.shared.edit_truth import EditTruth
 from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, Job, with_source_words
 from attnwarp_eval.study.shared.edits import files_digest
 from attnwarp_eval.study.shared.method_run import own_seconds
+
+WARP = "warp"
 
 
 def run(
@@ -46,17 +47,17 @@ def run(
     key: Path | None = None,
     report: Reporter = SILENT,
 ) -> Method:
-    """Edit every scene by a method; a folder begun earlier is continued.
+    """Edit every scene by a method, or warp it; a folder begun earlier is continued.
 
     A view that the method leaves out is handed in as a render of the edited splats.
 
     Args:
         suite: folder of the bench.
         out: folder to hand in.
-        method: name of the method.
+        method: name of the method; :data:`WARP` hands in warps alone, by no editor.
         editor: bundled editor, a folder in diffusers' format, or a key of
             :data:`attnwarp_eval.bench.EDITORS`.
-        options: fields of the method's settings, or its ``preset``.
+        options: fields of the method's settings (of a warp's for :data:`WARP`), or ``preset``.
         seed: seed of the first scene's noise.
         key: folder of a sealed bench's key, for editors and methods that need the truth.
         report: receiver of progress.
@@ -66,22 +67,18 @@ def run(
         ValueError: an unknown method, a wrong setting, or an editor that the method isn't made for.
     """
     load_plugins()
+    if method == WARP:
+        return warps.run(suite, out, options or {}, report)
     bench, fields = Suite.read(suite), dict(options or {})
     preset = fields.pop("preset", None)
-    of = EDITING_METHODS[check.one_of(method, list(EDITING_METHODS), "method")]
+    of = EDITING_METHODS[check.one_of(method, [*EDITING_METHODS, WARP], "method")]
     settings = of.settings(preset, fields, seed)
     told = Method(
         name=f"{method}, {preset}" if preset else method,
         editor=editor, track=SAME, settings=settings,
         editor_sha256="" if editor in EDITORS else files_digest(editor), seconds=0.0,
     )  # fmt: skip
-    path = out / "method.json"
-    if path.is_file():
-        before = Method.read(path)
-        if before.model_copy(update={"seconds": 0.0}) != told:
-            raise InputError(f"{out}: has pictures of another method; name another folder")
-        told = before
-    write_atomic(path, told.model_dump_json(indent=1).encode())
+    told = told.begun(out)
     for number, scene in enumerate(bench.scenes):
         for edit in json.loads(read_text(suite / scene / "edits.json"))["edits"]:
             place = out / scene / edit["name"]
@@ -97,7 +94,7 @@ def run(
             part = Part(report, number, len(bench.scenes))
             seconds = _edit(suite / scene, place, edit, method, editor, job_settings, truth, part)
             told = told.model_copy(update={"seconds": (told.seconds or 0) + seconds})
-            write_atomic(path, told.model_dump_json(indent=1).encode())
+            told.write(out)
     return told
 
 

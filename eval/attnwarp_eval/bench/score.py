@@ -1,4 +1,4 @@
-"""Scores of edited pictures of a bench; :mod:`attnwarp_eval.bench.result` has their order."""
+"""Scores of pictures and warps of a bench; :mod:`attnwarp_eval.bench.result` has their order."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,14 +19,17 @@ from attnwarp.io import read_image, read_ply
 from attnwarp.io.text import read_text
 from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.reporting import SILENT, Reporter
+from attnwarp_eval.bench import warps
 from attnwarp_eval.bench.result import (
-    FIGURES,
     ORDER,
     OWN,
     PROTOCOL,
+    WARPS,
     Method,
     Result,
     Score,
+    heads_of,
+    mean,
     table,
 )
 from attnwarp_eval.bench.suite import Suite, to_bytes, truth_file
@@ -60,43 +62,52 @@ EMPTY = (UNEDITED, COPIED, SMOOTHED) = "the source is unedited", "copies of the 
 def score(
     suite: Path, edited: Path, out: Path, report: Reporter = SILENT, *, key: Path | None = None
 ) -> list[Score]:
-    """Score a folder of edited pictures; finished edits are kept in ``out`` and not done again.
+    """Score a folder of edited pictures or of warps; what is done is kept in ``out``.
 
     Args:
         suite: folder of the bench, see :func:`attnwarp_eval.bench.suite.export`.
-        edited: folder with SCENE/EDIT/VIEW.png.
+        edited: folder with SCENE/EDIT/VIEW.png, or with SCENE/VIEW.npz.
         out: folder for bench-score.json and its page.
         report: receiver of progress.
         key: folder of a sealed bench's key.
 
     Raises:
-        InputError: the bench is damaged, its key is missing, no edit is there, or a picture has
+        InputError: the bench is damaged, its key is missing, no edit is there, or a file has
             another size.
     """
     bench = Suite.read(suite)
     root = bench.open(suite, key)
     told = Method.read(edited / "method.json")
-    there = [
-        (scene, edit["name"])
+    folders = {
+        (scene, edit["name"]): edited / scene / edit["name"]
         for scene in bench.scenes
         for edit in json.loads(read_text(suite / scene / "edits.json"))["edits"]
-    ]
-    given = [pair for pair in there if (edited / pair[0] / pair[1]).is_dir()]
-    if not given:
-        raise InputError(f"{edited}: has no folder SCENE/EDIT, such as {'/'.join(there[0])}")
+    }
+    if warps.handed_in(bench, edited):
+        told = told.model_copy(update={"track": WARPS})
+        folders = {(scene, WARPS): edited / scene for scene in bench.scenes}
+    given = {pair: folder for pair, folder in folders.items() if folder.is_dir()}
+    if not given or (told.track == WARPS) != (next(iter(given))[1] == WARPS):
+        example = edited / bench.scenes[0]
+        raise InputError(
+            f"{edited}: has nothing to score; write {example / 'EDIT' / 'VIEW.png'}, or"
+            f" {example / 'VIEW.npz'}, as docs/measuring/bench.md says"
+        )
     scores = []
-    for number, (scene, edit) in enumerate(given):
+    for number, ((scene, edit), folder) in enumerate(given.items()):
         report.step(number, len(given), f"{scene}, {edit}")
-        folder = edited / scene / edit
         kept = out / "scores" / f"{scene}-{edit}.json"
         digest = _digest(truth_file(root, scene), bench.spp, folder, told.track)
         stored = json.loads(read_text(kept)) if kept.is_file() else {}
         if stored.get("key") != digest:
-            made = _score(bench, root, scene, edit, folder, told.track)
+            if told.track == WARPS:
+                made = warps.score(bench, root, scene, folder)
+            else:
+                made = _score(bench, root, scene, edit, folder, told.track)
             stored = {"key": digest, "score": without_nan(asdict(made))}
             write_atomic(kept, json.dumps(stored).encode())
         scores.append(Score(**stored["score"]))
-    missing = [f"{scene}/{edit}" for scene, edit in there if (scene, edit) not in given]
+    missing = ["/".join(pair) for pair in folders if pair not in given]
     result = Result(
         protocol=PROTOCOL, bench=bench.identity(), method=told, scores=scores, missing=missing
     )
@@ -130,9 +141,9 @@ def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path, track:
         "apart": math.nan,
         "amount": _difference(truth.originals[source], pictures[source], truth.union[source]),
         "done": float(judged.done),
-        "agreement": _mean(row[DISAGREEMENT] for row in rows.values()),
-        "seen": _mean(row["multiview.same_answer.edit_seen"] for row in rows.values()),
-        "outside": _mean(
+        "agreement": mean(row[DISAGREEMENT] for row in rows.values()),
+        "seen": mean(row["multiview.same_answer.edit_seen"] for row in rows.values()),
+        "outside": mean(
             _difference(truth.originals[view], image, ~truth.union[view])
             for view, image in pictures.items()
         ),
@@ -143,7 +154,7 @@ def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path, track:
         renders = _renders(of, bench, folder / "edited.ply")
         values["render_error"] = _error(truth, renders, answer)
     if not any(fault.startswith(EMPTY) for fault in faults):
-        values["apart"] = _mean(row[DISAGREEMENT] for row in free.values()) + values["outside"]
+        values["apart"] = mean(row[DISAGREEMENT] for row in free.values()) + values["outside"]
     if track == OWN and truth.ambiguous:
         values |= dict.fromkeys(("error", "done", "seen", "render_error"), math.nan)
     return Score(scene, edit, values, rows, [*remarks, *faults])
@@ -238,7 +249,7 @@ def _error(truth: EditTruth, pictures: Mapping[str, Image], answer: str) -> floa
         ]
         for view, true in truth.answers[answer].items()
     }
-    return sum(_mean(error[k] for error in errors.values()) for k in (0, 1))
+    return sum(mean(error[k] for error in errors.values()) for k in (0, 1))
 
 
 def _difference(one: Image, two: Image, where: npt.NDArray[np.bool_]) -> float:
@@ -253,13 +264,8 @@ def _power(one: Image, two: Image, where: npt.NDArray[np.bool_]) -> float:
     return float((a[0] * b[0] + a[1] * b[1])[where].sum()) + 1e-9
 
 
-def _mean(values: Any) -> float:
-    finite = [value for value in values if not math.isnan(value)]
-    return float(np.mean(finite)) if finite else math.nan
-
-
 def _digest(truth: Path, spp: int, folder: Path, track: str) -> str:
-    files = sorted(path for path in folder.iterdir() if path.suffix in (".png", ".ply"))
+    files = sorted(path for path in folder.iterdir() if path.suffix in (".png", ".ply", ".npz"))
     parts = [str(PROTOCOL), track, read_text(truth), str(spp)]
     parts += [f"{path.name}:{hashlib.sha256(path.read_bytes()).hexdigest()}" for path in files]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
@@ -270,19 +276,22 @@ def _write(out: Path, result: Result) -> None:
     scores = result.scores
     remarks = [f"{s.scene}, {s.edit}: {text}" for s in scores for text in s.remarks]
     remarks += [f"not handed in: {', '.join(result.missing)}"] if result.missing else []
+    heads, digits = heads_of(scores[0].edit), 3 if result.method.track == WARPS else 2
     rows = [
         [
             s.scene,
             s.edit,
-            *("" if math.isnan(s.figures[k]) else f"{s.figures[k]:.2f}" for k in FIGURES),
+            *("" if math.isnan(s.figures[k]) else f"{s.figures[k]:.{digits}f}" for k in heads),
         ]
         for s in scores
     ]
-    each = Table(["scene", "edit", *FIGURES.values()], rows, folded=True)
+    each = Table(["scene", "edit", *heads.values()], rows, folded=True)
     told = result.method
     lead = [
-        f"Track: {told.track}, ordered by `{FIGURES[ORDER[told.track]]}`, less is better."
-        " Disagreement is read beside the change of the source, since unedited pictures agree too."
+        f"Track: {told.track}, ordered by `{heads[ORDER[told.track]]}`, less is better."
+        " Disagreement, errors and shares of what is kept are read beside how much was changed or"
+        " kept, since nothing at all has none."
     ]
-    sections = [Section("Scores", remarks, [table(scores)]), Section("By scene", tables=[each])]
+    tables = [table(scores), *([warps.by_yaw(scores)] if told.track == WARPS else [])]
+    sections = [Section("Scores", remarks, tables), Section("By scene", tables=[each])]
     write_files(Report(f"Scores of {told.name}", lead, sections), out, "bench-score")

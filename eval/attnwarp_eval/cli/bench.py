@@ -48,9 +48,9 @@ def export(
 def run(
     folder: Annotated[Path, typer.Argument(help="The exported bench.")],
     out: Annotated[Path, typer.Argument(help="Folder to hand in; one begun is continued.")],
-    method: Annotated[str, typer.Option(help="Method of this package or of a plugin.")] = (
-        "attention_warping"
-    ),
+    method: Annotated[
+        str, typer.Option(help="Method of this package or of a plugin; warp needs no editor.")
+    ] = "attention_warping",
     editor: Annotated[
         str, typer.Option(help="Bundled editor, a folder in diffusers' format, or ideal.")
     ] = "small-plain",
@@ -60,7 +60,7 @@ def run(
     ] = None,
     key: Annotated[Path | None, typer.Option(help="Folder of a sealed bench's truth.")] = None,
 ) -> None:
-    """Edit the scenes by a method of ours, or of a plugin, with an editor of ours."""
+    """Edit the scenes by a method of ours, or of a plugin, with an editor of ours, or warp them."""
     # As in "attnwarp edit", a method's ValueError is about the input.
     with clear_errors(strict=False), reporter(title=out.name) as report:
         from attnwarp.cli.shell import assignments
@@ -75,13 +75,15 @@ def run(
 @app.command()
 def score(
     folder: Annotated[Path, typer.Argument(help="The exported bench.")],
-    edited: Annotated[Path, typer.Argument(help="Folder with SCENE/EDIT/VIEW.png.")],
+    edited: Annotated[
+        Path, typer.Argument(help="Folder with SCENE/EDIT/VIEW.png, or warps as SCENE/VIEW.npz.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder for bench-score.json and its page.")] = Path(
         "runs/bench"
     ),
     key: Annotated[Path | None, typer.Option(help="Folder of a sealed bench's truth.")] = None,
 ) -> None:
-    """Score edited pictures of a bench against its truth, which is rendered again."""
+    """Score edited pictures of a bench, or warps, against its truth, which is made again."""
     from rich.console import Console
 
     with clear_errors(), reporter(title=edited.name) as report:

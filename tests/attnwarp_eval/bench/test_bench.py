@@ -18,7 +18,8 @@ from typer.testing import CliRunner
 
 from attnwarp.errors import InputError
 from attnwarp.io import read_dataset, read_image
-from attnwarp_eval.bench import result, score, suite
+from attnwarp.warp import PRESETS, warp_view
+from attnwarp_eval.bench import result, score, suite, warps
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.files import write_picture
 from attnwarp_eval.scene.file import load_scene
@@ -27,9 +28,11 @@ from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.shared.edit_truth import EditTruth
 from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.work import compute
+from attnwarp_eval.two_view import AMBIGUOUS, HIDDEN, VISIBLE, Hits, TwoView
+from attnwarp_eval.world import splats as sampled
+from attnwarp_eval.world import world
 
 SIZE, SPP, SCENE = 48, 2, "drawn-0"
-ANSWERS = ("red", "blue")
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +203,7 @@ def spoiled(bench):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("track", result.ORDER)
+@pytest.mark.parametrize("track", [result.SAME, result.OWN])
 def test_cheaters_are_named_or_ranked_behind_the_truth(bench, tmp_path, track):
     true, cheats = spoiled(bench)
     figure = result.ORDER[track]
@@ -308,6 +311,157 @@ def test_the_commands_score_a_folder_and_print_its_page(bench, tmp_path):
     assert "Scores of truth" in page and "not handed in: drawn-0/some_colour" in page
 
 
+def true_warps(bench):
+    """The shipped truth by view: float32 places in the source, and what it certainly shows."""
+    truth = bench / SCENE / "truth"
+    return {
+        view: {
+            "points": np.load(truth / "source_pixel" / f"{view}.npy"),
+            "visible": read_image(truth / "visible" / f"{view}.png")[..., 0] == 255,
+        }
+        for view in ("yaw010", "yaw030")
+    }
+
+
+def scored_warps(bench, tmp_path, answers):
+    folder = tmp_path / "warps" / SCENE
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for view, arrays in answers.items():
+        np.savez(folder / f"{view}.npz", **arrays)
+    (one,) = score.score(bench, tmp_path / "warps", tmp_path / "out")
+    return one
+
+
+def test_true_warps_have_no_error_and_planted_ones_have_theirs(bench, tmp_path):
+    true = true_warps(bench)
+    one = scored_warps(bench, tmp_path, true)
+    figures = one.figures
+    assert one.remarks == []
+    assert figures["warp.epe_p95"] < 1e-5  # places are stored in float32
+    assert figures["occlusion.recall"] == figures["warp.coverage"] == 1
+    assert figures["occlusion.hidden_share"] == figures["wrong"] == 0
+    moved = {v: a | {"points": a["points"] + np.float32([0, 2])} for v, a in true.items()}
+    figures = scored_warps(bench, tmp_path, moved).figures
+    np.testing.assert_allclose([figures["warp.epe_median"], figures["warp.epe_p95"]], 2, rtol=1e-5)
+    assert figures["wrong"] == 1 and figures["warp.below_1px"] == 0
+    # A matcher of few points, each of them right: by default it keeps what it answers.
+    few = np.zeros((SIZE, SIZE, 1), bool)
+    few[::5, ::7] = True
+    kept = {
+        v: {"points": np.where(few & a["visible"][..., None], a["points"], np.nan)}
+        for v, a in true.items()
+    }
+    figures = scored_warps(bench, tmp_path, kept).figures
+    counts = [(int((few[..., 0] & a["visible"]).sum()), a["visible"].sum()) for a in true.values()]
+    recall, wrong = np.mean([(k / n, 1 - 2 * k / (k + n)) for k, n in counts], axis=0)
+    assert figures["warp.epe_p95"] < 1e-5 and figures["occlusion.precision"] == 1
+    assert figures["occlusion.recall"] == figures["warp.coverage"] == pytest.approx(recall)
+    assert figures["wrong"] == pytest.approx(wrong)
+
+
+def test_figures_of_four_pixels_follow_by_hand():
+    label = np.array([[VISIBLE, VISIBLE, HIDDEN, AMBIGUOUS]])
+    ones, xy = np.ones((1, 4), bool), np.zeros((1, 4, 2))
+    truth = TwoView(None, None, Hits(*[None] * 6, ones), xy, ones, ones, label, ones)
+    points = np.array([[[0.6, 0.0], [0.0, 3.0], [0.0, 0.0], [0.0, 0.0]]])
+    figures = warps.figures(points, ones, truth)
+    assert figures["wrong"] == 1 - 2 * 1 / (3 + 2)  # one right, three accepted, two visible
+    assert figures["warp.epe_mean"] == (0.6 + 3) / 2 and figures["occlusion.recall"] == 1
+    assert figures["occlusion.hidden_share"] == 1 / 3
+
+
+def test_depth_leads_to_true_places_and_a_missing_view_has_no_answer(bench, tmp_path):
+    views = ("source", "yaw010", "yaw030")
+    depth = {v: {"depth": np.load(bench / SCENE / "depth" / f"{v}.npy")} for v in views}
+    true = true_warps(bench)
+    whole = scored_warps(bench, tmp_path, depth)
+    assert whole.remarks == [] and whole.figures["warp.epe_p95"] < 1e-3
+    # Depth is not read across edges.
+    assert whole.figures["occlusion.recall"] > 0.6
+    assert whole.figures["occlusion.hidden_share"] < 0.01
+    del depth["yaw030"]
+    some = scored_warps(bench, tmp_path, depth)
+    assert some.remarks == ["missing: yaw030"]
+    assert some.by_view["yaw010"] == whole.by_view["yaw010"]
+    assert some.by_view["yaw030"]["occlusion.visible_rejected"] == true["yaw030"]["visible"].sum()
+    assert some.by_view["yaw030"]["wrong"] == 1
+    del depth["source"]
+    known = {"yaw010": depth["yaw010"] | {"visible": true["yaw010"]["visible"]}}
+    assert scored_warps(bench, tmp_path, known).by_view["yaw010"]["wrong"] == 0
+    with pytest.raises(InputError, match="source.npz: has no depth, which tells"):
+        scored_warps(bench, tmp_path, depth)
+
+
+def test_warps_without_merit_and_slips_of_convention_are_named(bench, tmp_path):
+    true = true_warps(bench)
+    own = np.stack(np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5), -1)
+    everywhere, nowhere = np.ones((SIZE, SIZE), bool), np.zeros((SIZE, SIZE), bool)
+    cases = {
+        "everything is accepted": lambda a: a | {"visible": everywhere},
+        "nothing is accepted": lambda a: a | {"visible": nowhere},
+        "every pixel lies at its own place": lambda a: {"points": own},
+        "are x and y swapped": lambda a: a | {"points": a["points"][..., ::-1]},
+        "do pixel centres lie at integers": lambda a: a | {"points": a["points"] - 0.5},
+    }
+    for said, spoil in cases.items():
+        one = scored_warps(bench, tmp_path, {view: spoil(a) for view, a in true.items()})
+        assert any(remark.startswith(said) for remark in one.remarks), said
+        # A slip of 0.7 px is within the bound of 1 px, and tells in the end-point error alone.
+        assert one.figures["wrong"] > 0.1 or "integers" in said
+
+
+def test_arrays_of_another_size_type_or_unit_are_refused_by_name(bench, tmp_path):
+    points = true_warps(bench)["yaw010"]["points"]
+    for arrays, message in (
+        ({"points": points[:24, :24]}, r"points: is float32 \(24, 24, 2\), expected float"),
+        ({"points": points, "visible": points[..., 0]}, "visible: is float32 .* expected bool"),
+        ({"points": points / SIZE}, "points: lie within 1; give pixels"),
+        ({"depth": points}, "depth: is float32"),
+        ({"xy": points}, "has neither points nor depth"),
+        ({"points": np.array([None])}, "is no .npz of arrays"),
+    ):
+        with pytest.raises(InputError, match=f"yaw010.npz: {message}"):
+            scored_warps(bench, tmp_path, {"yaw010": arrays})
+
+
+def test_our_warps_through_the_door_have_a_studys_figures(bench, tmp_path):
+    path = bench / SCENE / "truth" / "scene.yaml"
+    study = {
+        "name": "warps", "size": SIZE, "scenes": [str(path)], "spp": SPP, "splats": suite.SPLATS,
+        "views": ["yaw010", "yaw030"], "variants": {"one": {"preset": "tolerant"}},
+        "probes": {"warp": ["one"]},
+    }  # fmt: skip
+    (tmp_path / "warps.yaml").write_text(yaml.safe_dump(study))
+    loaded = load_study(str(tmp_path / "warps.yaml"))
+    scenes = {name: load_scene(name) for name in loaded.scenes}
+    cell = next(c for c in cells_of(loaded, scenes) if c.probe == "warp")
+    record = compute(probe("warp"), cell, tmp_path)
+    made, out = tmp_path / "made", tmp_path / "out"
+    for call in (
+        ["run", str(bench), str(made), "--method", "warp", "--set", "preset=tolerant"],
+        ["score", str(bench), str(made), "--out", str(out)],
+        ["table", str(out / "bench-score.json"), "--out", str(out)],
+    ):
+        done = CliRunner().invoke(app, ["bench", *call])
+        assert done.exit_code == 0, done.output
+    from_ply = result.Result.read(out / "bench-score.json")
+    assert from_ply.method.track == result.WARPS and from_ply.method.seconds > 0
+    assert "| warp, tolerant | 1 |" in (out / "bench.md").read_text()
+    of, splats = world(str(path), SIZE), sampled(str(path), SIZE, 0, **suite.SPLATS)
+    views = {
+        v: warp_view(splats, of.source, of.targets[v], PRESETS["tolerant"]) for v in of.targets
+    }
+    answers = {v: {"points": w.correspondence.xy, "visible": w.mask} for v, w in views.items()}
+    one = scored_warps(bench, tmp_path, answers)
+    for view in record.views:
+        for name in one.by_view[view.name].keys() - {"yaw", "wrong"}:
+            np.testing.assert_equal(one.by_view[view.name][name], view.metrics[name])
+            # A PLY has splats in float32.
+            value = from_ply.scores[0].by_view[view.name][name]
+            np.testing.assert_allclose(value, view.metrics[name], rtol=1e-3, atol=1e-6)
+
+
 MADE_UP = """
 import hashlib
 def my_editor(picture, words):
@@ -319,6 +473,8 @@ def hash_of(*parts):
 def alone(scene, out, view, picture, edit):
     return my_editor(picture, edit["instruction"])
 edit_all("bench", "alone", alone)
+def my_matcher(source, view):
+    return [((x + 0.5, y + 0.25), (x + 0.75, y + 0.5)) for y in range(48) for x in range(0, 48, 5)]
 """
 """A method whose tint follows from the picture: views alone get different ones."""
 
@@ -326,15 +482,19 @@ edit_all("bench", "alone", alone)
 def walk(python, bench, folder, before=""):
     """Walk the page's way from an export to two scored folders in an environment's Python."""
     page = (Path(__file__).parents[3] / "docs" / "measuring" / "bench.md").read_text()
-    loop, carry = re.findall(r"```python\n(.*?)```", page, re.S)
+    loop, carry, warp = re.findall(r"```python\n(.*?)```", page, re.S)
     (folder / "bench").symlink_to(bench)
-    script = before + loop + "import numpy as np\n" + MADE_UP + carry
+    script = before + loop + "import numpy as np\n" + MADE_UP + carry + warp
     subprocess.run([python, "-c", script], cwd=folder, check=True, timeout=120)
     by_name = {}
     for name in ("alone", "edited"):
         made = score.score(bench, folder / name, folder / f"out-{name}")
         assert [one.edit for one in made] == list(suite.EDITS)
         by_name[name] = made
+    (warped,) = score.score(bench, folder / "warps", folder / "out-warps")
+    assert warped.remarks == [] and 0.1 < warped.figures["warp.coverage"] < 0.3
+    points = np.load(folder / "warps" / SCENE / "yaw010.npz")["points"]
+    assert points[7, 10].tolist() == [10.25, 7.25]  # a quarter of a pixel off its own place
     for alone, carried in zip(*by_name.values(), strict=True):
         assert carried.remarks == []
         # One tint of the source's for all that it sees, in place of a tint for each view.

@@ -106,6 +106,31 @@ def test_methods_are_ordered_by_their_track_and_paired_by_scene(tmp_path):
         result.compare([ours, moved])
 
 
+def test_warps_stand_in_a_table_of_their_own_behind_it_those_without_all_scenes(tmp_path):
+    def warped(name, wrong, **other):
+        data = made(name, wrong, result.WARPS, **other)
+        for one in data["scores"]:
+            values = dict.fromkeys(result.WARP_FIGURES, 0.5) | {"wrong": one["figures"]["error"]}
+            one |= {"edit": result.WARPS, "figures": values}
+        return read(tmp_path, data)
+
+    ours, best = warped("ours", [0.2, 0.4, 0.3] * 2), warped("best", [0.1, 0.25, 0.25] * 2)
+    few = warped("few", [0.0] * 5, missing=["drawn-5/warps"])
+    pictures = read(tmp_path, made("pictures", [2.0] * 6))
+    same, warps = result.compare([pictures, ours, best, few]).sections
+    assert (same.title, warps.title) == ("Same editor: colour", "Warps")
+    assert [row[0] for row in same.tables[0].rows] == ["pictures"]
+    (table,) = warps.tables
+    assert [row[0] for row in table.rows] == ["best", "ours", "few"]
+    assert len(table.columns) == len(table.rows[0]) and "editor" not in table.columns
+    # A tenth of the errors that the test above works out.
+    assert table.rows[0][-1] == "-0.100 [-0.147, -0.053]"
+    data = made("mixed", [1.0])
+    data["scores"][0]["edit"] = result.WARPS
+    with pytest.raises(InputError, match="lacks wrong"):
+        read(tmp_path, data)
+
+
 def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path):
     load_plugins()
     assert "ideal" in EDITORS

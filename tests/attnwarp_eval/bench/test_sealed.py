@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from attnwarp.errors import InputError
-from attnwarp.io import read_dataset, read_ply
+from attnwarp.io import read_dataset, read_image, read_ply
 from attnwarp_eval.bench import score, suite
 from attnwarp_eval.drawn.axes import to_words
 from attnwarp_eval.drawn.scenes import SceneDraft
@@ -147,6 +147,13 @@ def test_a_sealed_bench_is_scored_with_its_key_alone(benches, tmp_path):
     (one,) = score.score(folder, tmp_path / "in", tmp_path / "out", key=key)
     # Of a thing that no pixel shows it is undefined: whatever the secret draws.
     assert not one.figures["error"] > 0
+    places = [key / SCENE / "truth" / part / "yaw010" for part in ("source_pixel", "visible")]
+    visible = read_image(places[1].with_suffix(".png"))[..., 0] == 255
+    (tmp_path / "warps" / SCENE).mkdir(parents=True)
+    points = np.load(places[0].with_suffix(".npy"))
+    np.savez(tmp_path / "warps" / SCENE / "yaw010.npz", points=points, visible=visible)
+    (one,) = score.score(folder, tmp_path / "warps", tmp_path / "out", key=key)
+    assert not one.figures["wrong"] > 0
     for given, message in (
         (None, "is sealed"), (other, "not the key of"), (tmp_path, "lacks .*key.json"),
     ):  # fmt: skip
