@@ -23,9 +23,10 @@ SIZE = 128
 
 
 def draw(out: Path, scene: str, thing: str, instruction: str, seed: int) -> None:
-    """Rows: before the edit, each view edited alone, attention warped, and the preset `extended`.
-    Columns: the source view and targets. Every view has noise of its own, except in the last row,
-    whose preset ties it to the surface; nothing changes outside the thing's exact mask.
+    """Rows: before the edit; each view edited alone, attention warped, and the weights and mask of
+    `extended`, all with noise of each view's own; and each view alone with the noise of `extended`,
+    which sticks to the surface. Columns: the source view and targets. Nothing changes outside the
+    thing's exact mask.
     """
     truth = world(scene, SIZE)
     cameras = [truth.source, *(truth.targets[view] for view in VIEWS)]
@@ -36,18 +37,21 @@ def draw(out: Path, scene: str, thing: str, instruction: str, seed: int) -> None
     given = (model, cameras, before, load_editor("small-plain"), instruction)
     # The row shows edited views, so the splats need no tuning.
     few: dict[str, Any] = {"iterations": 1, "seed": seed}
-    alone = by_view(*given, ByViewSettings(**few, noise="fresh"), segments=segments)
     rows: dict[str, Mapping[int, Any]] = {
         "before": dict(enumerate(before)),
-        "each view alone": alone.edited,
+        "each view alone": by_view(
+            *given, ByViewSettings(**few, noise="fresh"), segments=segments
+        ).edited,
     }
     few |= {"stages": 1, "views_per_stage": len(VIEWS)}
+    alone = {"a0": 0.0, "unseen": "free"}
     for title, settings in (
         ("attention warped", preset("attention_warping", "corrected", noise="fresh", **few)),
-        ("extended", preset("attention_warping", "extended", **few)),
+        ("extended's weights", preset("attention_warping", "extended", noise="fresh", **few)),
+        ("alone, surface noise", preset("attention_warping", "extended", **few, **alone)),
     ):
         rows[title] = attention_warping(*given, settings, segments=segments).edited
-    figure, axes = pyplot.subplots(len(rows), len(cameras), figsize=(11, 9), dpi=80)
+    figure, axes = pyplot.subplots(len(rows), len(cameras), figsize=(11, 11.2), dpi=80)
     for axis, title in zip(axes[0], ("source view", *VIEWS), strict=True):
         axis.set_title(title)
     for row, (title, pictures) in zip(axes, rows.items(), strict=True):
