@@ -131,9 +131,8 @@ class _Page:
 
     @property
     def edits_alone(self) -> bool:
-        """True if the method edits each view alone, with separate noise."""
-        method, noise = self.manifest["method"], self.manifest["settings"]["noise"]
-        return bool(method == "by_view" and noise == "fresh")
+        """True if the method edits each view alone."""
+        return bool(self.manifest["method"] == "by_view")
 
     def head(self, given: Sequence[str], origin: str) -> str:
         """Write the instruction, a summary of the run, warnings, and the origin of the inputs."""
@@ -225,7 +224,7 @@ class _Page:
             ("Photograph", "photograph", self._photograph),
             ("Edited view", "edited", lambda name: self._read(f"views/{name}.png")),
             (
-                "The same view edited alone, with noise of its own", "edited alone",
+                "The same view edited alone, with the same noise", "edited alone",
                 lambda name: self._read(f"{CONTROL}/{name}.png"),
             ),
             ("Scene before", "scene before", lambda name: self._read(f"{RENDERS[0]}/{name}.png")),
@@ -323,12 +322,17 @@ class _Page:
             return ""
         where = "" if segments is None else " inside the mask"
         rows = [(title, f"{value:.1%}") for title, value in values.items()]
+        alone = values.get("each edited alone", math.inf)
+        same = (
+            "<p>Edited alone, with the same noise, the views agree as well: here the noise and the"
+            " editor make them agree, and carried features are not needed.</p>"
+        ) * (alone <= values["edited views"])
         return (
             "<h2>Do the views agree?</h2><p>Difference between the pictures of two views where"
             f" they show one point of the surface{where}, in percent of the full range: a mean over"
             f" all pairs of the {len(self.shown)} views above, at correspondences of the rendered"
             " splats. Less is more consistent. Photographs differ too: light, texture and depth"
-            f" are not exact.</p>{_table(('pictures', 'difference'), rows)}"
+            f" are not exact.</p>{_table(('pictures', 'difference'), rows)}{same}"
         )
 
     def outside(self) -> str:

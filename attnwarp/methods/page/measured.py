@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
-from itertools import permutations
+from functools import partial
+from itertools import groupby, permutations
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,17 @@ from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor
 from attnwarp.gaussians import Gaussians
 from attnwarp.io.names import file_stems
+from attnwarp.methods.attention_warping import AttentionWarping
+from attnwarp.methods.base import ViewEdit
 from attnwarp.methods.by_view import ByView
 from attnwarp.methods.pictures import Bytes, to_bytes
 from attnwarp.methods.scene import Scene, near_of
-from attnwarp.methods.settings import ByViewSettings
-from attnwarp.methods.work import Work
+from attnwarp.methods.settings import (
+    AttentionWarpingSettings,
+    ByViewSettings,
+    MethodSettings,
+)
+from attnwarp.methods.work import Work, chunks
 from attnwarp.reporting import Reporter
 from attnwarp.warp import preset, render_surface, sample_at, warp_surfaces
 from attnwarp.workdir import MANIFEST, Workdir
@@ -36,26 +43,46 @@ def edited_alone(
     views: Sequence[int],
     report: Reporter,
 ) -> None:
-    """Edit each view alone, with separate noise and all else equal, into a run's folder.
+    """Edit each view alone, with the run's noise and all else equal, into a run's folder.
 
     Args:
         views: numbers of the views; views already in the folder are kept.
     """
     manifest, names = folder.read_json(MANIFEST), file_stems(scene.cameras)
-    shared = {field.name for field in fields(ByViewSettings)} & manifest["settings"].keys()
-    own = {name: manifest["settings"][name] for name in shared}
-    settings = ByViewSettings.from_dict({**own, "noise": "fresh"})
-    instruction = manifest["instruction"]
-    work = Work(gaussians, scene, editor, instruction, settings, "auto", folder, report)
-    method = ByView(work, settings)
     (folder.path / CONTROL).mkdir(parents=True, exist_ok=True)
     files = {view: f"{CONTROL}/{names[view]}.png" for view in views}
     left = [view for view in views if not folder.has(files[view])]
-    for batch in method.batches(left):
-        report.step(left.index(batch[0]), len(left), "control: each view of the page edited alone")
-        edits = method.edit(batch, work.frozen, lambda: None)
-        for view, edit in zip(batch, edits, strict=True):
-            folder.write_picture(files[view], to_bytes(work.composite(view, edit.picture)))
+    if not left:
+        return
+
+    def work_with(settings: MethodSettings) -> Work:
+        instruction = manifest["instruction"]
+        return Work(gaussians, scene, editor, instruction, settings, "auto", folder, report)
+
+    edits: list[tuple[Sequence[int], Callable[..., list[ViewEdit]]]] = []
+    given = manifest["settings"]
+    if manifest["method"] == "attention_warping":
+        nothing = {"a0": 0.0, "unseen": "free", "reference": "none"}
+        settings = AttentionWarpingSettings.from_dict({**given, **nothing})
+        work, source = work_with(settings), names.index(manifest["source"])
+        method = AttentionWarping(work, settings, source, None, None, "cpu")
+        # Noise on the surface hangs on the sources', so they are edited first.
+        edits += [((v,), partial(method.edit_source, n)) for n, v in enumerate(method.sources)]
+        targets = [view for view in left if view not in method.sources]
+        for _, same in groupby(targets, key=lambda view: work.sizes[view]):
+            for some in chunks([*same], settings.batch):
+                edits.append((some, partial(method.edit_targets, 0, some)))
+    else:
+        shared = {field.name for field in fields(ByViewSettings)} & given.keys()
+        alone = ByViewSettings.from_dict({name: given[name] for name in shared})
+        work = work_with(alone)
+        by_view = ByView(work, alone)
+        edits += [(batch, partial(by_view.edit, batch)) for batch in by_view.batches(left)]
+    for number, (batch, edit) in enumerate(edits):
+        report.step(number, len(edits), "control: each view of the page edited alone")
+        for view, one in zip(batch, edit(work.frozen, lambda: None), strict=True):
+            if view in left:
+                folder.write_picture(files[view], to_bytes(work.composite(view, one.picture)))
 
 
 def disagreement(

@@ -15,7 +15,7 @@ from attnwarp import Camera
 from attnwarp.errors import InputError
 from attnwarp.io import read_image, read_splat
 from attnwarp.io.names import file_stems
-from attnwarp.methods import METHODS, by_view, preset
+from attnwarp.methods import METHODS, attention_warping, by_view, preset
 from attnwarp.methods import page as pages
 from attnwarp.methods.base import workdir_of
 from attnwarp.methods.page.measured import disagreement
@@ -143,11 +143,22 @@ def test_a_view_edited_alone_is_the_one_of_the_method_that_edits_every_view_alon
     folder, _ = warped
     model, cameras, images = scene
     inverted = [1 - image for image in images]
-    settings = preset("by_view", **{**QUICK, "iterations": 0, "batch": 1})
+    settings = preset("by_view", **{**QUICK, "iterations": 0, "batch": 1}, noise="shared")
     result = by_view(model, cameras, inverted, editor, "red", settings)
     for view, picture in result.edited.items():
         alone = read_image(folder / "control" / f"v{view}.png").astype(int)
         # Views that share a pass differ in the last bits from views one by one.
+        assert np.abs(alone - picture).max() <= 1
+
+
+def test_the_control_has_the_noise_of_the_surface_where_the_edit_has_it(edits, scene, editor):
+    chosen = {**QUICK, "stages": 1, "noise": "surface"}
+    folder, _ = edits("attention_warping", **chosen)
+    model, cameras, images = scene
+    settings = preset("attention_warping", **{**chosen, "iterations": 1}, a0=0.0)
+    result = attention_warping(model, cameras, images, editor, "red", settings)
+    for view, picture in result.edited.items():
+        alone = read_image(folder / "control" / f"v{view}.png").astype(int)
         assert np.abs(alone - picture).max() <= 1
 
 
