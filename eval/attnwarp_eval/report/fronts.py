@@ -33,7 +33,7 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
     reports = {front.probe: report_of(front.probe) for front in results.study.fronts}
     in_turn = {own.stage: timed_in_turn(results, own.stage) for own in reports.values()}
     text = _text(reports.values(), in_turn)
-    section = Section("What accuracy costs in time", list(text))
+    section, ranges = Section("What accuracy costs in time", list(text)), list[str]()
     for index, front in enumerate(results.study.fronts):
         metric = front.metric.format(layer=results.layer)
         shared = results.shared(front.probe, front.variants, metric)
@@ -45,7 +45,7 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
         points, rows = _points(results, front, shared, own.cost, timed)
         if not points:
             continue
-        section.text += shared.text(front.title)
+        ranges += shared.text(front.title)
         path = layout.figure(f"front-{index}.svg")
         specification = own.probe.metric(metric)
         label = f"{metric} ({specification.unit})"
@@ -76,6 +76,7 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
             ]
         section.tables.append(Table(columns, marked, front.title, folded=True))
         section.tables += _cheapest(results, shared, points, time)
+    section.text += [" ".join(ranges)] if ranges else []
     return [section] if section.tables or len(section.text) > len(text) else []
 
 

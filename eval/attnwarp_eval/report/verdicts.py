@@ -158,7 +158,9 @@ def table(judged: list[Judged], beside: Path) -> Table:
             rows.append([each.claim.text, absent, *["–"] * len(COLUMNS)])
             continue
         link = Path(os.path.relpath(each.report / "report.md", beside)).as_posix()
-        rows.append([*one.row, each.time, f"[{each.claim.study}]({link})"])
+        claim, verdict, difference, *rest = one.row
+        difference += f"; {each.by_answers}" * bool(each.by_answers)
+        rows.append([claim, verdict, difference, *rest, each.time, f"[{each.claim.study}]({link})"])
     return Table([*COLUMNS, "time", "report"], rows)
 
 

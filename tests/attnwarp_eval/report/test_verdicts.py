@@ -6,6 +6,7 @@ import dataclasses
 import json
 import lzma
 import pathlib
+import re
 
 import numpy as np
 import pytest
@@ -217,6 +218,32 @@ def test_the_documents_say_what_the_committed_raw_results_give():
         text = path.read_text()
         assert "<!-- /" in text
         assert filled(text, told, path.parent) == text
+
+
+def test_edits_with_several_right_answers_and_with_one_are_told_apart():
+    """Oracle: the committed records, read by hand."""
+    key, sides = "multiview.delta_e_above.edit_inside", {"mirrored": {}, "corrected": {}}
+    for cell in read_parts(ROOT / "reports" / "ablation").cells:
+        name = cell.variants[0]
+        if cell.probe == "editing" and name in sides and cell.record.extra.source.done:
+            several = len(cell.record.spec["edit"]["answers"]) > 1
+            for view in cell.record.views:
+                sides[name][cell.scene, several, view.name] = view.metrics[key]
+    expected = []
+    for several in (True, False):
+        scenes = {}
+        for at, value in sides["corrected"].items():
+            difference = value - sides["mirrored"].get(at, np.nan)
+            if at[1] == several and np.isfinite(difference):
+                scenes.setdefault(at[0], []).append(difference)
+        expected.append((np.mean([np.mean(own) for own in scenes.values()]), len(scenes)))
+    (line,) = [
+        one
+        for one in (ROOT / "reports/README.md").read_text().splitlines()
+        if "under mirrored features (bundled editor)" in one
+    ]
+    found = re.findall(r"([+-][\d.]+) dE00 \([^)]*\) over (\d+) scenes", line)
+    assert [(f"{mean:+.3g}", str(count)) for mean, count in expected] == found
 
 
 @pytest.mark.slow
