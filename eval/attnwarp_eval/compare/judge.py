@@ -150,8 +150,8 @@ def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparis
     Args:
         baseline: trusted figures.
         run: judged figures.
-        common: whether to compare only common cells, seeds included. The rest is then no fault,
-            and is listed in ``left_out``.
+        common: whether to compare only common cells, with one definition, seeds included. The rest
+            is then no fault, and is listed in ``left_out``.
     """
     left_out: list[str] = []
     if common and (seeds := baseline.seeds & run.seeds):
@@ -168,6 +168,10 @@ def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparis
         name = " / ".join(key)
         if {c.definition for c in first} != {c.definition for c in second}:
             detail = "another scene, setting, encoder or protocol than the baseline's"
+            if common:
+                left_out.append(f"{name} ({detail})")
+                del left[key], right[key]
+                continue
             faults.append(Fault("redefined", name, detail))
         if exact:
             faults += _counters(name, first[0].counters, second[0].counters)

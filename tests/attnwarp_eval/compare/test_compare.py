@@ -216,6 +216,11 @@ def test_a_cell_that_computes_something_else_is_a_regression(stored, run):
         ("redefined", "bear / warp / corrected / seed 0")
     ]
     assert result.regressed
+    # Nor are they common: a control may be of another scene, if the run has fewer.
+    common = compare(dataclasses.replace(baseline, cells=cells), baseline, common=True)
+    assert common.left_out[0].startswith("bear / warp / corrected / seed 0 (another scene")
+    counted = [sum(row.difference.views for row in one.rows) for one in (common, result)]
+    assert not common.faults and 0 < counted[0] < counted[1]
 
 
 def test_noise_in_seconds_and_memory_never_fails(stored, run):
