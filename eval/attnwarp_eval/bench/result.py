@@ -274,13 +274,13 @@ def compare(results: Sequence[Result]) -> Report:
         if any(result.method.track == track for result in those)
         for edit in dict.fromkeys(edit for result in those for edit in result.edits)
     ]
-    remarks = [
-        f"- {', '.join(filter(None, told))}: {s.scene}, {s.edit}: {text}"
-        for r in results
-        for told in [(r.method.name, r.method.editor)]
-        for s in r.scores
-        for text in s.remarks
-    ]
+    places: dict[str, list[str]] = {}
+    for r in results:
+        who = ", ".join(filter(None, (r.method.name, r.method.editor)))
+        for s in r.scores:
+            for text in s.remarks:
+                places.setdefault(f"- {who}: {text}", []).append(f"{s.scene} {s.edit}")
+    remarks = [f"{text} ({', '.join(where)})" for text, where in places.items()]
     lead = [
         f"{_bench(first.bench)} Means over scenes; from six scenes on with their 95 % intervals."
         " The last column is the difference, paired by scene, from the first method with the same"

@@ -73,8 +73,9 @@ def run(
     preset = fields.pop("preset", None)
     of = EDITING_METHODS[check.one_of(method, [*EDITING_METHODS, WARP], "method")]
     settings = of.settings(preset, fields, seed)
+    noise = f"{settings['noise']} noise" if settings.get("noise") else ""
     told = Method(
-        name=f"{method}, {preset}" if preset else method,
+        name=", ".join(filter(None, (method, preset, noise))),
         editor=editor, track=SAME, settings=settings,
         editor_sha256="" if editor in EDITORS else files_digest(editor), seconds=0.0,
     )  # fmt: skip

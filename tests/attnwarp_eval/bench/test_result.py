@@ -139,7 +139,10 @@ def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path):
     options = {"preset": "extended", "steps": 4, "iterations": 0, "stages": 1}
     told = run.run(bench, out, editor="ideal", options=options)
     assert told.track == result.SAME and told.seconds > 0
-    assert told.name == "attention_warping, extended" and told.settings["decay"] == "late"
+    assert (
+        told.name == "attention_warping, extended, surface noise"
+        and told.settings["decay"] == "late"
+    )
     for wrong, said in (
         (["foo"], "one of"),
         (["gaussctrl"], "made for a depth"),
