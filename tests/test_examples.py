@@ -140,6 +140,7 @@ size = {"width": 64, "height": 64, "fov_y": 60}
 cameras = [Camera.look_at((x, -4, 0), (0, 0, 0), **size) for x in (0, 1, 2)]
 source_xy = target_xy = np.array([[32.0, 32.0]])
 """,
+    "docs/measuring/bench.md": "my_matcher = None",
     "docs/method/algorithm.md": """
 source_picture = target_picture = np.random.default_rng(0).random((64, 64, 3), np.float32)
 view = None
