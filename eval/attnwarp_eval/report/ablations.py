@@ -29,7 +29,7 @@ POOLED = (
 NOTE = re.compile(r" \((?:\d+ undefined)?(?:, )?(?:(\d+) of \d+ scenes)?\)$")
 """Note behind a mean: values and scenes that are missing."""
 
-MOST_LINES = 60
+MOST_LINES = 50
 """Largest number of lines of short tables on a page; the tables after them are folded."""
 
 CLAIMED = "†"
