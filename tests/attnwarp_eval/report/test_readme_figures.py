@@ -1,0 +1,80 @@
+"""Figures in the bullets of README.md, recomputed from the raw results that lie beside their reports."""
+
+import json
+import lzma
+from collections import defaultdict
+from functools import cache
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[3]
+README = " ".join((ROOT / "README.md").read_text().split())
+SEEN, KEPT = ("ideal", "parts.seen.edit"), ("warp", "occlusion.recall")
+ANSWER = ("editing", "multiview.same_answer.edit")
+APART = ("editing", "multiview.delta_e_above.edit_inside")
+
+SENTENCES = [
+    ("fitted", SEEN, ["2DGS fit, extended"], "`extended` brings [{:.0%}]"),
+    ("fitted", SEEN, ["2DGS fit", "3DGS fit, extended", "3DGS fit"], "`corrected` {:.0%} (3DGS: {:.0%} and {:.0%})"),
+    ("fitted", SEEN, ["2DGS fit, each view alone"], "each view alone {:.0%}, `extended` with exact"),
+    ("fitted", SEEN, ["exact depth and mask"], "exact depth and mask {:.0%} (24 scenes"),
+    ("fitted", KEPT, ["2DGS fit, tolerant", "2DGS fit"], "mask keeps {:.0%} of what is visible there, that of `corrected` {:.0%}"),
+    ("ablation", ANSWER, ["shared: corrected"], "[{:.0%}](reports/ablation/report.md) with carried features and without"),
+    ("ablation", ANSWER, ["shared: each view alone"], "[{:.0%}](reports/ablation/report.md) with carried features and without"),
+    ("ablation", APART, ["shared: each view alone", "shared: corrected"], "differ more alone, by {:.1f} for {:.1f} dE00"),
+]  # fmt: skip
+
+
+@cache
+def cells(study):
+    raw = lzma.decompress((ROOT / "reports" / study / "results.jsonl.xz").read_bytes()).decode()
+    return [one for one in map(json.loads, raw.splitlines()) if "cell" in one]
+
+
+def mean(study, probe, metric, variant):
+    """Mean over scenes of means over views, of the edit that has several right answers if edits differ."""
+    scenes = defaultdict(list)
+    for one in cells(study):
+        cell, record = one["cell"], one["record"]
+        own = record.get("edit", {}).get("name") in (None, "some_colour")
+        if own and cell["probe"] == probe and variant in cell["variants"]:
+            scenes[cell["scene"]] += [view["metrics"].get(metric) for view in record["views"]]
+    told = [[value for value in values if value is not None] for values in scenes.values()]
+    return np.mean([np.mean(values) for values in told if values])
+
+
+@pytest.mark.parametrize(("study", "figure", "variants", "sentence"), SENTENCES)
+def test_a_bullet_has_the_means_of_the_raw_results(study, figure, variants, sentence):
+    means = [mean(study, *figure, variant) for variant in variants]
+    assert sentence.format(*means).replace("%", " %") in README
+
+
+def test_the_bullet_on_photographs_has_the_medians_of_the_tracks():
+    files = [
+        json.loads((ROOT / f"reports/tracks/bear-{kind}dgs.json").read_text()) for kind in "23"
+    ]
+    medians = {
+        preset: [
+            row["figures"]["median"]["value"]
+            for file in files
+            for row in file["rows"]
+            if (row["preset"], row["apart"], row["views"]) == (preset, 1, "all")
+        ]
+        for preset in ("paper", "corrected")
+    }
+    assert "{:.2f} against {:.2f} px between neighbouring".format(*medians["paper"]) in README
+    assert "both are at {:.2f} to {:.2f} px".format(*medians["corrected"]) in README
+
+
+def test_the_bullet_on_light_has_the_median_prices_of_the_scenes():
+    scenes = json.loads((ROOT / "reports/effects/effects.json").read_text())["scenes"]
+    costs = [scene["cost"] for scene in scenes]
+    caps = [cost.get("cap") or {"at_equal_error": cost["at_equal_noise"]} for cost in costs]
+    same_error = median(cap["at_equal_error"] for cap in caps)
+    assert f"takes [{same_error:.0f} times as long](reports/effects/effects.md) to the" in README
+    assert round(median(cost["faster"] for cost in costs)) == 2
+    told = "twice as long with the same samples, in the median of {} hand-made scenes"
+    assert told.format(len(scenes)) in README
