@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from base64 import b64decode
 from html.parser import HTMLParser
 
@@ -160,6 +161,19 @@ def test_the_control_has_the_noise_of_the_surface_where_the_edit_has_it(edits, s
     for view, picture in result.edited.items():
         alone = read_image(folder / "control" / f"v{view}.png").astype(int)
         assert np.abs(alone - picture).max() <= 1
+
+
+@pytest.mark.parametrize("agree", [True, False])
+def test_the_page_says_so_where_views_edited_alone_agree_as_well(warped, scene, tmp_path, agree):
+    folder = shutil.copytree(warped[0], tmp_path / "edit")
+    noise = np.random.default_rng(0)
+    for path in (folder / "control").glob("*.png"):
+        shape = read_image(path).shape
+        flat, noisy = np.full(shape, 90, np.uint8), noise.integers(0, 256, shape, np.uint8)
+        Image.fromarray(flat if agree else noisy).save(path)
+    text = pages.show_edit(workdir_of(folder), *scene).read_text()
+    assert "each edited alone" in text
+    assert ("the views agree as well" in text) == agree
 
 
 def test_a_method_that_edits_views_alone_has_no_other_control(edits):
