@@ -8,7 +8,7 @@ from typing import ClassVar
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import spread
-from attnwarp_eval.statistics.intervals import interval
+from attnwarp_eval.statistics.intervals import interval, over_scenes, paired
 from attnwarp_eval.study.probe_report import Layout, ProbeReport, register_report
 from attnwarp_eval.study.results import Results
 from attnwarp_lab.ideal.edge_report import edge_section
@@ -136,28 +136,43 @@ def _drift(results: Results, layout: Layout) -> Section:
     shown = {probe: said for probe, said in DRIFTING.items() if results.finished(probe)}
     with charts.drawing(path, columns=len(shown), height=4.2, width=6.5 * len(shown)) as all_axes:
         for axes, (probe, (title, key)) in zip(all_axes, shown.items(), strict=True):
-            found: dict[str, dict[float, dict[str, list[float]]]] = {}
+            found: dict[str, dict[float, dict[str, dict[str, float]]]] = {}
             for cell, record in results.finished(probe):
                 shift = record.spec.get("drift", {"shift": 0.0})["shift"]
                 by_shift = found.setdefault(cell.variants[0].partition(",")[0], {})
-                values = [view.metrics[key] for view in record.views]
-                by_shift.setdefault(shift, {}).setdefault(cell.scene, []).extend(values)
+                values = {f"{cell.seed}/{view.name}": view.metrics[key] for view in record.views}
+                by_shift.setdefault(shift, {}).setdefault(cell.scene, {}).update(values)
             means = {
-                name: {shift: interval(by[shift]) for shift in sorted(by)}
+                name: {shift: over_scenes(by[shift]) for shift in sorted(by)}
                 for name, by in found.items()
             }
             series = [charts.Line(name, list(by), list(by.values())) for name, by in means.items()]
             charts.lines(axes, series, x="planted shift, px", y=title, title=title.split(":")[0])
             shifts = sorted({shift for by in means.values() for shift in by})
+            alone = next(iter(found.values()))
+            gains = {
+                name: {shift: paired(alone.get(shift, {}), by[shift]) for shift in by}
+                for name, by in found.items()
+            }
             count = len(results.study.scenes)
             rows = [
-                [name, *(spread(by[s], count) if s in by else "" for s in shifts)]
-                for name, by in means.items()
+                [
+                    name,
+                    *(
+                        spread(of[name][shift], count) if shift in of[name] else ""
+                        for of in (means, gains)
+                        for shift in shifts
+                    ),
+                ]
+                for name in found
             ]
-            tables.append(Table(["method", *(f"{shift:g} px" for shift in shifts)], rows, title))
+            columns = ["method", *(f"{w}{s:g} px" for w in ("", "gain, ") for s in shifts)]
+            tables.append(Table(columns, rows, title))
     text = (
         "An editor that moves every picture it edits by this shift, each view in a direction of its"
-        f" own; pictures are of {results.study.size} px. Warps assume that it stays."
+        f" own; pictures are of {results.study.size} px. Warps assume that it stays. **Gain**: the"
+        " difference from the first row at the same shift, paired by scene. A shifted picture shows"
+        " background and other parts at a part's place, so views alone agree more by chance too."
     )
     picture = Picture("figures/drift.svg", "Agreement by the drift of the editor.")
     title = "How much drift does each method stand?"
