@@ -12,7 +12,6 @@ from attnwarp_eval.metrics.consistency import (
     Disagreement,
     Flow,
     cross_view,
-    flow_consistency,
     optical_flow,
     view_dependent,
 )
@@ -95,7 +94,6 @@ __all__ = [
     "feature_consistency",
     "feature_error",
     "fidelity",
-    "flow_consistency",
     "image_error",
     "image_similarity",
     "mask_error",

@@ -4,8 +4,9 @@ approximates it.
 Exactly: :func:`cross_view` compares the colours of the same surface point in two pictures, at
 correspondences known from the scene. Published work has no such correspondences and takes
 optical flow between the unedited pictures instead (Lai et al. 2018, Learning Blind Video Temporal
-Consistency); :func:`optical_flow` and :func:`flow_consistency` implement this. Only the positions
-differ between the two.
+Consistency); :func:`optical_flow` finds it, and
+:func:`attnwarp_eval.metrics.disagreement_at` compares along it. Only the positions differ between
+the two.
 
 Pictures are sRGB in [0, 1]. Sampling is in linear light, since a pixel is a mean of light, and at
 exact positions in float64. Two other samplers are unsuitable: ``cv2.remap`` rounds positions to
@@ -15,20 +16,17 @@ exact positions in float64. Two other samplers are unsuitable: ``cv2.remap`` rou
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp import check
 from attnwarp_eval.colors import to_linear, to_srgb
 from attnwarp_eval.metrics._pictures import picture, region
 from attnwarp_eval.metrics.arrays import Array, Mask, mean, quantile, share
 
 if TYPE_CHECKING:
     from attnwarp_eval.two_view import TwoView
-
-FlowMethod = Literal["dis", "farneback"]
 
 FLOW_LEAST = 12
 """Smallest side in pixels that OpenCV's DIS takes; below it there is no flow."""
@@ -193,24 +191,21 @@ class Flow:
 
     xy: Array
     accepted: Mask
-    method: FlowMethod
 
 
-def optical_flow(source_srgb: Any, target_srgb: Any, method: FlowMethod = "dis") -> Flow:
-    """Find each target pixel in the source picture by OpenCV's optical flow.
+def optical_flow(source_srgb: Any, target_srgb: Any) -> Flow:
+    """Find each target pixel in the source picture by OpenCV's Dense Inverse Search (Kroeger et al.
+    2016) with the medium preset, in 8-bit grey.
 
     Args:
         source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of one size; the UNEDITED pictures, as
             in published work.
-        method: "dis", Dense Inverse Search (Kroeger et al. 2016) with the medium preset, or
-            "farneback" (Farneback 2003) with five levels and a window of 15 px. Both see 8-bit
-            grey.
 
     Returns:
         Flow with NaN and False everywhere for pictures below 12 x 12 px.
 
     Raises:
-        ValueError: pictures of different sizes or not sRGB in [0, 1]; another method.
+        ValueError: pictures of different sizes or not sRGB in [0, 1].
 
     Example:
         >>> import numpy as np
@@ -222,14 +217,13 @@ def optical_flow(source_srgb: Any, target_srgb: Any, method: FlowMethod = "dis")
         >>> np.abs(flow.xy[32, 32] - 32.5).max().item() < 0.1  # nothing moved
         True
     """
-    check.one_of(method, ("dis", "farneback"), "method")
     target = picture(target_srgb, "target_srgb")
     source = picture(source_srgb, "source_srgb", shape=target.shape)
     height, width = shape = target.shape[:2]
     if min(shape) < FLOW_LEAST:
-        return Flow(np.full((*shape, 2), np.nan), np.zeros(shape, dtype=bool), method)
-    forward = _flow(_grey(target), _grey(source), method)
-    backward = _flow(_grey(source), _grey(target), method)
+        return Flow(np.full((*shape, 2), np.nan), np.zeros(shape, dtype=bool))
+    forward = _flow(_grey(target), _grey(source))
+    backward = _flow(_grey(source), _grey(target))
     centers = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
     xy = centers + forward
     inside = has_taps(xy, shape)
@@ -241,35 +235,7 @@ def optical_flow(source_srgb: Any, target_srgb: Any, method: FlowMethod = "dis")
     )
     with np.errstate(invalid="ignore"):
         accepted = inside & (gap <= FLOW_SLOPE * length + FLOW_SLACK)
-    return Flow(xy, accepted, method)
-
-
-def flow_consistency(
-    source_srgb: Any, target_srgb: Any, flow: Flow, *, mask: Any = None
-) -> Disagreement:
-    """Compare two edited pictures along the flow of the unedited ones, where the
-    forward-backward check passes.
-
-    Args:
-        source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of the size of ``flow``.
-        flow: result of :func:`optical_flow`.
-        mask: (H, W) bool of the target, pixels to compare; all if left out.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp_eval import metrics
-        >>> y, x = np.mgrid[:16, :16]
-        >>> still = metrics.Flow(np.stack([x + 0.5, y + 0.5], -1), np.ones((16, 16), bool), "dis")
-        >>> grey = np.full((16, 16, 3), 0.5)
-        >>> difference = metrics.flow_consistency(grey, grey + 0.1, still)
-        >>> round(float(np.nanmax(difference.srgb)), 6)
-        0.1
-    """
-    shape = flow.accepted.shape
-    target = picture(target_srgb, "target_srgb", shape=shape)
-    source = picture(source_srgb, "source_srgb", shape=shape)
-    selected = region(mask, shape)
-    return disagreement(source, target, flow.xy, selected & flow.accepted, int(selected.sum()))
+    return Flow(xy, accepted)
 
 
 def _pictures(source_srgb: Any, target_srgb: Any, pair: TwoView) -> tuple[Array, Array]:
@@ -328,28 +294,10 @@ def _grey(image: Array) -> npt.NDArray[np.uint8]:
     return cv2.cvtColor(np.round(255 * image).astype(np.uint8), cv2.COLOR_RGB2GRAY).astype(np.uint8)
 
 
-def _flow(
-    target_colors: npt.NDArray[np.uint8], source_colors: npt.NDArray[np.uint8], method: FlowMethod
-) -> Array:
+def _flow(target: npt.NDArray[np.uint8], source: npt.NDArray[np.uint8]) -> Array:
     """(H, W, 2) displacement of each pixel of the target in the source, in px."""
     import cv2
 
     cv: Any = cv2  # its stubs lack DIS, and None as the initial flow
-    if method == "dis":
-        flow = cv.DISOpticalFlow_create(cv.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(
-            target_colors, source_colors, None
-        )
-    else:
-        flow = cv.calcOpticalFlowFarneback(
-            target_colors,
-            source_colors,
-            None,
-            pyr_scale=0.5,
-            levels=5,
-            winsize=15,
-            iterations=3,
-            poly_n=7,
-            poly_sigma=1.5,
-            flags=0,
-        )
-    return flow.astype(np.float64)
+    search = cv.DISOpticalFlow_create(cv.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return search.calc(target, source, None).astype(np.float64)

@@ -80,16 +80,6 @@ def test_an_edit_that_changes_nothing_has_no_figure_and_one_that_both_show_has_0
     assert kept["consistency.edit_delta_e"] < 0
 
 
-def test_along_positions_of_flow_it_is_the_figure_of_flow():
-    source, target = pictures(2, 2)
-    xy, accepted = identity()
-    accepted[3:9] = False
-    flow = metrics.Flow(xy - 0.25, accepted, "dis")
-    along = metrics.flow_consistency(source, target, flow)
-    result = metrics.disagreement_at(source, target, flow.xy, accepted)
-    np.testing.assert_array_equal(result.delta_e, along.delta_e)
-
-
 @pytest.mark.parametrize("seen", [1.0, 0.875])
 def test_features_are_those_of_torchs_sampler(seen):
     random = np.random.default_rng(3)

@@ -17,7 +17,6 @@ from attnwarp.camera import fundamental
 from attnwarp.warp import WarpedView
 from attnwarp_eval import metrics
 from attnwarp_eval.metrics.arrays import Array, Mask, mean
-from attnwarp_eval.metrics.consistency import FlowMethod
 from attnwarp_eval.metrics.known_geometry import GRID
 from attnwarp_eval.two_view import TwoView
 from attnwarp_lab.ideal.figures import UNKNOWN, PartTruth, part_answers
@@ -118,15 +117,11 @@ class Pair:
         """(2, D) CLIP embeddings of the texts."""
         return np.asarray(self.encoders["clip"].texts(list(self.texts)))
 
-    def flow(self, method: FlowMethod) -> Where:
+    @cached_property
+    def flow(self) -> Where:
         """Optical flow of the pictures before the edit."""
-
-        def make() -> Where:
-            flow = metrics.optical_flow(self.before[0].picture, self.before[1].picture, method)
-            return flow.xy, flow.accepted
-
-        found: Where = self.before[1].once(method, make)
-        return found
+        flow = metrics.optical_flow(self.before[0].picture, self.before[1].picture)
+        return flow.xy, flow.accepted
 
 
 Measure = Callable[[Pair, Shown, Shown], float]
@@ -314,7 +309,7 @@ FIGURES = (
     Figure("consistency.tsed_distance", "epipolar distance", "poses", _epipolar),
     Figure(
         "consistency.flow_delta_e", "flow warp error", "originals",
-        lambda p, s, t: _colors(p.flow("dis"), s, t),
+        lambda p, s, t: _colors(p.flow, s, t),
     ),
     Figure("embedding.match_similarity", "DINO match similarity", "originals", _matched, "dino"),
     Figure(
