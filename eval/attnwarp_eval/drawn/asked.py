@@ -196,20 +196,15 @@ def _light(draft: Draft) -> Entry:
     others = [k for k, name in enumerate(TIMES) if k != draft.time]
     other = others[index(rng, len(others))]
     look = Look(0, 0, -1, draft.ground, other, _seed(draft, rng))
+    hour = {"day": "a sunny day", "sunset": "sunset", "night": "night", "cloudy": "cloudy"}
     lights = look.lights if not draft.smooth else [x for x in look.lights if x["type"] == "sky"]
     return _edit(
         draft,
         "light",
-        f"make it {_hour(other)}",
+        f"make it {hour[TIMES[other]]}",
         f"a photo of {described(draft.things[0])} {place(draft.ground)} {HOURS[TIMES[other]][0]}",
         lights=lights,
     )
-
-
-def _hour(time: int) -> str:
-    return {"day": "a sunny day", "sunset": "sunset", "night": "night", "cloudy": "cloudy"}[
-        TIMES[time]
-    ]
 
 
 def _several(draft: Draft) -> Entry:

@@ -127,13 +127,14 @@ def measured(scene: Scene, groups: Mapping[str, str], *, size: int = 96) -> dict
     names = np.array([groups[name] for name in small.object_names])
     group = np.where(hits.valid, names[np.maximum(hits.object_id, 0)], "around")
     standing, thing = group != "around", np.char.startswith(group.astype(str), "thing")
+    shiny = np.array([not isinstance(o.material, DiffuseMaterial) for o in small.spec.objects])
     hidden = float((pair.label == HIDDEN).sum())
     return {
         "occlusion": hidden / max(hidden + float(pair.visible.sum()), 1.0),
         "thin": _near_edges(hits.object_id, standing, round(0.015 * size)),
         "grazing": _share(hits.cosine[hits.valid] < np.cos(np.radians(75))),
         "texture": _steps(small, geometry, hits),
-        "highlights": _share(_shiny(small)[hits.object_id[thing]]),
+        "highlights": _share(shiny[hits.object_id[thing]]),
         "things": float(len({name for name in names if name.startswith("thing")})),
     }
 
@@ -161,10 +162,6 @@ def _steps(scene: Scene, geometry: Geometry, hits: Hits) -> float:
     step = np.abs(color[:, 1:] - color[:, :-1]).mean(-1)
     same = hits.valid[:, 1:] & (hits.object_id[:, 1:] == hits.object_id[:, :-1])
     return float(step[same].mean())
-
-
-def _shiny(scene: Scene) -> npt.NDArray[np.bool_]:
-    return np.array([not isinstance(item.material, DiffuseMaterial) for item in scene.spec.objects])
 
 
 def to_words(axes: Axes) -> str:

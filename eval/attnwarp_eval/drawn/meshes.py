@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -13,7 +12,7 @@ import numpy.typing as npt
 
 from attnwarp.errors import InputError
 from attnwarp_eval.drawn.draft import SATURATED, Thing, index, marks
-from attnwarp_eval.drawn.scenes import Drawn, SceneDraft
+from attnwarp_eval.drawn.scenes import SceneDraft
 from attnwarp_eval.drawn.worlds import COLORS, Look
 from attnwarp_eval.scene.meshes import MESH_SUFFIXES, read_mesh
 
@@ -40,30 +39,14 @@ def mesh_files(folder: Path) -> list[Path]:
     return found
 
 
-def draw_meshes(
-    number: int,
-    seed: int,
-    files: list[Path],
-    axes: Mapping[str, float] | None = None,
-    up: Literal["y", "z"] | None = None,
-) -> Drawn:
-    """Draw the scene of a number and a seed, with meshes for things.
-
-    Args:
-        number, seed, axes: as for :func:`~attnwarp_eval.drawn.scenes.draw`; there are two or three
-            things, regardless of the axis.
-        files: files of :func:`mesh_files`.
-        up: upright axis of all files; by default that of their format.
-
-    Raises:
-        InputError: a file cannot be read.
-    """
-    return _MeshDraft(number, seed, axes or {}, meshes=files, up=up).finished()
-
-
 @dataclass
-class _MeshDraft(SceneDraft):
-    """A scene of meshes while it is drawn."""
+class MeshDraft(SceneDraft):
+    """A scene of meshes while it is drawn: two or three things, regardless of the axis.
+
+    Attributes:
+        meshes: files of :func:`mesh_files`.
+        up: upright axis of all files; by default that of their format.
+    """
 
     meshes: list[Path] = field(default_factory=list)
     up: Literal["y", "z"] | None = None

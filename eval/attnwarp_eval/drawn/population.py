@@ -15,7 +15,7 @@ from attnwarp.process import cache_dir
 from attnwarp_eval.cache import content_key
 from attnwarp_eval.drawn.axes import check_axes, spread
 from attnwarp_eval.drawn.files import write
-from attnwarp_eval.drawn.meshes import LONGEST_EDGE, draw_meshes, mesh_files
+from attnwarp_eval.drawn.meshes import LONGEST_EDGE, MeshDraft, mesh_files
 from attnwarp_eval.drawn.scenes import Drawn, draw
 from attnwarp_eval.scene.base import Spec
 from attnwarp_eval.scene.explain import explain
@@ -161,7 +161,8 @@ class MeshScenes(_Scenes):
 
     def scene(self, number: int) -> Drawn:
         """Draw one scene."""
-        return draw_meshes(number, self.seed, self._paths, self.places(number), self.up)
+        places = self.places(number)
+        return MeshDraft(number, self.seed, places, meshes=self._paths, up=self.up).finished()
 
 
 Population = DrawnScenes | MeshScenes

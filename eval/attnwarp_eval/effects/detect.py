@@ -51,10 +51,10 @@ def detect(scene: Scene) -> dict[Effect, Finding]:
     spec_effects = transport.called_for(scene.spec)
     plugins, objects = graph(scene)
     by_graph = _in_graphs(plugins, objects)
+    # The scene's file does not name vertex colours of a mesh.
+    tinted = any(getattr(shape, "tint", None) is not None for shape in scene.shapes())
     for effect, evidence in by_graph.items():
-        if effect not in spec_effects and not (
-            effect == "textures" and not _checked_textures(scene)
-        ):
+        if effect not in spec_effects and not (effect == "textures" and tinted):
             raise SceneError(
                 f"Mitsuba's scene shows {effect} ({'; '.join(evidence)}) that the file does not; a"
                 " plan would be wrong",
@@ -123,11 +123,6 @@ _ABSENT: dict[Effect, str] = {
     "polarisation": "no light meets two specular surfaces",
     "dispersion": "no glass has an Abbe number",
 }
-
-
-def _checked_textures(scene: Scene) -> bool:
-    """Return True if no mesh has vertex colours, which the scene's file does not name."""
-    return all(getattr(shape, "tint", None) is None for shape in scene.shapes())
 
 
 def _in_graphs(

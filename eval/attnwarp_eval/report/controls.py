@@ -16,7 +16,6 @@ from attnwarp_eval.statistics.intervals import ByView, common
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.probe_report import report_of
 from attnwarp_eval.study.results import Results
-from attnwarp_eval.study.schema import Variant
 from attnwarp_eval.study.shared.controls import OTHER_SEED
 from attnwarp_eval.study.shared.edits import VariantPart
 
@@ -83,11 +82,6 @@ def share_text(share: Share) -> str:
     return f"{mean} % ({low} to {high} %)"
 
 
-def is_control(variant: Variant) -> bool:
-    """Return True if a variant takes features from the wrong place, or another seed."""
-    return isinstance(variant, VariantPart) and variant.control is not None
-
-
 def controls_of(results: Results, name: str, baseline: str) -> dict[str, str]:
     """Measured controls of a variant, by label.
 
@@ -96,9 +90,10 @@ def controls_of(results: Results, name: str, baseline: str) -> dict[str, str]:
     study, own = results.study, probe(name)
     meaning = own.meaning(study, study.variants[baseline])
     return {
-        label: str(variant.part(VariantPart).control)
+        label: str(variant.control)
         for label, variant in study.variants.items()
-        if is_control(variant)
+        if isinstance(variant, VariantPart)
+        and variant.control is not None
         and own.meaning(study, variant.model_copy(update={"control": None})) == meaning
         and results.records(name, label)
     }

@@ -90,7 +90,9 @@ def measured(results: Results) -> Section:
     if study.scenes:
         seeds = f"seed{'s' * (len(study.seeds) > 1)} {', '.join(map(str, study.seeds))}"
         size = f"{study.size} x {study.size} px"
-        text.append(f"- {_capital(study.scenes_in_words)}; {size}; {seeds}. {_means(results)}")
+        scenes = study.scenes_in_words
+        scenes = scenes[:1].upper() + scenes[1:]
+        text.append(f"- {scenes}; {size}; {seeds}. {_means(results)}")
     text += [f"- {line}" for line in _regimes(results)]
     text += [f"- {line}" for line in _revisions(results.all_records())]
     # Formatted as code: names of files may have asterisks.
@@ -104,10 +106,6 @@ def measured(results: Results) -> Section:
     text += [f"- Columns: {columns}."] if (columns := glossary(results)) else []
     text.append("- Tables of all figures: folded in report.html; `attnwarp-eval report --long`.")
     return Section("What it was measured on", ["\n".join(text)])
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _means(results: Results) -> str:

@@ -68,11 +68,6 @@ def ways(*backends: str, precisions: tuple[str, ...] = ("float64", "float32")) -
     return tuple(Way(backend, precision) for backend in backends for precision in precisions)
 
 
-def both_directions(forward: tuple[Way, ...]) -> tuple[Way, ...]:
-    """Add to each way the way of its gradients."""
-    return forward + tuple(Way(way.backend, way.precision, "backward") for way in forward)
-
-
 @dataclass(frozen=True)
 class Bound:
     """Largest allowed error.
@@ -154,12 +149,10 @@ class Case:
 
     def is_required(self, level: float, direction: Direction = "forward") -> bool:
         """Return True if this level must hold."""
-        return self.levels.index(level) <= self.levels.index(self._required(direction))
-
-    def _required(self, direction: Direction) -> float:
+        last = self.required
         if direction == "backward" and self.required_backward is not None:
-            return self.required_backward
-        return self.required
+            last = self.required_backward
+        return self.levels.index(level) <= self.levels.index(last)
 
     def outcome(self, level: float, way: Way) -> Outcome:
         """Evaluate one way at one level.

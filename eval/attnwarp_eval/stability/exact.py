@@ -75,7 +75,7 @@ class ExactSplats:
             origin = _apply(self.R, _vector(gaussians.origin))
             self.shift = [a + b for a, b in zip(position, origin, strict=True)]
             self.values: dict[str, list[Vector]] = {
-                name: [_vector(np.atleast_1d(row)) for row in _array(getattr(gaussians, name))]
+                name: [_vector(np.atleast_1d(row)) for row in getattr(gaussians, name).tolist()]
                 for name in FIELDS
             }
 
@@ -246,10 +246,6 @@ def _loss(pixels: Iterable[Pixel], weights: Sequence[tuple[float, float]]) -> Nu
         if b and pixel.depth is not None:
             loss += b * pixel.depth
     return loss
-
-
-def _array(tensor: Any) -> np.ndarray:
-    return np.asarray(tensor.detach().double().cpu().numpy())
 
 
 def _vector(values: Any) -> Vector:

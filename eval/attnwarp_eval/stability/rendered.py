@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -14,10 +14,11 @@ import torch
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
 from attnwarp.render import Render, render
-from attnwarp_eval.stability.case import Bound, Direction, Way, both_directions, ways
+from attnwarp_eval.stability.case import Bound, Direction, Way, ways
 from attnwarp_eval.stability.exact import FIELDS, ExactSplats, Pixel
 
-RENDERERS = both_directions(ways("reference", "cpu") + ways("gpu", precisions=("float32",)))
+_FORWARD = ways("reference", "cpu") + ways("gpu", precisions=("float32",))
+RENDERERS = _FORWARD + tuple(replace(way, direction="backward") for way in _FORWARD)
 """Every renderer, forward and backward."""
 
 UNDECIDED = 2e-7

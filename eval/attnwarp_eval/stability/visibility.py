@@ -57,7 +57,9 @@ def exact_labels(
     z, d = target_depth.astype(np.longdouble), source_depth.astype(np.longdouble)
     present = np.isfinite(z) & (z > 0)
     y, x = np.mgrid[:height, :width] + np.longdouble(0.5)
-    points = _to_world(target, _rays(target.K, x, y) * z[..., None])
+    seen_by_target = _rays(target.K, x, y) * z[..., None]
+    # R^T (p - t): exact up to the pose's deviation from a rotation.
+    points = (seen_by_target - _long(target.translation)) @ _long(target.rotation)
     seen = points @ _long(source.rotation).T + _long(source.translation)
     depth = seen[..., 2]
     position = (seen / depth[..., None]) @ _long(source.K).T
@@ -139,11 +141,6 @@ def _rays(K: npt.NDArray[np.float64], x: Extended, y: Extended) -> Extended:
     below = (y - exact[1, 2]) / exact[1, 1]
     right = (x - exact[0, 2] - exact[0, 1] * below) / exact[0, 0]
     return np.stack([right, below, np.ones_like(below)], axis=-1)
-
-
-def _to_world(camera: Camera, points: Extended) -> Extended:
-    """R^T (p - t): exact up to the pose's deviation from a rotation."""
-    return (points - _long(camera.translation)) @ _long(camera.rotation)
 
 
 def _close(a: Any, b: Any, scale: Any) -> npt.NDArray[np.bool_]:

@@ -93,8 +93,10 @@ def interval(values: Table, *, level: float = 0.95) -> Interval:
         error = 0.0  # rounding of equal means, not spread
     half = error * float(stats.t.ppf(0.5 + level / 2, count - 1))
     p = float(2 * stats.t.sf(abs(mean) / error, count - 1)) if error > 0 else float(mean == 0)
+    # Two-sided 5 %, and 80 % power.
+    detectable = error * float(stats.t.ppf(0.975, count - 1) + stats.t.ppf(0.8, count - 1))
     return Interval(
-        mean, mean - half, mean + half, count, views, undefined, _power_factor(count) * error, p,
+        mean, mean - half, mean + half, count, views, undefined, detectable, p,
         float(means.min()), float(means.max()),
     )  # fmt: skip
 
@@ -107,14 +109,6 @@ def over_scenes(table: ByView) -> Interval:
         2.0
     """
     return interval({scene: list(views.values()) for scene, views in table.items()})
-
-
-def _power_factor(scenes: int) -> float:
-    """Detectable difference in standard errors: t(0.975) + t(0.80), two-sided 5 % and 80 %
-    power."""
-    from scipy import stats
-
-    return float(stats.t.ppf(0.975, scenes - 1) + stats.t.ppf(0.8, scenes - 1))
 
 
 ROUNDING = 2e-14

@@ -201,7 +201,8 @@ def stored_study(store: Store) -> Stored:
     """
     stored = store.read_study()
     _check_plugins(store, stored)
-    path, remedy = store.root / "study.json", _remedy(store)
+    path = store.root / "study.json"
+    remedy = f"run the study again with --out {store.root}, which writes it anew"
     try:
         study = parse_study(stored["study"])
     except ValidationError as error:
@@ -243,10 +244,6 @@ def _check_plugins(store: Store, stored: dict[str, Any]) -> None:
             f"{store.root}: was made with the plugins {', '.join(missing)}, which are not named"
             f" here; install their packages, or set {VARIABLE}={','.join(missing)}"
         )
-
-
-def _remedy(store: Store) -> str:
-    return f"run the study again with --out {store.root}, which writes it anew"
 
 
 def expected(plan: Plan) -> dict[str, Any]:

@@ -25,7 +25,6 @@ from attnwarp_eval.study.populations import expanded
 from attnwarp_eval.study.probe import Probe, probe, probes
 from attnwarp_eval.study.schema import (
     FIGURE,
-    Front,
     Splats,
     Study,
     StudyError,
@@ -114,7 +113,9 @@ class _Joined(Study):
             _check_probe(front.probe, tabled, f"fronts[{i}].probe")
             self.check_variants(front.variants, f"fronts[{i}]", front.probe)
             check_distinct(front.variants, f"fronts[{i}].variants")
-            _check_metric(front, available[front.probe], f"fronts[{i}].metric")
+            key = f"fronts[{i}].metric"
+            if _known_metric(front.metric, available[front.probe], key).direction != "lower":
+                raise ValueError(f"{key}: {front.metric!r} is not one of which less is better")
         self._check_answer(available)
         self.check_variants(self.pictures.variants, "pictures.variants")
         for p in available.values():
@@ -181,11 +182,6 @@ def _known_metric(metric: str, own: Probe[Any], key: str) -> Metric:
     if "{" in metric.replace("{layer}", ""):
         raise ValueError(f"{key}: got {metric!r}; braces may hold 'layer' alone")
     return known
-
-
-def _check_metric(front: Front, front_probe: Probe[Any], key: str) -> None:
-    if _known_metric(front.metric, front_probe, key).direction != "lower":
-        raise ValueError(f"{key}: {front.metric!r} is not one of which less is better")
 
 
 def parse_study(data: Any) -> Study:

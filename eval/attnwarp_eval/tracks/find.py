@@ -162,12 +162,10 @@ def halve(dataset: Dataset, tracks: Tracks, folder: Path) -> int:
     for k, path in enumerate(dataset.image_paths):
         assert path is not None
         rows = np.flatnonzero(tracks.image == k)
-        image = read_image(path)
+        image = _eight_bits(path)
         x, y = np.floor(tracks.xy[rows]).astype(int).T
         inside = np.clip(y, 0, image.shape[0] - 1), np.clip(x, 0, image.shape[1] - 1)
-        colors[tracks.point[rows]] = image[inside][:, :3] // (
-            257 if image.dtype == np.uint16 else 1
-        )
+        colors[tracks.point[rows]] = image[inside]
     folder.mkdir(parents=True, exist_ok=True)
     write_transforms(folder, replace(dataset, points=points[started], colors=colors[started]))
     write(replace(tracks, started=started), folder / FILE)

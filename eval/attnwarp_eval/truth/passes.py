@@ -143,22 +143,6 @@ def sampler(integrator: Integrator, spp: int) -> str:
 # --------------------------------------------------------------------------------------------------
 
 
-def check_plannable(scene: Scene, spp: int | None) -> None:
-    """Refuse scenes without a possible plan.
-
-    Args:
-        spp: samples a pixel; None for the scene's number.
-
-    Raises:
-        ValueError: spp below 1.
-        SceneError: the scene pins, forbids or caps an effect that it cannot.
-    """
-    if spp is not None and spp < 1:
-        raise ValueError(f"spp: got {spp}, expected at least 1")
-    for message, _ in transport.contradictions(scene.spec):
-        raise SceneError(message, scene.path)
-
-
 def plan_passes(
     scene: Scene, spp: int | None, bounces: Bounces, first_reasons: tuple[str, ...] = ()
 ) -> Plan:
@@ -178,7 +162,10 @@ def plan_passes(
         >>> plan_passes(load_scene("spheres"), 16, 1).integrator
         'direct'
     """
-    check_plannable(scene, spp)
+    if spp is not None and spp < 1:
+        raise ValueError(f"spp: got {spp}, expected at least 1")
+    for message, _ in transport.contradictions(scene.spec):
+        raise SceneError(message, scene.path)
     spp = scene.spec.appearance.spp if spp is None else spp
     reasons = list(first_reasons)
     needed = transport.called_for(scene.spec)

@@ -67,9 +67,6 @@ def visibility(
         hits.primitive_id[asked],
     )
 
-    def by_rays(_: int) -> npt.NDArray[np.float64]:
-        return geometry.visible_from(points_asked, normal, primitive, source).astype(np.float64)
-
     def by_map(pixels: int, bilinear: bool) -> Callable[[int], npt.NDArray[np.float64]]:
         camera = source.resize(pixels, pixels)
 
@@ -98,7 +95,9 @@ def visibility(
     )
     seen = ~np.isfinite(first)
 
-    works: list[Callable[[int], Any]] = [by_rays]
+    works: list[Callable[[int], Any]] = [
+        lambda _: geometry.visible_from(points_asked, normal, primitive, source).astype(float)
+    ]
     names = ["rays"]
     for pixels in maps:
         for bilinear in (False, True):
