@@ -262,12 +262,15 @@ class EditPsnr:
         views: names of the measured views, in order. Methods that edit different views
             are not comparable by this figure: fewer edited views are easier to fit.
         mse: MSE of each view; NaN where undefined.
-        psnr: PSNR of each view in dB; +inf for equal pictures, NaN where undefined.
     """
 
     views: tuple[str, ...]
     mse: tuple[float, ...]
-    psnr: tuple[float, ...]
+
+    @property
+    def psnr(self) -> tuple[float, ...]:
+        """PSNR of each view in dB; +inf for equal pictures, NaN where undefined."""
+        return tuple(map(psnr_of_mse, self.mse))
 
     @property
     def pooled(self) -> float:
@@ -344,7 +347,7 @@ def edit_psnr(
         errors.append(
             _mse(*pair(image, rendered[view], mask, (f"edited[{view!r}]", f"rendered[{view!r}]")))
         )
-    return EditPsnr(tuple(edited), tuple(errors), tuple(psnr_of_mse(error) for error in errors))
+    return EditPsnr(tuple(edited), tuple(errors))
 
 
 def _mse(image: Array, target: Array, inside: Mask) -> float:

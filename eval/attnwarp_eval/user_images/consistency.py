@@ -8,7 +8,6 @@ Keypoints are found at full size; all else is computed on pictures whose longest
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,17 +32,17 @@ from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.task import Task, results
 from attnwarp_eval.user_images.measure import (
-    OFF,
     Figure,
     Inputs,
     Measured,
     Picture,
     Row,
-    load_encoders,
     natural,
     of_views,
     pictures_in,
     read_picture,
+    sha256_of,
+    usable,
 )
 
 LONGEST = 256
@@ -156,20 +155,8 @@ def measure_consistency(
         "originals": bool(originals),
         "colmap": inputs.colmap,
     }
-    wanted = []
-    for figure in FIGURES:
-        absent = [_OPTIONS[need] for need in figure.needs if not given[need]]
-        package, extra = _FOUND_BY.get(figure, ("", ""))
-        if absent:
-            done.missing[figure.title] = f"needs {' and '.join(absent)}"
-        elif figure.encoder is not None and encoders.get(figure.encoder) == OFF:
-            done.missing[figure.title] = f"left out by --{figure.encoder} {OFF}"
-        elif package and not _installed(package):
-            done.missing[figure.title] = f"needs the package {package}; install attnwarp[{extra}]"
-        else:
-            wanted.append(figure)
-    loaded = load_encoders(wanted, encoders, device, done)
-    wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
+    lacking = {need: option for need, option in _OPTIONS.items() if not given[need]}
+    wanted, loaded = usable(FIGURES, lacking, _not_installed, encoders, device, done)
     together = [figure for figure in wanted if figure in _TOGETHER]
     wanted = [figure for figure in wanted if figure not in _TOGETHER]
     pairs = _Pairs(inputs, cameras, posed, edited, originals, wanted, loaded)
@@ -213,10 +200,13 @@ def _scores(path: Path, pairs: Sequence[tuple[str, str]]) -> list[Row]:
     return rows
 
 
-def _installed(package: str) -> bool:
+def _not_installed(figure: Figure) -> str:
     from importlib.util import find_spec
 
-    return find_spec(package) is not None
+    package, extra = _FOUND_BY.get(figure, ("", ""))
+    if not package or find_spec(package) is not None:
+        return ""
+    return f"needs the package {package}; install attnwarp[{extra}]"
 
 
 def _files(
@@ -288,7 +278,9 @@ class _Pairs:
         self.wanted, self.loaded = tuple(wanted), loaded
         self._view: Callable[[str], _View] = lru_cache(maxsize=2)(self._read)
         self._small: Callable[[str], _View] = lru_cache(maxsize=2)(self._reduced)
-        self._keypoints = lru_cache(maxsize=2)(self._found)
+        self._keypoints = lru_cache(maxsize=2)(
+            lambda name: metrics.sift_features(self._view(name).edited, str(self.edited[name]))
+        )
         self._surface = lru_cache(maxsize=2)(self._rendered)
         self._encoded = lru_cache(maxsize=16)(self._features)
 
@@ -398,9 +390,6 @@ class _Pairs:
         )
         assert edited is not None
         return _View(edited, original, view.camera.resize(*size))
-
-    def _found(self, name: str) -> metrics.Keypoints:
-        return metrics.sift_features(self._view(name).edited, str(self.edited[name]))
 
     def _rendered(self, name: str) -> Any:
         from attnwarp.warp import Surface, render_surface, resize_depth
@@ -531,10 +520,4 @@ def _depths(folder: Path, *names: str) -> dict[str, Path]:
     return {name: folder / f"{name}.npy" for name in names}
 
 
-@lru_cache(maxsize=512)
-def _sha256(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+_sha256 = lru_cache(maxsize=512)(sha256_of)

@@ -9,7 +9,7 @@ import hashlib
 import itertools
 import math
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -188,7 +188,7 @@ def figures() -> tuple[Figure, ...]:
 _MASKED = (_EDIT, _PERCEPTUAL)
 """Figures affected by masks; the others use whole pictures."""
 
-PROTOCOL = 4
+PROTOCOL = 5
 """Version; raised when the same pictures would give other figures."""
 
 
@@ -242,11 +242,22 @@ def measure(
                 f"{_option(name)}: {len(turned)} pictures are turned as their EXIF tags ask,"
                 f" {turned[0].name} first"
             )
-    wanted = _possible(inputs, folders, encoders, done)
-    # Check even if only bundled encoders are needed, which would ignore it.
-    device_of(device)
-    loaded = load_encoders(wanted, encoders, device, done, load)
-    wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
+
+    def obstacle(figure: Figure) -> str:
+        if _views(figure, folders):
+            return ""
+        used = " and ".join(
+            f"{_option(name)} ({_some(folders[name])})" for name in _groups(figure, folders)
+        )
+        return f"no name stands in all of {used}"
+
+    lacking = {
+        name: _option(name)
+        for figure in figures()
+        for name in figure.needs
+        if getattr(inputs, name) is None
+    }
+    wanted, loaded = usable(figures(), lacking, obstacle, encoders, device, done, load)
     if not wanted:
         raise InputError(
             "nothing can be computed: "
@@ -262,7 +273,7 @@ def measure(
     needed = [name for name in folders["renders"] if any(name in names for names in views.values())]
     tasks = _tasks(inputs, folders, views, needed, loaded, device)
     for batch in results(store, tasks, math.ceil(len(needed) / BATCH), report):
-        gathered.add(batch)
+        gathered.add(*batch)
     _rows(inputs, source, views, loaded, gathered, done)
     return done
 
@@ -352,42 +363,38 @@ def inside(picture: Picture) -> npt.NDArray[np.bool_]:
     return np.asarray(picture.mean(axis=2) > 0.5)
 
 
-def _possible(
-    inputs: Inputs,
-    folders: Mapping[str, Mapping[str, Path]],
-    encoders: Mapping[Kind, str | None],
-    done: Measured,
-) -> list[Figure]:
-    """The figures that the inputs allow; ``done`` gets reasons for missing ones."""
-    wanted = []
-    for figure in figures():
-        absent = [_option(name) for name in figure.needs if getattr(inputs, name) is None]
-        if absent:
-            done.missing[figure.title] = f"needs {' and '.join(absent)}"
-        elif figure.encoder is not None and encoders.get(figure.encoder) == OFF:
-            done.missing[figure.title] = f"left out by --{figure.encoder} {OFF}"
-        elif not _views(figure, folders):
-            used = " and ".join(
-                f"{_option(name)} ({_some(folders[name])})" for name in _groups(figure, folders)
-            )
-            done.missing[figure.title] = f"no name stands in all of {used}"
-        else:
-            wanted.append(figure)
-    return wanted
-
-
-def load_encoders(
-    wanted: Sequence[Figure],
+def usable(
+    figures: Iterable[Figure],
+    lacking: Mapping[str, str],
+    obstacle: Callable[[Figure], str],
     encoders: Mapping[Kind, str | None],
     device: str,
     done: Measured,
     load: Callable[..., Any] | None = None,
-) -> dict[Kind, Any]:
-    """Load the encoders of figures; figures of encoders that fail to load are left out.
+) -> tuple[list[Figure], dict[Kind, Any]]:
+    """The figures that the inputs allow, and their encoders; ``done`` gets reasons for missing
+    ones.
+
+    Args:
+        lacking: missing need of a figure -> its option.
+        obstacle: reason why a figure with all its needs is missing; empty for none.
+        encoders, device, load: as for :func:`measure`.
 
     Raises:
-        InputError: a named encoder cannot be loaded, or is of another kind.
+        InputError: a named encoder cannot be loaded, or is of another kind; an unknown device.
     """
+    # Check even if only bundled encoders are needed, which would ignore it.
+    device_of(device)
+    wanted = []
+    for figure in figures:
+        if absent := [lacking[need] for need in figure.needs if need in lacking]:
+            done.missing[figure.title] = f"needs {' and '.join(absent)}"
+        elif figure.encoder is not None and encoders.get(figure.encoder) == OFF:
+            done.missing[figure.title] = f"left out by --{figure.encoder} {OFF}"
+        elif why := obstacle(figure):
+            done.missing[figure.title] = why
+        else:
+            wanted.append(figure)
     for kind, name in encoders.items():
         if name is None or name == "none":
             continue
@@ -414,7 +421,7 @@ def load_encoders(
                 " figures rank results among themselves and do not compare with published ones."
                 f" --{kind} names a real encoder"
             )
-    return loaded
+    return [f for f in wanted if f.encoder is None or f.encoder in loaded], loaded
 
 
 def _views(figure: Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[str]:
@@ -489,49 +496,33 @@ def _is_turned(path: Path) -> bool:
 
 @dataclass
 class _Gathered:
-    """Parts of each view that the figures need, so that its pictures can be freed."""
+    """Parts of each view that the figures need, so that its pictures can be freed.
 
-    errors: dict[str, tuple[float, float]] = field(default_factory=dict)  # MSE and PSNR
-    distances: dict[str, float] = field(default_factory=dict)
-    clip: dict[str, Embedding] = field(default_factory=dict)
-    dino: dict[str, Embedding] = field(default_factory=dict)
-    before: dict[str, Embedding] = field(default_factory=dict)  # CLIP, of the originals
-    own: dict[str, dict[str, float]] = field(default_factory=dict)  # by the figure's key
+    Attributes:
+        values: key of a figure of single views -> view -> value; of Edit PSNR, the MSE.
+        rows: "clip", "dino" or "before" (CLIP of the originals) -> view -> embedding.
+    """
 
-    def to_json(self) -> dict[str, Any]:
-        """Values as JSON, undefined ones as null; an infinite PSNR follows from its MSE, 0."""
+    values: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(dict))
+    rows: dict[str, dict[str, Embedding]] = field(default_factory=lambda: defaultdict(dict))
+
+    def to_json(self) -> Json:
+        """JSON, undefined values as null."""
         return {
-            "errors": without_nan({name: mse for name, (mse, _) in self.errors.items()}),
-            "psnr": without_nan({name: psnr for name, (_, psnr) in self.errors.items()}),
-            "distances": without_nan(self.distances),
-            "own": {view: without_nan(values) for view, values in self.own.items()},
-            **{
-                name: {view: row.tolist() for view, row in getattr(self, name).items()}
-                for name in ("clip", "dino", "before")
+            "values": {key: without_nan(own) for key, own in self.values.items()},
+            "rows": {
+                name: {view: row.tolist() for view, row in own.items()}
+                for name, own in self.rows.items()
             },
         }
 
-    @classmethod
-    def from_json(cls, views: Iterable[str], data: Json) -> _Gathered:
-        """Some views, in this order, from the JSON of :meth:`to_json`."""
-        errors, psnr, distances = (with_nan(data[k]) for k in ("errors", "psnr", "distances"))
-
-        def rows(name: str) -> dict[str, Embedding]:
-            return {v: np.array(data[name][v], np.float64) for v in views if v in data[name]}
-
-        return cls(
-            {v: (errors[v], psnr[v] if errors[v] else np.inf) for v in views if v in errors},
-            {v: distances[v] for v in views if v in distances},
-            rows("clip"),
-            rows("dino"),
-            rows("before"),
-            {view: with_nan(values) for view, values in data["own"].items()},
-        )
-
-    def add(self, other: _Gathered) -> None:
-        """Add the views of another."""
-        for name, values in vars(other).items():
-            getattr(self, name).update(values)
+    def add(self, views: Sequence[str], data: Json) -> None:
+        """Add some views, in this order, from the JSON of :meth:`to_json`."""
+        for key, own in data["values"].items():
+            values = with_nan(own)
+            self.values[key] |= {view: values[view] for view in views if view in values}
+        for name, own in data["rows"].items():
+            self.rows[name] |= {v: np.array(own[v], np.float64) for v in views if v in own}
 
 
 def _tasks(
@@ -541,7 +532,7 @@ def _tasks(
     needed: Sequence[str],
     loaded: Mapping[Kind, Any],
     device: str,
-) -> Iterator[Task[_Gathered]]:
+) -> Iterator[Task[tuple[Sequence[str], Json]]]:
     """Batches of the views ``needed`` with the inputs of the figures, each picture read once.
 
     A batch's files are hashed when its task is taken, just before they are read.
@@ -572,10 +563,10 @@ def _tasks(
     def gather(batch: Sequence[str]) -> _Gathered:
         result = _Gathered()
         renders = read("renders", batch)
-        encode("clip", renders, result.clip)
-        encode("dino", renders, result.dino)
+        encode("clip", renders, result.rows["clip"])
+        encode("dino", renders, result.rows["dino"])
         changed = [name for name in batch if name in members[_DIRECTION] | members[_NEIGHBOURS]]
-        encode("clip", partners("originals", changed, renders), result.before)
+        encode("clip", partners("originals", changed, renders), result.rows["before"])
         paired = [name for name in batch if name in members[_EDIT] | members[_PERCEPTUAL]]
         masked = paired if "masks" in folders else []
         masks = {
@@ -583,12 +574,11 @@ def _tasks(
         }
         for name, picture in partners("edited", paired, renders).items():
             if name in members[_EDIT]:
-                mask = {name: masks[name]} if masks else None
-                one = metrics.edit_psnr({name: picture}, {name: renders[name]}, mask)
-                result.errors[name] = (one.mse[0], one.psnr[0])
+                error = metrics.mse(picture, renders[name], masks.get(name))
+                result.values[_EDIT.key][name] = error
             if name in members[_PERCEPTUAL]:
                 try:
-                    result.distances[name] = metrics.perceptual(
+                    result.values[_PERCEPTUAL.key][name] = metrics.perceptual(
                         picture, renders[name], distance, masks.get(name)
                     )
                 except ValueError as error:
@@ -600,17 +590,17 @@ def _tasks(
             ]
             for name in names:
                 value = float(function(*(pictures[name] for pictures in shown)))
-                result.own.setdefault(name, {})[figure.key] = value
+                result.values[figure.key][name] = value
         return result
 
     own = {f: _function(f) for f in members if f not in _OF_PAPER and members[f]}
 
-    def task(batch: Sequence[str]) -> Task[_Gathered]:
+    def task(batch: Sequence[str]) -> Task[tuple[Sequence[str], Json]]:
         spec = {
             "probe": "user images",
             "protocol": PROTOCOL,
             "files": {
-                group: {name: _sha256(files[name]) for name in batch if name in files}
+                group: {name: sha256_of(files[name]) for name in batch if name in files}
                 for group, files in folders.items()
             },
             "figures": {
@@ -626,7 +616,7 @@ def _tasks(
             f"{batch[0]} to {batch[-1]}",
             spec,
             lambda tell: {"views": gather(batch).to_json()},
-            lambda record: _Gathered.from_json(batch, record["views"]),
+            lambda record: (batch, record["views"]),
         )
 
     # Encoders take a batch at once and round differently in another one: a batch is the cell.
@@ -634,9 +624,17 @@ def _tasks(
         yield task(needed[start : start + BATCH])
 
 
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
 
 def _rows(
@@ -650,41 +648,36 @@ def _rows(
     """Add the figures in the order of the paper's table."""
     texts = {
         name: _text(loaded["clip"], getattr(inputs, name), _option(name), done)
-        for name in _texts_needed(views)
+        for name in ("prompt", "source_prompt")
+        if any(figure.encoder == "clip" and name in figure.needs for figure in views)
     }
+    rows = gathered.rows
     for figure, names in views.items():
         if figure is _EDIT:
-            _edit_rows(gathered.errors, done)
+            _edit_rows(gathered.values[figure.key], done)
             continue
-        if figure is _PERCEPTUAL:
-            value = of_views(gathered.distances)
-            done.rows.append(
-                Row(figure.key, figure.title, value, gathered.distances, figure.encoder)
-            )
-            continue
-        if figure not in _OF_PAPER:
-            values = {name: gathered.own[name][figure.key] for name in names}
-            done.rows.append(Row(figure.key, figure.title, of_views(values), values))
+        if figure is _PERCEPTUAL or figure not in _OF_PAPER:
+            values = gathered.values[figure.key]
+            value = of_views(values)
+            done.rows.append(Row(figure.key, figure.title, value, values, figure.encoder))
             continue
         if figure is _CLIP:
-            similarity = metrics.clip_similarity(_stack(gathered.clip, names), texts["prompt"])
+            similarity = metrics.clip_similarity(_stack(rows["clip"], names), texts["prompt"])
         elif figure is _DIRECTION:
-            before, after = _stack(gathered.before, names), _stack(gathered.clip, names)
             similarity = metrics.directional_similarity(
-                before, after, texts["source_prompt"], texts["prompt"]
-            )
+                _stack(rows["before"], names), _stack(rows["clip"], names),
+                texts["source_prompt"], texts["prompt"],
+            )  # fmt: skip
         elif figure is _NEIGHBOURS:
             similarity = metrics.direction_consistency(
-                _stack(gathered.before, names), _stack(gathered.clip, names)
+                _stack(rows["before"], names), _stack(rows["clip"], names)
             )
             names = [f"{one} to {two}" for one, two in itertools.pairwise(names)]
         else:
             kind: Kind = "dino" if figure is _DINO else "clip"
-            assert source is not None  # the figure needs it, see _possible
+            assert source is not None  # the figure needs it, see usable
             edit = loaded[kind].images([source])
-            similarity = metrics.image_similarity(
-                edit, _stack(gathered.dino if figure is _DINO else gathered.clip, names)
-            )
+            similarity = metrics.image_similarity(edit, _stack(rows[kind], names))
         values = dict(zip(names, map(float, similarity.values), strict=True))
         done.rows.append(Row(figure.key, figure.title, similarity.mean, values, figure.encoder))
 
@@ -701,10 +694,8 @@ def _function(figure: Figure) -> Callable[..., float]:
     return cast(Callable[..., float], getattr(import_module(module), name))
 
 
-def _edit_rows(errors: Mapping[str, tuple[float, float]], done: Measured) -> None:
-    psnr = metrics.EditPsnr(
-        tuple(errors), tuple(m for m, _ in errors.values()), tuple(p for _, p in errors.values())
-    )
+def _edit_rows(errors: Mapping[str, float], done: Measured) -> None:
+    psnr = metrics.EditPsnr(tuple(errors), tuple(errors.values()))
     values = dict(zip(psnr.views, psnr.psnr, strict=True))
     done.rows.append(
         Row("edit.psnr_mean", "Edit PSNR, mean of the views", psnr.mean_finite, values)
@@ -720,14 +711,6 @@ def _edit_rows(errors: Mapping[str, tuple[float, float]], done: Measured) -> Non
             f"{psnr.undefined} mask{'s' * (psnr.undefined > 1)} with nothing brighter than half of"
             f" white: nothing of {'those views' if psnr.undefined > 1 else 'that view'} counts"
         )
-
-
-def _texts_needed(views: Iterable[Figure]) -> list[str]:
-    return [
-        n
-        for n in ("prompt", "source_prompt")
-        if any(f.encoder == "clip" and n in f.needs for f in views)
-    ]
 
 
 def _text(clip: Any, text: str, option: str, done: Measured) -> Embedding:

@@ -293,7 +293,7 @@ def test_edit_psnr_averages_the_error_and_not_the_decibels():
 )
 def test_edit_psnr_where_no_view_has_a_finite_one(psnr, pooled):
     mse = tuple(0.0 if value == math.inf else value for value in psnr)
-    got = metrics.EditPsnr(tuple(map(str, range(len(psnr)))), mse, psnr)
+    got = metrics.EditPsnr(tuple(map(str, range(len(psnr)))), mse)
     assert got.pooled == pytest.approx(pooled, nan_ok=True)
     assert math.isnan(got.mean_finite)
     assert got.identical + got.undefined == len(psnr)
