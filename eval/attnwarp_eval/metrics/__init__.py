@@ -13,7 +13,6 @@ from attnwarp_eval.metrics.consistency import (
     Flow,
     cross_view,
     optical_flow,
-    view_dependent,
 )
 from attnwarp_eval.metrics.depth import depth_error
 from attnwarp_eval.metrics.embedding import (
@@ -117,5 +116,4 @@ __all__ = [
     "ssim_map",
     "tsed",
     "tsed_of_views",
-    "view_dependent",
 ]

@@ -34,9 +34,6 @@ FLOW_LEAST = 12
 FLOW_SLOPE, FLOW_SLACK = 0.01, 0.5
 """Forward-backward check: |f + b|^2 <= 0.01 (|f|^2 + |b|^2) + 0.5 px^2 (Sundaram 2010, 3)."""
 
-VIEW_DEPENDENT = 0.05
-"""Tolerance of :func:`view_dependent` in linear light, above the noise of 8 samples a pixel."""
-
 
 @dataclass(frozen=True, eq=False)
 class Disagreement:
@@ -79,28 +76,25 @@ class Disagreement:
 
 
 def cross_view(
-    source_srgb: Any, target_srgb: Any, pair: TwoView, *, mask: Any = None, exclude: Any = None
+    source_srgb: Any, target_srgb: Any, pair: TwoView, *, mask: Any = None
 ) -> Disagreement:
     """Compare the colours of the same surface points in two pictures, at exact correspondences.
 
     A target pixel counts if
 
     - the source certainly shows it (``pair.visible``),
-    - it lies in neither view within 2 px of a depth or object edge (``pair.edge``),
-    - its position has all four bilinear taps, and
-    - ``exclude`` does not contain it.
+    - it lies in neither view within 2 px of a depth or object edge (``pair.edge``), and
+    - its position has all four bilinear taps.
 
-    There the two TRUE pictures of a matt scene differ too, due to bilinear sampling, the
-    area that a pixel covers in either view, and the noise of the renderer. The same figure of the
-    true pictures is this floor; report it with the figure.
+    There the two TRUE pictures differ too, due to bilinear sampling, the area that a pixel covers
+    in either view, the noise of the renderer, and highlights. The same figure of the true pictures
+    is this floor; report it with the figure.
 
     Args:
         source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of the sizes of ``pair``'s cameras.
         pair: :func:`attnwarp_eval.truth.two_view` of them.
         mask: (H, W) bool of the target, pixels to compare, such as the edited object's; by default
             all.
-        exclude: (H, W) bool of the target, pixels that may rightly differ, from
-            :func:`view_dependent`.
 
     Raises:
         ValueError: a picture that is not sRGB in [0, 1] or has another size than its camera.
@@ -117,67 +111,11 @@ def cross_view(
         >>> round(float(np.nanmax(difference.srgb)), 6), difference.counted.any().item()
         (0.1, True)
     """
-    source, target = _pictures(source_srgb, target_srgb, pair)
+    source = picture(source_srgb, "source_srgb", shape=(pair.source.height, pair.source.width))
+    target = picture(target_srgb, "target_srgb", shape=pair.label.shape)
     selected = region(mask, target.shape) & pair.visible
     counted = selected & ~pair.edge
-    if exclude is not None:
-        counted &= ~region(exclude, target.shape, "exclude")
     return disagreement(source, target, pair.xy, counted, int(selected.sum()))
-
-
-def view_dependent(
-    source_srgb: Any, target_srgb: Any, pair: TwoView, *, tolerance: float = VIEW_DEPENDENT
-) -> Mask:
-    """(H, W) bool: target pixels whose surface truly looks different in the source, such as
-    highlights and reflections.
-
-    A pixel is view-dependent if its colour in the TRUE target leaves the range of the four taps
-    around its position in the TRUE source by more than ``tolerance``, in any channel of linear
-    light. The range is used instead of the blend, so that fine texture beyond the sampling limit
-    is no highlight. False where the source does not show the pixel.
-
-    Args:
-        source_srgb, target_srgb: (h, w, 3) and (H, W, 3), truth of the two unedited views, in
-            [0, 1]. An edit that makes a matt object shiny adds highlights: join the mask
-            of its truth with this one.
-        pair: as for :func:`cross_view`.
-        tolerance: in linear light, of 1; above the noise of the pictures.
-
-    Raises:
-        ValueError: pictures of another size, type or range, or a negative tolerance.
-
-    Example:
-        >>> import numpy as np
-        >>> from attnwarp_eval import metrics
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> from attnwarp_eval.truth import Geometry, two_view
-        >>> scene = load_scene("spheres").with_size(32, 32)
-        >>> pair = two_view(Geometry(scene), scene.source, scene.targets[0])
-        >>> grey = np.full((32, 32, 3), 0.5)
-        >>> highlight = grey.copy()
-        >>> highlight[16, 16] = 1.0
-        >>> metrics.view_dependent(grey, highlight, pair).nonzero()
-        (array([16]), array([16]))
-    """
-    if not tolerance >= 0:
-        raise ValueError(
-            f"tolerance: got {tolerance}, expected a number of linear light that is not negative"
-        )
-    source, target = (to_linear(each) for each in _pictures(source_srgb, target_srgb, pair))
-    ask = pair.visible & ~pair.edge & has_taps(pair.xy, source.shape)
-    column, row = np.floor(pair.xy[ask] - 0.5).astype(np.int64).T
-    # At the last pixel's centre the second tap is outside, with weight 0.
-    right, below = (
-        np.minimum(column + 1, source.shape[1] - 1),
-        np.minimum(row + 1, source.shape[0] - 1),
-    )
-    taps = np.stack(
-        [source[row, column], source[row, right], source[below, column], source[below, right]]
-    )
-    beyond = np.maximum(taps.min(axis=0) - target[ask], target[ask] - taps.max(axis=0))
-    result = np.zeros(ask.shape, dtype=bool)
-    result[ask] = (beyond > tolerance).any(axis=-1)
-    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,13 +174,6 @@ def optical_flow(source_srgb: Any, target_srgb: Any) -> Flow:
     with np.errstate(invalid="ignore"):
         accepted = inside & (gap <= FLOW_SLOPE * length + FLOW_SLACK)
     return Flow(xy, accepted)
-
-
-def _pictures(source_srgb: Any, target_srgb: Any, pair: TwoView) -> tuple[Array, Array]:
-    return (
-        picture(source_srgb, "source_srgb", shape=(pair.source.height, pair.source.width)),
-        picture(target_srgb, "target_srgb", shape=pair.label.shape),
-    )
 
 
 def has_taps(xy: Array, shape: tuple[int, ...]) -> Mask:

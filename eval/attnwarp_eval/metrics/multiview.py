@@ -29,12 +29,7 @@ BELOW_FLOOR = (
 
 
 def above_floor(
-    edited: tuple[Any, Any],
-    truth: tuple[Any, Any],
-    pair: TwoView,
-    *,
-    mask: Any = None,
-    exclude: Any = None,
+    edited: tuple[Any, Any], truth: tuple[Any, Any], pair: TwoView, *, mask: Any = None
 ) -> dict[str, float]:
     """Compare the colours of two edited views at the same surface points, and of the true edited
     views at the same pixels.
@@ -44,7 +39,7 @@ def above_floor(
         truth: the same two views of the truly edited scene. For an ambiguous edit: the answer
             that :func:`attnwarp_eval.metrics.nearest_answer` names.
         pair: :func:`attnwarp_eval.truth.two_view` of source and target.
-        mask, exclude: as for :func:`attnwarp_eval.metrics.cross_view`.
+        mask: as for :func:`attnwarp_eval.metrics.cross_view`.
 
     Returns:
         ``multiview.delta_e`` (mean CIEDE2000), ``multiview.delta_e_floor`` (of the truth),
@@ -64,8 +59,7 @@ def above_floor(
         >>> figures["multiview.delta_e"], figures["multiview.delta_e_above"]
         (0.0, 0.0)
     """
-    difference = cross_view(*edited, pair, mask=mask, exclude=exclude)
-    floor = cross_view(*truth, pair, mask=mask, exclude=exclude)
+    difference, floor = (cross_view(*views, pair, mask=mask) for views in (edited, truth))
     # The pixels follow from the geometry alone, so both means are over the same pixels.
     value, least = mean(difference.delta_e[difference.counted]), mean(floor.delta_e[floor.counted])
     pixels = int(difference.counted.sum())
