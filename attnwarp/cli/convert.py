@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from attnwarp.cli.files import read_splats, read_views
 from attnwarp.cli.options import (
     AntialiasedOption,
-    Coordinates,
     DataArgument,
     Reading,
     ScreenFilterOption,
@@ -37,12 +36,12 @@ def convert(
         int | None, option("Cut harmonics beyond this degree.", min=0, max=3)
     ] = None,
     coordinates: Annotated[
-        Coordinates,
+        Literal["auto", "world", "relative"],
         option(
             "world, relative to the origin comment that attnwarp alone reads, or auto: world"
             " unless float32 would lose too much."
         ),
-    ] = Coordinates.auto,
+    ] = "auto",
 ) -> None:
     """Convert splats for other programs: 2DGS as thin 3DGS, .splat, fewer harmonics, no origin."""
     with clear_errors():
@@ -67,7 +66,7 @@ def convert(
                 coordinates="relative" if coordinates == "relative" else "world",
             )
         else:
-            write_ply(out, splats, third_scale=third_scale, coordinates=coordinates.value)
+            write_ply(out, splats, third_scale=third_scale, coordinates=coordinates)
         typer.echo(f"{out}: {len(splats)} splats")
 
 

@@ -6,7 +6,7 @@ import re
 import warnings
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -31,7 +31,6 @@ from attnwarp.cli.options import (
     Marking,
     Reading,
     ScreenFilterOption,
-    Store,
     of_machine,
     of_method,
     of_splats,
@@ -120,7 +119,8 @@ def edit(
     antialiased: AntialiasedOption = None,
     screen_filter: ScreenFilterOption = None,
     store: Annotated[
-        Store | None, of_machine("Recorded features: cpu (main memory), device or disk.", "WHERE")
+        Literal["cpu", "device", "disk"] | None,
+        of_machine("Recorded features: cpu (main memory), device or disk.", "WHERE"),
     ] = None,
     seconds: Annotated[
         float | None, of_method("Begin no edit and no iteration after.", "S", min=0)
@@ -182,7 +182,7 @@ def edit(
 
         edit_options = editing.checked()
         check.one_of(method, list(methods.METHODS), "--method")
-        given = {"source_picture": source_picture, "store": store and store.value}
+        given = {"source_picture": source_picture, "store": store}
         own: dict[str, Any] = {k: v for k, v in given.items() if v is not None}
         used = [*own, *["each_view_alone"] * alone]
         if used and method != "attention_warping":
@@ -226,7 +226,7 @@ def edit(
                 notes.append(note)
                 warnings.warn(note, InputWarning, stacklevel=1)
         planned: dict[str, Any] = {"iterations": fit_iterations, "max_splats": max_splats}
-        planned["kind"] = kind and kind.value[:2]
+        planned["kind"] = kind and kind[:2]
         result, page = edit_dataset(
             method, dataset, splats, editor, instruction, settings, out, edit_options,
             fit_plan=FitPlan(**{k: v for k, v in planned.items() if v is not None}),

@@ -74,13 +74,13 @@ def read_splats(
     from attnwarp.io import read_ply, read_splat
 
     if path.suffix.lower() == ".splat":
-        if kind is Kind.two:
+        if kind == "2dgs":
             raise ValueError(f"--kind: {path} is a .splat, which holds 3DGS alone")
         splats = replace(read_splat(path), antialiased=bool(antialiased))
         return splats if screen_filter is None else replace(splats, screen_filter=screen_filter)
     splats = read_ply(
         path,
-        kind=None if kind is None else "2d" if kind is Kind.two else "3d",
+        kind=None if kind is None else "2d" if kind == "2dgs" else "3d",
         antialiased=antialiased,
         screen_filter=screen_filter,
     )

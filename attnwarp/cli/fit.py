@@ -123,12 +123,12 @@ def fit(
         if start is not None and points is not None:
             raise ValueError(f"--points: got {points}, but --start names the first splats")
         first = None if start is None else _read_start(start, out, kind)
-        kind = kind or (Kind.three if first is not None and first.kind == "3d" else Kind.two)
+        kind = kind or ("3dgs" if first is not None and first.kind == "3d" else "2dgs")
         _check_third_scale(third_scale, kind)
         apart = _held_out(hold_out)
         use_threads(threads)
         limits = {"iterations": iterations, "max_splats": max_splats}
-        changes |= {"kind": kind.value[:2], "seed": seed}
+        changes |= {"kind": kind[:2], "seed": seed}
         changes |= {name: value for name, value in limits.items() if value is not None}
         if first is not None and first.antialiased:
             changes.setdefault("antialiased", True)
@@ -186,8 +186,8 @@ def _read_start(start: Path, out: Path, kind: Kind | None) -> Gaussians:
 def _check_third_scale(third_scale: float | None, kind: Kind) -> None:
     if third_scale is None:
         return
-    if kind is not Kind.two:
-        raise ValueError(f"--third-scale: got {third_scale} for {kind.value}, which has three")
+    if kind != "2dgs":
+        raise ValueError(f"--third-scale: got {third_scale} for {kind}, which has three")
     if not 0 < third_scale < float("inf"):
         raise ValueError(f"--third-scale: got {third_scale}, expected a length such as 1e-6")
 

@@ -6,9 +6,8 @@ import functools
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -19,43 +18,8 @@ if TYPE_CHECKING:
     from attnwarp.methods.command import EditOptions
     from attnwarp.methods.marks import Marks
 
-
-class Kind(StrEnum):
-    """Values of the option ``--kind`` of splats."""
-
-    two = "2dgs"
-    three = "3dgs"
-
-
-class Format(StrEnum):
-    """Values of the option for the format of a dataset."""
-
-    transforms = "transforms"
-    colmap = "colmap"
-
-
-class MissingImages(StrEnum):
-    """Values of the option for cameras without a picture."""
-
-    error = "error"
-    none = "none"
-
-
-class Store(StrEnum):
-    """Values of the option for the place of recorded features."""
-
-    cpu = "cpu"
-    device = "device"
-    disk = "disk"
-
-
-class Coordinates(StrEnum):
-    """Values of the option for the coordinates in a file of splats."""
-
-    auto = "auto"
-    world = "world"
-    relative = "relative"
-
+Kind = Literal["2dgs", "3dgs"]
+"""Kinds of splats, as commands name them."""
 
 PANELS = (
     "What is edited", "The method", "Splats", "The page", "The machine", "Reading DATA",
@@ -161,16 +125,17 @@ class Reading:
     """Options of reading a dataset: one per keyword of `attnwarp.io.read_dataset`."""
 
     format: Annotated[
-        Format | None, of_reading("transforms or colmap, where DATA holds both.", "NAME")
+        Literal["transforms", "colmap"] | None,
+        of_reading("transforms or colmap, where DATA holds both.", "NAME"),
     ] = None
     images: Annotated[Path | None, of_reading("Images of a COLMAP model.", "FOLDER")] = None
     scale: Annotated[
         int, of_reading("2, 4 or 8: images_N in place of images; cameras are resized.", "N")
     ] = 1
     missing_images: Annotated[
-        MissingImages,
+        Literal["error", "none"],
         of_reading("error, or none: leave out cameras whose image is missing.", "WHAT"),
-    ] = MissingImages.error
+    ] = "error"
     resize_cameras: Annotated[
         bool, of_reading("Fit cameras to images of another size.", None, "--resize-cameras")
     ] = False
