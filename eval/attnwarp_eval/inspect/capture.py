@@ -22,7 +22,6 @@ from attnwarp.render import render
 from attnwarp.warp import PRESETS, Surface, WarpSettings, render_surface
 from attnwarp.warp.settings import DepthStatistic, SplatDepth
 
-Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
 
@@ -42,8 +41,7 @@ class Capture:
     Attributes:
         near: near-plane depth in scene units, as in a fit and an edit.
         targets: all other cameras by the name of their file, without suffix.
-        center: (3,) point nearest to all optical axes.
-        up: (3,) mean of the cameras' upward axes.
+        center, up: (3,) point and direction, as those of an orbit on an edit's page.
 
     Raises:
         InputError: fewer than two cameras, or no source of that name.
@@ -65,15 +63,14 @@ class Capture:
         source = names[0] if source is None else source
         one_of(source, names, "source")
         # Import here: the fit's losses and networks import slowly.
+        from attnwarp.methods.page.orbit import focus_of, up_of
         from attnwarp.methods.scene import near_of
 
         self.near = near_of(cameras, model)
         self.names = names
         self.source = cameras[names.index(source)]
         self.targets = {camera.name: camera for camera in cameras if camera.name != source}
-        self.center = _convergence(cameras)
-        up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
-        self.up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0.0, 0, 1])
+        self.center, self.up = focus_of(cameras, model.world_means()), up_of(cameras)
         self.image: Callable[[str], Image] = cache(self._image)
         self._rendered: Callable[..., Surface] = cache(self._render)
 
@@ -228,17 +225,3 @@ def _resized(camera: Camera, longest: int) -> Camera:
         return camera
     width, height = (max(1, round(factor * side)) for side in (camera.width, camera.height))
     return camera.resize(width, height)
-
-
-def _convergence(cameras: Sequence[Camera]) -> Array:
-    """The point with the least squared distance to all optical axes.
-
-    Axes that are nearly parallel have no such point; the mean of the cameras is used then.
-    """
-    across = [np.eye(3) - np.outer(camera.forward, camera.forward) for camera in cameras]
-    matrix = np.sum(across, axis=0)
-    positions = np.array([camera.position for camera in cameras])
-    if np.linalg.cond(matrix) > 1e6:
-        return np.asarray(positions.mean(axis=0))
-    right = np.sum([a @ p for a, p in zip(across, positions, strict=True)], axis=0)
-    return np.asarray(np.linalg.solve(matrix, right))
