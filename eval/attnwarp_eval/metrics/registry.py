@@ -89,9 +89,7 @@ _DISAGREEMENT: tuple[tuple[str, str, Direction, float, float, str], ...] = (
 )
 
 _SPECS = (
-    Metric(
-        "calibration.mitsuba_agrees", "share", "higher", 1e-3, 0, "pixels whose point Mitsuba finds as the ray caster"
-    ),
+    Metric("calibration.mitsuba_agrees", "share", "higher", 1e-3, 0, "pixels whose point Mitsuba finds as the ray caster"),
     Metric("warp.epe_median", "px", "lower", 1e-4, 1e-3, "median endpoint error, visible pixels"),
     Metric("warp.epe_p95", "px", "lower", 1e-3, 1e-2, "95th percentile of the endpoint error, visible pixels"),
     Metric("warp.epe_mean", "px", "lower", 1e-3, 1e-2, "mean endpoint error, visible pixels"),
@@ -214,29 +212,10 @@ _SPECS = (
     Metric("fidelity.ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM against the truth of the edit"),
     Metric("fidelity.ms_ssim", "ratio", "higher", 1e-4, 1e-3, "MS-SSIM against the truth of the edit"),
     Metric("fidelity.distance", "ratio", "lower", 1e-4, 1e-2, "perceptual distance to the truth of the edit"),
-    Metric(
-        "fidelity.preserved_mse", "ratio", "lower", 1e-6, 1e-2, "MSE against the unedited picture, outside the object",
-        squared=True,
-    ),
-    Metric(
-        "fidelity.preserved_psnr", "dB", "higher", 1e-2, 1e-3, "PSNR against the unedited picture, outside the object"
-    ),
-    Metric(
-        "fidelity.preserved_ssim",
-        "ratio",
-        "higher",
-        1e-4,
-        1e-3,
-        "SSIM against the unedited picture, outside the object",
-    ),
-    Metric(
-        "fidelity.preserved_distance",
-        "ratio",
-        "lower",
-        1e-4,
-        1e-2,
-        "distance to the unedited picture, outside the object",
-    ),
+    Metric("fidelity.preserved_mse", "ratio", "lower", 1e-6, 1e-2, "MSE against the unedited picture, outside the object", squared=True),
+    Metric("fidelity.preserved_psnr", "dB", "higher", 1e-2, 1e-3, "PSNR against the unedited picture, outside the object"),
+    Metric("fidelity.preserved_ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM against the unedited picture, outside the object"),
+    Metric("fidelity.preserved_distance", "ratio", "lower", 1e-4, 1e-2, "distance to the unedited picture, outside the object"),
     Metric("fidelity.pixels", "pixels", "none", 0, 0, "pixels compared"),
     Metric("labels.right", "share", "higher", 1e-4, 0, "tokens that the source truly shows, and that take their own part's label"),
     Metric("labels.wrong", "share", "lower", 1e-4, 0, "of them, those that take another label"),

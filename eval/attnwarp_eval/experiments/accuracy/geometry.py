@@ -120,12 +120,8 @@ def depth(
 
         return work
 
-    report.step(
-        0,
-        0,
-        f"{scene.name}: {sum(len(m.faces) for m in meshes)} triangles against {rays} rays in"
-        " float64",
-    )
+    count = sum(len(mesh.faces) for mesh in meshes)
+    report.step(0, 0, f"{scene.name}: {count} triangles against {rays} rays in float64")
     valid = np.flatnonzero(refined.trace(camera).valid.ravel())
     chosen = np.sort(np.random.default_rng(0).choice(valid, min(rays, len(valid)), replace=False))
     directions = (camera.directions() @ camera.rotation).reshape(-1, 3)[chosen]
@@ -147,11 +143,8 @@ def depth(
         wrong = ~(relative < WRONG)
         right = relative[~wrong] if (~wrong).any() else np.array([np.nan])
         worst, half = float(right.max()), float(np.median(right))
-        more = {
-            "median": half,
-            "p99": float(np.quantile(right, 0.99)),
-            "wrong": float(wrong.mean()),
-        }
+        p99 = float(np.quantile(right, 0.99))
+        more = {"median": half, "p99": p99, "wrong": float(wrong.mean())}
         out.append(Contestant(name, (worst, worst, worst), tuple(took), more))
     return Panel(
         "depth", scene.name, "largest relative error of depth", tuple(out), tuple(turns.again)

@@ -66,10 +66,8 @@ class Panel:
         """Read the panel of a cell.
 
         Raises:
-            LookupError, TypeError, ValueError: the record is of another kind or protocol.
+            LookupError, TypeError, ValueError: the record is of another kind.
         """
-        if record["spec"]["protocol"] != PROTOCOL:
-            raise ValueError(f"protocol {record['spec']['protocol']}, expected {PROTOCOL}")
         fields = record["panel"]
         contestants = []
         for c in fields["contestants"]:

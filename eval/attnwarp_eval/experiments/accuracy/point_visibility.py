@@ -61,11 +61,8 @@ def visibility(
     unit = "share of points not labelled rightly"
     if not asked.any():
         return Panel("visibility", scene.name, unit, (), ())
-    points_asked, normal, primitive = (
-        hits.point[asked],
-        hits.normal[asked],
-        hits.primitive_id[asked],
-    )
+    points_asked, normal = hits.point[asked], hits.normal[asked]
+    primitive, count = hits.primitive_id[asked], sum(len(mesh.faces) for mesh in meshes)
 
     def by_map(pixels: int, bilinear: bool) -> Callable[[int], npt.NDArray[np.float64]]:
         camera = source.resize(pixels, pixels)
@@ -76,17 +73,9 @@ def visibility(
 
         return work
 
-    report.step(
-        0,
-        0,
-        f"{scene.name}: {sum(len(m.faces) for m in meshes)} triangles against {points} points in"
-        " float64",
-    )
-    chosen = np.sort(
-        np.random.default_rng(1).choice(
-            len(points_asked), min(points, len(points_asked)), replace=False
-        )
-    )
+    report.step(0, 0, f"{scene.name}: {count} triangles against {points} points in float64")
+    random, most = np.random.default_rng(1), min(points, len(points_asked))
+    chosen = np.sort(random.choice(len(points_asked), most, replace=False))
     away = points_asked[chosen] - source.position
     corners = np.concatenate([(m.vertices - source.position)[m.faces] for m in meshes])
     # A hit within 1e-7 of the way before the point is its own or a coincident surface.
@@ -118,13 +107,7 @@ def visibility(
             "points": float(len(seen)),
         }
         out.append(Contestant(name, _share(len(seen) - right, len(seen)), tuple(took), more))
-    return Panel(
-        "visibility",
-        scene.name,
-        unit,
-        tuple(out),
-        tuple(turns.again),
-    )
+    return Panel("visibility", scene.name, unit, tuple(out), tuple(turns.again))
 
 
 def _share(count: int, total: int) -> tuple[float, float, float]:
@@ -138,16 +121,8 @@ def _share(count: int, total: int) -> tuple[float, float, float]:
 
 def _faces_and_falls_in(hits: Hits, source: Camera) -> Mask:
     point = np.nan_to_num(hits.point)
-    local = (point - source.position) @ source.rotation.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        xy = local @ source.K.T
-        xy = xy[..., :2] / xy[..., 2:]
-    inside = (
-        (local[..., 2] > 0)
-        & (xy > 0).all(-1)
-        & (xy[..., 0] < source.width)
-        & (xy[..., 1] < source.height)
-    )
+    xy, z = source.project(point)
+    inside = (z > 0) & ((xy > 0) & (xy < (source.width, source.height))).all(-1)
     facing = np.einsum("hwi,hwi->hw", np.nan_to_num(hits.normal), source.position - point) > 0
     return hits.valid & inside & facing
 
@@ -155,9 +130,7 @@ def _faces_and_falls_in(hits: Hits, source: Camera) -> Mask:
 def _seen_in_map(depth: Array, camera: Camera, points: Array, bilinear: bool) -> Array:
     """1 if a point is not behind the depth map, 0 if it is, NaN if the map has no
     depth."""
-    local = (points - camera.position) @ camera.rotation.T
-    z = local[:, 2]
-    x, y = ((local @ camera.K.T)[:, k] / z for k in (0, 1))
+    (x, y), z = (values.T for values in camera.project(points))
     height, width = depth.shape
     if not bilinear:
         surface = depth[np.clip(y.astype(int), 0, height - 1), np.clip(x.astype(int), 0, width - 1)]
