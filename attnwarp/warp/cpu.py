@@ -131,68 +131,44 @@ def taps_at(
 def sample_maps(maps: Tensor, taps: Taps) -> Tensor:
     """Compute :func:`attnwarp.warp.sampling.sample_maps` by kernels."""
     planes = maps.reshape(-1, maps.shape[-1])
-    result: Tensor = _SampleMaps.apply(planes, taps)
+    result: Tensor = _Sampled.apply(planes, taps, False)
     return result.reshape(*maps.shape[:-1], taps.index.shape[1])
 
 
 def sample_tokens(tokens: Tensor, taps: Taps) -> Tensor:
     """Compute :func:`attnwarp.warp.sampling.sample_tokens` by kernels, in the tokens' dtype."""
-    result: Tensor = _SampleTokens.apply(tokens, taps)
+    result: Tensor = _Sampled.apply(tokens, taps, True)
     return result
 
 
-class _SampleMaps(torch.autograd.Function):
+class _Sampled(torch.autograd.Function):
+    """Planes (N, pixels), or tokens (N, pixels, C), read at taps."""
+
     @staticmethod
-    def forward(ctx: Any, planes: Tensor, taps: Taps) -> Tensor:
-        source, (index, weight) = _values(planes), taps.arrays
-        result = np.empty((len(source), index.shape[1]), source.dtype)
-        size = max(sampling.PLANES, PIECE // max(1, index.shape[1]))
-        run_jobs(
-            sampling.sample_maps,
-            [(*piece, source, index, weight, result) for piece in ranges(len(source), size)],
-        )
-        ctx.taps, ctx.shape = taps, planes.shape
-        return _tensor(result, planes.dtype)
+    def forward(ctx: Any, values: Tensor, taps: Taps, tokens: bool) -> Tensor:
+        source, (index, weight) = _values(values), taps.arrays
+        result = np.empty((len(source), index.shape[1], *source.shape[2:]), source.dtype)
+        if tokens:
+            kernel, pieces = sampling.sample_rows, _pieces(result)
+        else:
+            size = max(sampling.PLANES, PIECE // max(1, index.shape[1]))
+            kernel, pieces = sampling.sample_maps, ranges(len(source), size)
+        run_jobs(kernel, [(*piece, source, index, weight, result) for piece in pieces])
+        ctx.taps, ctx.shape, ctx.tokens = taps, values.shape, tokens
+        return _tensor(result, values.dtype)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
         index, weight = ctx.taps.arrays
         gradient = _values(upstream.to(ctx.taps.weight.dtype))
         result = np.zeros(tuple(ctx.shape), weight.dtype)
-        run_jobs(
-            sampling.scatter_maps,
-            [
-                (*piece, gradient, index, weight, result)
-                for piece in ranges(len(result), sampling.PLANES)
-            ],
-        )
-        return torch.from_numpy(result).to(upstream.dtype), None
-
-
-class _SampleTokens(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, tokens: Tensor, taps: Taps) -> Tensor:
-        source, (index, weight) = _values(tokens), taps.arrays
-        result = np.empty((len(source), index.shape[1], source.shape[2]), source.dtype)
-        run_jobs(
-            sampling.sample_rows,
-            [(*piece, source, index, weight, result) for piece in _pieces(result)],
-        )
-        ctx.taps, ctx.shape = taps, tokens.shape
-        return _tensor(result, tokens.dtype)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        index, weight = ctx.taps.arrays
-        gradient = _values(upstream.to(ctx.taps.weight.dtype))
-        result = np.zeros(tuple(ctx.shape), weight.dtype)
-        pieces = ranges(result.shape[2], CHANNELS)
-        run_jobs(
-            sampling.scatter_rows, [(*piece, gradient, index, weight, result) for piece in pieces]
-        )
-        return torch.from_numpy(result).to(upstream.dtype), None
+        if ctx.tokens:
+            kernel, pieces = sampling.scatter_rows, ranges(result.shape[2], CHANNELS)
+        else:
+            kernel, pieces = sampling.scatter_maps, ranges(len(result), sampling.PLANES)
+        run_jobs(kernel, [(*piece, gradient, index, weight, result) for piece in pieces])
+        return torch.from_numpy(result).to(upstream.dtype), None, None
 
 
 def _pieces(tokens: np.ndarray) -> list[tuple[int, int]]:
