@@ -50,10 +50,6 @@ def without_nan(value: Any) -> Any:
 def write_json(path: Path, value: Any, *, sort_keys: bool = True, durable: bool = True) -> None:
     """Write ``value`` as readable JSON, atomically.
 
-    Args:
-        sort_keys: whether the keys of objects are sorted.
-        durable: as for :func:`attnwarp_eval.files.write_atomic`.
-
     Raises:
         ValueError: a number that JSON lacks; see :func:`without_nan`.
     """

@@ -198,12 +198,7 @@ _plugins: dict[str, str] = {}
 
 
 def count_plugin(module: str, file: Path) -> None:
-    """Include the source of a plugin in the hash of the code.
-
-    Args:
-        module: name of the plugin's module.
-        file: file of the module; of a package all files count.
-    """
+    """Include a plugin's source, all files of a package, in the hash of the code."""
     whole = file.name == "__init__.py"
     _plugins[module] = _hash_of(file.parent, file.parent.rglob("*.py") if whole else [file])
     source_hash.cache_clear()

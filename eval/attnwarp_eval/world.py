@@ -33,10 +33,6 @@ Samples = tuple[SurfaceSamples, npt.NDArray[np.float64]]
 class World:
     """Parts of a scene shared by all variants: truth, memoised by view.
 
-    Args:
-        scene: the loaded scene.
-        size: size of the study's images, in pixels.
-
     Attributes:
         content_hash: hash of the scene's file, as in a cell's spec.
         signed_yaw: degrees from the source in [-180, 180), by the target's name.

@@ -79,11 +79,8 @@ def resumable(state: Callable[[], str]) -> Iterator[None]:
 
 @contextmanager
 def scheduler_lost(scheduler: str | None, kept: Callable[[], int]) -> Iterator[None]:
-    """Turn a broken connection to a scheduler into one clear line and exit code 3.
-
-    Args:
-        scheduler: address or file of the scheduler.
-        kept: function that counts stored cells.
+    """Turn a broken connection to a scheduler into one clear line and exit code 3; ``kept`` counts
+    stored cells.
     """
     from attnwarp_eval.study.cluster import ClusterLost
 

@@ -72,10 +72,7 @@ def _lines(snapshot: Snapshot) -> Iterator[str]:
 
 
 def read_baseline(path: Path) -> Snapshot:
-    """Read a baseline's file.
-
-    Args:
-        path: path of the JSON lines that ``compare --update`` wrote.
+    """Read a baseline's file, the JSON lines that ``compare --update`` wrote.
 
     Raises:
         BaselineError: the file is not a baseline, or was changed after it was written.

@@ -147,11 +147,8 @@ Key = tuple[str, ...]
 def compare(baseline: Snapshot, run: Snapshot, common: bool = False) -> Comparison:
     """Compare a run with a baseline over the union of their cells, metrics and views.
 
-    Args:
-        baseline: trusted figures.
-        run: judged figures.
-        common: whether to compare only common cells, with one definition, seeds included. The rest
-            is then no fault, and is listed in ``left_out``.
+    With ``common`` only common cells of one definition, seeds included, are compared. The rest is
+    then no fault, and is listed in ``left_out``.
     """
     left_out: list[str] = []
     if common and (seeds := baseline.seeds & run.seeds):
@@ -263,10 +260,6 @@ _NOT_FAILED = ("", NOT_IN_STUDY, NOT_MEASURED)
 def _lacking(lacking: Mapping[Key, str], there: Mapping[Key, object]) -> list[Fault]:
     """Faults for missing keys: first scenes, probes, variants and seeds without any cell, then
     single cells. A failed cell has a separate line with its error.
-
-    Args:
-        lacking: keys -> the reason.
-        there: keys present on the side.
     """
     rest, faults = dict(lacking), []
     for place, what in enumerate(_WHOLE):

@@ -73,9 +73,6 @@ def write_pictures(baseline: Path, pictures: Pictures) -> None:
     """Save a run's pictures next to a baseline's file, in place of former ones.
 
     The former ones are removed after all new ones are saved.
-
-    Args:
-        pictures: pictures of the baseline's run.
     """
     folder = folder_of(baseline)
     new, former = folder.with_suffix(".pictures-new"), folder.with_suffix(".pictures-former")

@@ -21,11 +21,7 @@ NOT_MEASURED = "not measured"
 
 @dataclass(frozen=True)
 class Figure:
-    """One gated metric of one cell.
-
-    Attributes:
-        values: by view, to nine significant digits; NaN where undefined.
-    """
+    """One gated metric of one cell: values by view, to nine significant digits."""
 
     version: int
     values: Mapping[str, float]

@@ -215,12 +215,9 @@ def cost_front(
 ) -> list[str]:
     """Error against seconds with intervals on both axes; the front as a staircase, dominated points
     in grey. With more than :data:`MOST_NAMES` points only those on the front have names; the others
-    have tooltips.
+    have tooltips. Return the names on the front, cheapest first.
 
     ``log``: whether the error's axis is logarithmic, as that of seconds always is.
-
-    Returns:
-        The names on the front, cheapest first.
 
     Example:
         >>> from pathlib import Path
@@ -351,9 +348,6 @@ def _strokes(axes: Axes) -> Iterator[npt.NDArray[np.float64]]:
 
 def ends(value: Interval) -> tuple[float, float]:
     """Ends of a bar: of the interval, or with few scenes the lowest and the highest scene.
-
-    Args:
-        value: interval; its ends may be NaN.
 
     Example:
         >>> from attnwarp_eval.statistics.intervals import interval

@@ -13,10 +13,6 @@ FEWEST_SCENES = 6
 def number(value: float | None, digits: int = 3) -> str:
     """A number to ``digits`` significant digits; a dash where it is undefined.
 
-    Args:
-        value: None and NaN are undefined.
-        digits: number of significant digits.
-
     Example:
         >>> number(0.0123456), number(12345.6), number(None)
         ('0.0123', '12346', '–')
@@ -73,7 +69,6 @@ def spread(value: Interval, scenes: int | None = None) -> str:
     statement about scenes in general.
 
     Args:
-        value: the interval.
         scenes: scenes of the study; if fewer were measured, the text says how many.
 
     Example:

@@ -112,10 +112,7 @@ def _embedder(report: Report, root: Path) -> Callable[[str], str]:
 
 
 def reduction(total: int) -> float:
-    """Scale of the sides of a page's pictures, 1 to keep them.
-
-    Args:
-        total: bytes of all pictures.
+    """Scale of the sides of a page's pictures, ``total`` bytes in all; 1 to keep them.
 
     Example:
         >>> reduction(LARGEST), reduction(4 * LARGEST)
@@ -228,10 +225,6 @@ def markdown_table(table: Table) -> str:
 def templates(package: str, *, autoescape: bool) -> Environment:
     """Load the templates next to a package's modules; an undefined name is an error.
 
-    Args:
-        package: package with the templates in its folder.
-        autoescape: whether values are escaped for HTML; False for Markdown.
-
     Example:
         >>> templates("attnwarp_eval.document", autoescape=True).list_templates("j2")
         ['report.html.j2', 'report.md.j2']
@@ -288,12 +281,7 @@ def page(report: Report, root: Path) -> str:
 
 
 def write_files(report: Report, folder: Path, name: str, *, long: bool = True) -> list[Path]:
-    """Write the report as Markdown and as a page; return their paths, the page at the end.
-
-    Args:
-        report: report with pictures and figures below ``folder``.
-        name: name of the files, without a suffix.
-        long: as for :func:`markdown`.
+    """Write the report as Markdown and as a page, see :func:`markdown`; return their paths.
 
     Example:
         >>> from pathlib import Path

@@ -21,9 +21,6 @@ HEAD = (
 def to_text(data: Mapping[str, Any]) -> str:
     """A scene as the text of a YAML file: an object a paragraph, an edit a paragraph.
 
-    Args:
-        data: the scene, of plain lists, dictionaries, numbers and texts.
-
     Example:
         >>> from attnwarp_eval.drawn.scenes import draw
         >>> from attnwarp_eval.scene.yaml import read_yaml

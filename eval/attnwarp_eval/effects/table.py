@@ -57,10 +57,8 @@ class Settings:
 
 
 def measure_entry(scene: Scene, settings: Settings, report: Reporter = SILENT) -> dict[str, Any]:
-    """Measure a scene's effects, the cost of its plan, and the proof, as JSON.
-
-    Args:
-        settings: settings of the entry; :func:`side_by_side` makes the pictures.
+    """Measure a scene's effects, the cost of its plan, and the proof, as JSON. The pictures are
+    those of :func:`side_by_side`.
     """
     from attnwarp_eval.effects.proof import prove
     from attnwarp_eval.truth.llvm import variant

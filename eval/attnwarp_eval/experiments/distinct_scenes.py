@@ -9,10 +9,7 @@ from attnwarp_eval.scene.scene import Scene
 
 
 def distinct_scenes(names: Sequence[str]) -> list[Scene]:
-    """Load scenes with distinct names; a repeated scene is loaded once.
-
-    Args:
-        names: scenes' names or paths.
+    """Load scenes by name or path; their names are distinct, and a repeated one is loaded once.
 
     Raises:
         InputError: a scene that cannot be used, or two scenes with the same name.

@@ -39,9 +39,6 @@ def collect(
         names: scenes' names or paths.
         out: folder of ``effects.json``, the report, ``<scene>.jpg`` and ``cells/``.
 
-    Returns:
-        The entries, as in ``effects.json``.
-
     Raises:
         InputError: a scene that is unknown or contradicts itself, two scenes of one name, another
             run that is writing to ``out``, or rows of its ``effects.json`` that would be lost.

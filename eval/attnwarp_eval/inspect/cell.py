@@ -90,20 +90,13 @@ class CellReport:
 
 
 def cell_of(pair: Pair, size: Size, column: int, row: int) -> tuple[int, int]:
-    """The cell (column, row) of a feature grid that contains a target pixel's centre.
-
-    Args:
-        size: (h, w) of the feature grid.
-    """
+    """The cell (column, row) of an (h, w) feature grid that contains a target pixel's centre."""
     (height, width), (h, w) = pair.size, size
     return (2 * column + 1) * w // (2 * width), (2 * row + 1) * h // (2 * height)
 
 
 def cell_report(pair: Pair, size: Size, column: int, row: int) -> CellReport:
-    """Report on one cell of the target's feature grid.
-
-    Args:
-        size: (h, w) of the grid.
+    """Report on one cell of the target's (h, w) feature grid.
 
     Raises:
         ValueError: the cell lies outside the grid.

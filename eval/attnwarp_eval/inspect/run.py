@@ -22,13 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class RunEdit:
-    """A run's pictures of one edited view.
-
-    Attributes:
-        folder: path of the run.
-        source, target: names of the views.
-        steps: "before" and "edited".
-    """
+    """A run's pictures of one edited view, "before" and "edited"."""
 
     folder: Path
     source: str

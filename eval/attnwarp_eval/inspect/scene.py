@@ -64,10 +64,8 @@ def seen_surface(seen: Seen, colors: Image, seam: float = SEAM) -> pyvista.PolyD
 
 
 def coarser_surface(seen: Seen, surface: pyvista.PolyData, faces: int) -> pyvista.PolyData:
-    """:func:`seen_surface` with about ``faces`` faces, from every k-th pixel of every k-th row.
-
-    Args:
-        surface: result of :func:`seen_surface`, for its colours.
+    """:func:`seen_surface` with about ``faces`` faces, from every k-th pixel of every k-th row of
+    the full one, which has the colours.
     """
     colors = np.zeros((*seen.valid.shape, 3))
     colors.reshape(-1, 3)[surface.point_data["pixel"]] = surface.point_data["colors"] / 255

@@ -158,11 +158,7 @@ class Subject:
 
 
 def of_scene(scene: str, size: int = SIZE) -> Subject:
-    """A scene under the presets, with splats sampled on its surfaces as in studies.
-
-    Args:
-        scene: a name, or the path of a file.
-        size: side of the pictures in px.
+    """A scene, by name or path, under the presets, with splats sampled on its surfaces.
 
     Raises:
         InputError: no such scene.
@@ -183,10 +179,7 @@ def of_run(
 ) -> Subject:
     """A run's variants and views; edited views with pictures come first.
 
-    Args:
-        scene: a scene of the run; by default the first.
-        size: size of the images; by default the run's.
-        seed: a seed of the run; by default the first.
+    Scene and seed are by default the first, and the size of the images is the run's.
 
     Raises:
         InputError: the folder is not a run, a record is damaged, the run has no such scene or seed

@@ -36,16 +36,10 @@ def serve(
     port: int = 0,
     announce: Callable[[str], object] = print,
 ) -> None:
-    """Serve a window until the last browser has left, or until it is interrupted.
+    """Serve a window, drawn off screen, until the last browser has left or it is interrupted.
 
     The address holds a secret: other users of the machine and other pages of the browser cannot
-    connect without it.
-
-    Args:
-        window: window, drawn off screen.
-        host: address to listen at.
-        port: port to listen at; 0 takes a free one.
-        announce: callback with the address to open.
+    connect without it. ``announce`` is called with it, and port 0 takes a free one.
 
     Raises:
         InputError: the address cannot be used.

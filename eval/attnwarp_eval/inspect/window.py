@@ -161,11 +161,7 @@ class Window:
         self.look(camera.position, camera.rotation)
 
     def fly(self, show: Callable[[], object] = lambda: None, steps: int = FLIGHT) -> None:
-        """Move the view from the source camera to the target.
-
-        Args:
-            show: called after each picture.
-        """
+        """Move the view from the source camera to the target; call ``show`` after each picture."""
         self.look_through(self.pair.cameras[0].name)
         for position, rotation in scene.fly(self.pair.cameras, self.subject.center, steps):
             self.look(position, rotation)

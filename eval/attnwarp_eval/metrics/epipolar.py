@@ -207,13 +207,7 @@ def sift_features(image_srgb: Any, name: str = "image_srgb") -> Keypoints:
 
 
 def match_features(source: Keypoints, target: Keypoints) -> tuple[Array, Array]:
-    """Match features of two pictures: mutual nearest neighbours, by a margin.
-
-    Args:
-        source, target: keypoints from :func:`sift_features`.
-
-    Returns:
-        (N, 2) and (N, 2) positions in px, as from :func:`sift_matches`.
+    """Match features from :func:`sift_features` of two pictures, as :func:`sift_matches` does.
 
     Example:
         >>> import numpy as np

@@ -108,16 +108,10 @@ def ssim(image: Any, target: Any, mask: Any = None) -> float:
 
 def ssim_map(image: Any, target: Any, mask: Any = None) -> Array:
     """(H - 10, W - 10) similarity of each window, a mean over channels; NaN if it is not wholly
-    inside the mask.
+    inside the mask. Arguments and errors are those of :func:`ssim`.
 
     The window at [i, j] is centred on the pixel [i + 5, j + 5]. Empty for a picture below 11 x 11
     px.
-
-    Args:
-        image, target, mask: as :func:`ssim`.
-
-    Raises:
-        ValueError: as :func:`ssim`.
 
     Example:
         >>> import numpy as np
@@ -151,17 +145,11 @@ def ms_ssim(image: Any, target: Any, mask: Any = None) -> float:
     are each other's negatives) has no real power and counts as 0.
 
     With a mask, a pixel of a coarser scale is inside if its four pixels are, and windows count
-    as in :func:`ssim`.
-
-    Args:
-        image, target, mask: as :func:`ssim`.
+    as in :func:`ssim`, whose arguments and errors it has.
 
     Returns:
         NaN if a scale has no window: a side below 176 px, or a mask without a square of
         about that size.
-
-    Raises:
-        ValueError: as :func:`ssim`.
 
     Example:
         >>> import numpy as np

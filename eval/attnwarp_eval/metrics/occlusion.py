@@ -41,7 +41,7 @@ Ints = npt.NDArray[np.int64]
 def confusion(
     accepted: Any, label: Any, surface: Any, behind: Any = None, among: Any = None
 ) -> Counts:
-    """Count accepted and rejected pixels by their true class.
+    """Count accepted and rejected pixels by their true class, for each of :data:`COUNTS`.
 
     Args:
         accepted: (H, W) bool, the mask to judge.
@@ -49,9 +49,6 @@ def confusion(
         surface: (H, W) bool, the target pixel shows a surface.
         behind: (H, W) bool, the surface's point lies behind the source camera.
         among: (H, W) bool, the pixels to count; by default all.
-
-    Returns:
-        One integer for each of :data:`COUNTS`.
 
     Example:
         >>> import numpy as np

@@ -18,14 +18,7 @@ Scores = dict[str, dict[tuple[str, ...], float]]
 
 
 def read_scores(path: Path, columns: Sequence[str], option: str) -> Scores:
-    """Read a file of scores.
-
-    Args:
-        path: file.
-        columns: columns that name a pair.
-
-    Returns:
-        Scores by figure, such as "consistency.score_lower.MEt3R".
+    """Scores of a file by figure, such as "consistency.score_lower.MEt3R".
 
     Raises:
         InputError: the file cannot be read, a column of no known meaning, or a score that is no

@@ -19,12 +19,7 @@ from attnwarp_eval.study.results import Results
 
 
 def build(results: Results, root: Path, *, timings: bool = True, pictures: bool = True) -> Report:
-    """The report's content; figures are written below ``root``/figures.
-
-    Args:
-        timings: whether measured seconds and memory are shown.
-        pictures: whether the views' pictures are shown.
-    """
+    """The report's content; figures are written below ``root``/figures."""
     layout = Layout(root, timings)
     judged = judge(results, load_claims())
     compared = compared_of(results, judged)

@@ -137,11 +137,7 @@ def load_claims() -> tuple[Claim, ...]:
 
 
 def variant_like(results: Results, data: Mapping[str, Any], name: str) -> str | None:
-    """Name of the first measured variant with the meaning of ``data``.
-
-    Args:
-        data: a variant in the format of a study's YAML.
-    """
+    """Name of the first measured variant with the meaning of ``data``, as in a study's YAML."""
     asked, study = probe(name), results.study
     if name not in study.probes:
         return None

@@ -173,10 +173,7 @@ def difference_text(value: Contrast, unit: str, level: float = 0.95) -> str:
 
 
 def scene_texts(value: Contrast, unit: str, scenes: Sequence[str]) -> list[str]:
-    """The difference of each scene; a dash where it is undefined.
-
-    Args:
-        scenes: names of scenes, in display order.
+    """The difference of each of the scenes, in order; a dash where it is undefined.
 
     Example:
         >>> tables = [{f"s{k}": {"v": v + 0.01 * v * k} for k in range(2)} for v in (1.0, 0.6)]
@@ -207,11 +204,7 @@ def no_verdict(value: Contrast) -> str:
 
 
 def detectable_text(value: Contrast) -> str:
-    """The smallest difference that one test at 5 % detects in 80 % of studies.
-
-    Args:
-        value: contrast with the spread between scenes.
-    """
+    """The smallest difference that one test at 5 % detects in 80 % of studies."""
     least = value.student.detectable
     if value.scenes < FEWEST_SCENES or not math.isfinite(least):
         return "–"

@@ -100,13 +100,7 @@ def controls_of(results: Results, name: str, baseline: str) -> dict[str, str]:
 
 
 def seen(results: Results, name: str, metric: str, baseline: str, label: str) -> bool:
-    """Return True if a figure separates a control from its variant: worse, or different for a seed.
-
-    Args:
-        results, name, baseline: as for :func:`controls_of`.
-        metric: a figure for which one direction is better.
-        label: label of the control.
-    """
+    """Return True if a figure tells a control from its variant: worse, or different for a seed."""
     direction = probe(name).metric(metric).direction
     judged = between(results, name, baseline, label, metric).verdict(direction)  # type: ignore[arg-type]
     other_seed = results.study.variants[label].part(VariantPart).control == OTHER_SEED
@@ -118,9 +112,6 @@ def blind(results: Results, name: str, metric: str, baseline: str) -> bool:
 
     Features from the wrong place must do worse. Otherwise the figure does not depend on the
     source of features, so "can't tell" about two warps says nothing.
-
-    Args:
-        metric: a figure for which one direction is better.
     """
     found = controls_of(results, name, baseline)
     wrong = [label for label, control in found.items() if control != OTHER_SEED]

@@ -52,11 +52,8 @@ def interest(metric: Metric, scale: Scale) -> float | None:
 
 
 def needed(value: Contrast, difference: float) -> int:
-    """Scenes with which a test at 5 % detects a true difference in 80 % of studies, at least six.
-
-    Args:
-        value: contrast with the spread between scenes.
-        difference: true difference on the contrast's scale.
+    """Scenes, at least six, with which a test at 5 % detects a true difference on the contrast's
+    scale in 80 % of studies.
     """
     return max(FEWEST, scenes_needed(difference, value.deviation))
 
@@ -115,12 +112,7 @@ class Cost:
 def cost_of(
     kinds: Iterable[tuple[str, tuple[str, ...]]], measured: tuple[Results, Path] | None
 ) -> Cost:
-    """Estimate the cost of cells from the means of finished cells of their kind.
-
-    Args:
-        kinds: probe and variants of each cell to do.
-        measured: results of the finished part, with its folder, or None.
-    """
+    """Estimate the cost of cells of some probes and variants from the means of finished ones."""
     seconds: dict[tuple[str, tuple[str, ...]], list[float]] = {}
     size = 0.0
     if measured is not None:

@@ -38,12 +38,10 @@ DIGITS = 6
 
 def write_raw(store: Store, path: Path) -> Path:
     """Write the raw results of a run, without its pictures and without paths of this machine.
+    Return the file's path.
 
     Args:
         path: path of the file; in a folder, the file is called :data:`NAME`.
-
-    Returns:
-        Path of the file.
 
     Raises:
         StoreError: the folder is not a run, or a record is damaged.

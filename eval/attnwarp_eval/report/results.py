@@ -59,9 +59,6 @@ def read_results(store: Store) -> Results:
 def lines(results: Results, timings: bool = True) -> Iterable[str]:
     """Lines of results.jsonl: one per (cell, figure of quality), sorted, so that a diff can
     be read.
-
-    Args:
-        timings: whether the lines include seconds and memory.
     """
     rows = []
     for cell in results.cells:

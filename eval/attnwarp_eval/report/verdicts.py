@@ -53,10 +53,7 @@ class Judged:
 
 
 def verdicts(folder: Path) -> list[Judged]:
-    """Every claim with its verdict, p-values adjusted over all studies together.
-
-    Args:
-        folder: path of reports, with raw results next to each.
+    """Every claim with its verdict by a folder of reports, p-values adjusted over all studies.
 
     Raises:
         InputError: raw results are unreadable or of different studies.
@@ -145,11 +142,7 @@ def _time(results: Results, one: JudgedClaim) -> str:
 
 
 def table(judged: list[Judged], beside: Path) -> Table:
-    """The table of all claims.
-
-    Args:
-        beside: folder that links are relative to.
-    """
+    """The table of all claims, with links relative to the folder ``beside``."""
     rows = []
     for each in judged:
         one = each.judged
@@ -196,9 +189,6 @@ def _plainly(one: JudgedClaim) -> str:
 def filled(text: str, judged: list[Judged], beside: Path) -> str:
     """Fill a document's marked places with the table and the lines; lines stay as they are while
     none of their claims has raw results.
-
-    Args:
-        judged: result of :func:`verdicts`.
 
     Example:
         >>> filled("<!-- headlines -->\\nas before\\n<!-- /headlines -->\\n", [], Path())

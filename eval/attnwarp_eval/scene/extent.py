@@ -56,11 +56,7 @@ class Extent:
 
 
 def extent(scene: Scene, shapes: Sequence[Shape] | None = None) -> Extent:
-    """The extent of a scene.
-
-    Args:
-        shapes: ``scene.shapes()``, if the caller already has them.
-    """
+    """The extent of a scene, or of its ``shapes`` that the caller already has."""
     shapes = scene.shapes() if shapes is None else shapes
     pieces = [_pieces(shape) for shape in shapes]
     low, high, area = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))

@@ -12,13 +12,9 @@ Which = tuple[str | None, str | None]
 
 
 def with_bounces(text: str, numbers: Mapping[Which, int | Literal["unlimited"]]) -> str:
-    """Write numbers of bounces into the text of a scene file.
+    """Write the numbers of bounces of a scene and its edited scenes into the text of its file.
 
     An edit gets a number if it differs from the scene's, or if the edit already has one.
-
-    Args:
-        text: text of a file that :func:`~attnwarp_eval.scene.file.load_scene` reads.
-        numbers: numbers of the scene and of its edited scenes.
 
     Example:
         >>> print(with_bounces("name: room\\nappearance: {spp: 8}  # few", {(None, None): 3}))

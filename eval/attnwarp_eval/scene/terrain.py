@@ -138,10 +138,7 @@ class ScatterSpec(Spec):
         return lattice_noise(cells, self.seed).reshape(self.count, columns)
 
     def mesh(self, height: Height) -> Mesh:
-        """All things as one mesh.
-
-        Args:
-            height: the ground below.
+        """All things as one mesh, on the ground of this height.
 
         Raises:
             ValueError: ``avoid`` excludes every position.

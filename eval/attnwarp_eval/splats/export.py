@@ -106,11 +106,7 @@ EXPORTED = re.compile(r"orbit_\d+_of_\d+\.png")
 
 
 def orbit_name(index: int, count: int) -> str:
-    """Name of a camera of :func:`orbit`.
-
-    Args:
-        index: index of the camera, from 0.
-        count: number of all cameras, which decides the number of digits.
+    """Name of a camera of :func:`orbit`; its digits are as many as the count of cameras needs.
 
     Example:
         >>> orbit_name(0, 64) == orbit_name(1, 64)

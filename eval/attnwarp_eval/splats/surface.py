@@ -166,9 +166,7 @@ def colored_samples(
     geometry: Geometry | None = None,
 ) -> tuple[SurfaceSamples, Array]:
     """Points on a scene's surfaces, and (N, 3) linear RGB that the truth has there.
-
-    Args:
-        scene, count, seed, focus, geometry: see :func:`surface_splats`.
+    Arguments are those of :func:`surface_splats`.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene

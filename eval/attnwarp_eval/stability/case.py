@@ -155,12 +155,7 @@ class Case:
         return self.levels.index(level) <= self.levels.index(last)
 
     def outcome(self, level: float, way: Way) -> Outcome:
-        """Evaluate one way at one level.
-
-        Args:
-            level: one of ``levels``.
-            way: one of ``ways``.
-        """
+        """Evaluate one way at one level."""
         error, refusal = math.nan, ""
         try:
             with np.errstate(all="ignore"):
@@ -173,9 +168,7 @@ class Case:
         """Judge an error by this case's bound.
 
         Args:
-            level: one of ``levels``.
-            way: one of ``ways``.
-            error: error in the bound's unit; NaN if the result is not finite, or refused.
+            error: in the bound's unit; NaN if the result is not finite, or refused.
             refusal: message of the refusal, else empty.
         """
         return Outcome(

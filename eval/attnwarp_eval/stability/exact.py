@@ -87,11 +87,8 @@ class ExactSplats:
     def gradient(
         self, pixels: Sequence[tuple[float, float]], weights: Sequence[tuple[float, float]]
     ) -> dict[str, np.ndarray]:
-        """Derivatives of sum_p a_p alpha_p + b_p depth_p, by field.
-
-        Args:
-            pixels: (x, y) of each pixel.
-            weights: (a, b) of each pixel.
+        """Derivatives of sum_p a_p alpha_p + b_p depth_p by field, with weights (a, b)
+        of pixels (x, y).
         """
         with mpmath.workdps(DIGITS):
             # One splat moves at a time; the others are fixed.

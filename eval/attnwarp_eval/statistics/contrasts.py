@@ -107,9 +107,7 @@ class Contrast:
     def needed(self, adjusted_p: float, bound: float | None = None) -> int:
         """Scenes that would give a verdict in 80 % of studies if the true difference and
         its spread were those seen here: on a difference, or on equality within a bound.
-
-        Args:
-            adjusted_p, bound: as for :meth:`verdict`.
+        Arguments are those of :meth:`verdict`.
         """
         level = self.level(adjusted_p)
         # With fewer scenes no sign pattern is rare enough for the level: p is at least 2 / 2**n.

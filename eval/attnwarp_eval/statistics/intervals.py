@@ -158,9 +158,6 @@ def paired(a: ByView, b: ByView) -> Interval:
 def common(tables: Sequence[ByView]) -> list[dict[str, dict[str, float]]]:
     """Each table over the views in which all tables are defined; scenes without any are left out.
 
-    Args:
-        tables: scene -> view key -> value, NaN where undefined.
-
     Example:
         >>> ours = {"bear": {"yaw010": 1.0, "yaw020": 2.0}, "fence": {"yaw010": 3.0}}
         >>> theirs = {"bear": {"yaw010": float("nan"), "yaw020": 4.0}}

@@ -83,9 +83,6 @@ class SignFlips:
         """Means that the test does not refuse; NaN if it can refuse none.
 
         The interval contains 0 exactly if ``p`` is above 1 - ``level``.
-
-        Args:
-            level: coverage, in (0, 1).
         """
         if len(self._clean) < 2:
             return math.nan, math.nan

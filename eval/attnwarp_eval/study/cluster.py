@@ -146,10 +146,8 @@ class _Remote(Workplace):
 def run_on_workers(
     cells: list[Cell], root: Path, jobs: int, report: CellReporter
 ) -> Generator[Ended]:
-    """Compute and write cells on this machine, one process a worker.
-
-    Yields:
-        Each cell as it ends, with its failure.
+    """Compute and write cells on this machine, one process a worker; yield each as it
+    ends, with its failure.
     """
     threads = max(1, core_count() // jobs)
     # dask has workers return freed memory to the system at once; image-sized arrays then cost more
@@ -237,7 +235,8 @@ def run_on_scheduler(
     report: CellReporter,
     needs: Sequence[Path] = (),
 ) -> Generator[Ended]:
-    """Compute cells on the workers of the user's scheduler, and write the records here.
+    """Compute cells on the workers of the user's scheduler, and write the records here; yield
+    each as it ends, with its failure.
 
     Args:
         store: the run's folder; workers read it only if ``needs`` lists it.
@@ -246,9 +245,6 @@ def run_on_scheduler(
         report: callback for each cell handed out, and for a line about each refused or lost
             worker.
         needs: paths that every worker must be able to read.
-
-    Yields:
-        Each cell as it ends, with its failure.
 
     Raises:
         ClusterError: the scheduler cannot be reached, or every worker is refused.

@@ -138,12 +138,7 @@ class Work:
             self.draw(view, draw)
 
     def draw(self, view: str, draw: Callable[[], Mapping[str, bytes]]) -> None:
-        """Save the pictures of a view, or of the source, if the study saves them.
-
-        Args:
-            view: as in :meth:`add`.
-            draw: as in :meth:`add`.
-        """
+        """Save the pictures of a view, or of the source, as :meth:`add` does."""
         if view not in self.cell.pictures:
             return
         with self.meter.stage("pictures"):

@@ -81,11 +81,7 @@ class ProbeReport:
         self.probe, self.name = own, own.name
 
     def columns_at(self, layer: int) -> dict[str, str]:
-        """Columns of the table of variants, title -> metric.
-
-        Args:
-            layer: size of the feature grid that tables show.
-        """
+        """Columns of the table of variants, title -> metric; a grid has ``layer`` cells a side."""
         columns = self.columns or {
             name: name for name, metric in self.probe.metrics.items() if not metric.is_count
         }
@@ -108,11 +104,7 @@ class ProbeReport:
         return None
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
-        """Folded tables below a table of variants.
-
-        Args:
-            names: names of the variants, the baseline first.
-        """
+        """Folded tables below a table of variants, whose first one is the baseline."""
         return []
 
 
@@ -163,10 +155,7 @@ def reports() -> list[ProbeReport]:
 
 def in_degrees(names: Iterable[str], views: Iterable[View]) -> list[str]:
     """Heads of columns of views: each view's degrees from the source, or its name if it has no yaw,
-    a yaw that differs between records, or the yaw of another view.
-    Args:
-        names: names of views, without the task.
-        views: figures of the views, from records.
+    a yaw that differs between records, or the yaw of another view. Names are without the task.
 
     Example:
         >>> views = [View("near", 12.2, {}), View("left", 30, {}), View("right", 30, {})]

@@ -59,13 +59,7 @@ class View:
 
 @dataclass(frozen=True)
 class PictureFile:
-    """A picture of one view in the run's folder.
-
-    Attributes:
-        content: content, such as ``mask``.
-        path: relative to the run's folder.
-        sha256: sha256 of the file.
-    """
+    """A picture of one view, its path relative to the run's folder."""
 
     view: str
     content: str

@@ -17,12 +17,7 @@ from attnwarp_eval.study.schema import Study
 
 @dataclass(frozen=True)
 class Outcome:
-    """An expected cell of a run.
-
-    Attributes:
-        variants: all names of its content in the study.
-        record: record; None if the cell is not done.
-    """
+    """An expected cell of a run, with all variants of its content; not done without a record."""
 
     id: str
     title: str

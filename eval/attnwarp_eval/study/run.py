@@ -172,12 +172,7 @@ def verify(store: Store) -> Problems:
 
 @dataclass(frozen=True)
 class Stored:
-    """Contents of ``study.json`` of a run.
-
-    Attributes:
-        cells: cells of a complete run.
-        notices: notices of :class:`Plan`.
-    """
+    """Contents of ``study.json`` of a run."""
 
     study: Study
     cells: list[dict[str, Any]]
@@ -320,19 +315,9 @@ def compute_cells(
     needs: Sequence[Path] = (),
     keep_going: bool = True,
 ) -> list[Failure]:
-    """Compute cells, in this process or on workers, and return the failures.
+    """Compute cells, in this process or on workers, and return the failures; see :func:`execute`.
 
-    Args:
-        cells: cells of registered probes.
-        store: the run's folder, destination of every record and failure.
-        jobs: worker processes, at most one for each cell; 1 computes in this process.
-        scheduler: address or file, as for :func:`execute`.
-        scenes: scenes by their names in cells.
-        needs: paths that a scheduler's workers must be able to read.
-        keep_going: as for :func:`execute`.
-
-    Raises:
-        ClusterError, ClusterLost: see :func:`execute`.
+    Workers of a scheduler must be able to read the paths of ``needs``.
     """
     jobs = min(jobs, len(cells))
     if scheduler is not None:

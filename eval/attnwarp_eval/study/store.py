@@ -162,11 +162,7 @@ class Store:
         return {path.stem for path in self.cells.glob("??/*.json")}
 
     def write(self, record: dict[str, Any]) -> None:
-        """Write the record of a finished cell, and remove its earlier failure.
-
-        Args:
-            record: record with at least ``id`` and ``spec``.
-        """
+        """Write a finished cell's record, with its ``id``, and remove its earlier failure."""
         write_json(self.path(record["id"]), _sealed(record), durable=_flush_is_due())
         (self.failed / f"{record['id']}.json").unlink(missing_ok=True)
 
@@ -270,11 +266,7 @@ class Store:
         return problems
 
     def damaged_pictures(self, pictures: Iterable[Mapping[str, Any]]) -> list[str]:
-        """One line for each picture that differs from its checksum.
-
-        Args:
-            pictures: entries of a record, with ``path`` and ``sha256``.
-        """
+        """One line for each picture of a record that differs from its checksum."""
         remedy = f"run again with --out {self.root}, which makes it anew"
         bad = []
         for picture in pictures:

@@ -223,9 +223,6 @@ def _models(joined: tuple[Probe[Any], ...]) -> tuple[type[Study], type[Variant]]
 def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:
     """Every cell of a study, scene by scene; variants of the same content share one.
 
-    Args:
-        scenes: the loaded scenes by their names in the study.
-
     Raises:
         StudyError: the study does not fit a scene, such as a view that the scene lacks.
 
@@ -482,11 +479,7 @@ def _beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def explain_errors(error: ValidationError, model: type[BaseModel] | None = None) -> str:
-    """Pydantic's errors in one readable text: each key, the given value, and the expected value.
-
-    Args:
-        error: validation error of a study or of a part.
-    """
+    """Pydantic's errors in one readable text: each key, the given value, and the expected value."""
     model = model or _models(tuple(probes()))[0]
     problems = error.errors(include_url=False)
     return "; ".join(explain.explain(problem, model, KEYS) for problem in problems)

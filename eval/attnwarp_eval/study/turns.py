@@ -14,12 +14,7 @@ from attnwarp_eval.study.results import Results
 
 @dataclass(frozen=True)
 class Timed:
-    """Seconds of one stage of contestants that ran in turn.
-
-    Attributes:
-        turns: timings, one for each cell that timed the stage.
-        stage: stage of :class:`InTurn`.
-    """
+    """Seconds of one stage of contestants that ran in turn, by the cells that timed it."""
 
     turns: Sequence[InTurn]
     stage: str

@@ -148,13 +148,9 @@ def write(tracks: Tracks, path: Path, key: str = "") -> None:
 
 def halve(dataset: Dataset, tracks: Tracks, folder: Path) -> int:
     """Write a capture again with every second point of the tracks as a fit's initial points, and
-    its tracks next to it; return the number of points.
+    its tracks.npz next to it; return the number of points.
 
     Pictures are not copied. Splats fitted to this capture have not seen the other points.
-
-    Args:
-        dataset: as in :func:`find_tracks`.
-        folder: receives transforms.json, the points, and tracks.npz.
     """
     points = world_points(tracks, dataset.cameras)
     started = (np.arange(len(points)) % 2 == 0) & np.isfinite(points).all(axis=1)

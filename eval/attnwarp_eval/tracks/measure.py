@@ -222,9 +222,6 @@ def summarise(pairs: Sequence[Pair], seed: int = 0) -> dict[str, Figure]:
 
     Points of one picture share its pose and its splats, so whole target pictures are resampled,
     :data:`RESAMPLES` times; an interval holds the middle 95 percent.
-
-    Args:
-        pairs: at least one.
     """
     targets = sorted({pair.target for pair in pairs})
     parts = [

@@ -212,11 +212,7 @@ class Page:
             self.pictures[f"{label}, {name}: {Path(cameras[pair.target].name).name}"] = image
 
     def write(self, inputs: Mapping[str, Any]) -> list[Path]:
-        """Write tracks.json and the page; return their paths, the page at the end.
-
-        Args:
-            inputs: names and values of the command's inputs.
-        """
+        """Write tracks.json, with the command's inputs, and the page; return their paths."""
         started, camera = self.tracks.started, self.views.cameras[0]
         notes = [
             f"{int((~started).sum())} points in {len(self.views.cameras)} pictures, measured at"
@@ -257,14 +253,7 @@ class Page:
 
 
 def draw(pair: Pair, tracks: Tracks, image: np.ndarray[Any, Any], path: Path) -> None:
-    """Draw the target's picture with the points of a pair, coloured by their error.
-
-    Args:
-        pair: a pair with the target.
-        tracks: in px of the target's camera.
-        image: (H, W, 3) sRGB in [0, 1] of the target.
-        path: path of the PNG.
-    """
+    """Draw the target, (H, W, 3) sRGB in [0, 1], with a pair's points coloured by their error."""
     import cv2
 
     scale = max(1, round(512 / max(image.shape[:2])))

@@ -134,7 +134,7 @@ def _corner_status(geometry: Geometry, source: Camera, target: Camera) -> npt.ND
 
 
 def edges(geometry: Geometry, camera: Camera) -> Mask:
-    """Pixels next to a depth or object edge.
+    """(H, W) bool: pixels next to a depth or object edge.
 
     Two neighbours (left and right, above and below) have an edge between them if
 
@@ -142,9 +142,6 @@ def edges(geometry: Geometry, camera: Camera) -> Mask:
     - only one of them shows an object, or
     - neither tangent plane comes within one pixel's footprint (z / f) of the other's depth. So a
       slanted floor is no edge.
-
-    Returns:
-        (H, W) bool: pixels with such a neighbour.
     """
     hits = geometry.trace(camera)
     directions = camera.directions() @ camera.rotation
@@ -174,10 +171,6 @@ def edges(geometry: Geometry, camera: Camera) -> Mask:
 def edge_band(geometry: Geometry, camera: Camera, width: float = EDGE_BAND) -> Mask:
     """(H, W) bool: pixels within ``width`` pixels of an edge (see :func:`edges`), adjacent pixels
     included.
-
-    Args:
-        camera: camera of the view; (H, W) is its size.
-        width: px.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene

@@ -26,9 +26,6 @@ def edit_mask(
 ) -> npt.NDArray[np.bool_]:
     """(H, W) bool: pixels of a view that show an edited object; all of them for an edit of the
     light.
-
-    Args:
-        hits: hits of the view from :meth:`~attnwarp_eval.truth.Geometry.trace`.
     """
     edit = scene.edit(name)
     if (pick(edit, answer) or edit).lights is not None:

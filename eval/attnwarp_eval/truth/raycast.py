@@ -57,10 +57,7 @@ class RayHits:
 
 
 class Geometry:
-    """The surfaces of a scene, ready to be traced.
-
-    Args:
-        scene: a :class:`~attnwarp_eval.scene.scene.Scene`, or a sequence of shapes.
+    """The surfaces of a scene, or of a sequence of shapes, ready to be traced.
 
     Attributes:
         center: (3,) float64 middle of the bounding box.
@@ -329,18 +326,16 @@ class Geometry:
     def reached(
         self, eyes: npt.ArrayLike, points: npt.ArrayLike, primitive_id: npt.ArrayLike
     ) -> Mask:
-        """Mask of points, True where the way from an eye to a surface point is free.
+        """(N,) mask of points, True where the way from an eye to a surface point is free.
 
         The ray is cast from the eye to the point, without any offset. The way is free if the first
         hit is on the point's primitive, or lies at 1 +- ``REACH_TOLERANCE`` of the way.
+        A sphere's far side counts as reached, so test the facing side too.
 
         Args:
             eyes: (N, 3) or (3,) world coordinates.
             points: (N, 3) points on surfaces.
             primitive_id: (N,) the primitive of each point.
-
-        Returns:
-            (N,) bool. A sphere's far side counts as reached, so test the facing side too.
         """
         points = np.asarray(points, dtype=np.float64)
         eyes = np.broadcast_to(np.asarray(eyes, dtype=np.float64), points.shape)
@@ -354,16 +349,13 @@ class Geometry:
         primitive_id: npt.ArrayLike,
         eye: Camera | npt.ArrayLike,
     ) -> Mask:
-        """Mask of surface points that can be seen from ``eye``: reached, from the side that
+        """(N,) mask of surface points that can be seen from ``eye``: reached, from the side that
         ``normals`` face.
 
         Args:
             points, normals: (N, 3) world; the normal selects the side of the surface.
             primitive_id: (N,) as in :class:`Hits`.
             eye: a camera (its position counts, not its image) or a (3,) point.
-
-        Returns:
-            (N,) bool.
         """
         position = eye.position if isinstance(eye, Camera) else np.asarray(eye, dtype=np.float64)
         points = np.asarray(points, dtype=np.float64)

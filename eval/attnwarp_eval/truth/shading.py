@@ -218,15 +218,9 @@ def buried(
     primitive_id: npt.NDArray[np.int64],
     rays: int = 64,
 ) -> npt.NDArray[np.bool_]:
-    """Mask of surface points that rays from outside cannot reach: inside other objects, or
-    where two of them touch.
-
-    Args:
-        points, normals, primitive_id: as in :func:`irradiance`.
-        rays: largest number of directions tried per point.
-
-    Returns:
-        (N,) bool.
+    """(N,) mask of surface points that rays from outside cannot reach: inside other objects, or
+    where two of them touch. At most ``rays`` directions are tried from each; the other arguments
+    are those of :func:`irradiance`.
     """
     left = np.arange(len(points))
     for start in range(0, rays, 8):
@@ -261,15 +255,9 @@ def hemisphere(normals: Array, rays: int, turn: float = 0.0) -> Iterator[Array]:
 
 
 def frames(normals: Array) -> tuple[Array, Array]:
-    """Two unit vectors perpendicular to each normal and to each other, t x b = n.
+    """Two (N, 3) unit vectors perpendicular to each unit normal and to each other, t x b = n.
 
     The construction of Duff et al. 2017, which has no singular direction.
-
-    Args:
-        normals: (N, 3) unit.
-
-    Returns:
-        tangent, bitangent: (N, 3).
     """
     x, y, z = normals.T
     sign = np.where(z < 0, -1.0, 1.0)

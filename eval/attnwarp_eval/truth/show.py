@@ -73,16 +73,14 @@ def render_views(
     scene: Scene, out: Path, *, views: list[str] | None = None, spp: int | None = None,
     report: Reporter = SILENT,
 ) -> Iterator[Path]:  # fmt: skip
-    """Write each view's picture, depth and normals as PNG, and one sheet of them all.
+    """Write each view's picture, depth and normals as PNG, and ``sheet.png`` of them all; yield
+    each file.
 
     Args:
         scene: scene at the image size of the output.
         out: output folder, created if missing.
         views: names of cameras; by default all.
         spp: samples a pixel; by default the scene's number.
-
-    Yields:
-        Each written file; the sheet, ``sheet.png``, last.
 
     Raises:
         InputError: ``views`` is empty, or names a camera unknown to the scene.

@@ -114,11 +114,7 @@ _FOUND_BY: Mapping[Figure, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class _View:
-    """A view before pairing.
-
-    Attributes:
-        edited, original: (H, W, 3) at full size; the original, or None.
-    """
+    """A view before pairing, its pictures at full size."""
 
     edited: Picture
     original: Picture | None

@@ -140,13 +140,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Figure:
-    """Definition of a figure of pictures.
-
-    Attributes:
-        key, title: as of :class:`Row`.
-        needs: fields of :class:`Inputs`.
-        encoder: kind of the encoder behind it, if any.
-    """
+    """Definition of a figure of pictures, as of :class:`Row`, with the :class:`Inputs` it needs."""
 
     key: str
     title: str

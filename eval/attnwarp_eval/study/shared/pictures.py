@@ -48,12 +48,7 @@ SHARED = ("source", "target")
 def of_warp(
     world: World, name: str, spp: int, truth: TwoView, view: WarpedView
 ) -> dict[str, bytes]:
-    """JPEG files of a warp: the two true views, the warped source, mask and endpoint error.
-
-    Args:
-        truth: truth of the pair, at image size (H, W).
-        view: the warp to show, (H, W).
-    """
+    """JPEG files of a warp: the two true views, the warped source, mask and endpoint error."""
     source, target = world.image(world.source.name, spp), world.image(name, spp)
     return _jpegs(
         {
@@ -73,13 +68,7 @@ def of_depth(surface: Surface, hits: Hits) -> dict[str, bytes]:
 
 
 def of_fit(surface: Surface, hits: Hits, image: npt.NDArray[np.uint8]) -> dict[str, bytes]:
-    """JPEG files of a fit's held-out view.
-
-    Args:
-        surface: rendered surface of the splats, with its image.
-        hits: truth of the view.
-        image: (H, W, 3) sRGB, true picture of the view.
-    """
+    """JPEG files of a fit's held-out view, whose true picture is (H, W, 3) sRGB."""
     return _jpegs(
         {
             "target": (image / 255).astype(np.float32),
@@ -100,12 +89,7 @@ MARKS = {
 def of_mask(
     world: World, name: str, marked: npt.NDArray[np.bool_], thing: npt.NDArray[np.bool_], spp: int
 ) -> dict[str, bytes]:
-    """JPEG file of a lifted mask in the colours of :data:`MARKS` over the darkened target.
-
-    Args:
-        marked: (H, W) bool, the mask.
-        thing: (H, W) bool, the exact mask.
-    """
+    """JPEG file of a lifted mask in the colours of :data:`MARKS` over the darkened target."""
     target = world.image(name, spp)
     classes = (marked & thing, ~marked & thing, marked & ~thing)
     grey = 0.35 * target.mean(axis=2, keepdims=True).repeat(3, axis=2)

@@ -32,12 +32,7 @@ def surface_spec(study: Study, variant: Variant, seed: int) -> Json:
 
 
 def check_splats(study: Study, probe: str, what: str) -> None:
-    """Raise ValueError if a rendering probe measures a variant without splats.
-
-    Args:
-        study: study, with or without the probe.
-        what: measured part of a render.
-    """
+    """Raise ValueError if a rendering probe, of ``what``, measures a variant without splats."""
     for name in study.probes.get(probe, []):
         if study.variants[name].geometry != "splats":
             raise ValueError(
@@ -61,11 +56,7 @@ def is_fitted(spec: Mapping[str, Any]) -> bool:
 
 
 def splats_of(work: Work, spec: Mapping[str, Any] | None = None) -> Gaussians:
-    """Splats of a cell's spec.
-
-    Args:
-        spec: replacement of the cell's spec.
-    """
+    """Splats of a cell's spec, or of ``spec`` in its place."""
     spec = work.spec if spec is None else spec
     if is_fitted(spec):
         return fits.fit_of(work, spec).gaussians

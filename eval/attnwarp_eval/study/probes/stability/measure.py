@@ -44,12 +44,7 @@ class Extra:
 
 @dataclass(frozen=True)
 class Swept:
-    """Measured outcomes of one way of one case.
-
-    Attributes:
-        case, way: case, and the swept input.
-        outcomes: outcomes by level, the easiest first.
-    """
+    """Measured outcomes of one way of one case by level, the easiest first."""
 
     case: Case
     way: Way
