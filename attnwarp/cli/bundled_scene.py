@@ -37,9 +37,7 @@ def bundled() -> list[str]:
 
 def capture(name: str, folder: Path, report: Reporter) -> str:
     """Unpack a bundled capture: cameras, pictures, exact masks, splats; one in the folder is kept.
-
-    Returns:
-        Origin of the capture, a sentence.
+    Return a sentence on its origin.
     """
     if not (folder / "transforms.json").is_file():  # this file is unpacked last
         shutil.unpack_archive(FOLDER / f"{name}.zip", folder)

@@ -336,11 +336,7 @@ class ViewEdits:
     def denoise(
         self, start: Start, sights: Sequence[Sight | None], step: Callable[[], None]
     ) -> list[Image]:
-        """Edit views from their start.
-
-        Returns:
-            (h, w, 3) pictures in [0, 1].
-        """
+        """Edit views from their start, as (h, w, 3) pictures in [0, 1]."""
         work, s = self.work, self.settings
         if start.replayed is not None:
             picture, task, maps = start.replayed

@@ -20,14 +20,11 @@ C3 = (
 
 
 def basis(direction: torch.Tensor, degree: int) -> torch.Tensor:
-    """Compute the values of the (degree + 1)^2 harmonics.
+    """Compute the values of the harmonics, (..., (degree + 1)^2).
 
     Args:
         direction: (..., 3) unit vectors from the camera to the splat, in world axes.
         degree: highest degree, 0 to 3.
-
-    Returns:
-        (..., (degree + 1)^2).
     """
     x, y, z = direction.unbind(-1)
     values = [torch.full_like(x, C0)]

@@ -36,15 +36,9 @@ FILMS = (".gif", ".mp4")
 
 
 def focus_of(cameras: Sequence[Camera], points: Array) -> Array:
-    """Compute the point that cameras look at: nearest to all optical axes.
+    """Compute the (3,) world point that cameras look at: nearest to all optical axes.
 
     If the axes are parallel or diverge, the point lies at the scene's distance before the cameras.
-
-    Args:
-        points: (N, 3) points of the scene.
-
-    Returns:
-        (3,) in world units.
     """
     positions = np.stack([camera.position for camera in cameras])
     axes = np.stack([camera.forward for camera in cameras])
