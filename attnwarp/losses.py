@@ -108,13 +108,8 @@ def ssim(image: check.Array, target: check.Array) -> Tensor:
 
 
 def ssim_map(image: check.Array, target: check.Array) -> Tensor:
-    """Compute the structural similarity of each window, (H - 10, W - 10, C); see :func:`ssim`.
-
-    Args:
-        image, target: as :func:`ssim`.
-
-    Raises:
-        ValueError: as :func:`ssim`.
+    """Compute the structural similarity of each window, (H - 10, W - 10, C), a mean of which is
+    :func:`ssim`; arguments and errors are the same.
 
     Example:
         >>> import torch
@@ -129,16 +124,7 @@ def ssim_map(image: check.Array, target: check.Array) -> Tensor:
 
 def ssim_terms(image: check.Array, target: check.Array) -> tuple[Tensor, Tensor]:
     """Compute the two factors of :func:`ssim_map`, weighted separately in MS-SSIM: luminance, and
-    contrast and structure.
-
-    Args:
-        image, target: as :func:`ssim`.
-
-    Returns:
-        Two (H - 10, W - 10, C) tensors without gradients.
-
-    Raises:
-        ValueError: as :func:`ssim`.
+    contrast and structure; two tensors of its shape without gradients.
 
     Example:
         >>> import torch

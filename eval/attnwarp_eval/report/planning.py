@@ -40,17 +40,6 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def interest(metric: Metric, scale: Scale) -> float | None:
-    """Smallest difference of a metric that matters, on a scale; None if undefined.
-
-    Example:
-        >>> from attnwarp_eval.metrics.registry import METRICS
-        >>> round(interest(METRICS["warp.epe_median"], "ratio"), 4)  # a tenth more or less
-        0.0953
-    """
-    return INTEREST.get(scale, INTEREST.get(metric.unit))
-
-
 def needed(value: Contrast, difference: float) -> int:
     """Scenes, at least six, with which a test at 5 % detects a true difference on the contrast's
     scale in 80 % of studies.
@@ -66,7 +55,7 @@ def plan_scenes(results: Results) -> Table:
     for title, name, metric, value in _contrasts(results):
         if len(value.by_scene) < 3:
             continue
-        aim, spread = interest(metric, value.scale), value.deviation
+        aim, spread = INTEREST.get(value.scale, INTEREST.get(metric.unit)), value.deviation
         shown = "–" if aim is None else _difference(aim, value.scale)
         count = "–" if aim is None else count_of(needed(value, aim))
         own = count_of(needed(value, value.flips.mean)) if value.flips.mean else "–"

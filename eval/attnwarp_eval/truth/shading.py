@@ -29,6 +29,9 @@ from attnwarp_eval.truth.raycast import Geometry
 
 Array = npt.NDArray[np.float64]
 
+Points = tuple[Array, Array, npt.NDArray[np.int64]]
+"""(N, 3) surface points, their (N, 3) normals, and (N,) primitives."""
+
 
 def sun_direction(sun: SunSpec) -> Array:
     """(3,) unit vector toward the sun; azimuth counts from +x toward +y."""
@@ -90,7 +93,7 @@ def irradiance(
             differ from 1024 by 1 % in the median and 9 % at the 95th percentile (points in deep
             shade), without bias. Each lamp gets as many points.
     """
-    total = np.zeros((len(points), 3))
+    total, at = np.zeros((len(points), 3)), (points, normals, primitive_id)
     for light in scene.spec.lights:
         if isinstance(light, SunSpec):
             toward = sun_direction(light)
@@ -102,19 +105,14 @@ def irradiance(
             lit = lit[geometry.reached(eyes, points[lit], primitive_id[lit])]
             total[lit] += cosine[lit, None] * light.irradiance * np.array(linear_rgb(light.color))
         elif isinstance(light, SkySpec):
-            total += _sky_irradiance(light, geometry, points, normals, primitive_id, rays)
+            total += _sky_irradiance(light, geometry, at, rays)
         else:
-            total += _lone_irradiance(light, geometry, points, normals, primitive_id)
-    return total + _lamp_irradiance(scene, geometry, points, normals, primitive_id, rays)
+            total += _lone_irradiance(light, geometry, at)
+    return total + _lamp_irradiance(scene, geometry, at, rays)
 
 
-def _lone_irradiance(
-    light: PointSpec | SpotSpec,
-    geometry: Geometry,
-    points: Array,
-    normals: Array,
-    primitive_id: npt.NDArray[np.int64],
-) -> Array:
+def _lone_irradiance(light: PointSpec | SpotSpec, geometry: Geometry, at: Points) -> Array:
+    points, normals, primitive_id = at
     total = np.zeros((len(points), 3))
     away = np.array(light.position) - points
     distance = np.linalg.norm(away, axis=1)
@@ -133,14 +131,8 @@ def _lone_irradiance(
     return total
 
 
-def _lamp_irradiance(
-    scene: Scene,
-    geometry: Geometry,
-    points: Array,
-    normals: Array,
-    primitive_id: npt.NDArray[np.int64],
-    rays: int,
-) -> Array:
+def _lamp_irradiance(scene: Scene, geometry: Geometry, at: Points, rays: int) -> Array:
+    points, normals, primitive_id = at
     total = np.zeros((len(points), 3))
     lamps = {
         k: item.emission for k, item in enumerate(scene.spec.objects) if item.emission is not None
@@ -196,14 +188,8 @@ def _spread(shape: Sphere | Rectangle | Mesh, count: int) -> tuple[Array, Array,
     return points, normal[picked] / (2 * areas[picked, None]), float(areas.sum())
 
 
-def _sky_irradiance(
-    sky: SkySpec,
-    geometry: Geometry,
-    points: Array,
-    normals: Array,
-    primitive_id: npt.NDArray[np.int64],
-    rays: int,
-) -> Array:
+def _sky_irradiance(sky: SkySpec, geometry: Geometry, at: Points, rays: int) -> Array:
+    points, normals, primitive_id = at
     total = np.zeros((len(points), 3))
     for direction in hemisphere(normals, rays):
         free = geometry.reached(points + 2 * geometry.extent * direction, points, primitive_id)

@@ -625,10 +625,6 @@ def test_a_default_that_is_not_installed_costs_its_figures_but_one_that_was_name
 
 
 def test_a_bundled_encoder_s_figures_come_with_a_warning(data, models, monkeypatch):
-    from dataclasses import replace
-
-    from attnwarp_eval.user_images import measure
-
     encoder = load_encoder(models["clip"])
     encoder.about = replace(encoder.about, name="clip-small", source="bundled")
     asked = []

@@ -27,8 +27,6 @@ from attnwarp_eval.stability.rendered import (
 CROSS = [(16, 16), (16, 17), (15, 16), (17, 18), (19, 16), (16, 13)]
 """Pixels around the middle of a picture of 33 x 33."""
 
-MP = "the renderer's formulas in mpmath with 50 digits, gradients by central differences"
-
 
 def _edge_on(tilt: float) -> Shot:
     angle = math.radians(tilt)

@@ -40,8 +40,6 @@ WARPS = ways("reference", "cpu")
 POSITION = Bound("px", 1e-4, "numerics of the warp; a thousandth of what a feature grid resolves")
 LOOSE = Bound("px", 1e-3, "the world's own coordinates are rounded before the warp reads them")
 
-MP = "pinhole projection in mpmath with 60 digits, from the stored poses and depths"
-
 
 @dataclass(frozen=True)
 class Pair:
