@@ -125,13 +125,13 @@ def mean(values: Iterable[float]) -> float:
 class Method(BaseModel):
     """Declaration of a method, as in a folder's ``method.json``.
 
-    ``seconds`` for all edits, as declared. ``editor_sha256`` and ``settings`` are written by
-    ``attnwarp-eval bench run``.
+    ``name`` is the folder's, unless declared; ``seconds`` for all edits, as declared.
+    ``editor_sha256`` and ``settings`` are written by ``attnwarp-eval bench run``.
     """
 
     model_config = ConfigDict(extra="forbid")
 
-    name: str = "a method without a name"
+    name: str = ""
     editor: str = ""
     track: Literal["same editor", "own editor", "warps"] = "own editor"
     seconds: float | None = Field(default=None, ge=0)
@@ -196,6 +196,12 @@ class Result(BaseModel):
         data = self.model_dump() | {"scores": [without_nan(asdict(s)) for s in self.scores]}
         text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
         write_atomic(path, text.encode())
+
+    @property
+    def remarks(self) -> list[str]:
+        """Faults of what was handed in, by scene and edit, and what was not handed in."""
+        said = [f"{s.scene}, {s.edit}: {text}" for s in self.scores for text in s.remarks]
+        return said + ([f"not handed in: {', '.join(self.missing)}"] if self.missing else [])
 
     @property
     def edits(self) -> list[str]:

@@ -61,7 +61,7 @@ EMPTY = (UNEDITED, COPIED, SMOOTHED) = "the source is unedited", "copies of the 
 
 def score(
     suite: Path, edited: Path, out: Path, report: Reporter = SILENT, *, key: Path | None = None
-) -> list[Score]:
+) -> Result:
     """Score a folder of edited pictures or of warps; what is done is kept in ``out``.
 
     Args:
@@ -78,6 +78,7 @@ def score(
     bench = Suite.read(suite)
     root = bench.open(suite, key)
     told = Method.read(edited / "method.json")
+    told = told.model_copy(update={"name": told.name or edited.resolve().name})
     folders = {
         (scene, edit["name"]): edited / scene / edit["name"]
         for scene in bench.scenes
@@ -112,7 +113,7 @@ def score(
         protocol=PROTOCOL, bench=bench.identity(), method=told, scores=scores, missing=missing
     )
     _write(out, result)
-    return scores
+    return result
 
 
 def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path, track: str) -> Score:
@@ -274,8 +275,6 @@ def _digest(truth: Path, spp: int, folder: Path, track: str) -> str:
 def _write(out: Path, result: Result) -> None:
     result.write(out / "bench-score.json")
     scores = result.scores
-    remarks = [f"{s.scene}, {s.edit}: {text}" for s in scores for text in s.remarks]
-    remarks += [f"not handed in: {', '.join(result.missing)}"] if result.missing else []
     heads, digits = heads_of(scores[0].edit), 3 if result.method.track == WARPS else 2
     rows = [
         [
@@ -293,5 +292,5 @@ def _write(out: Path, result: Result) -> None:
         " kept, since nothing at all has none."
     ]
     tables = [table(scores), *([warps.by_yaw(scores)] if told.track == WARPS else [])]
-    sections = [Section("Scores", remarks, tables), Section("By scene", tables=[each])]
+    sections = [Section("Scores", result.remarks, tables), Section("By scene", tables=[each])]
     write_files(Report(f"Scores of {told.name}", lead, sections), out, "bench-score")

@@ -92,11 +92,10 @@ def score(
         from attnwarp_eval.document.write import terminal
 
         with resumable(lambda: "finished edits are kept"):
-            scores = measure(folder, edited, out, report, key=key)
-    Console().print(terminal(of_scores(scores)))
-    for one in scores:
-        for remark in one.remarks:
-            typer.echo(f"{one.scene}, {one.edit}: {remark}", err=True)
+            result = measure(folder, edited, out, report, key=key)
+    Console().print(terminal(of_scores(result.scores)))
+    for remark in result.remarks:
+        typer.echo(remark, err=True)
     typer.echo(out / "bench-score.html")
 
 

@@ -64,7 +64,7 @@ def scored(bench, tmp_path, pictures, edit="some_colour", track=result.SAME):
         shutil.rmtree(tmp_path / "in")
     folder = handed_in(tmp_path / "in", {edit: pictures})
     (folder / "method.json").write_text(json.dumps({"track": track}))
-    (one,) = score.score(bench, folder, tmp_path / "out")
+    (one,) = score.score(bench, folder, tmp_path / "out").scores
     return one
 
 
@@ -300,7 +300,6 @@ def test_a_killed_export_goes_on_to_the_same_files(tmp_path):
 
 def test_the_commands_score_a_folder_and_print_its_page(bench, tmp_path):
     folder = handed_in(tmp_path, {"colour": true_pictures(bench, "colour", ["edited"] * 3)})
-    (folder / "method.json").write_text(json.dumps({"name": "truth"}))
     out = tmp_path / "out"
     done = CliRunner().invoke(app, ["bench", "score", str(bench), str(folder), "--out", str(out)])
     assert done.exit_code == 0, done.output
@@ -308,7 +307,8 @@ def test_the_commands_score_a_folder_and_print_its_page(bench, tmp_path):
     assert not [head for head in result.FIGURES.values() if head not in done.stdout]
     assert str(out / "bench-score.html") in done.stdout.replace("\n", "")
     page = (out / "bench-score.md").read_text()
-    assert "Scores of truth" in page and "not handed in: drawn-0/some_colour" in page
+    missing = "not handed in: drawn-0/some_colour"
+    assert f"Scores of {folder.name}" in page and missing in page and missing in done.stderr
 
 
 def true_warps(bench):
@@ -329,7 +329,7 @@ def scored_warps(bench, tmp_path, answers):
     folder.mkdir(parents=True)
     for view, arrays in answers.items():
         np.savez(folder / f"{view}.npz", **arrays)
-    (one,) = score.score(bench, tmp_path / "warps", tmp_path / "out")
+    (one,) = score.score(bench, tmp_path / "warps", tmp_path / "out").scores
     return one
 
 
@@ -358,6 +358,8 @@ def test_true_warps_have_no_error_and_planted_ones_have_theirs(bench, tmp_path):
     assert figures["warp.epe_p95"] < 1e-5 and figures["occlusion.precision"] == 1
     assert figures["occlusion.recall"] == figures["warp.coverage"] == pytest.approx(recall)
     assert figures["wrong"] == pytest.approx(wrong)
+    marked = {v: {"points": np.nan_to_num(a["points"], nan=-1)} for v, a in kept.items()}
+    assert scored_warps(bench, tmp_path, marked).figures["wrong"] == figures["wrong"]
 
 
 def test_figures_of_four_pixels_follow_by_hand():
@@ -396,6 +398,14 @@ def test_depth_leads_to_true_places_and_a_missing_view_has_no_answer(bench, tmp_
 def test_warps_without_merit_and_slips_of_convention_are_named(bench, tmp_path):
     true = true_warps(bench)
     own = np.stack(np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5), -1)
+
+    def turned(a):
+        """Places in the view, by the pixel of the source."""
+        column, row = a["points"][a["visible"]].astype(int).T
+        points = np.full_like(own, np.nan)
+        points[row, column] = own[a["visible"]]
+        return points
+
     everywhere, nowhere = np.ones((SIZE, SIZE), bool), np.zeros((SIZE, SIZE), bool)
     cases = {
         "everything is accepted": lambda a: a | {"visible": everywhere},
@@ -403,12 +413,15 @@ def test_warps_without_merit_and_slips_of_convention_are_named(bench, tmp_path):
         "every pixel lies at its own place": lambda a: {"points": own},
         "are x and y swapped": lambda a: a | {"points": a["points"][..., ::-1]},
         "do pixel centres lie at integers": lambda a: a | {"points": a["points"] - 0.5},
+        "is 0.5 added twice": lambda a: a | {"points": a["points"] + 0.5},
+        "are they displacements": lambda a: a | {"points": a["points"] - own},
+        "do they lead from the source": lambda a: {"points": turned(a)},
     }
     for said, spoil in cases.items():
         one = scored_warps(bench, tmp_path, {view: spoil(a) for view, a in true.items()})
         assert any(remark.startswith(said) for remark in one.remarks), said
         # A slip of 0.7 px is within the bound of 1 px, and tells in the end-point error alone.
-        assert one.figures["wrong"] > 0.1 or "integers" in said
+        assert one.figures["wrong"] > 0.1 or "0.5" in one.remarks[0]
 
 
 def test_arrays_of_another_size_type_or_unit_are_refused_by_name(bench, tmp_path):
@@ -418,7 +431,8 @@ def test_arrays_of_another_size_type_or_unit_are_refused_by_name(bench, tmp_path
         ({"points": points, "visible": points[..., 0]}, "visible: is float32 .* expected bool"),
         ({"points": points / SIZE}, "points: lie within 1; give pixels"),
         ({"depth": points}, "depth: is float32"),
-        ({"xy": points}, "has neither points nor depth"),
+        ({"visible": points[..., 0] > 9}, "has neither points nor depth"),
+        ({"points": points, "mask": points[..., 0] > 9}, "mask: is unknown, expected points"),
         ({"points": np.array([None])}, "is no .npz of arrays"),
     ):
         with pytest.raises(InputError, match=f"yaw010.npz: {message}"):
@@ -438,8 +452,14 @@ def test_our_warps_through_the_door_have_a_studys_figures(bench, tmp_path):
     cell = next(c for c in cells_of(loaded, scenes) if c.probe == "warp")
     record = compute(probe("warp"), cell, tmp_path)
     made, out = tmp_path / "made", tmp_path / "out"
+    run = ["run", str(bench), str(made), "--method", "warp", "--set", "preset=tolerant"]
+    stop = made / SCENE / "yaw030.npz"
+    stop.mkdir(parents=True)
+    assert CliRunner().invoke(app, ["bench", *run]).exit_code == 2
+    assert result.Method.read(made / "method.json").seconds > 0  # of the view that it finished
+    stop.rmdir()
     for call in (
-        ["run", str(bench), str(made), "--method", "warp", "--set", "preset=tolerant"],
+        run,
         ["score", str(bench), str(made), "--out", str(out)],
         ["table", str(out / "bench-score.json"), "--out", str(out)],
     ):
@@ -488,10 +508,10 @@ def walk(python, bench, folder, before=""):
     subprocess.run([python, "-c", script], cwd=folder, check=True, timeout=120)
     by_name = {}
     for name in ("alone", "edited"):
-        made = score.score(bench, folder / name, folder / f"out-{name}")
+        made = score.score(bench, folder / name, folder / f"out-{name}").scores
         assert [one.edit for one in made] == list(suite.EDITS)
         by_name[name] = made
-    (warped,) = score.score(bench, folder / "warps", folder / "out-warps")
+    (warped,) = score.score(bench, folder / "warps", folder / "out-warps").scores
     assert warped.remarks == [] and 0.1 < warped.figures["warp.coverage"] < 0.3
     points = np.load(folder / "warps" / SCENE / "yaw010.npz")["points"]
     assert points[7, 10].tolist() == [10.25, 7.25]  # a quarter of a pixel off its own place

@@ -160,7 +160,8 @@ def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path):
         ]
         done = CliRunner().invoke(app, call)
         assert done.exit_code == 2 and said in done.stderr
-    (one,) = (s for s in score.score(bench, out, tmp_path / "score") if s.edit == "colour")
+    scores = score.score(bench, out, tmp_path / "score").scores
+    (one,) = (s for s in scores if s.edit == "colour")
     # The ideal editor knows the only answer, and leaves the rest alone to the width of a token.
     assert one.figures["done"] == 1 and one.figures["outside"] < 1 and one.remarks == []
     place = out / "drawn-0" / "colour"

@@ -146,7 +146,7 @@ def test_a_sealed_bench_is_scored_with_its_key_alone(benches, tmp_path):
     (folder, key), (_, other) = benches
     true = key / SCENE / "truth" / "some_colour" / "blue"
     shutil.copytree(true, tmp_path / "in" / SCENE / "some_colour")
-    (one,) = score.score(folder, tmp_path / "in", tmp_path / "out", key=key)
+    (one,) = score.score(folder, tmp_path / "in", tmp_path / "out", key=key).scores
     # Of a thing that no pixel shows it is undefined: whatever the secret draws.
     assert not one.figures["error"] > 0
     places = [key / SCENE / "truth" / part / "yaw010" for part in ("source_pixel", "visible")]
@@ -154,7 +154,7 @@ def test_a_sealed_bench_is_scored_with_its_key_alone(benches, tmp_path):
     (tmp_path / "warps" / SCENE).mkdir(parents=True)
     points = np.load(places[0].with_suffix(".npy"))
     np.savez(tmp_path / "warps" / SCENE / "yaw010.npz", points=points, visible=visible)
-    (one,) = score.score(folder, tmp_path / "warps", tmp_path / "out", key=key)
+    (one,) = score.score(folder, tmp_path / "warps", tmp_path / "out", key=key).scores
     assert not one.figures["wrong"] > 0
     for given, message in (
         (None, "is sealed"), (other, "not the key of"), (tmp_path, "lacks .*key.json"),
