@@ -176,7 +176,7 @@ class Joint(Coder):
         self.factor, self.token = int(self.pipe.vae_scale_factor), self.token_of(config)
         self.side_multiple = self.factor * self.token
         self.schedule = self.flow(parts["scheduler"])
-        self._layers = self.layers_of(config)
+        self._layers = stack_layers(self.stacks, config, self.token - 1)
         self.block_sets = self.sets_of(self._layers)
         self._now: tuple[tuple[str, ...], Size] = ((), (0, 0))
 
@@ -247,11 +247,6 @@ class Joint(Coder):
     def token_of(cls, config: Mapping[str, Any]) -> int:
         """Compute the side of a token in latents: 1 or 2."""
         return TOKEN
-
-    @classmethod
-    def layers_of(cls, config: Mapping[str, Any]) -> tuple[Layer, ...]:
-        """List the layers of a network from its configuration."""
-        return stack_layers(cls.stacks, config, cls.token_of(config) - 1)
 
     @classmethod
     def sets_of(cls, layers: Sequence[Layer]) -> dict[str, tuple[int, ...]]:

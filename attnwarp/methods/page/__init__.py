@@ -75,7 +75,7 @@ def show_edit(
     """
     page = _Page(folder, cameras, images, before)
     # A method that edits views alone needs no control.
-    if editor is not None and not page.edits_alone:
+    if editor is not None and page.manifest["method"] != "by_view":
         views = [page.names.index(name) for name in page.shown]
         scene = Scene.checked(cameras, images, page.segments)
         edited_alone(folder, before, scene, editor, views, report)
@@ -128,11 +128,6 @@ class _Page:
         self.points = before.world_means()
         self.focus = focus_of(cameras, self.points)
         self.turn = orbit(cameras, self.points, first=self.first)
-
-    @property
-    def edits_alone(self) -> bool:
-        """True if the method edits each view alone."""
-        return bool(self.manifest["method"] == "by_view")
 
     def head(self, given: Sequence[str], origin: str) -> str:
         """Write the instruction, a summary of the run, warnings, and the origin of the inputs."""

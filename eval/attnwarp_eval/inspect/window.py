@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,6 @@ class Window:
         size: size of the window, in pixels.
 
     Attributes:
-        state: displayed state.
         picked: the report of the picked pixel or cell, or None.
         changed: callback after each change of the state.
 
@@ -90,7 +90,7 @@ class Window:
         self._insets: tuple[Any, ...] = ()
         self._large: dict[str, tuple[Any, Callable[[Any], Any]]] = {}
         self._lighter: dict[str, Any] = {}
-        self._sliders: dict[str, tuple[Any, Callable[[], int], Callable[[], str]]] = {}
+        self._sliders: dict[str, tuple[Any, str, Sequence[Any]]] = {}
         # PyVista wraps its methods in a way that mypy cannot follow.
         self.plotter: Any = self._plotter(off_screen, size)
         self._samples: int = self.plotter.render_window.GetMultiSamples()
@@ -264,20 +264,20 @@ class Window:
             self.pick(column, row)
 
     def _add_sliders(self) -> None:
-        choices: dict[str, tuple[Sequence[Any], Callable[[], Any], Callable[[Any], None]]] = {
-            "view": (self.targets, lambda: self.state.target, lambda v: self.show(target=v)),
-            "variant": (self.variants, lambda: self.state.variant, lambda v: self.show(variant=v)),
-            "layer": (self.layers, lambda: self.state.layer, lambda v: self.show(layer=v)),
-            "step": (self.steps, lambda: self.state.step, lambda v: self.show(step=v)),
+        choices: dict[str, tuple[str, Sequence[Any]]] = {
+            "view": ("target", self.targets),
+            "variant": ("variant", self.variants),
+            "layer": ("layer", self.layers),
+            "step": ("step", self.steps),
         }
-        choices = {name: choice for name, choice in choices.items() if len(choice[0]) > 1}
+        choices = {name: choice for name, choice in choices.items() if len(choice[1]) > 1}
         width = 0.66 / len(choices) if choices else 0.0
-        for number, (name, (values, current, change)) in enumerate(choices.items()):
+        for number, (name, (field, values)) in enumerate(choices.items()):
             left = 0.3 + number * width
             slider = self.plotter.add_slider_widget(
-                _changing(values, current, change),
+                partial(self._slide, field, values),
                 (0, len(values) - 1),
-                value=list(values).index(current()),
+                value=values.index(getattr(self.state, field)),
                 title=name,
                 fmt="",
                 pointa=(left, 0.07),
@@ -290,17 +290,20 @@ class Window:
             )
             # VTK's key i would hide it.
             slider.KeyPressActivationOff()
-            self._sliders[name] = (
-                slider,
-                _index(values, current),
-                _title(name, current),
-            )
+            self._sliders[name] = slider, field, values
         self._move_sliders()
 
+    def _slide(self, field: str, values: Sequence[Any], number: float) -> None:
+        chosen = values[round(number)]
+        if chosen != getattr(self.state, field):
+            self.show(**{field: chosen})
+
     def _move_sliders(self) -> None:
-        for slider, index, title in self._sliders.values():
-            slider.GetRepresentation().SetValue(index())
-            slider.GetRepresentation().SetTitleText(plain(title()))
+        for name, (slider, field, values) in self._sliders.items():
+            value = getattr(self.state, field)
+            shown = layer_name(value) if field == "layer" else value
+            slider.GetRepresentation().SetValue(values.index(value))
+            slider.GetRepresentation().SetTitleText(plain(f"{name}: {shown}"))
 
     # --- drawing
 
@@ -520,25 +523,6 @@ def plain(text: str, most: int = 120) -> str:
 
 def _next(names: Sequence[Any], current: Any, by: int = 1) -> Any:
     return names[(names.index(current) + by) % len(names)]
-
-
-def _changing(
-    values: Sequence[Any], current: Callable[[], Any], change: Callable[[Any], None]
-) -> Callable[[float], None]:
-    def slide(value: float) -> None:
-        chosen = values[round(value)]
-        if chosen != current():
-            change(chosen)
-
-    return slide
-
-
-def _index(values: Sequence[Any], current: Callable[[], Any]) -> Callable[[], int]:
-    return lambda: list(values).index(current())
-
-
-def _title(name: str, current: Callable[[], Any]) -> Callable[[], str]:
-    return lambda: f"{name}: {layer_name(current()) if name == 'layer' else current()}"
 
 
 def layer_name(layer: Size | None) -> str:
