@@ -38,11 +38,10 @@ APART = 0.8
 def drawing(
     path: Path, columns: int = 1, height: float = 3.4, *, rows: int = 1, width: float | None = None
 ) -> Iterator[list[Axes]]:
-    """A figure of ``rows`` x ``columns`` axes, row by row, saved on leaving without a date or
-    random ids.
+    """A figure of ``rows`` x ``columns`` axes, row by row, saved as SVG on leaving without a date
+    or random ids.
 
     Args:
-        path: path of the SVG.
         height, width: height and width of the whole figure, in inches; 5.4 a column if ``width`` is
             left out.
 

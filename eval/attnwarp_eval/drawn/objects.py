@@ -456,7 +456,6 @@ def body(word: str, instance: int, *, plain: bool = False, resolution: int = 64)
         word: a key of :data:`RECIPES`.
         instance: the same number gives the same shape.
         plain: without the details' colours, as for a statue.
-        resolution: resolution of the meshing lattice.
     """
     rng = np.random.default_rng([instance, *word.encode()])
     parts = RECIPES[word](Dice(rng))

@@ -106,7 +106,6 @@ class Edit:
     Attributes:
         path: folder of the edit.
         views: names of the edited target views.
-        settings: settings of the edit's warp.
         steps: "before", the stages, and "edited" once the edit is done.
     """
 

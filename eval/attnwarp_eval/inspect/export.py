@@ -52,7 +52,6 @@ def write_export(path: Path, subject: Subject, state: State, picked: Any = None)
     Args:
         path: ends in .html (a page that needs no network), .glb (coloured surface, frusta with
             their pictures, splats, rays) or .vtp (the surface with every number of its pixels).
-        subject, state: subject, and the displayed state.
         picked: the report of a picked pixel or cell, or None.
 
     Raises:

@@ -249,7 +249,6 @@ class Part:
     Attributes:
         name: name of the part; a part of the same name is replaced.
         key: inputs of the part; a part with an unchanged key is not redrawn.
-        mesh: function that makes the mesh.
         color: "#rrggbb", or None for the mesh's own ``colors``.
         picture: function that makes the (H, W, 3) sRGB texture, if any.
         opacity: in [0, 1].

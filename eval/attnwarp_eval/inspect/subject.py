@@ -55,7 +55,6 @@ class Subject:
             splats.
         targets: names of the views.
         capture: the user's capture, without truth.
-        edit: edit of the user's capture.
         measured: measured figures of a run's variants, where they edit the scene or fit splats to
             it.
         elsewhere: advice on the file to open for an edited view without pictures in the run; empty

@@ -57,7 +57,6 @@ def refit(
 
     Args:
         splats: splats of the scene before the edit.
-        cameras: cameras of the V views.
         sets: V pictures each, (H, W, 3) sRGB in [0, 1] of their cameras' sizes. All sets are
             fitted at once, in little more time than one.
         held: numbers of the views that are held out from the fit.

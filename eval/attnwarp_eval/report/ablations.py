@@ -42,7 +42,6 @@ class Row:
 
     Attributes:
         variant, metric: names of the variant and the metric.
-        specification: specification of the metric.
         difference: difference of the variant from the baseline.
         p: p-value adjusted over the table, or over the claims if a claim makes this comparison.
         claim: claim that makes this comparison, if any.

@@ -38,8 +38,6 @@ class JudgedClaim:
     """A claim, its measurement in a run, and the verdict.
 
     Attributes:
-        claim: claim.
-        measured: measurement of the run.
         agreement: numbers of views with the expected sign, and of all views.
         here: result on the run's scenes.
         below_floor: number of scenes in which both sides disagree less than true views.

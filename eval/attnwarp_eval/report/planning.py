@@ -88,7 +88,6 @@ class Cost:
     """Cost of the cells to do.
 
     Attributes:
-        hours: hours of one worker.
         gigabytes: added to the run's folder.
         unknown: number of cells of unmeasured kinds; ``hours`` and ``gigabytes`` exclude them.
     """

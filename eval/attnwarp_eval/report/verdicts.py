@@ -35,10 +35,8 @@ class Judged:
     """Claim with its verdict over all studies.
 
     Attributes:
-        claim: claim.
         judged: judged claim; None if its study has no raw results, or lacks a side.
         time: ratio of the last side's seconds to the first one's, taken in turn; a dash without.
-        report: folder of the report.
         by_answers: description of the difference for edits with several right answers and with one,
             if the study has both.
         context: the claim's sentence on other variants, filled in.

@@ -215,7 +215,6 @@ def export(
     unfinished export.
 
     Args:
-        scene: a scene.
         folder: output folder, created if missing.
         views, size: number of views, and the edge of their images in px.
         points, noise, seed: as for :func:`first_points`.

@@ -188,7 +188,6 @@ class Outcome:
     Attributes:
         required: whether the level must hold.
         error: error in the bound's unit; infinite if the result is not finite, NaN if refused.
-        tolerance: tolerance in the same unit.
         refusal: message of the refusal, else empty.
         must_refuse: whether the input had to be refused.
     """

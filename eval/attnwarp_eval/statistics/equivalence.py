@@ -188,7 +188,6 @@ class PairedTest:
 
     Attributes:
         difference, error: difference and standard error, as shares of the mean.
-        p: two-sided p-value.
     """
 
     difference: float

@@ -96,7 +96,6 @@ class Work:
         root: the run's folder.
         scene_world: world of the scene at the study's size; None for a probe that needs no
             scenes.
-        meter: meter of seconds and counters.
         views, pictures: results so far.
     """
 

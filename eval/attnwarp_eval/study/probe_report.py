@@ -48,7 +48,6 @@ class ProbeReport:
     and decorated by :func:`register_report`. It measures nothing.
 
     Attributes:
-        name: name of the probe.
         columns: columns of the table of variants, title -> metric; ``{layer}`` stands for a feature
             grid. Without any, every metric of the probe under its name. Metrics with a ``column``
             in the registry follow them.
@@ -190,7 +189,6 @@ def side_by_side(
 
     Args:
         probe, variants: probe and variants of the pictures; variants are the rows.
-        content: content of the pictures.
         scene: scene of the pictures; the first one with pictures if this has none.
         first: label of a leading row -> its content, the same for all variants.
     """

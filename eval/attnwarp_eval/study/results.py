@@ -90,7 +90,6 @@ class Results:
 
     Attributes:
         cells: one entry for each expected cell, in the study's order.
-        failures: the table of failed cells.
         notices: notices to the reader, by scene.
     """
 

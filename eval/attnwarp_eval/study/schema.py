@@ -161,7 +161,6 @@ class AnswerPictures(Part):
         probe: probe that draws the pictures, by default the main probe.
         scene: scene of the pictures; the first one with pictures if this has none.
         first: label of a leading row -> its content, the same for all variants.
-        content: content of the variants' rows.
     """
 
     caption: str

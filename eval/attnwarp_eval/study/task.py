@@ -19,7 +19,6 @@ class Task(Generic[T]):
     """Unit of work whose record is a cell of a folder.
 
     Attributes:
-        title: title for the progress display.
         spec: all inputs that decide the result, and no others.
         compute: function that computes the rest of the record, as JSON.
         read: function from record to result; a record that it refuses is computed again.

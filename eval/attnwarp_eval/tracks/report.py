@@ -179,7 +179,6 @@ class Page:
         Args:
             path: path of the splats. Its folder names them; views of the folder's ``held_out`` were
                 held out of the fit.
-            splats: the splats.
             presets: names of the warp's settings.
             apart: distances between the views of a pair.
             truth: name of the scene that the capture is an export of.

@@ -67,7 +67,6 @@ class Inputs:
             :func:`attnwarp_eval.user_images.consistency.measure_consistency`.
         depth: folder of depth maps, for it; scores: its file of scores.
         background: sRGB in [0, 1] behind transparent pixels of pictures.
-        colmap: whether COLMAP reconstructs the views.
     """
 
     renders: Path | None = None

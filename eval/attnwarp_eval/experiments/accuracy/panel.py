@@ -36,7 +36,6 @@ class Panel:
 
     Attributes:
         question: "pictures", "depth" or "visibility".
-        scene: name of the scene.
         contestants: the baseline first; none if the scene has nothing to measure.
         again: seconds of the baseline's second run of each round.
         squares: squared error of each round, by contestant ("pictures" only).

@@ -81,7 +81,6 @@ class Job:
         gaussians: the scene before the edit.
         cameras: cameras of the views, the source first; all of one size (H, W).
         images: (H, W, 3) sRGB in [0, 1], the views before the edit.
-        editor: editor of single views.
         instruction: in words; a description of the result for an editor that is guided by depth.
         settings: return value of the method's ``settings``.
         folder: for the method's files; removed afterwards.
