@@ -21,6 +21,7 @@ from string import Template
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from attnwarp.errors import InputError
@@ -308,8 +309,8 @@ def _write_scene(
         report.step(0, 0, f"{place.name}: {edit['name']}")
         truth = edit_truth(str(path), size, spp, edit["name"], tuple(views))
         for view in views:
-            mask = np.repeat(255 * truth.union[view][..., None].astype(np.uint8), 3, axis=2)
-            write_picture(place / "masks" / edit["name"] / f"{view}.png", mask)
+            mask = 255 * truth.union[view].astype(np.uint8)
+            _write_grey(place / "masks" / edit["name"] / f"{view}.png", mask)
             for answer, pictures in truth.answers.items():
                 path_of = root / "truth" / edit["name"] / answer / f"{view}.png"
                 write_picture(path_of, to_bytes(pictures[view]))
@@ -347,10 +348,14 @@ def _write_geometry(root: Path, of: World, view: str) -> None:
     pair = of.between(of.source.name, view)
     shown = np.full(pair.label.shape, 128, np.uint8)
     shown[pair.visible], shown[pair.unseen] = 255, 0
-    write_picture(
-        root / "truth" / "visible" / f"{view}.png", np.repeat(shown[..., None], 3, axis=2)
-    )
+    _write_grey(root / "truth" / "visible" / f"{view}.png", shown)
     _write_array(root / "truth" / "source_pixel" / f"{view}.npy", pair.xy.astype(np.float32))
+
+
+def _write_grey(path: Path, image: npt.NDArray[np.uint8]) -> None:
+    import cv2
+
+    write_atomic(path, bytes(cv2.imencode(".png", image)[1]))
 
 
 def _write_array(path: Path, array: Any) -> None:

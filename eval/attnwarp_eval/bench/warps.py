@@ -184,8 +184,8 @@ def _remarks(points: Points, visible: Mask, true: Points) -> list[str]:
         points, visible: answers of several views.
         true: exact positions of what is visible, else NaN.
     """
-    remarks = ["everything is accepted"] if visible.all() else []
-    remarks += [] if visible.any() else ["nothing is accepted"]
+    remarks = ["everything is kept"] if visible.all() else []
+    remarks += [] if visible.any() else ["nothing is kept"]
     own = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in points.shape[2:0:-1])), axis=-1)
     moved = np.abs(points - own)[~np.isnan(points)]
     if moved.size and moved.max() < 1e-3:
