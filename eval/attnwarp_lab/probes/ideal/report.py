@@ -146,14 +146,15 @@ def _drift(results: Results, layout: Layout) -> Section:
                 name: {shift: over_scenes(by[shift]) for shift in sorted(by)}
                 for name, by in found.items()
             }
-            series = [charts.Line(name, list(by), list(by.values())) for name, by in means.items()]
-            charts.lines(axes, series, x="planted shift, px", y=title, title=title.split(":")[0])
             shifts = sorted({shift for by in means.values() for shift in by})
             alone = next(iter(found.values()))
             gains = {
-                name: {shift: paired(alone.get(shift, {}), by[shift]) for shift in by}
+                name: {shift: paired(alone.get(shift, {}), by[shift]) for shift in sorted(by)}
                 for name, by in found.items()
             }
+            series = [charts.Line(name, list(by), list(by.values())) for name, by in gains.items()]
+            editor, _, what = title.partition(": ")
+            charts.lines(axes, series, x="planted shift, px", y=f"gain: {what}", title=editor)
             count = len(results.study.scenes)
             rows = [
                 [
@@ -174,6 +175,6 @@ def _drift(results: Results, layout: Layout) -> Section:
         " difference from the first row at the same shift, paired by scene. A shifted picture shows"
         " background and other parts at a part's place, so views alone agree more by chance too."
     )
-    picture = Picture("figures/drift.svg", "Agreement by the drift of the editor.")
+    picture = Picture("figures/drift.svg", "Gain over views alone, by the drift of the editor.")
     title = "How much drift does each method stand?"
     return Section(title, [text], tables, [picture], leads=True)
