@@ -52,6 +52,21 @@ def test_a_bullet_has_the_means_of_the_raw_results(study, figure, variants, sent
     assert sentence.format(*means).replace("%", " %") in README
 
 
+def test_the_bullet_on_editors_that_move_the_picture_has_what_is_lost_of_the_gain():
+    def lost(method, shift):
+        gains = [
+            mean("drift-study", *SEEN, f"{method}, ideal, {px} px")
+            - mean("drift-study", *SEEN, f"each view alone, ideal, {px} px")
+            for px in (0, shift)
+        ]
+        return 100 * (1 - gains[1] / gains[0])
+
+    warped, extended = "attention warping", "extended"
+    assert f"[{lost(warped, 2):.0f} %](reports/drift-study/report.md) of its gain" in README
+    assert f"`extended` {lost(extended, 2):.0f} %; one of 8 px costs" in README
+    assert f"costs them {lost(warped, 8):.0f} and {lost(extended, 8):.0f} %" in README
+
+
 def test_the_bullet_on_photographs_has_the_medians_of_the_tracks():
     files = [
         json.loads((ROOT / f"reports/tracks/bear-{kind}dgs.json").read_text()) for kind in "23"
