@@ -65,7 +65,7 @@ FIGURES = {
 
 WARP_FIGURES = {
     "wrong": "wrong or not kept",
-    "warp.epe_median": "end-point error, px",
+    "warp.epe_median": "median end-point error, px",
     "warp.epe_p95": "its 95th percentile, px",
     "warp.below_1px": "visible within 1 px",
     "warp.coverage": "visible with a position",
@@ -290,8 +290,9 @@ def compare(results: Sequence[Result]) -> Report:
     lead = [
         f"{_bench(first.bench)} Means over scenes; from six scenes on with their 95 % intervals."
         " The last column is the difference, paired by scene, from the first method with the same"
-        " editor, else from the first of all. Less is better; disagreement is read beside the"
-        " change of the source."
+        " editor, else from the first of all. Less is better."
+        + " Disagreement is read beside the change of the source."
+        * bool(tracks[OWN])
     ]
     if remarks:
         sections.append(Section("Remarks", ["\n".join(remarks)]))
