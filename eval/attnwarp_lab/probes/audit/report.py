@@ -35,8 +35,8 @@ and below which it is blind to it."""
 ALARM = 0.05
 """Share of right pairs without highlights that lie above the threshold for false alarms."""
 
-LEAST_ARMS = 4
-"""Smallest number of real edits of a scene whose order is compared."""
+LEAST_ARMS = 3
+"""Smallest number of edits of a scene by one editor whose order is compared."""
 
 Values = dict[str, list[float]]
 
@@ -61,6 +61,9 @@ class Pairs:
         given = [Figure(key, key.partition(".")[2].partition(".")[2], "scores") for key in scores]
         self.rows = [r for r in (*given, *FIGURES) if f"{r.key}.{RIGHT[0]}" in first]
         self.arms = list(records[0][1].spec["arms"])
+        self.by_editor: dict[str, list[str]] = {}
+        for arm, spec in records[0][1].spec["arms"].items():
+            self.by_editor.setdefault(str(spec.get("editor")), []).append(arm)
         self._kept: dict[tuple[object, ...], Auroc] = {}
 
     @cached_property
@@ -184,13 +187,14 @@ class Pairs:
         return interval(shares, level=level)
 
     def tau(self, row: Figure, truth: Figure) -> Interval:
-        """Kendall's rank correlation of a figure with the true disagreement of a scene's real
-        edits, both means over the pairs up to :data:`NEAR` degrees.
+        """Kendall's rank correlation of a figure with the true disagreement of a scene's edits by
+        one editor, both means over the pairs up to :data:`NEAR` degrees; mean over the editors,
+        whose edits differ too much for one list.
         """
         found: Values = {}
-        for scene, record in self.records:
+        for (scene, record), arms in product(self.records, self.by_editor.values()):
             means = np.array(
-                [[self._mean(record, one, arm) for arm in self.arms] for one in (row, truth)]
+                [[self._mean(record, one, arm) for arm in arms] for one in (row, truth)]
             )
             known = np.isfinite(means).all(axis=0)
             if known.sum() >= LEAST_ARMS:
@@ -351,9 +355,10 @@ def _answer(results: Results, pairs: Pairs) -> Section:
     if pairs.arms:
         text.insert(
             1,
-            f"**tau**: Kendall's rank correlation, within a scene, of {len(pairs.arms)} real edits"
-            " by a figure with their true disagreement: colour above its floor at exact"
-            " correspondences, labels and parts that show the same right answer.",
+            f"**tau**: Kendall's rank correlation, within a scene and an editor, of"
+            f" {' and '.join(str(len(arms)) for arms in pairs.by_editor.values())} edits by a"
+            " figure with their true disagreement: colour above its floor at exact correspondences,"
+            " labels and parts that show the same right answer. Mean over the editors.",
         )
     if pairs.scenes < len(results.study.scenes):
         text.insert(0, f"**Measured on {pairs.scenes} of {len(results.study.scenes)} scenes.**")
