@@ -109,8 +109,8 @@ class IdealReport(ProbeReport):
         columns = [*names, *next(iter(found.values()))]
         text = [
             (
-                "An editor that repairs whatever it can tell to be wrong. Damage by wrong features"
-                " is a lower bound for a real one, and no difference means: below a part's size."
+                "An editor that repairs whatever it can tell to be wrong; a real one may repair"
+                " less. No difference means: below a part's size."
                 " Alone, with fresh noise, answers come alike often and agree by chance."
             ),
             *self.problems(results),
@@ -172,8 +172,10 @@ def _drift(results: Results, layout: Layout) -> Section:
     text = (
         "An editor that moves every picture it edits by this shift, each view in a direction of its"
         f" own; pictures are of {results.study.size} px. Warps assume that it stays. **Gain**: the"
-        " difference from the first row at the same shift, paired by scene. A shifted picture shows"
-        " background and other parts at a part's place, so views alone agree more by chance too."
+        " difference from the first row at the same shift, paired by scene; less is better of dE00."
+        " A shifted picture shows background and other parts at a part's place, so views alone"
+        " agree more by chance too. Only edits whose source shows a right answer count, so rows"
+        " stand on different scenes. Of fewer than six a bracket holds the least and the most."
     )
     picture = Picture("figures/drift.svg", "Gain over views alone, by the drift of the editor.")
     title = "How much drift does each method stand?"
