@@ -194,7 +194,7 @@ class Result(BaseModel):
     def write(self, path: Path) -> None:
         """Write as JSON, undefined figures as null."""
         data = self.model_dump() | {"scores": [without_nan(asdict(s)) for s in self.scores]}
-        text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        text = json.dumps(data, ensure_ascii=False, allow_nan=False) + "\n"
         write_atomic(path, text.encode())
 
     @property

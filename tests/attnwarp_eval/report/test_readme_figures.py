@@ -74,6 +74,24 @@ def test_the_bullet_on_editors_that_move_the_picture_has_what_is_lost_of_the_gai
     assert "8 px cost {:.0f} % and {:.0f} %".format(*large) in README
 
 
+def test_the_bullet_on_metrics_counts_the_scenes_in_which_a_blurred_set_scores_higher():
+    def higher(flaw):
+        scenes = defaultdict(list)
+        for one in cells("audit"):
+            if one["cell"]["probe"] == "audit":
+                values = one["record"]["views"][0]["metrics"]
+                right, blurred = (
+                    values[f"consistency.fitted_psnr.fitted.{name}"] for name in ("right", flaw)
+                )
+                scenes[one["cell"]["scene"]].append(blurred > right)
+        return sum(map(all, scenes.values())), len(scenes)
+
+    told = "Edit PSNR scores higher than the right edit in {} of {} scenes if one view"
+    assert told.format(*higher("blur=1")) in README
+    all_blurred, scenes = higher("blur_all=2")
+    assert all_blurred == scenes and "and in all if every view is blurred by 2 px" in README
+
+
 def test_the_bullet_on_photographs_has_the_medians_of_the_tracks():
     files = [
         json.loads((ROOT / f"reports/tracks/bear-{kind}dgs.json").read_text()) for kind in "23"
