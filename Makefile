@@ -19,7 +19,7 @@ GATE := build/gate
 # Where LLVM is installed, each process of the tests would compile Mitsuba's integrators. The tests of LLVM choose their own variant.
 test test-all: export ATTNWARP_MITSUBA ?= scalar_rgb
 
-.PHONY: demo test test-all gate baseline bench docs lint checks kernels kernels-float64 measured venv clean
+.PHONY: demo test test-all gate baseline bench docs lint checks kernels kernels-float64 measured venv clean count
 
 ## an edit carried, what the mask is for, accuracy against time: runs/demo/report.html
 demo:
@@ -84,6 +84,10 @@ kernels-float64: lint
 build/collected.txt: .venv/.installed-dev | kernels-float64
 	@mkdir -p build
 	@$(BIN)/python -m pytest --collect-only -qq > $@ || { tail -60 $@; rm $@; exit 1; }
+
+## lines of code by package, without docstrings, comments and blank lines
+count:
+	@python3 scripts/count_code.py
 
 venv:
 	@scripts/venv.sh
