@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import numbers
 import sys
@@ -14,6 +15,9 @@ from attnwarp.errors import suggest
 
 if TYPE_CHECKING:
     import torch
+
+MOST_LISTED = 12
+"""Number of allowed names up to which an error lists them beside the nearest."""
 
 Array: TypeAlias = "torch.Tensor | np.ndarray[Any, Any]"
 """Array of torch or numpy."""
@@ -211,10 +215,24 @@ def text(value: Any, name: str) -> None:
 
 
 def one_of(value: str, allowed: Sequence[str], name: str) -> str:
-    """Return ``value`` if it is among ``allowed``, else raise ValueError listing them."""
+    """Return ``value`` if it is among ``allowed``, else raise ValueError listing them. Of many,
+    those nearest to a misspelt one are listed.
+
+    Example:
+        >>> from attnwarp import check
+        >>> check.one_of("a_0", ["a0", *map(str, range(40))], "setting")
+        Traceback (most recent call last):
+        ValueError: setting: got 'a_0'; did you mean 'a0'? It is none of the 41 names
+    """
     if value not in allowed:
-        raise ValueError(
-            f"{name}: got {value!r}, expected one of {', '.join(map(repr, allowed))}"
-            f"{suggest(str(value), allowed)}"
-        )
+        raise ValueError(f"{name}: got {value!r}{_expected(str(value), allowed)}")
     return value
+
+
+def _expected(word: str, allowed: Sequence[str]) -> str:
+    """Write which names are allowed."""
+    near = difflib.get_close_matches(word, allowed)
+    if near and len(allowed) > MOST_LISTED:
+        names = " or ".join(map(repr, near))
+        return f"; did you mean {names}? It is none of the {len(allowed)} names"
+    return f", expected one of {', '.join(map(repr, allowed))}{suggest(word, allowed)}"
