@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import types
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -80,14 +81,29 @@ class Settings:
     def changed(self: S, **changes: Any) -> S:
         """Copy the settings with some fields changed.
 
+        Args:
+            changes: fields by name. For a field that holds settings itself, a dictionary changes
+                the fields it names and keeps the others, as ``**{"field.name": value}`` does.
+
         Raises:
             ValueError: a field is unknown, or a value is out of range; the message names the field.
         """
-        _check_names(type(self), changes)
-        return replace(self, **changes)  # type: ignore[type-var]
+        values: dict[str, Any] = {}
+        for key, value in changes.items():
+            name, dot, inner = key.partition(".")
+            _check_names(type(self), [name])
+            before = values.get(name, getattr(self, name))
+            change = {inner: value} if dot else value
+            if isinstance(change, dict) and isinstance(before, Settings):
+                values[name] = before.changed(**{str(k): v for k, v in change.items()})
+            elif dot:
+                raise ValueError(f"{name}: got {before!r}, expected its fields by name")
+            else:
+                values[name] = change
+        return replace(self, **values)  # type: ignore[type-var]
 
 
-def _check_names(kind: Any, data: dict[str, Any]) -> None:
+def _check_names(kind: Any, data: Iterable[str]) -> None:
     for name in data:
         check.one_of(name, [field.name for field in fields(kind)], "setting")
 

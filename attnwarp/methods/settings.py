@@ -706,7 +706,8 @@ def preset(method: str, name: str | None = None, /, **changes: Any) -> Any:
     Args:
         method: key of :data:`attnwarp.methods.METHODS`.
         name: name of a preset of the method; the method's default if omitted.
-        changes: fields of the method's settings; ``warp.NAME`` is a field of the warp's settings.
+        changes: fields of the method's settings. ``warp`` as a dictionary changes the fields of the
+            warp's settings that it names, ``warp.NAME`` one.
 
     Raises:
         ValueError: an unknown method, preset or field, or a value out of range; the message names
@@ -718,19 +719,10 @@ def preset(method: str, name: str | None = None, /, **changes: Any) -> Any:
         3000
         >>> preset("attention_warping", stages=1, **{"warp.opaque": 0.9}).warp.opaque
         0.9
+        >>> preset("attention_warping", "released", warp={"opaque": 0.9}).warp.depth
+        'center'
     """
     check.one_of(method, list(PRESETS), "method")
     named = next(iter(PRESETS[method])) if name is None else name
     check.one_of(named, list(PRESETS[method]), "preset")
-    settings = PRESETS[method][named]
-    values: dict[str, Any] = {}
-    for key, value in changes.items():
-        group, _, field = key.rpartition(".")
-        if group != "warp":
-            values[key] = value
-            continue
-        before = values.get("warp", getattr(settings, "warp", None))
-        if not isinstance(before, WarpSettings):
-            raise ValueError(f"warp: got {before!r}, expected its fields by name")
-        values["warp"] = before.changed(**{field: value})
-    return settings.changed(**values)
+    return PRESETS[method][named].changed(**changes)

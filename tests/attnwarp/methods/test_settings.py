@@ -83,6 +83,23 @@ def test_extended_is_corrected_with_ideas_beyond_the_paper():
     assert PRESETS["extended"] == replace(PRESETS["corrected"], **ideas)
 
 
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ([("warp", {"opaque": 0.9})], {"opaque": 0.9}),
+        ([("warp.opaque", 0.9)], {"opaque": 0.9}),
+        ([("warp", {"opaque": 0.9}), ("warp.normal_angle", 30)], {"opaque": 0.9, "normal_angle": 30}),
+        ([("warp.normal_angle", 30), ("warp", {"opaque": 0.9})], {"opaque": 0.9, "normal_angle": 30}),
+        ([("warp", {})], {}),
+    ],
+    ids=["dict", "dotted", "dict then dotted", "dotted then dict", "empty"],
+)  # fmt: skip
+def test_a_dictionary_changes_the_fields_that_it_names(changes, expected):
+    released = PRESETS["released"]
+    for changed in (preset("released", **dict(changes)), released.changed(**dict(changes))):
+        assert changed == replace(released, warp=replace(released.warp, **expected))
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_settings_survive_json(name):
     text = json.dumps(PRESETS[name].to_dict())
@@ -114,7 +131,10 @@ def test_shares_of_the_steps_are_those_that_begin_within(steps, shares, numbers)
         ({"start": (5, 3)}, "start: got \\[5, 3\\]"),
         ({"start": (700, 1000)}, "start: got \\[700, 1000\\], .* in \\[0, 999\\]"),
         ({"stagse": 1}, "did you mean 'stages'"),
+        ({"a_0": 1}, r"setting: got 'a_0'; did you mean 'a0'\?.{,40}$"),
         ({"warp.opaqe": 1}, "did you mean 'opaque'"),
+        ({"warp": {"opaqe": 1}}, "did you mean 'opaque'"),
+        ({"a0.opaque": 1}, "a0: got 0.9, expected its fields by name"),
         ({"mask": 1}, "mask: got 1, expected true or false"),
         ({"sources": 0}, "sources: got 0, expected a whole number >= 1"),
         (

@@ -189,13 +189,16 @@ def scene_seed(study: Study, scene: str, seed: int) -> int:
 
 def settings_of(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
     """Settings of a variant's method: a preset, the study's fields, the variant's, and the
-    fields of its warp.
+    fields of its warp. A dictionary changes the fields that it names.
 
     Raises:
         ValueError: an unknown preset or field, or a value out of range.
     """
     own, shared = variant.part(VariantPart), study.part(EditingPart).editing.options
-    fields = {**shared, **own.options}
+    fields = dict(shared)
+    for key, value in own.options.items():
+        both = isinstance(value, dict) and isinstance(fields.get(key), dict)
+        fields[key] = {**fields[key], **value} if both else value
     if "seed" in fields:
         raise ValueError("options.seed: the seeds are the study's own; set seeds there")
     presets = (own.options.get("preset"), variant.preset, fields.pop("preset", None))

@@ -7,6 +7,7 @@ from tiny_scenes import cameras, pictures, splats
 from attnwarp.editing.small import load_editor
 from attnwarp.encoders import load_encoder
 from attnwarp.methods import Budget
+from attnwarp.warp import WarpSettings
 from attnwarp_eval.study import parse_study
 from attnwarp_eval.study.shared import edits
 from attnwarp_eval.study.shared.editing_methods import EDITING_METHODS, Donor, Job
@@ -81,3 +82,14 @@ def test_a_variant_has_the_preset_of_its_method_that_it_names(method, name, expe
     )
     settings = edits.settings_of(study, study.variants["v"], 0)
     assert {key: settings[key] for key in expected} == expected
+
+
+def test_a_variants_dictionary_changes_the_studys():
+    study = parse_study({
+        "name": "one", "scenes": ["bear"], "editing": {"options": {"warp": {"opaque": 0.9}}},
+        "variants": {"v": {"options": {"warp": {"normal_angle": 30}}, "set": {"depth": "center"}}},
+        "probes": {"editing": ["v"]},
+    })  # fmt: skip
+    warp = edits.settings_of(study, study.variants["v"], 0)["warp"]
+    given = {"opaque": 0.9, "normal_angle": 30, "depth": "center"}
+    assert warp == {**WarpSettings().to_dict(), **given}
