@@ -29,8 +29,8 @@ pixels for steeper rays."""
 ROUND_TRIP = 0.01
 """Largest round-trip error of a border pixel, undistorted and distorted again, in px."""
 
-FOLD_GRID = 200
-"""Number of points per axis in the search for folds; the search takes milliseconds."""
+RAYS, STEPS = 200, 200
+"""Rays to each border of the picture, and points on each, in the search for folds."""
 
 
 INVERTED = 1e-9
@@ -124,9 +124,9 @@ class Lens:
         """
         target = np.asarray(xy, dtype=np.float64)
         if self.kind == "fisheye":
-            # Newton's method in the angle alone, starting at the angle without coefficients.
+            # Newton's method in the angle alone.
             r = np.linalg.norm(target, axis=-1)
-            theta = np.minimum(r, STEEPEST)
+            theta = self._before_fold(r)
             for _ in range(50):
                 slope = (self._angle(theta + 1e-6) - self._angle(theta - 1e-6)) / 2e-6
                 slope = np.where(np.abs(slope) > 1e-6, slope, 1.0)
@@ -139,9 +139,10 @@ class Lens:
             cut = (r > ends[1]) & bool(ends[1] > ends[0]) & (theta >= STEEPEST)
             found = (left <= INVERTED * (1 + r)) | cut
             return np.where(found[..., None], target * factor[..., None], np.nan)
-        # Newton's method, starting from the inverse of the radial terms before their first fold:
-        # a start at the target may converge beyond a fold.
-        point = self._unrolled(target)
+        length = np.linalg.norm(target, axis=-1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            factor = np.where(length > 0, self._before_fold(length) / length, 1.0)
+        point = target * factor[..., None]
         for _ in range(50):
             here, dx, dy, det = self._linear(point)
             error = here - target
@@ -188,17 +189,16 @@ class Lens:
         k1, k2, _, _, k3, k4, k5, k6 = self.coefficients
         return (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
 
-    def _unrolled(self, target: Array) -> Array:
-        """Invert the radial terms by a table up to their first fold."""
-        r = np.linspace(0, np.tan(STEEPEST), RADII)
+    def _before_fold(self, length: Array) -> Array:
+        """Invert the radial terms by a table up to their first fold, the start of Newton's method:
+        a start at the target may converge beyond a fold. Gives angles for a fisheye lens.
+        """
+        r = np.linspace(0, STEEPEST if self.kind == "fisheye" else np.tan(STEEPEST), RADII)
         with np.errstate(invalid="ignore", divide="ignore"):
-            shown = r * self._radial(r * r)
+            shown = self._angle(r) if self.kind == "fisheye" else r * self._radial(r * r)
             rising = np.diff(shown) > 0
         end = RADII if rising.all() else 1 + int(np.argmin(rising))
-        length = np.linalg.norm(target, axis=-1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            factor = np.where(length > 0, np.interp(length, shown[:end], r[:end]) / length, 1.0)
-        return target * factor[..., None]
+        return np.interp(length, shown[:end], r[:end])
 
     def _angle(self, theta: Array) -> Array:
         k1, k2, k3, k4 = self.coefficients
@@ -218,7 +218,8 @@ def undistorted_camera(camera: Camera, lens: Lens) -> Camera:
         high as the distorted one.
 
     Raises:
-        ValueError: the coefficients fold the picture over, so that no inverse exists.
+        ValueError: the coefficients fold the picture over, so that no inverse exists, or no window
+            without a blank pixel exists.
 
     Example:
         >>> from attnwarp.io import Lens, undistorted_camera
@@ -240,18 +241,24 @@ def undistorted_camera(camera: Camera, lens: Lens) -> Camera:
         error = np.abs(_pixels(camera, lens.distort(point)) - side).max(axis=-1)
         if not (steep | (error <= ROUND_TRIP)).all():
             raise _folded(camera, lens)
+    # The inverse of a border pixel may lie beyond two folds, even on the axis' other side, where
+    # the picture is no longer mirrored: the whole way there is searched.
+    ends = np.concatenate([point[:: max(1, len(point) // RAYS)] for point in points])
+    if lens.folds(ends * np.linspace(0, 1, STEPS)[:, None, None]).any():
+        raise _folded(camera, lens)
     left, right, top, bottom = (_pixels(camera, point) for point in points)
     cx, cy = camera.K[0, 2], camera.K[1, 2]
     x0, x1 = _window(left[:, 0].max(), right[:, 0].min(), cx, W)
     y0, y1 = _window(top[:, 1].max(), bottom[:, 1].min(), cy, H)
+    if x1 <= x0 or y1 <= y0:
+        raise ValueError(
+            f"lens: the coefficients {lens.coefficients} bend the borders of the picture of camera"
+            f" {camera.name!r} so far that no window without a blank pixel is left; calibrate the"
+            " lens again"
+        )
     K = camera.K.copy()
     K[:2, 2] -= [x0, y0]
-    target = Camera(K, camera.world_to_camera, x1 - x0, y1 - y0, camera.name)
-    # A border beyond a fold may still be valid.
-    grid = [np.linspace(0.5, n - 0.5, min(n, FOLD_GRID)) for n in (target.width, target.height)]
-    if lens.folds(target.directions(np.stack(np.meshgrid(*grid), -1))[..., :2]).any():
-        raise _folded(camera, lens)
-    return target
+    return Camera(K, camera.world_to_camera, x1 - x0, y1 - y0, camera.name)
 
 
 def _folded(camera: Camera, lens: Lens) -> ValueError:
@@ -334,4 +341,4 @@ def _window(low: float, high: float, center: float, size: int) -> tuple[int, int
         # Cropped first from the side that is farther from the principal point.
         cut = int(np.clip(round((spare + (center - first) - (last - center)) / 2), 0, spare))
         first, last = first + cut, last - (spare - cut)
-    return first, max(last, first + 1)
+    return first, last

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from attnwarp import Camera
+from attnwarp.cli.main import app
 from attnwarp.errors import InputError
 from attnwarp.fit import load_views
 from attnwarp.io import (
@@ -180,6 +182,52 @@ def test_a_fold_inside_the_picture_is_refused_where_only_the_border_has_an_inver
         assert focal < 1000
         with pytest.raises(ValueError, match="fold the picture"):
             undistorted_camera(camera, lens)
+
+
+def first_turn(k):
+    """Where r (1 + k1 r^2 + ...), or an angle's polynomial, turns first."""
+    slope = [0.0] * (2 * len(k) + 1)
+    slope[::2] = [(2 * i + 1) * c for i, c in enumerate((1.0, *k))]
+    roots = np.roots(slope[::-1])
+    return min(roots[(abs(roots.imag) < 1e-9) & (roots.real > 0)].real, default=np.inf)
+
+
+@pytest.mark.parametrize("kind", ["brown", "fisheye"])
+def test_a_picture_is_undistorted_if_and_only_if_its_corners_lie_before_the_first_turn(kind):
+    """Beyond a second turn, or on the other side of the axis, a border has an inverse again."""
+    rng, kept, refused = np.random.default_rng(4), 0, 0
+    while min(kept, refused) < 20:
+        k = tuple(rng.normal(0, 1, 2) * rng.choice([0.1, 1, 3]))
+        focal, corner = rng.uniform(15, 90), np.hypot(31.5, 23.5)
+        camera = Camera(np.array([[focal, 0, 32], [0, focal, 24], [0, 0, 1]]), np.eye(4), *SIZE)
+        turn = first_turn(k)
+        if turn > (1.4 if kind == "fisheye" else np.tan(1.4)):
+            continue  # beyond the steepest rays of a picture
+        largest = turn * (1 + k[0] * turn**2 + k[1] * turn**4)
+        if abs(corner / focal - largest) < 0.02:
+            continue  # too near to tell
+        lens = Lens(kind, k if kind == "fisheye" else (*k, 0.0, 0.0))
+        if corner / focal > largest:
+            refused += 1
+            with pytest.raises(ValueError, match=r"fold the picture of camera '' over"):
+                undistorted_camera(camera, lens)
+            continue
+        kept += 1
+        target = undistorted_camera(camera, lens)
+        radius = np.linalg.norm(target.directions()[..., :2], axis=-1).max()
+        assert (np.arctan(radius) if kind == "fisheye" else radius) < turn
+        assert target.width > 16 and target.height > 16
+
+
+def test_a_lens_that_folds_is_refused_by_the_command_with_the_cameras_name(tmp_path):
+    data = constant_pictures(tmp_path / "in", ["a.png"], reds=(0,))
+    frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist()}
+    # r (1 - 0.7 r^2 - 0.9 r^4) turns at 0.56; the corner of 64 x 48 px lies at 0.8.
+    top = {"w": 64, "h": 48, "fl_x": 50.0, "k1": -0.7, "k2": -0.9, "frames": [frame]}
+    (data.image_paths[0].parent / "transforms.json").write_text(json.dumps(top))
+    done = CliRunner().invoke(app, ["undistort", str(tmp_path / "in"), str(tmp_path / "out")])
+    assert done.exit_code == 2 and "fold the picture of camera '0.png'" in done.stderr
+    assert not (tmp_path / "out/images").exists()
 
 
 def test_a_wide_fisheye_is_cut_to_twice_its_size():
