@@ -57,7 +57,7 @@ def poses(
 def _names(pictures: Path, out: Path, each_camera: bool) -> list[str]:
     """Names of the photographs of a folder, checked before the work."""
     from attnwarp.io import image_size
-    from attnwarp.io.file import check_other
+    from attnwarp.io.file import check_other, visible
     from attnwarp.io.images import IMAGE_SUFFIXES, orientation
 
     if not pictures.is_dir():
@@ -66,7 +66,7 @@ def _names(pictures: Path, out: Path, each_camera: bool) -> list[str]:
         check_other(own, pictures, "the folder of photographs")
     if (out / "transforms.json").exists():
         raise InputError(f"{out}: holds a capture; name another --out, or remove it")
-    paths = sorted(p for p in pictures.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+    paths = [p for p in visible(pictures.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES]
     if len(paths) < LEAST:
         raise InputError(
             f"{pictures}: holds {len(paths)} pictures ({', '.join(IMAGE_SUFFIXES[:3])} and the like"

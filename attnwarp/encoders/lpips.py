@@ -24,6 +24,7 @@ from attnwarp.devices import device_of
 from attnwarp.encoders._weights import full_float32, sha256_of, state_of
 from attnwarp.encoders.base import EncoderInfo, Image, checked_pairs
 from attnwarp.errors import InputError
+from attnwarp.io.file import visible
 
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
@@ -232,7 +233,7 @@ def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
     if place.is_file():
         files = [place]
     elif place.is_dir():
-        files = sorted(p for p in place.iterdir() if p.suffix in SUFFIXES and p.is_file())
+        files = [p for p in visible(place.iterdir()) if p.suffix in SUFFIXES and p.is_file()]
     else:
         files = []
     if not files:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp.io.dataset import Dataset, Missing, nearest_rotation, with_images
-from attnwarp.io.file import FileFormatError
+from attnwarp.io.file import FileFormatError, visible
 from attnwarp.io.find import FileFinder
 from attnwarp.io.images import image_size
 from attnwarp.io.text import read_text
@@ -62,7 +62,7 @@ def read_blendedmvs(path: str | os.PathLike[str], *, missing_images: Missing = "
     path = Path(path)
     if not is_blendedmvs(path):
         raise FileNotFoundError(f"{path}: no scene of BlendedMVS ({CAMERAS} and {IMAGES}) is there")
-    files = sorted((path / CAMERAS).glob(f"*{SUFFIX}"))
+    files = visible((path / CAMERAS).glob(f"*{SUFFIX}"))
     if not files:
         raise FileFormatError(path / CAMERAS, f"holds no camera, expected files *{SUFFIX}")
     finder = FileFinder(path / IMAGES)

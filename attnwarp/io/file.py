@@ -9,7 +9,7 @@ import platform
 import re
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 from typing import BinaryIO
@@ -157,6 +157,18 @@ def write_atomically(
             error.filename = str(path)
         temporary.unlink(missing_ok=True)
         raise
+
+
+def visible(paths: Iterable[Path]) -> list[Path]:
+    """Sort the paths of a listing, without hidden ones.
+
+    macOS writes ``._a.jpg`` beside ``a.jpg`` on disks of other systems and into archives.
+
+    Example:
+        >>> [path.name for path in visible([Path("b.jpg"), Path("._a.jpg"), Path("a.jpg")])]
+        ['a.jpg', 'b.jpg']
+    """
+    return sorted(path for path in paths if not path.name.startswith("."))
 
 
 ABANDONED_SECONDS = 24 * 3600

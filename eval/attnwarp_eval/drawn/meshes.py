@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.errors import InputError
+from attnwarp.io.file import visible
 from attnwarp_eval.drawn.draft import SATURATED, Thing, index, marks
 from attnwarp_eval.drawn.scenes import SceneDraft
 from attnwarp_eval.drawn.worlds import COLORS, Look
@@ -33,7 +34,7 @@ def mesh_files(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError(f"meshes: there is no folder {folder}")
-    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES)
+    found = [path for path in visible(folder.iterdir()) if path.suffix.lower() in MESH_SUFFIXES]
     if not found:
         raise InputError(f"meshes: {folder} has no mesh; expected {', '.join(MESH_SUFFIXES)}")
     return found

@@ -34,6 +34,9 @@ def corner():
 def test_photographs_become_a_capture_and_one_of_another_place_is_named(corner, tmp_path):
     pytest.importorskip("pycolmap")
     save(tmp_path / "photographs", [*corner, textured_corner.picture(1, CAMERAS[0])])
+    # What macOS and Windows put beside them.
+    for name in ("._IMG_0.jpg", ".DS_Store", "Thumbs.db"):
+        (tmp_path / "photographs" / name).write_bytes(bytes.fromhex("0005160700020000"))
     done = poses(tmp_path / "photographs", "--out", tmp_path / "capture")
     assert done.exit_code == 0, done.output
     assert "1 of 7 photographs have no pose, and are left out: IMG_6.jpg" in done.stderr

@@ -34,6 +34,7 @@ def placed(request, tmp_path_factory):
         (folder / f"{name}.pth").write_bytes(
             (tiny_models.linear_layers() / f"{name}.pth").read_bytes()
         )
+    (folder / f"._{BACKBONES[request.param].file}").write_bytes(b"\0\5\x16\7")  # of macOS
     return folder, network, request.param
 
 

@@ -32,6 +32,11 @@ def picture(folder, name, width, height):
     (folder / name).write_bytes(encode_picture(np.full((height, width, 3), 90, np.uint8), ".jpg"))
 
 
+def apple_double(path):
+    """Write the file that macOS puts beside another one (RFC 1740: its number and version)."""
+    path.with_name(f"._{path.name}").write_bytes(bytes.fromhex("0005160700020000") + bytes(18))
+
+
 def scaled_folders(root, cameras, scales=(1, 2, 4, 8)):
     for scale in scales:
         for camera in cameras:
@@ -78,7 +83,9 @@ def mipnerf360(root, cameras):
 
 
 def blendedmvs(root, cameras):
-    """BlendedMVS: MVSNet's cameras, images with and without background, depth maps."""
+    """BlendedMVS: MVSNet's cameras, images with and without background, depth maps, and what macOS
+    writes beside them.
+    """
     (root / "cams").mkdir(parents=True)
     for k, camera in enumerate(cameras):
         rows = lambda M: "\n".join(" ".join(f"{v:.17g}" for v in row) for row in M)  # noqa: E731
@@ -87,6 +94,8 @@ def blendedmvs(root, cameras):
         )
         picture(root / "blended_images", f"{k:08d}.jpg", W, H)
         picture(root / "blended_images", f"{k:08d}_masked.jpg", W, H)
+        apple_double(root / "cams" / f"{k:08d}_cam.txt")
+        apple_double(root / "blended_images" / f"{k:08d}.jpg")
     (root / "cams" / "pair.txt").write_text("3\n0\n2 1 9.0 2 8.0\n")
     (root / "rendered_depth_maps").mkdir()
 

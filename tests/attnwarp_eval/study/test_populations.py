@@ -94,6 +94,7 @@ def test_meshes_of_a_folder_stand_upright_on_drawn_ground(tmp_path, monkeypatch)
     box = trimesh.creation.box((2.0, 6.0, 2.0)).apply_translation((5, 40, -3))
     box.export(models / "tower.obj")  # y is up
     trimesh.creation.cone(radius=0.5, height=3.0).export(models / "cone.stl")  # z is up
+    (models / "._tower.obj").write_bytes(b"\0\5\x16\7")  # macOS' own
     path = tmp_path / "mine.yaml"
     path.write_text(STUDY.replace("{drawn: 3, generator: 1,", "{meshes: models, n: 3,"))
     study = load_study(str(path))
