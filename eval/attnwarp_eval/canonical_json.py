@@ -7,11 +7,15 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from attnwarp.errors import InputError
+from attnwarp.io.text import read_text
 from attnwarp_eval.files import write_atomic
+
+T = TypeVar("T")
 
 
 def canonical_json(value: Any) -> str:
@@ -55,3 +59,29 @@ def write_json(path: Path, value: Any, *, sort_keys: bool = True, durable: bool 
     """
     text = json.dumps(value, indent=1, sort_keys=sort_keys, allow_nan=False) + "\n"
     write_atomic(path, text.encode(), durable=durable)
+
+
+def read_as(kind: type[T], path: Path, remedy: str) -> T:
+    """Read a JSON file as a model or dataclass of pydantic.
+
+    Args:
+        kind: class of the content.
+        path: path of the file.
+        remedy: what to do about a bad file, in words.
+
+    Raises:
+        InputError: the file is missing, no JSON, or an entry is missing, unknown or wrong.
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        return TypeAdapter(kind).validate_json(read_text(path))
+    except OSError as error:
+        why = "is missing" if isinstance(error, FileNotFoundError) else str(error.strerror)
+    except UnicodeDecodeError:
+        why = "is no text"
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the file"
+        why = f"{place}: {first['msg']}"
+    raise InputError(f"{path}: {why}; {remedy}")

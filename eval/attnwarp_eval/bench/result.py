@@ -29,15 +29,13 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
-    ValidationError,
     ValidationInfo,
     field_validator,
 )
 from pydantic.dataclasses import dataclass
 
 from attnwarp.errors import InputError
-from attnwarp.io.text import read_text
-from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.canonical_json import read_as, without_nan
 from attnwarp_eval.document.model import Report, Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES
 from attnwarp_eval.files import write_atomic
@@ -146,7 +144,8 @@ class Method(BaseModel):
         Raises:
             InputError: an unknown key or a value of another kind.
         """
-        return _validated(cls, path) if path.is_file() else cls()
+        remedy = "mend or remove it; docs/measuring/bench.md has its keys"
+        return read_as(cls, path, remedy) if path.is_file() else cls()
 
     def begun(self, out: Path) -> Method:
         """Write the declaration to a folder to hand in; return the one that is there already.
@@ -189,7 +188,7 @@ class Result(BaseModel):
         Raises:
             InputError: no such file, or of another format.
         """
-        return _validated(cls, path)
+        return read_as(cls, path, "make it with attnwarp-eval bench score")
 
     def write(self, path: Path) -> None:
         """Write as JSON, undefined figures as null."""
@@ -211,17 +210,6 @@ class Result(BaseModel):
     def values(self, edit: str, figure: str) -> dict[str, float]:
         """A figure by scene."""
         return {s.scene: s.figures[figure] for s in self.scores if s.edit == edit}
-
-
-def _validated(kind: Any, path: Path) -> Any:
-    try:
-        return kind.model_validate_json(read_text(path))
-    except FileNotFoundError:
-        raise InputError(f"{path}: is missing; make it with attnwarp-eval bench score") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "the file"
-        raise InputError(f"{path}: {place}: {first['msg']}; see docs/measuring/bench.md") from None
 
 
 def bounded(value: Interval, figure: str, sign: str = "") -> str:

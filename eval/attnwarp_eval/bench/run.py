@@ -7,7 +7,6 @@ leaves names the editor by its files' digest, and the method's settings.
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Mapping
 from importlib import import_module
@@ -18,12 +17,11 @@ import numpy as np
 
 from attnwarp import check
 from attnwarp.io import read_dataset, read_image, read_ply, write_ply
-from attnwarp.io.text import read_text
 from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.reporting import SILENT, Part, Reporter
 from attnwarp_eval.bench import EDITORS, warps
 from attnwarp_eval.bench.result import SAME, Method
-from attnwarp_eval.bench.suite import Suite, to_bytes
+from attnwarp_eval.bench.suite import Edit, Suite, to_bytes
 from attnwarp_eval.files import write_picture
 from attnwarp_eval.plugins import load_plugins
 from attnwarp_eval.study.shared.controls import SCENE_STEP
@@ -81,17 +79,17 @@ def run(
     )  # fmt: skip
     told = told.begun(out)
     for number, scene in enumerate(bench.scenes):
-        for edit in json.loads(read_text(suite / scene / "edits.json"))["edits"]:
-            place = out / scene / edit["name"]
+        for edit in bench.edits(suite, scene):
+            place = out / scene / edit.name
             if all((place / f"{view}.png").is_file() for view in bench.views):
                 continue
-            report.step(number, len(bench.scenes), f"{scene}, {edit['name']}")
+            report.step(number, len(bench.scenes), f"{scene}, {edit.name}")
             job_settings = with_source_words(
-                {**settings, "seed": seed + SCENE_STEP * number}, edit["source"]
+                {**settings, "seed": seed + SCENE_STEP * number}, edit.source
             )
             truth = None
             if editor in EDITORS or of.needs_truth:
-                truth = bench.truth(bench.open(suite, key), scene, edit["name"])[1]
+                truth = bench.truth(bench.open(suite, key), scene, edit.name)[1]
             part = Part(report, number, len(bench.scenes))
             seconds = _edit(suite / scene, place, edit, method, editor, job_settings, truth, part)
             told = told.model_copy(update={"seconds": (told.seconds or 0) + seconds})
@@ -102,7 +100,7 @@ def run(
 def _edit(
     scene: Path,
     place: Path,
-    edit: Mapping[str, Any],
+    edit: Edit,
     method: str,
     editor: str,
     settings: dict[str, Any],
@@ -125,7 +123,7 @@ def _edit(
         loaded = getattr(import_module(module), function)(images, truth, settings["steps"])
     else:
         loaded = load_editor(editor)
-    words = edit["target" if loaded.guide == "depth" else "instruction"]
+    words = edit.target if loaded.guide == "depth" else edit.instruction
     answers = {} if truth is None else truth.answers
     splats = read_ply(scene / "splats.ply")
     with tempfile.TemporaryDirectory() as folder:

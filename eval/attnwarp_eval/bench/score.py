@@ -16,6 +16,7 @@ from scipy.ndimage import binary_erosion
 from attnwarp.colors import ciede2000, to_lab
 from attnwarp.errors import InputError
 from attnwarp.io import read_image, read_ply
+from attnwarp.io.file import inside
 from attnwarp.io.text import read_text
 from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.reporting import SILENT, Reporter
@@ -80,13 +81,13 @@ def score(
     told = Method.read(edited / "method.json")
     told = told.model_copy(update={"name": told.name or edited.resolve().name})
     folders = {
-        (scene, edit["name"]): edited / scene / edit["name"]
+        (scene, edit.name): inside(edited, f"{scene}/{edit.name}")
         for scene in bench.scenes
-        for edit in json.loads(read_text(suite / scene / "edits.json"))["edits"]
+        for edit in bench.edits(suite, scene)
     }
     if warps.handed_in(bench, edited):
         told = told.model_copy(update={"track": WARPS})
-        folders = {(scene, WARPS): edited / scene for scene in bench.scenes}
+        folders = {(scene, WARPS): inside(edited, scene) for scene in bench.scenes}
     given = {pair: folder for pair, folder in folders.items() if folder.is_dir()}
     if not given or (told.track == WARPS) != (next(iter(given))[1] == WARPS):
         example = edited / bench.scenes[0]
@@ -266,7 +267,8 @@ def _power(one: Image, two: Image, where: npt.NDArray[np.bool_]) -> float:
 
 
 def _digest(truth: Path, spp: int, folder: Path, track: str) -> str:
-    files = sorted(path for path in folder.iterdir() if path.suffix in (".png", ".ply", ".npz"))
+    held = (path for path in folder.iterdir() if path.suffix in (".png", ".ply", ".npz"))
+    files = sorted(inside(folder, path.name) for path in held)
     parts = [str(PROTOCOL), track, read_text(truth), str(spp)]
     parts += [f"{path.name}:{hashlib.sha256(path.read_bytes()).hexdigest()}" for path in files]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()

@@ -14,22 +14,26 @@ import json
 import os
 import secrets
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 from scipy.spatial.transform import Rotation
 
 from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import Dataset, read_image, write_ply, write_transforms
+from attnwarp.io.file import inside
 from attnwarp.io.text import read_text
 from attnwarp.process import core_count
 from attnwarp.reporting import SILENT, Part, Reporter, duration
+from attnwarp_eval.canonical_json import read_as
 from attnwarp_eval.drawn.asked import BRIGHT
 from attnwarp_eval.drawn.draft import GENERATOR
 from attnwarp_eval.drawn.files import to_text
@@ -40,8 +44,9 @@ from attnwarp_eval.splats.export import first_points
 from attnwarp_eval.study.shared.edit_truth import EditTruth, answers_of, edit_truth
 from attnwarp_eval.world import World, splats, world
 
-FORMAT = 1
+FORMAT: Final = 1
 FILE = "bench.json"
+EDITS_FILE = "edits.json"
 
 EDITS = ("colour", "some_colour")
 """Edits of each scene: one right answer, and several."""
@@ -65,11 +70,47 @@ TIME = 946_684_800
 """Time of a sealed bench's files, 2000-01-01 UTC: the real ones would tell how long each took."""
 
 
-@dataclass(frozen=True)
+STRICT = ConfigDict(extra="forbid")
+AGAIN = "export or copy the bench again"
+
+Name = Annotated[str, Field(pattern=r"^[\w-][\w .-]*$")]
+"""Name of a file or folder in a bench from elsewhere: one that does not lead out of its folder."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class Edit:
+    """An edit in a scene's ``edits.json``.
+
+    Attributes:
+        name: its name.
+        instruction: what to do, in words.
+        source: what the scene shows before.
+        target: what it shows after.
+        answers: number of right answers.
+    """
+
+    name: Name
+    instruction: str
+    source: str
+    target: str
+    answers: int
+
+
+@dataclass(frozen=True, config=STRICT)
+class Edits:
+    """A scene's ``edits.json``: the names of its views, the source first, and its edits."""
+
+    views: tuple[Name, ...]
+    source: Name
+    edits: tuple[Edit, ...]
+
+
+@dataclass(frozen=True, config=STRICT)
 class Suite:
     """Definition of a bench, as in its ``bench.json``.
 
     Attributes:
+        format: version of the layout.
         seed: seed of the drawn scenes; None if sealed.
         size: edge of the pictures, px.
         spp: samples per pixel.
@@ -79,11 +120,12 @@ class Suite:
         sealed: salted hashes of all right answers, sorted; empty if open.
     """
 
+    format: Literal[1]
     seed: int | None
-    size: int
-    spp: int
-    scenes: tuple[str, ...]
-    views: tuple[str, ...]
+    size: Annotated[int, Field(ge=16, le=1024)]
+    spp: Annotated[int, Field(ge=1)]
+    scenes: Annotated[tuple[Name, ...], Field(min_length=1)]
+    views: Annotated[tuple[Name, ...], Field(min_length=2)]
     files: Mapping[str, str]
     sealed: tuple[str, ...] = ()
 
@@ -97,15 +139,24 @@ class Suite:
         path = folder / FILE
         if not path.is_file():
             raise InputError(f"{folder}: is no bench, which has a {FILE}; export one first")
-        data = json.loads(read_text(path))
-        if data.pop("format", None) != FORMAT:
-            raise InputError(f"{path}: is of another version; export the bench again")
-        data |= {name: tuple(data[name]) for name in ("scenes", "views", "sealed")}
-        suite = cls(**data)
+        suite = read_as(cls, path, AGAIN)
         for name, digest in suite.files.items():
-            if not (folder / name).is_file() or _sha256(folder / name) != digest:
-                raise InputError(f"{folder / name}: is missing or changed; export the bench again")
+            path = inside(folder, name)
+            if not path.is_file() or _sha256(path) != digest:
+                raise InputError(f"{path}: is missing or changed; {AGAIN}")
         return suite
+
+    def edits(self, folder: Path, scene: str) -> tuple[Edit, ...]:
+        """Read a scene's edits.
+
+        Raises:
+            InputError: the file is damaged, or names other views than the bench.
+        """
+        path = folder / scene / EDITS_FILE
+        of_scene = read_as(Edits, path, AGAIN)
+        if of_scene.views != self.views:
+            raise InputError(f"{path}: has other views than {folder / FILE}; {AGAIN}")
+        return of_scene.edits
 
     def identity(self) -> dict[str, Any]:
         """Entries that decide the scenes; results with equal ones can be compared."""
@@ -201,12 +252,12 @@ def export(
         if found["asked"] != asked:
             raise InputError(f"{root / name}: has other settings; name another folder")
         files |= found["files"]
-        views = tuple(json.loads(read_text(folder / name / "edits.json"))["views"])
+        views = read_as(Edits, folder / name / EDITS_FILE, AGAIN).views
     words = _datasheet(count, None if sealed else seed, len(views), size)
     write_atomic(folder / "README.md", words.encode())
     hashes = _salted(root, scenes, seed) if sealed else ()
-    suite = Suite(None if sealed else seed, size, spp, scenes, views, files, hashes)
-    text = json.dumps({"format": FORMAT, **asdict(suite)}, indent=1) + "\n"
+    suite = Suite(FORMAT, None if sealed else seed, size, spp, scenes, views, files, hashes)
+    text = json.dumps(asdict(suite), indent=1) + "\n"
     write_atomic(folder / FILE, text.encode())
     if sealed:
         for path in (*folder.rglob("*"), folder):
@@ -320,7 +371,7 @@ def _write_scene(
         for edit in data["edits"]
     ]
     text = json.dumps({"views": views, "source": views[0], "edits": edits}, indent=1) + "\n"
-    write_atomic(place / "edits.json", text.encode())
+    write_atomic(place / EDITS_FILE, text.encode())
 
 
 def fitted_splats(dataset: Dataset, folder: Path, report: Reporter = SILENT) -> Gaussians:

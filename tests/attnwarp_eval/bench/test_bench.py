@@ -1,5 +1,6 @@
 """Oracles: the same pictures in a study, true pictures and pictures spoiled on purpose, COLMAP's own reader."""
 
+import hashlib
 import json
 import math
 import re
@@ -261,6 +262,54 @@ def test_a_missing_view_is_said_and_a_wrong_size_or_damage_refused(bench, tmp_pa
     (copy / SCENE / "edits.json").write_text("{}")
     with pytest.raises(InputError, match="missing or changed"):
         score.score(copy, tmp_path / "in", tmp_path / "out")
+
+
+def given_away(bench, tmp_path, file, text):
+    """A copy of the bench with another file in it, whose hash fits."""
+    copy = tmp_path / "given"
+    shutil.copytree(bench, copy)
+    (copy / file).write_text(text)
+    held = json.loads((copy / suite.FILE).read_text())
+    if file in held["files"]:
+        held["files"][file] = hashlib.sha256(text.encode()).hexdigest()
+        (copy / suite.FILE).write_text(json.dumps(held))
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("file", "name", "place"),
+    [
+        (f"{SCENE}/edits.json", '"colour"', "edits.0.name"),
+        (suite.FILE, f'"{SCENE}"', "scenes.0"),
+        (suite.FILE, '"source"', "views.0"),
+    ],
+)
+def test_a_bench_from_elsewhere_writes_in_the_folder_named_alone(
+    bench, tmp_path, file, name, place
+):
+    text = (bench / file).read_text().replace(name, '"../../../evil"', 1)
+    copy = given_away(bench, tmp_path, file, text)
+    handed_in(tmp_path / "in", {"colour": true_pictures(bench, "colour", ["edited"] * 3)})
+    for call in (["run", "--method", "by_view", "--set", "steps=1"], ["score"]):
+        out = ["--out", str(tmp_path / "out")] if call == ["score"] else []
+        done = CliRunner().invoke(
+            app, ["bench", call[0], str(copy), str(tmp_path / "in"), *call[1:], *out]
+        )
+        assert done.exit_code == 2 and place in done.stderr, done.output
+    assert not list(tmp_path.parent.glob("evil*")) and not list(tmp_path.rglob("evil*"))
+
+
+def test_a_hand_in_that_links_out_of_its_folder_is_refused(bench, tmp_path):
+    pictures = true_pictures(bench, "colour", ["edited"] * 3)
+    place = handed_in(tmp_path / "in", {"colour": pictures}) / SCENE / "colour"
+    (place / "source.png").unlink()
+    (place / "source.png").symlink_to(bench / SCENE / "truth" / "colour" / "edited" / "source.png")
+    with pytest.raises(InputError, match=r"source.png'?: leads out of"):
+        score.score(bench, tmp_path / "in", tmp_path / "out")
+    shutil.rmtree(place)
+    place.symlink_to(bench / SCENE / "truth" / "colour" / "edited")
+    with pytest.raises(InputError, match="leads out of"):
+        score.score(bench, tmp_path / "in", tmp_path / "out")
 
 
 def test_an_export_goes_on_where_it_was_and_keeps_other_settings_out(bench, tmp_path):
