@@ -85,8 +85,10 @@ class Features:
                     f" {_in_words(guidance)}"
                 )
 
-    def check_batches(self, stages: Sequence[int], *, further: bool) -> None:
-        """Refuse, before any work, source branches that a later batch lacks."""
+    def check_batches(self, stages: Sequence[int], *, further: bool, attends: bool) -> None:
+        """Refuse, before any work, source branches that a later batch lacks, and any difference of
+        branches if views attend to the source.
+        """
         if not self.layers:
             return
         s = self.settings
@@ -98,6 +100,14 @@ class Features:
         guidances |= {f"stage {number + 1}": s.guidance(number) for number in stages}
         for name, guidance in guidances.items():
             branches = self.branches(guidance)
+            source = self.source_guidance(further=False)
+            if attends and branches != self.branches(source):
+                raise ValueError(
+                    f"unseen: attends to the source, which has {', '.join(self.branches(source))}"
+                    f" at {_in_words(source)}, but at {_in_words(guidance)} {name} has"
+                    f" {', '.join(branches)}; set unseen to 'free', or choose another"
+                    " text_guidance, source_text_guidance or guidance_drop"
+                )
             # A further source also records the branches named by the settings.
             needs_all = name == "a further source" and s.branches is not None
             for keep in recorded:

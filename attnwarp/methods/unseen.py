@@ -95,11 +95,6 @@ def attending(
             return own
         source = kept.by_pass[name][number].to(tokens)
         branches, views = len(source), len(unseen)
-        if len(tokens) != branches * views:
-            raise ValueError(
-                f"unseen: the source has {branches} guidance branches and the views"
-                f" {len(tokens) / views:g}; give both one text guidance"
-            )
         others = source[:, None].expand(-1, views, -1, -1).flatten(0, 1)
         # Tokens attend one by one, so those that are seen in every view are left out.
         asked = share.any(dim=0)[:, 0].nonzero()[:, 0]

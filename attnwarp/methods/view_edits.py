@@ -215,7 +215,9 @@ class ViewEdits:
 
     def check_stages(self, stages: int) -> None:
         """Refuse, before any work, branches that a stage lacks."""
-        self.features.check_batches(range(stages), further=len(self.sources) > 1)
+        self.features.check_batches(
+            range(stages), further=len(self.sources) > 1, attends=self.attends
+        )
 
     def notes(self, stages: int) -> list[str]:
         """Describe settings that the views or the editor limit, one line each."""

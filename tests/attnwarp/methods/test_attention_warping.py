@@ -803,6 +803,15 @@ def test_arguments_that_do_not_fit_are_named(scene, editor):
             },
             "text guidance 1.5 a further source has text, uncond; choose",
         ),
+        (
+            {"unseen": "attend", "source_text_guidance": 1.5},  # s_T = s_I
+            "unseen: .* source, which has text, uncond .* stage 1 has text, image, uncond; set",
+        ),
+        (
+            # As many branches each, of which one differs.
+            {"unseen": "attend", "image_guidance": 0.0, "source_text_guidance": 0.0, "text_guidance": 1.0},
+            "unseen: .* at text guidance 0, but at text guidance 1 stage 1 has",
+        ),
     ],
 )
 def test_settings_that_an_edit_cannot_have_are_refused_before_any_work(
@@ -810,8 +819,9 @@ def test_settings_that_an_edit_cannot_have_are_refused_before_any_work(
 ):
     def refused():
         with pytest.raises(ValueError, match=message):
-            run(scene, editor, tmp_path, replace(QUICK, **changes))
+            run(scene, editor, tmp_path, replace(QUICK, **changes), segments=everything)
 
+    everything = [np.ones((32, 32), bool)] * 5
     rows, _ = rows_of(editor.unet, refused)
     assert not rows
     assert not any(tmp_path.iterdir())  # a manifest would hold the folder to the wrong setting
