@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from attnwarp.devices import device_of
+from attnwarp.editing.identity import files_of, mark_loaded
 from attnwarp.encoders._weights import not_finite, reason_of, silent_transformers
 from attnwarp.errors import InputError, install_command
 from attnwarp.io.text import read_text
@@ -191,6 +192,7 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
     how: dict[str, Any] = {} if issubclass(kind, PreTrainedModel) else {"low_cpu_mem_usage": False}
     if _variants(folder) == ["fp16"]:
         how["variant"] = "fp16"
+    files = files_of(folder)
     with readable(folder), silent_transformers():
         # Silently random values for missing tensors would look like a bad editor.
         network, report = kind.from_pretrained(
@@ -206,7 +208,9 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
             f"{folder}: its weights have NaN or infinite values in {damaged[0]}"
             f"{f' and {len(damaged) - 1} more' if len(damaged) > 1 else ''}; fetch the model again"
         )
-    return network.to(device)
+    network = network.to(device)
+    mark_loaded(network, files)
+    return network
 
 
 def index_of(folder: str | Path) -> dict[str, Any]:

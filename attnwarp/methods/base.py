@@ -29,6 +29,7 @@ from attnwarp import check, losses
 from attnwarp.camera import Camera
 from attnwarp.devices import on_cpu_unless_named
 from attnwarp.editing.editor import Editor
+from attnwarp.editing.identity import editor_digest
 from attnwarp.encoders import load_encoder
 from attnwarp.fit import compile_kernels
 from attnwarp.fit.views import Drawn
@@ -49,7 +50,6 @@ from attnwarp.methods.scene import (
     Segments,
     check_cameras,
     check_loaded,
-    editor_digest,
     near_of,
     render_picture,
 )

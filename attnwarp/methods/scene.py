@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +14,6 @@ import torch
 from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.digest import digest, digest_each
-from attnwarp.editing.editor import Editor
-from attnwarp.editing.schedule import Schedule
 from attnwarp.fit import FitSettings, Views, extent_of
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.pictures import Image, Segment
@@ -155,47 +152,3 @@ def render_picture(gaussians: Gaussians, camera: Camera, near: float, backend: s
     if bool(color.isnan().any()):
         raise RuntimeError(f"view {camera.name!r} renders as NaN; lower the learning rates")
     return np.asarray(color.clamp(0, 1).float().cpu().numpy())
-
-
-def editor_digest(editor: Editor) -> str:
-    """Hash an editor's networks, layers, schedule, options and tokenizer (SHA-256)."""
-    # One list, since concatenated numbers are ambiguous: 1.5 and 12 read as 1.51 and 2.
-    values = [type(editor).__name__, {name: getattr(editor, name) for name in editor.options}]
-    values += [*map(repr, editor.layers()), *_identity(editor.schedule)]
-    parts: list[Any] = [values]
-    for name, part in sorted(editor.parts.items()):
-        if not isinstance(part, torch.nn.Module):
-            parts += [name, _tokens(part)]
-            continue
-        parts += [name, _configuration(part)]
-        for key, value in sorted(part.state_dict().items()):
-            parts += [key, value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy()]
-    return digest(*parts)
-
-
-def _identity(schedule: Schedule) -> list[Any]:
-    """List the fields of a schedule; a few step numbers identify its spacing of steps."""
-    fields = {k: v for k, v in sorted(vars(schedule).items()) if not callable(v)}
-    numbers = {k: v.tolist() if isinstance(v, torch.Tensor) else v for k, v in fields.items()}
-    spacing = [list(schedule.timesteps(n, (64, 64))) for n in (1, 2, 7)]
-    return [type(schedule).__name__, numbers, spacing]
-
-
-def _configuration(network: Any) -> list[tuple[str, str]]:
-    """List a network's configuration, without its path and library version."""
-    config = getattr(network, "config", {})
-    # transformers' configurations have hundreds of defaults, which change between versions.
-    said = config.to_diff_dict() if hasattr(config, "to_diff_dict") else dict(config)
-    about = ("architectures", "dtype", "torch_dtype", "transformers_version")
-    return sorted((k, repr(v)) for k, v in said.items() if k not in about and k[0] != "_")
-
-
-def _tokens(tokenizer: Any) -> Any:
-    """Identify a tokenizer: vocabulary, merges, rules, padding, and length."""
-    padding = [tokenizer.pad_token_id, tokenizer.model_max_length]
-    backend = getattr(tokenizer, "backend_tokenizer", None)
-    if backend is None:
-        return [padding, sorted(tokenizer.get_vocab().items())]
-    said = json.loads(backend.to_str())
-    # The serialised tokenizer also contains the padding and truncation of its last call.
-    return [padding, {k: v for k, v in said.items() if k not in ("padding", "truncation")}]

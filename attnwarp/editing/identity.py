@@ -1,0 +1,122 @@
+"""Identity of an editor: SHA-256 of all that decides its pictures.
+
+Weights are hashed once. The hash of a network that was loaded from files is kept in the folder of
+derived files by their paths, sizes and times of change; a network made or changed in memory is
+hashed each time.
+"""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from attnwarp.digest import digest, digest_each
+from attnwarp.editing.editor import Editor
+from attnwarp.editing.schedule import Schedule
+from attnwarp.io.file import write_atomically
+from attnwarp.process import cache_dir
+
+SAMPLES = 16
+"""Number of values of each tensor by which a change that torch does not count is noticed."""
+
+
+def files_of(folder: Path) -> list[tuple[str, int, int]]:
+    """List a folder's files, each with its size in bytes and its time of change in ns."""
+    states = [(path.resolve(), path.stat()) for path in sorted(folder.iterdir()) if path.is_file()]
+    return [(str(path), state.st_size, state.st_mtime_ns) for path, state in states]
+
+
+def mark_loaded(network: Any, files: list[tuple[str, int, int]]) -> None:
+    """Note on a network the files that it was loaded from, and the state of its tensors."""
+    network.loaded_from = files, _versions(network)
+
+
+def _versions(network: Any) -> dict[str, int] | None:
+    """Count the changes of each tensor in place; None if torch does not count them."""
+    tensors = network.state_dict()
+    if any(tensor.is_inference() for tensor in tensors.values()):
+        return None
+    return {name: tensor._version for name, tensor in tensors.items()}
+
+
+def editor_digest(editor: Editor) -> str:
+    """Hash an editor's networks, layers, schedule, options and tokenizer (SHA-256)."""
+    # One list, since concatenated numbers are ambiguous: 1.5 and 12 read as 1.51 and 2.
+    values = [type(editor).__name__, {name: getattr(editor, name) for name in editor.options}]
+    values += [*map(repr, editor.layers()), *_identity(editor.schedule)]
+    parts: list[Any] = [values]
+    for name, part in sorted(editor.parts.items()):
+        network = isinstance(part, torch.nn.Module)
+        parts += [
+            name,
+            *([_configuration(part), weights_digest(part)] if network else [_tokens(part)]),
+        ]
+    return digest(*parts)
+
+
+def weights_digest(network: torch.nn.Module) -> str:
+    """Hash a network's tensors (SHA-256), or find the hash of those in the same files."""
+    path = _kept(network)
+    with suppress(OSError):
+        if path is not None and len(kept := path.read_text()) == 64:
+            return kept
+    tensors = sorted(network.state_dict().items())
+    result = digest_each(
+        part
+        for name, tensor in tensors
+        for part in (name, str(tensor.dtype), list(tensor.shape), _bytes(tensor.flatten()))
+    )
+    if path is not None:
+        with suppress(OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, lambda stream: stream.write(result.encode()), durable=False)
+    return result
+
+
+def _kept(network: torch.nn.Module) -> Path | None:
+    """Find the file of a network's hash; None if the network is not as its files have it."""
+    files, versions = getattr(network, "loaded_from", (None, None))
+    if versions is None or versions != _versions(network):
+        return None
+    samples = {
+        name: _bytes(tensor.flatten()[:: max(1, tensor.numel() // SAMPLES)]).tobytes().hex()
+        for name, tensor in network.state_dict().items()
+    }
+    return cache_dir() / "networks" / digest(files, str(getattr(network, "dtype", "")), samples)
+
+
+def _bytes(values: torch.Tensor) -> np.ndarray[Any, Any]:
+    return values.detach().cpu().contiguous().view(torch.uint8).numpy()
+
+
+def _identity(schedule: Schedule) -> list[Any]:
+    """List the fields of a schedule; a few step numbers identify its spacing of steps."""
+    fields = {k: v for k, v in sorted(vars(schedule).items()) if not callable(v)}
+    numbers = {k: v.tolist() if isinstance(v, torch.Tensor) else v for k, v in fields.items()}
+    spacing = [list(schedule.timesteps(n, (64, 64))) for n in (1, 2, 7)]
+    return [type(schedule).__name__, numbers, spacing]
+
+
+def _configuration(network: Any) -> list[tuple[str, str]]:
+    """List a network's configuration, without its path and library version."""
+    config = getattr(network, "config", {})
+    # transformers' configurations have hundreds of defaults, which change between versions.
+    said = config.to_diff_dict() if hasattr(config, "to_diff_dict") else dict(config)
+    about = ("architectures", "dtype", "torch_dtype", "transformers_version")
+    return sorted((k, repr(v)) for k, v in said.items() if k not in about and k[0] != "_")
+
+
+def _tokens(tokenizer: Any) -> Any:
+    """Identify a tokenizer: vocabulary, merges, rules, padding, and length."""
+    padding = [tokenizer.pad_token_id, tokenizer.model_max_length]
+    backend = getattr(tokenizer, "backend_tokenizer", None)
+    if backend is None:
+        return [padding, sorted(tokenizer.get_vocab().items())]
+    said = json.loads(backend.to_str())
+    # The serialised tokenizer also contains the padding and truncation of its last call.
+    return [padding, {k: v for k, v in said.items() if k not in ("padding", "truncation")}]
