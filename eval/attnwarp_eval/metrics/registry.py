@@ -202,8 +202,6 @@ _SPECS = (
     Metric("multiview.delta_e", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 of two edited views at the same points"),
     Metric("multiview.delta_e_floor", "dE00", "none", 1e-3, 1e-2, "the same of the true edited views"),
     Metric("multiview.delta_e_above", "dE00", "lower", 1e-3, 1e-2, "disagreement above that floor; below 0, views are more alike than true ones"),
-    Metric("multiview.labels", "share", "higher", 1e-4, 0, "the object's pixels whose nearest true answers agree between two views"),
-    Metric("multiview.parts", "share", "higher", 1e-4, 0, "the object's parts whose nearest true answers agree between two views"),
     Metric("multiview.share", "share", "none", 1e-4, 0, "share of the pixels asked about that was compared"),
     Metric("multiview.pixels", "pixels", "none", 0, 0, "pixels compared"),
     Metric("multiview.same_answer", "share", "higher", 1e-4, 0, "views whose nearest answer is the source's"),

@@ -3,7 +3,7 @@
 The metrics are pure functions of :mod:`attnwarp_eval.metrics`; this module reads the files, and
 compares each view with the next in the order of their names. COLMAP reconstructs all of them.
 Keypoints are found at full size; all else is computed on pictures whose longest side is
-:data:`LONGEST` px, and colours at every second row and column of them, as in the study ``audit``.
+:data:`LONGEST` px, and colours at every second row and column of them.
 """
 
 from __future__ import annotations

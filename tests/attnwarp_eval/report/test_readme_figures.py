@@ -30,7 +30,8 @@ SENTENCES = [
 
 @cache
 def cells(study):
-    raw = lzma.decompress((ROOT / "reports" / study / "results.jsonl.xz").read_bytes()).decode()
+    (path,) = (ROOT / "reports" / study).glob("*.jsonl.xz")
+    raw = lzma.decompress(path.read_bytes()).decode()
     return [one for one in map(json.loads, raw.splitlines()) if "cell" in one]
 
 

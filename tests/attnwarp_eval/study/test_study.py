@@ -232,7 +232,7 @@ def test_relative_paths_count_from_the_studys_file(tmp_path, monkeypatch):
     own.write_text(shipped.read_text())
     path = tmp_path / "studies" / "study.yaml"
     path.write_text(
-        "name: s\nscenes: [scenes/own.yaml, bear, /abs/other.yaml]\nprobes: {audit: []}\n"
+        "name: s\nscenes: [scenes/own.yaml, bear, /abs/other.yaml]\nvariants: {v: {}}\nprobes: {warp: [v]}\n"
         "encoders: {clip: 'clip:models/clip', dino: dino-small, perceptual: 'lpips:/abs/lpips'}\n"
     )
     for folder in (tmp_path, tmp_path / "elsewhere"):
@@ -253,7 +253,9 @@ def test_relative_paths_count_from_the_studys_file(tmp_path, monkeypatch):
 
 def test_two_files_of_one_name_are_called_by_their_paths_and_a_name_chooses_a_file(tmp_path):
     path = tmp_path / "study.yaml"
-    path.write_text("name: s\nscenes: [a/room.yaml, b/room.yaml, bear.yaml]\nprobes: {audit: []}\n")
+    path.write_text(
+        "name: s\nscenes: [a/room.yaml, b/room.yaml, bear.yaml]\nvariants: {v: {}}\nprobes: {warp: [v]}\n"
+    )
     files = [str(tmp_path / name) for name in ("a/room.yaml", "b/room.yaml", "bear.yaml")]
     assert load_study(str(path)).scene_names == [*files[:2], "bear"]
     # The study's own file, not the scene of that name which comes along.

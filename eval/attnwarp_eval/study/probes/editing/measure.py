@@ -54,13 +54,17 @@ STOPWATCH = Stopwatch()
 """Seconds of the methods run by this process."""
 
 
+class StudyPart(EditingPart, EncodersPart):
+    """Keys of a study for this probe."""
+
+
 @register
 class EditingProbe(MethodProbe[EditResult]):
     """One edit of one scene by one method."""
 
     name = "editing"
     protocol = 3
-    study_part = EditingPart
+    study_part = StudyPart
     variant_part = VariantPart
     metrics = metrics_of(
         "multiview.", "fidelity.", "embedding.", "depth.", "image.", "cost.", "edit.drift"
