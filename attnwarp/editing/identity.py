@@ -7,7 +7,10 @@ hashed each time.
 
 from __future__ import annotations
 
+import hashlib
 import json
+import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -25,13 +28,21 @@ SAMPLES = 16
 """Number of values of each tensor by which a change that torch does not count is noticed."""
 
 
-def files_of(folder: Path) -> list[tuple[str, int, int]]:
-    """List a folder's files, each with its size in bytes and its time of change in ns."""
-    states = [(path.resolve(), path.stat()) for path in sorted(folder.iterdir()) if path.is_file()]
-    return [(str(path), state.st_size, state.st_mtime_ns) for path, state in states]
+State = tuple[str, int, int]
+"""A file's path, size in bytes, and time of change in ns."""
 
 
-def mark_loaded(network: Any, files: list[tuple[str, int, int]]) -> None:
+def files_of(folder: Path) -> list[State]:
+    """List the states of a folder's files."""
+    return [_state(path) for path in sorted(folder.iterdir()) if path.is_file()]
+
+
+def _state(path: Path) -> State:
+    state = path.stat()
+    return str(path.resolve()), state.st_size, state.st_mtime_ns
+
+
+def mark_loaded(network: Any, files: list[State]) -> None:
     """Note on a network the files that it was loaded from, and the state of its tensors."""
     network.loaded_from = files, _versions(network)
 
@@ -61,25 +72,44 @@ def editor_digest(editor: Editor) -> str:
 
 def weights_digest(network: torch.nn.Module) -> str:
     """Hash a network's tensors (SHA-256), or find the hash of those in the same files."""
-    path = _kept(network)
-    with suppress(OSError):
-        if path is not None and len(kept := path.read_text()) == 64:
-            return kept
     tensors = sorted(network.state_dict().items())
-    result = digest_each(
+    parts = (
         part
         for name, tensor in tensors
         for part in (name, str(tensor.dtype), list(tensor.shape), _bytes(tensor.flatten()))
     )
-    if path is not None:
-        with suppress(OSError):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(path, lambda stream: stream.write(result.encode()), durable=False)
-    return result
+    return _once(_loaded(network), lambda: digest_each(parts))
 
 
-def _kept(network: torch.nn.Module) -> Path | None:
-    """Find the file of a network's hash; None if the network is not as its files have it."""
+def file_digest(path: Path) -> str:
+    """Hash a file (SHA-256), or find its hash by its path, size and time of change."""
+
+    def made() -> str:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+
+    state = _state(path)
+    # A change within the clock's step, a hundredth of a second, could leave the time as it is.
+    return _once(None if time.time() - state[2] / 1e9 < 2 else [state], made)
+
+
+def _once(key: Any, make: Callable[[], str]) -> str:
+    """Find a hash in the folder of derived files, or make and keep it; None keeps none."""
+    if key is None:
+        return make()
+    path = cache_dir() / "hashes" / digest(key)
+    with suppress(OSError):
+        if len(kept := path.read_text()) == 64:
+            return kept
+    made = make()
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, lambda stream: stream.write(made.encode()), durable=False)
+    return made
+
+
+def _loaded(network: torch.nn.Module) -> list[Any] | None:
+    """Describe a network as loaded; None if it is not as its files have it."""
     files, versions = getattr(network, "loaded_from", (None, None))
     if versions is None or versions != _versions(network):
         return None
@@ -87,7 +117,7 @@ def _kept(network: torch.nn.Module) -> Path | None:
         name: _bytes(tensor.flatten()[:: max(1, tensor.numel() // SAMPLES)]).tobytes().hex()
         for name, tensor in network.state_dict().items()
     }
-    return cache_dir() / "networks" / digest(files, str(getattr(network, "dtype", "")), samples)
+    return [files, str(getattr(network, "dtype", "")), samples]
 
 
 def _bytes(values: torch.Tensor) -> np.ndarray[Any, Any]:

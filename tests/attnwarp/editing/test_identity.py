@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from types import SimpleNamespace
 
 import pytest
@@ -10,7 +11,7 @@ from tiny_editors import pix2pix
 
 from attnwarp.editing.editor import Editor
 from attnwarp.editing.editors.pix2pix import InstructPix2Pix
-from attnwarp.editing.identity import editor_digest, weights_digest
+from attnwarp.editing.identity import editor_digest, file_digest, weights_digest
 
 
 def test_editors_of_other_guidance_have_other_digests_where_their_digits_read_alike():
@@ -134,3 +135,19 @@ def test_a_loaded_network_that_is_changed_has_another_digest(change, hashed, tmp
         else:
             editor.unet.more = torch.nn.Linear(1, 1)
     assert hashed(editor)[0] != first
+
+
+def test_a_file_is_hashed_once_until_it_changes(tmp_path, monkeypatch):
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path / "cache"))
+    path, reads, real = tmp_path / "weights", [], hashlib.file_digest
+    monkeypatch.setattr(hashlib, "file_digest", lambda *given: reads.append(1) or real(*given))
+    for number, content in enumerate((b"abc", b"abd", b"abcd")):
+        path.write_bytes(content)
+        os.utime(path, ns=(number, number))
+        expected = hashlib.sha256(content).hexdigest()
+        reads.clear()
+        assert [file_digest(path), file_digest(path)] == [expected] * 2
+        assert len(reads) == 1
+    path.write_bytes(b"abce")  # now: a further change could have the same time
+    assert [file_digest(path) for _ in range(2)] == [hashlib.sha256(b"abce").hexdigest()] * 2
+    assert len(reads) == 3

@@ -244,6 +244,7 @@ def files_digest(name: str) -> str:
     Raises:
         StudyError: no editor of that name.
     """
+    from attnwarp.editing.identity import file_digest
     from attnwarp.editing.small import SUMS, folders_of
 
     try:
@@ -256,7 +257,7 @@ def files_digest(name: str) -> str:
         files = {place: path for place, path in files.items() if place.parts[0] != "controlnet"}
         files |= {"controlnet" / path.relative_to(control): path for path in control.rglob("*")}
     sums = [
-        [place.as_posix(), hashlib.sha256(path.read_bytes()).hexdigest()]
+        [place.as_posix(), file_digest(path)]
         for place, path in sorted(files.items())
         if path.suffix in (".json", ".safetensors") and path.name != SUMS
     ]
