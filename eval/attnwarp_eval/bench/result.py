@@ -1,17 +1,15 @@
 """Results on a bench, one JSON file a method, and tables that compare them.
 
-A track has one order, fixed before any method was scored:
+Each track has one order, less is better:
 
-- same editor (one of ours, so that all right answers are known): ``error``, the mean CIEDE2000 of
-  all views to the right answer that the source's picture is nearest to, inside the mask plus
-  outside. Another right answer in a view is an error there, and a missing view counts as unedited.
-- own editor: ``apart``, disagreement above the floor plus change outside the mask. Pictures that
-  are unedited, copied or smoothed agree without any merit: a remark names them, and ``apart`` is
-  undefined. A method with such a scene stands behind those without.
+- same editor (one of ours) and own editor: ``error``, the mean CIEDE2000 of all views to the right
+  answer that the source's picture is nearest to, inside the mask plus outside. Another right answer
+  in a view is an error there, and a missing view counts as unedited. Beside it stands ``apart``:
+  how far the views' disagreement is from that of the true edited views, more or less.
 - warps: ``wrong``, what is accepted wrongly or not kept, see
   :func:`attnwarp_eval.bench.warps.figures`. A missing view has no answer anywhere, which is 1.
 
-Less is better in all. Behind the others, too, stands a method that left scenes out.
+So the truth is first, and copies are not. Who lacks a scene that another has stands behind.
 """
 
 from __future__ import annotations
@@ -41,7 +39,7 @@ from attnwarp_eval.document.numbers import FEWEST_SCENES
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.statistics.intervals import Interval, interval, paired
 
-PROTOCOL: Final = 2
+PROTOCOL: Final = 3
 """Version; raised when equal pictures would get other scores."""
 
 SAME: Final = "same editor"
@@ -50,7 +48,7 @@ WARPS: Final = "warps"
 
 FIGURES = {
     "error": "error, dE00",
-    "apart": "disagreement + outside, dE00",
+    "apart": "disagreement, less or more than the truth's, dE00",
     "amount": "change of the source, dE00",
     "done": "edits done",
     "agreement": "disagreement above the floor, dE00",
@@ -75,7 +73,7 @@ WARP_FIGURES = {
 
 SHARES = ("done", "seen")
 
-ORDER = {SAME: "error", OWN: "apart", WARPS: "wrong"}
+ORDER = {SAME: "error", OWN: "error", WARPS: "wrong"}
 """Figure that orders the methods of each track."""
 
 Figure = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
@@ -124,7 +122,8 @@ class Method(BaseModel):
     """Declaration of a method, as in a folder's ``method.json``.
 
     ``name`` is the folder's, unless declared; ``seconds`` for all edits, as declared.
-    ``editor_sha256`` and ``settings`` are written by ``attnwarp-eval bench run``.
+    ``editor_sha256``, ``settings`` and ``bench``, the SHA-256 of its bench.json, are written by
+    ``attnwarp-eval bench run``.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -136,6 +135,7 @@ class Method(BaseModel):
     url: str = ""
     editor_sha256: str = ""
     settings: dict[str, Any] = Field(default_factory=dict)
+    bench: str = ""
 
     @classmethod
     def read(cls, path: Path) -> Method:
@@ -151,7 +151,7 @@ class Method(BaseModel):
         """Write the declaration to a folder to hand in; return the one that is there already.
 
         Raises:
-            InputError: the folder has another method's files.
+            InputError: the folder has files of another method or bench.
         """
         path = out / "method.json"
         if not path.is_file():
@@ -159,7 +159,7 @@ class Method(BaseModel):
             return self
         before = Method.read(path)
         if before.model_copy(update={"seconds": self.seconds}) != self:
-            raise InputError(f"{out}: has files of another method; name another folder")
+            raise InputError(f"{out}: has files of another method or bench; name another folder")
         return before
 
     def write(self, out: Path) -> None:
@@ -170,12 +170,12 @@ class Method(BaseModel):
 class Result(BaseModel):
     """Result of a method: the file that a table has of it.
 
-    ``bench`` has what decides the scenes: generator, seed, size, samples, views, salted hashes.
+    ``bench`` has what decides the scenes: generator, seed, size, samples, views.
     """
 
     model_config = ConfigDict(extra="forbid")
 
-    protocol: Literal[2]
+    protocol: Literal[3]
     bench: dict[str, Any]
     method: Method
     scores: list[Score] = Field(min_length=1)
@@ -289,8 +289,6 @@ def compare(results: Sequence[Result]) -> Report:
 
 def _bench(of: Mapping[str, Any]) -> str:
     drawn = f"Drawn scenes of generator {of['generator']}, {len(of['views'])} views"
-    if of["seed"] is None:
-        return f"{drawn} of {of['size']} px, sealed."
     asked = {"size": of["size"], "spp": of["spp"], "targets": len(of["views"]) - 1}
     options = " ".join(
         f"--{name} {value}" for name, value in (asked | {"seed": of["seed"]}).items()
@@ -302,6 +300,7 @@ def _compared(results: Sequence[Result], track: str, edit: str) -> Table:
     figure = ORDER[track]
     heads = heads_of(edit)
     keys = [figure, *(key for key in heads if key != figure)]
+    scenes = {scene for result in results for scene in result.values(edit, figure)}
     ranked = []
     for result in results:
         if edit not in result.edits:
@@ -314,10 +313,7 @@ def _compared(results: Sequence[Result], track: str, edit: str) -> Table:
         seconds = "" if told.seconds is None else f"{told.seconds:.0f}"
         row = [told.name, told.editor, str(len(values)), *means, seconds]
         row.append("" if first is result else bounded(gain, figure, "+"))
-        behind = any(math.isnan(value) for value in values.values()) or any(
-            name.endswith(f"/{edit}") for name in result.missing
-        )
-        ranked.append((behind, _over(values).mean, row))
+        ranked.append((values.keys() < scenes, _over(values).mean, row))
     ranked.sort(key=lambda one: (one[0], math.isnan(one[1]), one[1]))
     columns = ["method", "editor", "scenes", *(heads[key] for key in keys), "seconds"]
     columns.append(f"{figure}, difference")

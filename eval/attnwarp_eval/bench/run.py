@@ -21,7 +21,7 @@ from attnwarp.methods.scene import near_of, render_picture
 from attnwarp.reporting import SILENT, Part, Reporter
 from attnwarp_eval.bench import EDITORS, warps
 from attnwarp_eval.bench.result import SAME, Method
-from attnwarp_eval.bench.suite import Edit, Suite, to_bytes
+from attnwarp_eval.bench.suite import FILE, Edit, Suite, sha256, to_bytes
 from attnwarp_eval.files import write_picture
 from attnwarp_eval.plugins import load_plugins
 from attnwarp_eval.study.shared.controls import SCENE_STEP
@@ -42,7 +42,6 @@ def run(
     *,
     options: Mapping[str, Any] | None = None,
     seed: int = 0,
-    key: Path | None = None,
     report: Reporter = SILENT,
 ) -> Method:
     """Edit every scene by a method, or warp it; a folder begun earlier is continued.
@@ -57,11 +56,10 @@ def run(
             :data:`attnwarp_eval.bench.EDITORS`.
         options: fields of the method's settings (of a warp's for :data:`WARP`), or ``preset``.
         seed: seed of the first scene's noise.
-        key: folder of a sealed bench's key, for editors and methods that need the truth.
         report: receiver of progress.
 
     Raises:
-        InputError: the folder has another method's pictures, or the bench is damaged.
+        InputError: the folder has pictures of another method or bench, or the bench is damaged.
         ValueError: an unknown method, a wrong setting, or an editor that the method isn't made for.
     """
     load_plugins()
@@ -76,6 +74,7 @@ def run(
         name=", ".join(filter(None, (method, preset, noise))),
         editor=editor, track=SAME, settings=settings,
         editor_sha256="" if editor in EDITORS else files_digest(editor), seconds=0.0,
+        bench=sha256(suite / FILE),
     )  # fmt: skip
     told = told.begun(out)
     for number, scene in enumerate(bench.scenes):
@@ -89,7 +88,7 @@ def run(
             )
             truth = None
             if editor in EDITORS or of.needs_truth:
-                truth = bench.truth(bench.open(suite, key), scene, edit.name)[1]
+                truth = bench.truth(suite, scene, edit.name)[1]
             part = Part(report, number, len(bench.scenes))
             seconds = _edit(suite / scene, place, edit, method, editor, job_settings, truth, part)
             told = told.model_copy(update={"seconds": (told.seconds or 0) + seconds})

@@ -56,13 +56,11 @@ pictures count as smooth: an editor may keep either."""
 
 DISAGREEMENT = "multiview.delta_e_above.edit_inside"
 
-EMPTY = (UNEDITED, COPIED, SMOOTHED) = "the source is unedited", "copies of the source", "smooth"
+UNEDITED, COPIED, SMOOTHED = "the source is unedited", "copies of the source", "smooth"
 """Beginnings of remarks on pictures that agree without merit."""
 
 
-def score(
-    suite: Path, edited: Path, out: Path, report: Reporter = SILENT, *, key: Path | None = None
-) -> Result:
+def score(suite: Path, edited: Path, out: Path, report: Reporter = SILENT) -> Result:
     """Score a folder of edited pictures or of warps; what is done is kept in ``out``.
 
     Args:
@@ -70,14 +68,11 @@ def score(
         edited: folder with SCENE/EDIT/VIEW.png, or with SCENE/VIEW.npz.
         out: folder for bench-score.json and its page.
         report: receiver of progress.
-        key: folder of a sealed bench's key.
 
     Raises:
-        InputError: the bench is damaged, its key is missing, no edit is there, or a file has
-            another size.
+        InputError: the bench is damaged, no edit is there, or a file has another size.
     """
     bench = Suite.read(suite)
-    root = bench.open(suite, key)
     told = Method.read(edited / "method.json")
     told = told.model_copy(update={"name": told.name or edited.resolve().name})
     folders = {
@@ -99,13 +94,13 @@ def score(
     for number, ((scene, edit), folder) in enumerate(given.items()):
         report.step(number, len(given), f"{scene}, {edit}")
         kept = out / "scores" / f"{scene}-{edit}.json"
-        digest = _digest(truth_file(root, scene), bench.spp, folder, told.track)
+        digest = _digest(truth_file(suite, scene), bench.spp, folder, told.track)
         stored = json.loads(read_text(kept)) if kept.is_file() else {}
         if stored.get("key") != digest:
             if told.track == WARPS:
-                made = warps.score(bench, root, scene, folder)
+                made = warps.score(bench, suite, scene, folder)
             else:
-                made = _score(bench, root, scene, edit, folder, told.track)
+                made = _score(bench, suite, scene, edit, folder, told.track)
             stored = {"key": digest, "score": without_nan(asdict(made))}
             write_atomic(kept, json.dumps(stored).encode())
         scores.append(Score(**stored["score"]))
@@ -117,8 +112,8 @@ def score(
     return result
 
 
-def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path, track: str) -> Score:
-    of, truth = bench.truth(root, scene, edit)
+def _score(bench: Suite, suite: Path, scene: str, edit: str, folder: Path, track: str) -> Score:
+    of, truth = bench.truth(suite, scene, edit)
     pictures, remarks = _pictures(bench, folder)
     source = bench.views[0]
     if source not in pictures:
@@ -130,17 +125,15 @@ def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path, track:
         figures = EditFigures(of, truth, source, pictures, judged)
         return {view: figures.row(view) for view in pictures if view != source}
 
-    rows = rows_of(judged)
     # An own editor has answers of its own, so that any source has an edit to agree with.
-    free = rows if judged.done else rows_of(replace(judged, done=True))
-    rows = free if track == OWN else rows
+    rows = rows_of(replace(judged, done=True) if track == OWN else judged)
     scenes = of.scene, of.scene.edited(edit, dict(answers_of(of.scene, edit))[answer])
     again = [to_srgb(appearance(x, of.camera(source), spp=bench.spp, seed=1)) for x in scenes]
     faults = _remarks(truth, pictures, source, answer, again)
     drifts = [edit_drift(truth.originals[view], image) for view, image in pictures.items()]
     values = {
         "error": _error(truth, pictures, answer),
-        "apart": math.nan,
+        "apart": mean(abs(row[DISAGREEMENT]) for row in rows.values()),
         "amount": _difference(truth.originals[source], pictures[source], truth.union[source]),
         "done": float(judged.done),
         "agreement": mean(row[DISAGREEMENT] for row in rows.values()),
@@ -155,10 +148,6 @@ def _score(bench: Suite, root: Path, scene: str, edit: str, folder: Path, track:
     if (folder / "edited.ply").is_file():
         renders = _renders(of, bench, folder / "edited.ply")
         values["render_error"] = _error(truth, renders, answer)
-    if not any(fault.startswith(EMPTY) for fault in faults):
-        values["apart"] = mean(row[DISAGREEMENT] for row in free.values()) + values["outside"]
-    if track == OWN and truth.ambiguous:
-        values |= dict.fromkeys(("error", "done", "seen", "render_error"), math.nan)
     return Score(scene, edit, values, rows, [*remarks, *faults])
 
 

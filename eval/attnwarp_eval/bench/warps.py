@@ -32,7 +32,7 @@ from attnwarp.warp import (
 )
 from attnwarp_eval import metrics
 from attnwarp_eval.bench.result import WARP_FIGURES, WARPS, Method, Score, mean
-from attnwarp_eval.bench.suite import Suite, truth_file
+from attnwarp_eval.bench.suite import FILE, Suite, sha256, truth_file
 from attnwarp_eval.document.model import Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.files import write_atomic
@@ -74,13 +74,13 @@ def handed_in(bench: Suite, folder: Path) -> bool:
     )
 
 
-def score(bench: Suite, root: Path, scene: str, folder: Path) -> Score:
-    """Score a scene's warps, a folder with VIEW.npz, against the truth below ``root``.
+def score(bench: Suite, suite: Path, scene: str, folder: Path) -> Score:
+    """Score a scene's warps, a folder with VIEW.npz, against the truth of the bench.
 
     Raises:
         InputError: a file is damaged, or an array has another name, size or type.
     """
-    of = world(str(truth_file(root, scene)), bench.size)
+    of = world(str(truth_file(suite, scene)), bench.size)
     views = bench.views[1:]
     answers = {view: _answer(folder, of, view) for view in views}
     truths = {view: of.pair(view, bench.size) for view in views}
@@ -106,9 +106,10 @@ def figures(points: Points, visible: Mask, truth: TwoView) -> dict[str, float]:
 
     Args:
         points: (H, W, 2) positions in the source, NaN without an answer.
-        visible: (H, W) bool, the accepted pixels.
+        visible: (H, W) bool, the accepted pixels; one without a position is not accepted.
         truth: exact relation of the source and the view.
     """
+    visible = visible & np.isfinite(points).all(axis=-1)
     near = np.hypot(*np.moveaxis(points - truth.xy, -1, 0)) < NEAR
     right = int((visible & truth.visible & near).sum())
     counted = int((visible & (truth.label != AMBIGUOUS)).sum()) + int(truth.visible.sum())
@@ -210,7 +211,10 @@ def run(suite: Path, out: Path, options: Mapping[str, Any], report: Reporter = S
     name = fields.pop("preset", "corrected")
     settings = preset(name, **fields)
     words = ", ".join(["warp", name, *(f"{key}={value}" for key, value in fields.items())])
-    told = Method(name=words, track=WARPS, settings=settings.to_dict(), seconds=0.0).begun(out)
+    told = Method(
+        name=words, track=WARPS, settings=settings.to_dict(), seconds=0.0,
+        bench=sha256(suite / FILE),
+    ).begun(out)  # fmt: skip
     for k, scene in enumerate(bench.scenes):
         targets = [view for view in bench.views[1:] if not (out / scene / f"{view}.npz").is_file()]
         if not targets:

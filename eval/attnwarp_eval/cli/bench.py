@@ -27,10 +27,6 @@ def export(
     spp: Annotated[int, typer.Option(min=1, help="Samples a pixel.")] = 16,
     targets: Annotated[int, typer.Option(min=1, max=15, help="Views beside the source.")] = 15,
     seed: Annotated[int, typer.Option(min=0, help="Of the drawn scenes.")] = 0,
-    sealed: Annotated[
-        Path | None,
-        typer.Option(help="Folder for the secret and the truth; scenes are drawn from the secret."),
-    ] = None,
 ) -> None:
     """Write scenes with pictures, cameras, depth, masks, splats, instructions, and their truth."""
     with clear_errors(), reporter(title=folder.name) as report:
@@ -39,7 +35,7 @@ def export(
         with resumable(lambda: "finished scenes are kept"):
             write(
                 folder, count=SMALL if small else scenes, seed=seed, size=size, spp=spp,
-                targets=targets, sealed=sealed, report=report,
+                targets=targets, report=report,
             )  # fmt: skip
     typer.echo(folder / "README.md")
 
@@ -58,7 +54,6 @@ def run(
     changes: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Setting of the method.")
     ] = None,
-    key: Annotated[Path | None, typer.Option(help="Folder of a sealed bench's truth.")] = None,
 ) -> None:
     """Edit the scenes by a method of ours, or of a plugin, with an editor of ours, or warp them."""
     # As in "attnwarp edit", a method's ValueError is about the input.
@@ -68,7 +63,7 @@ def run(
 
         options = assignments(changes or [], {"seed": "--seed"})
         with resumable(lambda: "finished edits are kept"):
-            edit(folder, out, method, editor, options=options, seed=seed, key=key, report=report)
+            edit(folder, out, method, editor, options=options, seed=seed, report=report)
     typer.echo(out / "method.json")
 
 
@@ -81,7 +76,6 @@ def score(
     out: Annotated[Path, typer.Option(help="Folder for bench-score.json and its page.")] = Path(
         "runs/bench"
     ),
-    key: Annotated[Path | None, typer.Option(help="Folder of a sealed bench's truth.")] = None,
 ) -> None:
     """Score edited pictures of a bench, or warps, against its truth, which is made again."""
     from rich.console import Console
@@ -92,7 +86,7 @@ def score(
         from attnwarp_eval.document.write import terminal
 
         with resumable(lambda: "finished edits are kept"):
-            result = measure(folder, edited, out, report, key=key)
+            result = measure(folder, edited, out, report)
     Console().print(terminal(of_scores(result.scores)))
     for remark in result.remarks:
         typer.echo(remark, err=True)

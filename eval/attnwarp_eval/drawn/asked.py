@@ -118,7 +118,7 @@ def _plain(rng: np.random.Generator, color: str) -> Entry:
 
 
 def _seed(draft: Draft, rng: np.random.Generator) -> int:
-    return draft.long_seed(int(rng.random() * 2**31))
+    return int(rng.random() * 2**31)
 
 
 def _colour(draft: Draft) -> Entry:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -83,16 +82,6 @@ class Draft:
         """Random numbers for one aspect, independent of other aspects' draws."""
         return np.random.default_rng([GENERATOR, self.seed, self.number, *what.encode()])
 
-    def long_seed(self, short: int) -> int:
-        """Seed of a shape or a look: ``short``, hashed with the scene's seed if that is a secret.
-
-        Every short seed can be tried, until a shape or a look is found to the last digit.
-        """
-        if self.seed < 2**64:
-            return short
-        text = f"{self.seed} {self.number} {short}"
-        return int.from_bytes(hashlib.sha256(text.encode()).digest(), "big")
-
     def colors_of(self, kind: str) -> list[int]:
         """Held-out colours of this kind, from which its colour is drawn."""
         return unseen_colors(kind)
@@ -115,7 +104,7 @@ class Draft:
         # Light of a sun that glass or a mirror bends is a caustic, which would double the cost of
         # every picture. Smooth things stand under an even sky.
         self.smooth, self.time = smooth, TIMES.index("cloudy" if smooth else time)
-        own = self.long_seed(int(rng.integers(2**31)))
+        own = int(rng.integers(2**31))
         self.look = Look(0, 0, -1, self.ground, self.time, own)
         self.lights = [dict(light) for light in self.look.lights]
         self.fog = None
@@ -139,7 +128,7 @@ class Draft:
         return Look(
             FINISHES.index(finish), color if colored else -1,
             second if finish in ("striped", "checked") else -1,
-            self.ground, self.time, self.long_seed(int(rng.integers(2**31))),
+            self.ground, self.time, int(rng.integers(2**31)),
         )  # fmt: skip
 
     def surface(self, look: Look) -> dict[str, Any]:

@@ -149,7 +149,7 @@ class SceneDraft(Draft):
         for k, kind in enumerate(kinds):
             own = self.stream(f"thing {k}")
             look = self.look_of(own, kind, shiny[k], patterned[k])
-            instance = self.long_seed(FIRST_SHAPE + int(own.integers(2**32)))
+            instance = FIRST_SHAPE + int(own.integers(2**32))
             size = 1.0 if k == 0 else 0.4 + 0.7 * self.axes.occlusion
             scale = round(size * between(own, 0.95, 1.2), 3)
             yaw = round(between(own, 0, 360), 1)
@@ -209,7 +209,7 @@ class SceneDraft(Draft):
                 words = USUAL.get(name, ()) if rng.random() < 0.5 else SATURATED
                 color = COLORS.index((words or SATURATED)[index(rng, len(words or SATURATED))])
                 finish = FINISHES.index("plain")
-                seed = self.long_seed(int(rng.integers(2**31)))
+                seed = int(rng.integers(2**31))
                 own = Look(finish, color, -1, look.ground, look.time, seed)
             label = f"{kind}_{name}".replace(" ", "_")
             objects.append({"name": label, "shape": shape, **self.surface(own)})

@@ -14,7 +14,7 @@ from attnwarp_eval.cli.main import app
 from attnwarp_eval.plugins import load_plugins
 
 REPORTS = Path(__file__).parents[3] / "reports" / "bench"
-BENCH = {"generator": 1, "seed": 31, "size": 64, "spp": 4, "views": ["source"], "sealed": []}
+BENCH = {"generator": 1, "seed": 31, "size": 64, "spp": 4, "views": ["source"]}
 
 
 def made(name, errors, track=result.SAME, apart=1.0, **other):
@@ -28,7 +28,7 @@ def made(name, errors, track=result.SAME, apart=1.0, **other):
     ]  # fmt: skip
     method = {"name": name, "editor": "small-plain", "track": track}
     return {
-        "protocol": 2,
+        "protocol": 3,
         "bench": BENCH,
         "method": method,
         "scores": scores,
@@ -67,7 +67,7 @@ def test_the_table_is_made_of_the_results_beside_it():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"protocol": 1}, "protocol: Input should be 2"),
+        ({"protocol": 1}, "protocol: Input should be 3"),
         ({"rank": 1}, "rank: Extra inputs"),
         ({"scores": []}, "scores: List should have at least 1"),
         ({"method": {"track": "fastest"}}, "method.track"),
@@ -89,7 +89,7 @@ def test_methods_are_ordered_by_their_track_and_paired_by_scene(tmp_path):
     ours = read(tmp_path, made("ours", [2.0, 4.0, 3.0] * 2))
     best = read(tmp_path, made("best", [1.0, 2.5, 2.5] * 2))  # 1, 1.5, 0.5 less, twice
     named = read(tmp_path, made("named", [0.1] * 6, result.OWN, [0.0, None] + [0.0] * 4))
-    own = read(tmp_path, made("own", [9.0] * 6, result.OWN, 5.0))
+    own = read(tmp_path, made("own", [9.0] * 6, result.OWN, -4.5))
     report = result.compare([ours, best, named, own])
     same, other = (section.tables[0].rows for section in report.sections)
     assert [row[0] for row in same] == ["best", "ours"]
@@ -98,9 +98,8 @@ def test_methods_are_ordered_by_their_track_and_paired_by_scene(tmp_path):
     few = [read(tmp_path, made(name, errors)) for name, errors in (("a", [1.0]), ("b", [2.0]))]
     assert result.compare(few).sections[0].tables[0].rows[1][-1] == "+1.00"
     assert same[0][3:7] == ["2.00 [1.19, 2.81]", "1.00 [1.00, 1.00]", "0.50 [0.50, 0.50]", "0.50"]
-    assert other[-1][3] == "0.00 (1 undefined)"  # five scenes have no interval
-    # Undefined in one scene: behind, though its mean is less.
-    assert [row[0] for row in other] == ["ours", "best", "own", "named"]
+    assert other[0][4] == "0.00 (1 undefined)"  # five scenes have no interval
+    assert [row[0] for row in other] == ["named", "best", "ours", "own"]
     moved = read(tmp_path, made("b", [1.0], bench=BENCH | {"seed": 32}))
     with pytest.raises(InputError, match="another bench"):
         result.compare([ours, moved])
@@ -115,7 +114,7 @@ def test_warps_stand_in_a_table_of_their_own_behind_it_those_without_all_scenes(
         return read(tmp_path, data)
 
     ours, best = warped("ours", [0.2, 0.4, 0.3] * 2), warped("best", [0.1, 0.25, 0.25] * 2)
-    few = warped("few", [0.0] * 5, missing=["drawn-5/warps"])
+    few = warped("few", [0.0] * 5)  # scored on a bench of five scenes: nothing is missing
     pictures = read(tmp_path, made("pictures", [2.0] * 6))
     same, warps = result.compare([pictures, ours, best, few]).sections
     assert (same.title, warps.title) == ("Same editor: colour", "Warps")
@@ -167,8 +166,14 @@ def test_our_methods_hand_in_every_view_and_go_on_where_they_were(tmp_path):
     place = out / "drawn-0" / "colour"
     before = read_image(place / "source.png")
     (place / "source.png").unlink()
+    run.run(bench, tmp_path / "warps", "warp")
     again = run.run(bench, out, editor="ideal", options=options)
     assert again.seconds > told.seconds
     np.testing.assert_array_equal(read_image(place / "source.png"), before)
     with pytest.raises(InputError, match="another method"):
         run.run(bench, out, "by_view", editor="ideal", options={"steps": 4, "iterations": 0})
+    held = json.loads((bench / suite.FILE).read_text())
+    (bench / suite.FILE).write_text(json.dumps(held | {"seed": 10}))  # another bench
+    for method, place in (("attention_warping", out), ("warp", tmp_path / "warps")):
+        with pytest.raises(InputError, match="of another method or bench"):
+            run.run(bench, place, method, editor="ideal", options=options if place == out else {})
