@@ -104,6 +104,7 @@ def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
     scenes = f"{loaded.scenes_in_words}; " if loaded.scenes else ""
     _name_untabulated(loaded)
     _name_notices(planned)
+    _name_computed_once(planned)
     typer.echo(
         f"study {loaded.name}: {scenes}seeds {', '.join(map(str, loaded.seeds))};"
         f" {len(planned.cells)} cells, {planned.reused} done in {store.root}"
@@ -141,6 +142,14 @@ def _name_notices(planned: Plan) -> None:
     for scene, lines in planned.notices.items():
         for line in lines:
             warn(f"scene {scene}: {line}")
+
+
+def _name_computed_once(planned: Plan) -> None:
+    """Print the variants that are one computation, which the report also has."""
+    from attnwarp_eval.study.computations import alike
+
+    for name, labels in alike((cell.probe, cell.labels) for cell in planned.cells):
+        log(f"one computation, so equal rows of {name}: {', '.join(labels)}")
 
 
 def _name_untabulated(study: Study) -> None:
@@ -199,6 +208,7 @@ def run_study(
         with resumable(lambda: f"{len(store.done())} cells are kept"):
             planned = plan(loaded, store)
             _name_notices(planned)
+            _name_computed_once(planned)
             with store.lock():
                 if planned.other_code:
                     log(

@@ -9,6 +9,7 @@ from typing import Any
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import FEWEST_SCENES, number
 from attnwarp_eval.report.ablations import glossary
+from attnwarp_eval.study.computations import alike
 from attnwarp_eval.study.probe import probe
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
@@ -94,6 +95,10 @@ def measured(results: Results) -> Section:
         scenes = scenes[:1].upper() + scenes[1:]
         text.append(f"- {scenes}; {size}; {seeds}. {_means(results)}")
     text += [f"- {line}" for line in _regimes(results)]
+    text += [
+        f"- One computation, so equal rows of `{name}`: {', '.join(labels)}."
+        for name, labels in alike((cell.probe, cell.variants) for cell in results.cells)
+    ]
     text += [f"- {line}" for line in _revisions(results.all_records())]
     # Formatted as code: names of files may have asterisks.
     notices = [

@@ -22,6 +22,7 @@ from attnwarp_eval.scene.notices import notices
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
+from attnwarp_eval.study.computations import check_keys
 from attnwarp_eval.study.probe import probe, probes
 from attnwarp_eval.study.record import Environment, Failure
 from attnwarp_eval.study.reporting import CellReporter
@@ -82,6 +83,8 @@ def plan(study: Study, store: Store) -> Plan:
     scenes = _scenes(study)
     cells = cells_of(study, scenes)
     _check_names(study, list(scenes.values()), cells)
+    named = dict(zip(study.scene_names, scenes.values(), strict=True))
+    check_keys(study, named, cells)
     done = store.done()
     load_plugins()  # plugins' source is part of the code
     this = Environment.from_json(environment())
@@ -94,7 +97,6 @@ def plan(study: Study, store: Store) -> Plan:
             todo.append(cell)
         else:
             other_code += not record.environment.same_code(this)
-    named = dict(zip(study.scene_names, scenes.values(), strict=True))
     said = {
         name: lines
         for name, scene in named.items()

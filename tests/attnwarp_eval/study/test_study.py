@@ -9,8 +9,10 @@ import yaml
 from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
+from attnwarp_eval.report.measured import measured
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
+from attnwarp_eval.study.results import Outcome, Results
 from attnwarp_eval.study.run import expected, plan, stored_study, verify
 from attnwarp_eval.study.shared import edits, encoders
 from attnwarp_eval.study.study import scene_files, shipped_studies
@@ -144,8 +146,39 @@ def test_variants_that_no_table_would_show_are_named_before_they_are_computed(
     path = write(tmp_path, ablations=ablations)
     done = CliRunner().invoke(app, ["run", path, "--dry-run", "--out", str(tmp_path / "run")])
     assert done.exit_code == 0
-    lines = done.stderr.splitlines()
+    lines = [line for line in done.stderr.splitlines() if "one computation" not in line]
     assert [line.partition(" a table")[0] for line in lines] == expected
+
+
+@pytest.mark.parametrize(
+    ("probe", "own", "told"),
+    [
+        ("warp", {"control": "mirrored"}, r"variants.own.control: no probe .*\(warp\) reads it"),
+        ("warp", {"mask": "truth"}, "variants.own.mask"),
+        ("warp", {"options": {"a0": 0}}, "variants.own.options"),
+        ("warp", {"geometry": "truth", "splats": {"count": 9}}, "variants.own.splats"),
+        ("depth", {"set": {"pixel_centers": "integer"}}, "differs from 'plain' in pixel_centers"),
+    ],
+)
+def test_a_key_that_no_probe_of_the_variant_reads_is_refused(tmp_path, probe, own, told):
+    path = write(tmp_path, variants={"plain": {}, "own": own}, probes={probe: ["plain", "own"]})
+    with pytest.raises(StudyError, match=told):
+        plan(load_study(path), Store(tmp_path / "run"))
+    result = CliRunner().invoke(app, ["run", path, "--dry-run"])
+    assert result.exit_code == 2
+
+
+def test_variants_that_are_one_computation_are_named(tmp_path):
+    path = write(tmp_path)
+    shown = CliRunner().invoke(app, ["run", path, "--dry-run", "--out", str(tmp_path / "run")])
+    assert "equal rows of depth: corrected, again, slipped\n" in shown.stderr
+    assert "equal rows of warp: corrected, again\n" in shown.stderr
+    cells_of_run = plan(load_study(path), Store(tmp_path / "run")).cells
+    outcomes = [
+        Outcome(c.id, c.title, c.scene, c.labels, c.probe, c.seed, None) for c in cells_of_run
+    ]
+    text = "\n".join(measured(Results(load_study(path), outcomes, [])).text)
+    assert "One computation, so equal rows of `warp`: corrected, again." in text
 
 
 def test_a_scene_in_place_of_a_study_is_told_as_one(tmp_path):
