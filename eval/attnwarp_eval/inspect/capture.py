@@ -122,10 +122,10 @@ class Edit:
         return read_ply(self.path / ("edited.ply" if step == EDITED else f"rounds/{number}.ply"))
 
     def edited(self, view: str) -> Image | None:
-        """(h, w, 3) the edited picture of a view."""
-        for path in sorted(self.path.glob(f"rounds/*/{glob.escape(view)}.png")):
-            return read_picture(path)
-        return None
+        """(h, w, 3) the edited picture of a view, of the last round that edited it."""
+        paths = self.path.glob(f"rounds/*/{glob.escape(view)}.png")
+        last = max(paths, key=lambda path: int(path.parent.name), default=None)
+        return None if last is None else read_picture(last)
 
     def after(self, view: str, step: str) -> Image | None:
         """(h, w, 3) render of the scene after a step; None if the edit has not written it."""

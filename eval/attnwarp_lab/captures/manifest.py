@@ -297,7 +297,7 @@ class Loaded:
         kept = [against, *others[:1]]
         name, capture = next(iter(m.captures.items()))
         first = dict([next(iter(capture.edits.items()))])
-        return self.with_rows(seeds=m.seeds[:1]).only(kept).changed(
+        return self.with_rows(seeds=self.seeds(m.variants[against])[:1]).only(kept).changed(
             captures={name: capture.model_copy(update={"edits": first})}, geometry=0,
             tables=[TablePart(title="Quick look", rows=kept, against=against)],
         )  # fmt: skip

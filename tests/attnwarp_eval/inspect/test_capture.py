@@ -11,8 +11,9 @@ from attnwarp.errors import InputError
 from attnwarp.io import read_image, read_ply
 from attnwarp.render import render
 from attnwarp.warp import PRESETS, sample, warp_view
+from attnwarp_eval.files import write_picture
 from attnwarp_eval.inspect import subject
-from attnwarp_eval.inspect.capture import Capture, read_edit
+from attnwarp_eval.inspect.capture import Capture, Edit, read_edit
 from attnwarp_eval.inspect.pixel import report
 from attnwarp_eval.inspect.window import plain
 
@@ -147,3 +148,12 @@ def test_what_is_missing_is_named_with_the_remedy(folders, tmp_path):
 def test_names_are_drawn_as_they_stand():
     assert plain("a\x1b[2Jb\x00$x^2$\u202e") == "a?[2Jb?\\$x^2\\$?"
     assert len(plain("x" * 10_000)) == 120
+
+
+def test_a_view_that_later_rounds_edit_again_is_shown_as_the_last_one_left_it(tmp_path):
+    for number in (1, 2, 10):
+        place = tmp_path / f"rounds/{number}/a.png"
+        place.parent.mkdir(parents=True)
+        write_picture(place, np.full((4, 4, 3), number, dtype=np.uint8))
+    shown = Edit(tmp_path, "", "0", ("a",), PRESETS["corrected"], ()).edited("a")
+    assert np.rint(255 * shown).max() == 10

@@ -199,3 +199,13 @@ def test_the_shipped_manifest_has_the_published_numbers():
     assert settings["source_prompt"] == "{source}"
     ip2p = settings_of(loaded, manifest.variants["attention warp, IP2P"], 0, 512)
     assert ip2p["guidance_drop"] == 1.5 and ip2p["start"] == [700, 980]
+
+
+def test_a_quick_look_keeps_the_seeds_of_the_command_line():
+    loaded = load_manifest("paper")
+    for given, expected in (
+        (loaded.with_rows(seeds=[7, 8]), 7),
+        (loaded, loaded.manifest.seeds[0]),
+    ):
+        rows = given.quick().manifest.variants.values()
+        assert [row.seeds for row in rows] == [[expected], [expected]]
