@@ -26,6 +26,12 @@ FORMAT = 2
 
 OLDER = "made by an older version; run it again"
 
+KINDS = {
+    "study": "of a study (attnwarp-eval run)",
+    "manifest": "on captures (attnwarp-eval captures, which writes its tables)",
+}
+"""Key of a ``study.json`` that says what its run is of -> words for messages."""
+
 T = TypeVar("T")
 
 
@@ -92,20 +98,28 @@ class Store:
             self._sweep()
             yield
 
-    def refuse_strangers(self) -> None:
-        """Check that a run would overwrite only files of runs.
+    def refuse_strangers(self, kind: str = "study") -> None:
+        """Check that a run would overwrite only files of runs of its kind.
+
+        Args:
+            kind: as for :meth:`read_study`.
 
         Raises:
-            StoreError: the folder has files with a run's names and no study.json, or is the current
-                folder with other files in it, as an empty path gives.
+            StoreError: the folder has files with a run's names and no study.json, or a run of
+                another kind, or is the current folder with other files in it, as an empty path
+                gives.
         """
+        there: dict[str, Any] = {}
+        with contextlib.suppress(OSError, ValueError):  # a damaged file is written anew
+            there = _read_object(self.root / "study.json")
+        self._check_kind(there, kind)
         if (self.root / "study.json").exists() or self.cells.is_dir():
             return  # the cells of a run whose study.json is lost are reused
         own = ("report.md", "report.html", "results.jsonl")
-        there = [self.root / name for name in own if (self.root / name).exists()]
-        if there:
+        files = [self.root / name for name in own if (self.root / name).exists()]
+        if files:
             raise StoreError(
-                f"{there[0]}: is there without a study.json, and a run would write over it; name"
+                f"{files[0]}: is there without a study.json, and a run would write over it; name"
                 " another folder with --out, or move it away"
             )
         if self.root.resolve() == Path.cwd() and any(self.root.iterdir()):
@@ -125,12 +139,15 @@ class Store:
         # Keep the study's order: seconds are taken on a scene's first edit.
         write_json(self.root / "study.json", _sealed(study), sort_keys=False)
 
-    def read_study(self) -> dict[str, Any]:
+    def read_study(self, kind: str = "study") -> dict[str, Any]:
         """The content of ``study.json``.
 
+        Args:
+            kind: what the run is of, a key of :data:`KINDS`.
+
         Raises:
-            StoreError: the folder is not a run, an older version wrote it, or the file was changed
-                after it was written.
+            StoreError: the folder is not a run, or one of another kind, an older version wrote it,
+                or the file was changed after it was written.
         """
         path = self.root / "study.json"
         if not path.is_file():
@@ -151,7 +168,14 @@ class Store:
                 f"{path}: {problem}; run the study again with --out {self.root}, which writes it"
                 " anew"
             )
+        self._check_kind(study, kind)
         return study
+
+    def _check_kind(self, study: Mapping[str, Any], kind: str) -> None:
+        """Raise StoreError if the content of a study.json is that of another kind of run."""
+        other = next((name for name in KINDS if name in study and kind not in study), None)
+        if other is not None:
+            raise StoreError(f"{self.root}: is a run {KINDS[other]}; expected one {KINDS[kind]}")
 
     def path(self, cell_id: str) -> Path:
         """The path of a cell's record."""
@@ -242,9 +266,13 @@ class Store:
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         return {**about, "path": path.relative_to(self.root).as_posix(), "sha256": sha256}
 
-    def verify(self) -> Problems:
-        """Recompute every hash and compare with the list of expected cells."""
-        study = self.read_study()
+    def verify(self, kind: str = "study") -> Problems:
+        """Recompute every hash and compare with the list of expected cells.
+
+        Args:
+            kind: as for :meth:`read_study`.
+        """
+        study = self.read_study(kind)
         expected = {c["id"]: c["title"] for c in study["cells"]}
         problems = Problems()
         done = self.done()

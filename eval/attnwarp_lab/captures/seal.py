@@ -47,7 +47,7 @@ def write_seal(store: Store) -> Path:
     content = {
         "code": here["source"],
         "versions": here["versions"],
-        "inputs": store.read_study()["inputs"],
+        "inputs": store.read_study("manifest")["inputs"],
         "files": {
             path.relative_to(store.root).as_posix(): _sha256(path)
             for path in sorted(store.root.rglob("*"))
@@ -101,13 +101,13 @@ def verify(store: Store) -> Problems:
     Raises:
         StoreError: the folder is not a run.
     """
-    found = store.verify()
+    found = store.verify("manifest")
     try:
         seal = _read_seal(store)
     except StoreError as error:
         found.damaged.append(str(error))
         return found
-    if store.read_study()["inputs"] != seal["inputs"]:
+    if store.read_study("manifest")["inputs"] != seal["inputs"]:
         found.damaged.append(f"{store.root / SEAL}: has other inputs than study.json")
     found.damaged += [f"{store.root / name}: {what}" for name, what in _broken(store, seal).items()]
     return found
@@ -200,7 +200,7 @@ def _read(run: Path) -> tuple[dict[str, Any], Cells]:
         if cell["kind"] == "edit"
         for method in cell["variants"]
     }
-    return Store(run).read_study(), figures
+    return Store(run).read_study("manifest"), figures
 
 
 def _differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:

@@ -177,7 +177,7 @@ def captures(
             device_of(name)
         named = one.name if one.data else Path(str(manifest)).stem
         store = Store(out or Path("runs/captures") / named)
-        store.refuse_strangers()
+        store.refuse_strangers("manifest")
         report.log("checking captures and weights")
         checked = check(loaded, store.root, devices[0] if scheduler is None else "cpu", report)
         checked.refuse()

@@ -5,8 +5,10 @@ import json
 import re
 
 import pytest
+from typer.testing import CliRunner
 
 from attnwarp_eval.canonical_json import canonical_json
+from attnwarp_eval.cli.main import app
 from attnwarp_eval.cost import environment
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.study.cell import Cell
@@ -212,3 +214,21 @@ def test_two_states_of_files_that_are_not_committed_are_other_code():
     # A later revision, or one with changes elsewhere, has the code that it has.
     for git in ({"sha": "b" * 40, "dirty": True}, {"sha": "a" * 40, "dirty": False}):
         assert this.same_code(Environment.from_json({**here, "git": git}))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("report",), ("inspect",), ("verify",), ("compare", "other"), ("run", "quick", "--out")],
+)
+def test_a_run_on_captures_is_told_as_one_where_a_study_is_expected(tmp_path, monkeypatch, command):
+    """Oracle: the entries that ``attnwarp-eval captures`` writes."""
+    monkeypatch.chdir(tmp_path)
+    Store(".").write_study({"manifest": {}, "inputs": {}, "cells": []})
+    before = (tmp_path / "study.json").read_bytes()
+    done = CliRunner().invoke(app, [*command, "."])
+    assert done.exit_code == 2
+    assert "is a run on captures (attnwarp-eval captures, which writes its tables)" in done.stderr
+    assert (tmp_path / "study.json").read_bytes() == before
+    Store(tmp_path).write_study({"study": {}, "cells": []})
+    with pytest.raises(StoreError, match="is a run of a study"):
+        Store(tmp_path).refuse_strangers("manifest")
