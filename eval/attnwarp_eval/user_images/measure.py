@@ -263,7 +263,8 @@ def measure(
     if inputs.source_edit is not None and any("source_edit" in figure.needs for figure in wanted):
         source = read_picture(inputs.source_edit, inputs.background)  # before the long part
     gathered = _Gathered()
-    needed = [name for name in folders["renders"] if any(name in names for names in views.values())]
+    named = dict.fromkeys(name for files in folders.values() for name in files)
+    needed = [name for name in named if any(name in names for names in views.values())]
     tasks = _tasks(inputs, folders, views, needed, loaded, device)
     for batch in results(store, tasks, math.ceil(len(needed) / BATCH), report):
         gathered.add(*batch)
@@ -433,25 +434,22 @@ def _compare_names(
     views: Mapping[Figure, Sequence[str]],
     done: Measured,
 ) -> None:
-    """Name the pictures without a partner."""
-    renders = list(folders["renders"])
+    """Name the pictures without a partner in the first folder, the renders if there are any."""
+    first, *others = folders
     used = {name for figure in views for name in figure.needs} | (
         {"masks"} if any(figure in views for figure in _MASKED) else set()
     )
-    for other in (
-        name for name in ("edited", "originals", "masks") if name in folders and name in used
-    ):
-        partners = folders[other]
+    for other in (name for name in others if name in used):
         # A scene is usually fitted to some of its views: renders without an edited picture are not
         # an error.
         for relation, names in (
             (
-                f"of {_option('renders')} without one in {_option(other)}",
-                [n for n in renders if n not in partners],
+                f"of {_option(first)} without one in {_option(other)}",
+                [n for n in folders[first] if n not in folders[other]],
             ),
             (
-                f"of {_option(other)} without one in {_option('renders')}",
-                [n for n in partners if n not in renders],
+                f"of {_option(other)} without one in {_option(first)}",
+                [n for n in folders[other] if n not in folders[first]],
             ),
         ):
             if names:
@@ -465,9 +463,10 @@ def _check_sizes(
     from attnwarp.io.images import upright_size
 
     for figure, names in views.items():
-        for other in _groups(figure, folders):
-            for name in names if other != "renders" else ():
-                one, two = folders["renders"][name], folders[other][name]
+        first, *others = _groups(figure, folders)
+        for other in others:
+            for name in names:
+                one, two = folders[first][name], folders[other][name]
                 _same_size(one, upright_size(one), two, upright_size(two))
 
 
@@ -538,12 +537,12 @@ def _tasks(
         return {name: read_picture(folders[group][name], background) for name in names}
 
     def partners(
-        group: str, names: Iterable[str], renders: Mapping[str, Picture]
+        group: str, names: Iterable[str], of: Mapping[str, Picture], first: str = "renders"
     ) -> dict[str, Picture]:
         pictures = read(group, names)
         for name, picture in pictures.items():  # again, for formats whose header alone is not known
-            sizes = [(array.shape[1], array.shape[0]) for array in (renders[name], picture)]
-            _same_size(folders["renders"][name], sizes[0], folders[group][name], sizes[1])
+            sizes = [(array.shape[1], array.shape[0]) for array in (of[name], picture)]
+            _same_size(folders[first][name], sizes[0], folders[group][name], sizes[1])
         return pictures
 
     def encode(kind: Kind, pictures: Mapping[str, Picture], to: dict[str, Embedding]) -> None:
@@ -555,7 +554,7 @@ def _tasks(
 
     def gather(batch: Sequence[str]) -> _Gathered:
         result = _Gathered()
-        renders = read("renders", batch)
+        renders = read("renders", [n for n in batch if n in folders.get("renders", {})])
         encode("clip", renders, result.rows["clip"])
         encode("dino", renders, result.rows["dino"])
         changed = [name for name in batch if name in members[_DIRECTION] | members[_NEIGHBOURS]]
@@ -578,9 +577,9 @@ def _tasks(
                     raise InputError(f"{folders['edited'][name]}: {error}") from None
         for figure, function in own.items():
             names = [name for name in batch if name in members[figure]]
-            shown = [
-                renders if g == "renders" else partners(g, names, renders) for g in figure.needs
-            ]
+            first, *others = figure.needs
+            shown = [renders if first == "renders" else read(first, names)]
+            shown += [partners(group, names, shown[0], first) for group in others]
             for name in names:
                 value = float(function(*(pictures[name] for pictures in shown)))
                 result.values[figure.key][name] = value

@@ -285,6 +285,28 @@ def test_pictures_without_a_partner_are_named_and_left_out(data, models):
     assert list(result["embedding.clip_similarity"]["views"]) == list(VIEWS)
 
 
+@pytest.mark.parametrize("renders", [0, 1])
+def test_pictures_without_renders_have_the_figures_that_need_none(tmp_path, renders):
+    random = np.random.default_rng(0)
+    scene = cv2.GaussianBlur(random_picture(random, (96, 120)), (0, 0), 1.5)
+    for view in VIEWS:
+        write(tmp_path / "originals" / f"{view}.png", scene)
+        write(tmp_path / "edited" / f"{view}.png", np.roll(scene, 2, axis=1))
+    for view in VIEWS[:renders]:
+        write(tmp_path / "renders" / f"{view}.png", scene)
+    folders = ("originals", "edited", *["renders"] * renders)
+    options = [f"--{group}={tmp_path / group}" for group in folders]
+    options += ["--clip=none", "--perceptual=none", f"--out={tmp_path / 'out'}"]
+    result = call("metrics", *options)
+    assert result.exit_code == 0, result.output
+    drift = json.loads((tmp_path / "out" / "metrics.json").read_text())["metrics"]["edit.drift"]
+    # Every picture moves by two pixels.
+    assert drift["views"] == pytest.approx(dict.fromkeys(VIEWS, 2.0), abs=0.1)
+    write(tmp_path / "edited" / "view2.png", scene[:40])
+    result = call("metrics", *options)
+    assert result.exit_code == 2 and "is 120 x 40 px, but" in result.stderr
+
+
 @pytest.mark.door
 @pytest.mark.parametrize("group, suffix", [("masks", "png")])
 def test_a_pair_of_different_sizes_names_both(data, models, group, suffix):
