@@ -36,7 +36,7 @@ from attnwarp_eval.bench.result import (
 from attnwarp_eval.bench.suite import Suite, to_bytes, truth_file
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.document.model import Report, Section, Table
+from attnwarp_eval.document.model import Grid, Picture, Report, Section, Table
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.image import edit_drift
@@ -55,6 +55,9 @@ SMOOTH = 0.5
 pictures count as smooth: an editor may keep either."""
 
 DISAGREEMENT = "multiview.delta_e_above.edit_inside"
+
+SHOWN_SCENES, SHOWN_VIEWS = 3, 5
+"""Numbers of scenes and views of which a page shows an edit's pictures."""
 
 UNEDITED, COPIED, SMOOTHED = "the source is unedited", "copies of the source", "smooth"
 """Beginnings of remarks on pictures that agree without merit."""
@@ -87,8 +90,9 @@ def score(suite: Path, edited: Path, out: Path, report: Reporter = SILENT) -> Re
     if not given or (told.track == WARPS) != (next(iter(given))[1] == WARPS):
         example = edited / bench.scenes[0]
         raise InputError(
-            f"{edited}: has nothing to score; write {example / 'EDIT' / 'VIEW.png'}, or"
-            f" {example / 'VIEW.npz'}, as docs/measuring/bench.md says"
+            f"{edited}: has nothing to score; write {example / 'EDIT' / 'VIEW.png'} or"
+            f" {example / 'VIEW.npz'}, as docs/measuring/bench.md says, or make it with"
+            f" attnwarp-eval bench run {suite} {edited}"
         )
     scores = []
     for number, ((scene, edit), folder) in enumerate(given.items()):
@@ -108,7 +112,9 @@ def score(suite: Path, edited: Path, out: Path, report: Reporter = SILENT) -> Re
     result = Result(
         protocol=PROTOCOL, bench=bench.identity(), method=told, scores=scores, missing=missing
     )
-    _write(out, result)
+    edits = dict.fromkeys(edit for _, edit in given if edit != WARPS)
+    grids = [_grid(bench, suite, out, edit, given) for edit in edits]
+    _write(out, result, grids)
     return result
 
 
@@ -263,7 +269,28 @@ def _digest(truth: Path, spp: int, folder: Path, track: str) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
-def _write(out: Path, result: Result) -> None:
+def _grid(
+    bench: Suite, suite: Path, out: Path, edit: str, given: Mapping[tuple[str, str], Path]
+) -> Grid:
+    """Views of an edit's first scenes, before it and as handed in; the files are copied."""
+    views = bench.views[:: math.ceil(len(bench.views) / SHOWN_VIEWS)]
+    rows = []
+    for scene in [scene for scene, name in given if name == edit][:SHOWN_SCENES]:
+        sources = {"before": suite / scene / "images", "handed in": given[scene, edit]}
+        for row, folder in sources.items():
+            pictures = []
+            for view in views:
+                file, path = folder / f"{view}.png", f"pictures/{scene}-{edit}-{row[:6]}-{view}.png"
+                if file.is_file():
+                    write_atomic(out / path, file.read_bytes())
+                pictures.append(
+                    Picture(path, f"{scene}, {row}, {view}") if file.is_file() else None
+                )
+            rows.append((f"{scene}, {row}", pictures))
+    return Grid(edit, list(views), rows)
+
+
+def _write(out: Path, result: Result, grids: list[Grid]) -> None:
     result.write(out / "bench-score.json")
     scores = result.scores
     heads, digits = heads_of(scores[0].edit), 3 if result.method.track == WARPS else 2
@@ -284,4 +311,5 @@ def _write(out: Path, result: Result) -> None:
     ]
     tables = [table(scores), *([warps.by_yaw(scores)] if told.track == WARPS else [])]
     sections = [Section("Scores", result.remarks, tables), Section("By scene", tables=[each])]
+    sections += [Section("Pictures", grids=grids)] if grids else []
     write_files(Report(f"Scores of {told.name}", lead, sections), out, "bench-score")

@@ -366,6 +366,14 @@ def test_the_commands_score_a_folder_and_print_its_page(bench, tmp_path):
     page = (out / "bench-score.md").read_text()
     missing = "not handed in: drawn-0/some_colour"
     assert f"Scores of {folder.name}" in page and missing in page and missing in done.stderr
+    # One row of pictures before the edit, one as handed in.
+    shown = [out / name for name in re.findall(r"\]\((pictures/.*?)\)", page)]
+    images = [bench / SCENE / "images", folder / SCENE / "colour"]
+    files = [f / f"{view}.png" for f in images for view in ("source", "yaw010", "yaw030")]
+    assert [path.read_bytes() for path in shown] == [path.read_bytes() for path in files]
+    call = ["bench", "score", str(bench), str(tmp_path / "none"), "--out", str(out)]
+    nothing = CliRunner().invoke(app, call)
+    assert nothing.exit_code == 2 and f"bench run {bench} {tmp_path / 'none'}" in nothing.stderr
 
 
 def true_warps(bench):
