@@ -9,8 +9,8 @@ programs that write them.
 
 from __future__ import annotations
 
-import io
 import math
+import mmap
 import os
 import warnings
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ from attnwarp import check
 from attnwarp.errors import InputWarning
 from attnwarp.gaussians import LARGEST_FILTER, LEAST_FILTER, SCREEN_FILTER, Gaussians, Kind
 from attnwarp.io.file import FileFormatError, existing_file, write_atomically
-from attnwarp.io.text import is_text, overstated, plain_ply, split_ply
+from attnwarp.io.ply_elements import PlyError, parse_ply, write_vertices
 
 Array = npt.NDArray[np.float64]
 Columns = dict[str, npt.NDArray[Any]]
@@ -370,16 +370,12 @@ def _write_vertices(
     comments: Sequence[str] = (),
 ) -> None:
     """Write columns, each part's names, numpy's type and (N, names) values, atomically."""
-    from plyfile import PlyData, PlyElement
-
     kinds = [(name, kind) for names, kind, _ in parts for name in names]
     rows = np.empty(len(parts[0][2]), dtype=kinds)
     for names, _, block in parts:
         for i, name in enumerate(names):
             rows[name] = block[:, i]
-    element = PlyElement.describe(rows, "vertex")
-    data = PlyData([element], byte_order="<", comments=list(comments))
-    write_atomically(path, data.write, follow_link=True)
+    write_atomically(path, lambda stream: write_vertices(stream, rows, comments), follow_link=True)
 
 
 def _names(stem: str, count: int) -> tuple[str, ...]:
@@ -388,92 +384,21 @@ def _names(stem: str, count: int) -> tuple[str, ...]:
 
 def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
     """Read the scalar columns of the element ``vertex``, and all header comments."""
-    import plyfile
-
-    header, text = _check_header(path)
-    # plyfile needs uniform line ends, and closes the text stream that it reads.
-    plain = plain_ply(path.read_bytes()) if text or b"\r" in header else None
-    try:
-        # Values too large for their type become infinite and are refused later.
-        with (
-            np.errstate(over="ignore"),
-            path.open("rb") if plain is None else io.BytesIO(plain) as stream,
-        ):
-            data = plyfile.PlyData.read(stream)
-            size = path.stat().st_size if plain is None else len(plain)
-            left = 0 if text else size - stream.tell()
-    except plyfile.PlyHeaderParseError as error:
-        raise FileFormatError(
-            path, f"not a PLY file, or its header is damaged ({error})"
-        ) from error
-    except plyfile.PlyElementParseError as error:
-        row = error.row
-        prop = error.prop.name if error.prop is not None else None
-        count = error.element.count if error.element is not None else 0
-        if "early end-of-file" in error.message:
-            message = (
-                f"the body ends in row {row} of the {count} that the header announces; get the file"
-                " again, whole"
-            )
-        else:
-            message = f"{error.message} in row {row} of {count}; the row is damaged"
-        raise FileFormatError(path, message, field=prop, row=row) from error
-    except UnicodeDecodeError as error:
-        raise FileFormatError(path, _not_ascii(path.read_bytes())) from error
-    except (ValueError, OverflowError, MemoryError) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise FileFormatError(path, f"cannot be read as a PLY file: {first}") from error
-    if text and plain is not None:
-        found = split_ply(plain)
-        body = b"" if found is None else plain[found[1] :]
-        rows = sum(element.count for element in data.elements)
-        left = max(0, sum(1 for line in body.splitlines() if line.strip()) - rows)
-    if left:
-        raise FileFormatError(
-            path,
-            f"{left} {'lines' if text else 'bytes'} are left after the rows that the header"
-            " announces; the file is damaged, so get it again",
-        )
-    if "vertex" not in data:
-        names = [element.name for element in data.elements]
-        raise FileFormatError(
-            path, f"no element 'vertex' (elements: {', '.join(names) or 'none'})", field="vertex"
-        )
-    vertex = data["vertex"]
-    scalar = [p.name for p in vertex.properties if not isinstance(p, plyfile.PlyListProperty)]
-    own = {name: name for name in scalar}
-    # CloudCompare stores unknown properties as scalar fields of these names.
-    own |= {
-        name.removeprefix("scalar_"): name
-        for name in scalar
-        if name.startswith("scalar_") and name.removeprefix("scalar_") not in own
-    }
-    comments = list(data.comments) + [
-        comment for element in data.elements for comment in element.comments
-    ]
-    return {name: np.asarray(vertex.data[place]) for name, place in own.items()}, comments
-
-
-def _check_header(path: Path) -> tuple[bytes, bool]:
-    """Read the header, and whether the body is text. A row count larger than the bytes is refused
-    before memory is allocated.
-    """
-    size = path.stat().st_size
     with path.open("rb") as stream:
-        begin = stream.read(1 << 20)
-    found = split_ply(begin)
-    if found is None:
-        return b"", False
-    lines, start = found
-    if (beyond := overstated(lines, size)) is not None:
-        name, count = beyond
+        data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    try:
+        elements, comments = parse_ply(data)
+    except PlyError as error:
+        raise FileFormatError(path, str(error), field=error.name, row=error.row) from None
+    if "vertex" not in elements:
         raise FileFormatError(
-            path,
-            f"the header announces {count} rows, but the file has {size} bytes; get the file again,"
-            " whole",
-            field=name,
+            path, f"no element 'vertex' (elements: {', '.join(elements) or 'none'})", field="vertex"
         )
-    return begin[:start], is_text(lines)
+    columns = elements["vertex"].scalars()
+    # CloudCompare stores unknown properties as scalar fields of these names.
+    return {
+        name.removeprefix("scalar_"): column for name, column in columns.items()
+    } | columns, comments
 
 
 def _refuse_other_formats(path: Path, columns: Columns) -> None:
@@ -773,16 +698,3 @@ def _logit(opacities: npt.NDArray[np.floating[Any]]) -> Array:
     with np.errstate(divide="ignore"):
         logit = np.log(o) - np.log1p(-o)
     return np.where(o == 0, LOGIT_OF_ZERO, np.where(o == 1, LOGIT_OF_ONE, logit))
-
-
-def _not_ascii(content: bytes) -> str:
-    """Describe the error of a file whose header is not ASCII text."""
-    lines, _ = split_ply(content) or ([], 0)
-    if lines and lines[0].strip() == b"ply":
-        for number, line in enumerate(lines, 1):
-            if line.startswith((b"comment", b"obj_info")) and not line.isascii():
-                return (
-                    f"line {number} of its header, a comment, is not ASCII text as PLY's must be;"
-                    " take the line out"
-                )
-    return "not a PLY file: its header is not ASCII text"

@@ -858,11 +858,10 @@ def test_the_help_of_edit_names_every_method_and_preset(monkeypatch):
 
 
 @pytest.mark.door
-def test_a_missing_package_is_named(tmp_path, monkeypatch):
-    write_ply(tmp_path / "a.ply", spread())
-    monkeypatch.setitem(sys.modules, "plyfile", None)
-    done = in_process("convert", tmp_path / "a.ply", tmp_path / "b.ply")
-    assert done.exit_code == 2 and "needs the package plyfile: pip install plyfile" in done.stderr
+def test_a_missing_package_is_named(data, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    done = in_process("undistort", data, tmp_path / "flat")
+    assert done.exit_code == 2 and "needs the package cv2: pip install cv2" in done.stderr
 
 
 @pytest.mark.door

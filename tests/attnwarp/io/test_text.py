@@ -12,7 +12,7 @@ from attnwarp.editing.folder import config_of
 from attnwarp.encoders.preprocess import read_json
 from attnwarp.errors import InputError
 from attnwarp.io import FileFormatError, read_colmap, read_dataset, read_ply, read_points
-from attnwarp.io.text import plain_ply, read_text, split_ply
+from attnwarp.io.text import read_text
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -93,11 +93,6 @@ def test_a_ply_of_any_system_is_read_whole_whatever_its_comments_say(end, form, 
     (tmp_path / "b.ply").write_bytes(data + b"1 2 3 4 5 6" + ENDS[end])
     with pytest.raises(FileFormatError, match="left after the rows that the header announces"):
         read_points(tmp_path / "b.ply")
-
-
-def test_a_header_without_an_end_is_no_header():
-    assert split_ply(b"ply\ncomment end_header is never a line of its own\n") is None
-    assert plain_ply(b"ply\rnothing more") == b"ply\rnothing more"
 
 
 def by_name(columns, rows, names):

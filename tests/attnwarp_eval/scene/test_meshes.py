@@ -234,9 +234,9 @@ p 1
         ),
         pytest.param(
             "a.ply",
-            "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\n"
+            "ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\n"
             "element face 200000000\nproperty list uchar int vertex_indices\nend_header\n",
-            "announces 200000000 face, but the file has 143 bytes",
+            "the body ends in row 0 of the 200000000 that the header announces",
             id="a header that announces what would take gigabytes",
         ),
         ("a.glb", "glTF", "begins with no glTF header"),
