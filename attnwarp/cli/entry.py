@@ -9,8 +9,6 @@ import signal
 import sys
 from typing import Any
 
-from attnwarp import process
-
 STOPPED = 130
 """Exit code after Ctrl-C, SIGTERM or SIGHUP; shells use it for Ctrl-C."""
 
@@ -24,15 +22,20 @@ def enter(name: str, module: str) -> None:
         os.write(2, f"{name}: stopped; nothing was written\n".encode())
         os._exit(STOPPED)
 
+    before = signal.getsignal(signal.SIGINT)
+    heeds = before is signal.default_int_handler  # a shell's background job ignores Ctrl-C
+    if heeds:
+        # A command has nothing to save before its import ends, and Ctrl-C comes early.
+        signal.signal(signal.SIGINT, leave)
+
+    from attnwarp import process
+
     # Read when torch loads OpenMP, whose idle threads else spin: on a busy machine the perceptual
     # distance took 15 times the CPU time on two threads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     process.keep_freed_memory()
-    before = signal.getsignal(signal.SIGINT)
-    heeds = before is signal.default_int_handler  # a shell's background job ignores Ctrl-C
-    # A command has nothing to save before its import ends.
-    early = [*process.heeded(process.STOPS), *([signal.SIGINT] if heeds else [])]
-    for number in early:
+    stops = process.heeded(process.STOPS)
+    for number in stops:
         signal.signal(number, leave)
     sys.argv[1:] = [expanded(argument) for argument in sys.argv[1:]]
     main = importlib.import_module(module).main
@@ -49,7 +52,7 @@ def enter(name: str, module: str) -> None:
             os._exit(done.code)
         raise
     finally:
-        for number in early:
+        for number in [*stops, *([signal.SIGINT] if heeds else [])]:
             signal.signal(number, lambda *_: os._exit(STOPPED))
 
 

@@ -41,17 +41,21 @@ NOTHING = "stopped; nothing was written"
 
 _program = "attnwarp"
 _printed: set[str] = set()
+_stop_told = False
+"""True once a line has told that the command was stopped."""
 
 
 def begin(name: str) -> None:
     """Set the command name, the prefix of all messages."""
-    global _program
-    _program = name
+    global _program, _stop_told
+    _program, _stop_told = name, False
     _printed.clear()
 
 
 def fail(message: str, code: int = USAGE) -> typer.Exit:
     """Print an error on stderr; the caller raises the returned exception."""
+    global _stop_told
+    _stop_told = _stop_told or code == STOPPED
     log(message)
     return typer.Exit(code)
 
@@ -218,6 +222,9 @@ def run(app: typer.Typer, name: str) -> None:
         closed_pipe()
         sys.exit(fail(file_error(error)).exit_code)
     except SystemExit as done:
+        if done.code == STOPPED and not _stop_told:
+            # Typer's exit after Ctrl-C where a command does not look out for it: while it imports.
+            log("stopped")
         # Typer's code for a closed pipe is 1; a regression has a separate exception type.
         sys.exit(CLOSED_PIPE if done.code == 1 and type(done) is SystemExit else done.code)
     except Exception as error:

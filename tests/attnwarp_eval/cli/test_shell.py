@@ -40,6 +40,34 @@ def test_a_polite_kill_says_what_is_kept_as_ctrl_c_does(name):
     assert done.stderr == expected
 
 
+@pytest.mark.parametrize(
+    ("moment", "line"),
+    [
+        ("attnwarp.process", "attnwarp-eval: stopped; nothing was written\n"),
+        ("attnwarp_eval.study.study", "attnwarp-eval: stopped\n"),
+    ],
+)
+def test_ctrl_c_during_an_import_ends_in_one_line(moment, line):
+    """The signal comes as the module's import begins: of the command, and of what a command needs."""
+    program = f"""
+import signal, sys
+
+class Interrupt:
+    def find_spec(self, name, *rest):
+        if name == {moment!r}:
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupt())
+sys.argv = ["attnwarp-eval", "run", "quick", "--dry-run"]
+from attnwarp_eval.__main__ import main
+main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=200
+    )
+    assert (done.returncode, done.stderr) == (130, line)
+
+
 def test_output_to_a_full_disk_is_one_line_and_exit_code_2():
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(PRINTS, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
