@@ -17,7 +17,7 @@ WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EBADF, errno.EINVAL)
 
 @contextmanager
 def locked(path: Path, *, wait: bool) -> Iterator[None]:
-    """Hold a lock file, creating it if missing.
+    """Hold a lock file, creating it if missing; it has the number of the process that holds it.
 
     Raises:
         BlockingIOError: another process holds the lock, and ``wait`` is False.
@@ -26,6 +26,8 @@ def locked(path: Path, *, wait: bool) -> Iterator[None]:
     file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.truncate(file, 0)
+        os.write(file, str(os.getpid()).encode())
         yield
     finally:
         os.close(file)

@@ -88,12 +88,13 @@ class Store:
             )
         self.root.mkdir(parents=True, exist_ok=True)
         with ExitStack() as held:
+            lock = self.root / ".lock"
             try:
-                held.enter_context(locked(self.root / ".lock", wait=False))
+                held.enter_context(locked(lock, wait=False))
             except BlockingIOError:
                 raise StoreError(
-                    f"{self.root}: another run is writing to this folder; wait for it, or name"
-                    " another with --out"
+                    f"{self.root}: another run (process {lock.read_text()}) is writing to this"
+                    " folder; wait for it, or name another with --out"
                 ) from None
             self._sweep()
             yield

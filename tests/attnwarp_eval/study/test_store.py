@@ -2,17 +2,24 @@
 
 import hashlib
 import json
+import os
 import re
+import threading
+from contextlib import ExitStack
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
 
+from attnwarp.errors import InputWarning
+from attnwarp.io.lock import locked
 from attnwarp_eval.canonical_json import canonical_json
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.cost import environment
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.record import Environment
+from attnwarp_eval.study.shared import fits
 from attnwarp_eval.study.store import Store, StoreError
 from attnwarp_eval.study.task import Task, results
 
@@ -177,14 +184,31 @@ def test_study_json_carries_the_sha256_of_its_content(tmp_path):
         store.read_study()
 
 
-@pytest.mark.door
-def test_a_second_run_on_the_same_folder_is_refused(tmp_path):
+def test_a_second_run_on_the_same_folder_is_refused_with_the_first_ones_process(tmp_path):
     with (
         Store(tmp_path).lock(),
-        pytest.raises(StoreError, match="another run"),
+        pytest.raises(StoreError, match=rf"another run \(process {os.getpid()}\)"),
         Store(tmp_path).lock(),
     ):
         pass
+
+
+def test_a_fit_that_another_process_makes_is_waited_for_with_a_word(tmp_path, monkeypatch):
+    spec = {
+        "fit": {"settings": {}, "views": 9, "points": 10, "noise": 0},
+        "scene": "", "size": 1, "spp": 1, "seed": 0,
+    }  # fmt: skip
+    world = SimpleNamespace(scene=None, geometry=None)
+    cell = Cell(spec, "bear", "fitted", "fit", 0)
+    work = SimpleNamespace(spec=spec, world=world, root=tmp_path, cell=cell)
+    monkeypatch.setattr(fits.fitted, "fit_scene", lambda *_, **__: "the other's")
+    folder = fits.folder_of(tmp_path, spec)
+    folder.mkdir(parents=True)
+    with ExitStack() as other:
+        other.enter_context(locked(folder / ".lock", wait=False))
+        threading.Timer(0.3, other.close).start()
+        with pytest.warns(InputWarning, match=f"waits for process {os.getpid()}, which makes"):
+            assert fits.fit_of(work) == "the other's"
 
 
 def test_success_forgets_the_former_failure(tmp_path):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
 
 import attnwarp.fit
+from attnwarp.errors import InputWarning
 from attnwarp.fit import FitSettings
 from attnwarp.io.lock import locked
 from attnwarp_eval.canonical_json import digest
@@ -68,8 +71,18 @@ def fit_of(work: Work, spec: Mapping[str, Any] | None = None) -> attnwarp.fit.Fi
     spec, world = work.spec if spec is None else spec, work.world
     data, folder = spec["fit"], folder_of(work.root, spec)
     folder.mkdir(parents=True, exist_ok=True)
+    lock = folder / ".lock"
     # If two workers need one fit, the second reads the first's result.
-    with locked(folder / ".lock", wait=True):
+    with ExitStack() as held:
+        try:
+            held.enter_context(locked(lock, wait=False))
+        except BlockingIOError:
+            warnings.warn(
+                f"{work.cell.title}: waits for process {lock.read_text()}, which makes this fit",
+                InputWarning,
+                stacklevel=2,
+            )
+            held.enter_context(locked(lock, wait=True))
         return fitted.fit_scene(
             world.scene,
             FitSettings.from_dict(data["settings"]),
