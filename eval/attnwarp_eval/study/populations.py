@@ -47,7 +47,8 @@ def expanded(data: Mapping[str, Any]) -> dict[str, Any]:
         except InputError:
             return result  # the folder of meshes is elsewhere, and only the figures are read
         if not all(_is_one_of(path, files) for path in named):
-            # With further scenes, the set is no sample of a population.
+            # With further scenes, the set is no sample of a population, whose files are drawn here.
+            wanted.files({path.stem for path in named if path == files.get(path.stem)})
             result["population"] = None
             return result
         result["scenes"] = [str(files[path.stem]) for path in named]

@@ -809,7 +809,12 @@ def test_arguments_that_do_not_fit_are_named(scene, editor):
         ),
         (
             # As many branches each, of which one differs.
-            {"unseen": "attend", "image_guidance": 0.0, "source_text_guidance": 0.0, "text_guidance": 1.0},
+            {
+                "unseen": "attend",
+                "image_guidance": 0.0,
+                "source_text_guidance": 0.0,
+                "text_guidance": 1.0,
+            },
             "unseen: .* at text guidance 0, but at text guidance 1 stage 1 has",
         ),
     ],

@@ -6,10 +6,12 @@ from pathlib import Path
 import pytest
 import trimesh
 
+from attnwarp.errors import InputError
 from attnwarp_eval.drawn.files import to_text
 from attnwarp_eval.drawn.scenes import draw
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.study import StudyError, load_study
+from attnwarp_eval.study import Store, StudyError, load_study
+from attnwarp_eval.study.run import plan
 from attnwarp_eval.study.study import cells_of, parse_study, scene_files
 
 STUDY = """\
@@ -64,6 +66,13 @@ def test_a_part_of_a_population_says_so_and_other_scenes_are_no_sample(study_fil
     assert load_study(str(study_file), scenes=[str(other)]).sampled == ""
     mixed = load_study(str(study_file), scenes=["drawn-2", "spheres"])
     assert mixed.sampled == "" and mixed.scene_names == ["drawn-2", "spheres"]
+
+
+def test_drawn_scenes_beside_a_misspelt_one_are_drawn_and_not_blamed(study_file):
+    study = load_study(str(study_file), scenes=["drawn-2", "bear-1"])
+    assert Path(study.scenes[0]).read_text() == to_text(draw(2, 7, axes={"thin": 0.2}).data)
+    with pytest.raises(InputError, match="bear-1.*did you mean 'bear'"):
+        plan(study, Store(study_file.parent / "run"))
 
 
 def test_a_stored_study_finds_its_scenes_on_a_machine_that_has_none_of_them(
