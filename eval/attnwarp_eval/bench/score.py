@@ -36,6 +36,7 @@ from attnwarp_eval.bench.result import (
 from attnwarp_eval.bench.suite import Suite, to_bytes, truth_file
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.colors import to_srgb
+from attnwarp_eval.cost import source_hash
 from attnwarp_eval.document.model import Grid, Picture, Report, Section, Table
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.files import write_atomic
@@ -264,7 +265,7 @@ def _power(one: Image, two: Image, where: npt.NDArray[np.bool_]) -> float:
 def _digest(truth: Path, spp: int, folder: Path, track: str) -> str:
     held = (path for path in folder.iterdir() if path.suffix in (".png", ".ply", ".npz"))
     files = sorted(inside(folder, path.name) for path in held)
-    parts = [str(PROTOCOL), track, read_text(truth), str(spp)]
+    parts = [str(PROTOCOL), track, read_text(truth), str(spp), source_hash()]
     parts += [f"{path.name}:{hashlib.sha256(path.read_bytes()).hexdigest()}" for path in files]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 

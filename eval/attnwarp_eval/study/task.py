@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Generic, TypeVar
 
 from attnwarp.reporting import SILENT, Part, Reporter
 from attnwarp_eval.canonical_json import digest
-from attnwarp_eval.study.record import Json
+from attnwarp_eval.cost import environment
+from attnwarp_eval.study.record import Environment, Json
 from attnwarp_eval.study.store import Store
 
 T = TypeVar("T")
@@ -35,6 +37,9 @@ def results(
 ) -> Iterator[T]:
     """Compute the results of tasks, in order. After an interruption only missing ones are computed.
 
+    A record has the environment that computed it. One of other code, versions or another machine is
+    computed again: what is written of results has one environment, that of now.
+
     Args:
         store: store of the folder, locked during the call.
         tasks: tasks, consumed one by one, so that each can be freed.
@@ -51,15 +56,23 @@ def results(
         >>> list(results(Store("run"), squares, 2))
         [4, 9]
     """
+    this = Environment.from_json(environment())
+
+    def read(record: Json, task: Task[T]) -> T:
+        before = Environment.from_json(record["environment"])
+        if not before.same_code(this) or before.machine != this.machine:
+            raise ValueError("computed in another environment")
+        return task.read(record)
+
     with store.lock():
         for number, task in enumerate(tasks):
             report.step(number, total, task.title)
             cell_id = digest(task.spec)
-            result = store.whole(cell_id, task.read)
+            result = store.whole(cell_id, partial(read, task=task))
             if result is None:
-                store.write(
-                    {"id": cell_id, "spec": task.spec, **task.compute(Part(report, number, total))}
-                )
+                body = task.compute(Part(report, number, total))
+                about = {"id": cell_id, "spec": task.spec, "environment": this.to_json()}
+                store.write({**about, **body})
                 result = store.read_as(cell_id, task.read)  # as a resumed run reads it
             yield result
     report.step(total, total, "done")

@@ -21,6 +21,7 @@ from attnwarp.errors import InputError
 from attnwarp.io import read_dataset, read_image
 from attnwarp.io.lock import alone_in
 from attnwarp.warp import PRESETS, warp_view
+from attnwarp_eval import cost
 from attnwarp_eval.bench import result, score, suite, warps
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.files import write_picture
@@ -157,6 +158,16 @@ def test_scores_equal_those_of_a_study_to_the_last_digit(bench, tmp_path):
     for view in record.views:
         for name, value in one.by_view[view.name.partition("/")[2]].items():
             np.testing.assert_equal(value, view.metrics[name])
+
+
+def test_scores_of_other_code_are_measured_again(bench, tmp_path, monkeypatch):
+    pictures, measured, measure = true_pictures(bench, "colour", ["edited"] * 3), [], score._score
+    monkeypatch.setattr(score, "_score", lambda *given: measured.append(1) or measure(*given))
+    for source, times in (("one", 1), ("one", 1), ("two", 2)):
+        for module in (cost, score):
+            monkeypatch.setattr(module, "source_hash", lambda source=source: source, raising=False)
+        scored(bench, tmp_path, pictures, "colour")
+        assert len(measured) == times
 
 
 def test_true_pictures_of_one_answer_have_no_error(bench, tmp_path):

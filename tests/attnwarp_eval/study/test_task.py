@@ -5,6 +5,7 @@ import json
 import pytest
 from edit_folders import Watched
 
+from attnwarp_eval import cost
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.task import Task, results
@@ -53,6 +54,21 @@ def test_tasks_that_were_interrupted_go_on_and_leave_the_bytes_of_a_whole_run(tm
         (2, 3, "4 squared"),
         (2, 3, "4 times 4"),
     ]
+
+
+def test_results_of_other_code_are_computed_again_and_name_the_code_that_made_them(
+    tmp_path, monkeypatch
+):
+    store, computed = Store(tmp_path), []
+    for source in ("one", "one", "two"):
+        monkeypatch.setattr(cost, "source_hash", lambda source=source: source)
+        cost.environment.cache_clear()
+        assert list(results(store, squares(computed)(store), 3)) == [4, 9, 16]
+        # What is written beside them is this environment.
+        assert store.read(digest({"x": 3}))["environment"]["source"] == source
+    assert computed == [2, 3, 4] * 2
+    monkeypatch.undo()
+    cost.environment.cache_clear()
 
 
 @pytest.mark.parametrize("damage", ["digit", "cut", "other shape", "picture"])
