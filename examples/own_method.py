@@ -22,7 +22,7 @@ class NearestFirst(AttentionWarping):
     def __init__(self, work, settings, **rest):
         super().__init__(work, settings, **rest)
         cameras = work.scene.cameras
-        source = cameras[self.sources[0]].position
+        source = cameras[self.source].position
         drawn = [view for stage in self.stages for view in stage]
         drawn.sort(key=lambda view: np.linalg.norm(cameras[view].position - source))
         order = iter(drawn)

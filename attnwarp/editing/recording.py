@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -100,38 +99,22 @@ class RecordingPlan:
         return values * len(self.keep) * self.views * len(self.recorded) * self.dtype.itemsize
 
     def __str__(self) -> str:
-        return in_words([self])
+        def counted(number: int, word: str) -> str:
+            plural = "branches" if word == "branch" else f"{word}s"
+            return f"{number} {word if number == 1 else plural}"
 
-
-def in_words(plans: Sequence[RecordingPlan]) -> str:
-    """Describe the recordings of one or several sources in a line, with their total memory.
-
-    Example:
-        >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
-        >>> plan = RecordingPlan((layer,), (32, 32), ("text",), steps=20)
-        >>> print(in_words([plan, plan]))
-        recording 2 sources, 1 layer, 1 branch (text), 20 steps in float32: 10.0 MiB on the device
-    """
-
-    def counted(number: int, word: str) -> str:
-        plural = "branches" if word == "branch" else f"{word}s"
-        return f"{number} {word if number == 1 else plural}"
-
-    first = plans[0]
-    amount = sum(plan.bytes for plan in plans) / 2**20
-    size = f"{amount / 1024:.2f} GiB" if amount >= 1024 else f"{amount:.1f} MiB"
-    kind = str(first.dtype).removeprefix("torch.")
-    sources = f"{len(plans)} sources, " if len(plans) > 1 else ""
-    places = {"device": "on the device", "cpu": "in main memory"}
-    folders = [plan.store for plan in plans if isinstance(plan.store, Path)]
-    some = len(first.recorded)
-    some_of = "" if some == first.steps else f"{some} of "
-    place = f"in {os.path.commonpath(folders)}" if folders else places[str(first.store)]
-    return (
-        f"recording {sources}{counted(len(first.layers), 'layer')},"
-        f" {counted(len(first.keep), 'branch')} ({', '.join(first.keep)}),"
-        f" {some_of}{counted(first.steps, 'step')} in {kind}: {size} {place}"
-    )
+        amount = self.bytes / 2**20
+        size = f"{amount / 1024:.2f} GiB" if amount >= 1024 else f"{amount:.1f} MiB"
+        kind = str(self.dtype).removeprefix("torch.")
+        places = {"device": "on the device", "cpu": "in main memory"}
+        some = len(self.recorded)
+        some_of = "" if some == self.steps else f"{some} of "
+        place = f"in {self.store}" if isinstance(self.store, Path) else places[self.store]
+        return (
+            f"recording {counted(len(self.layers), 'layer')},"
+            f" {counted(len(self.keep), 'branch')} ({', '.join(self.keep)}),"
+            f" {some_of}{counted(self.steps, 'step')} in {kind}: {size} {place}"
+        )
 
 
 @dataclass(eq=False)

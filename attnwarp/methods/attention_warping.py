@@ -26,7 +26,6 @@ from attnwarp.gaussians import Gaussians
 from attnwarp.methods.base import Loop, Method, Options, Result, ViewEdit, run
 from attnwarp.methods.geometry import Warps
 from attnwarp.methods.settings import AttentionWarpingSettings
-from attnwarp.methods.sight import Sight
 from attnwarp.methods.stages import draw_stages, released_order
 from attnwarp.methods.view_edits import RecordedSource, ViewEdits
 from attnwarp.methods.work import Work, chunks
@@ -153,25 +152,22 @@ class AttentionWarping(Method):
     ) -> None:
         self.work, self.settings = work, settings
         self.views = ViewEdits(work, settings, source, by_hand, warps, store, self.edit_source)
-        self.sources = self.views.sources
-        unedited = [view for view in range(len(work.sizes)) if view not in self.sources]
+        self.source = source
+        unedited = [view for view in range(len(work.sizes)) if view != source]
         self.stages = draw_stages(unedited, settings)
         self.views.check_stages(len(self.stages) if unedited else 0)
         self.about, self.inputs = self.views.about, self.views.inputs
         if warps is not None:
-            targets = [*self.sources[1:], *chain(*self.stages)]
-            self.inputs["warps"] = self.views.geometry.digest(self.sources, targets)
+            self.inputs["warps"] = self.views.geometry.digest([source], [*chain(*self.stages)])
         self.notes = self.views.notes(len(self.stages))
         if settings.psnr_views == "before_last_stage" and len(self.stages) > 1:
             self.psnr_leaves_out = self.stages[-1]
 
     def run(self, loop: Loop) -> None:
         """Run Algorithm 1."""
-        s, edited = self.settings, [*self.sources]
-        # (1) Edit the source and record its features; further sources, if any, receive them.
-        for number, view in enumerate(self.sources):
-            rows = self.views.rows_of_source(number)
-            loop.edit(0, (view,), partial(self.edit_source, number), rows=rows)
+        s, edited = self.settings, [self.source]
+        # (1) Edit the source and record its features.
+        loop.edit(0, (self.source,), self.edit_source, rows=self.views.rows_of_source())
         # (2) For each stage:
         for stage, views in enumerate(self.stages):
             # (3) choose views at random among the unedited ones (see draw_stages);
@@ -182,80 +178,61 @@ class AttentionWarping(Method):
                     loop.edit(stage, batch, partial(self.edit_targets, stage, batch), rows=rows)
             # (6) tune the splats on the edited views.
             edited += [view for view in views if view not in edited]
-            own = [*(self.sources[1:] if stage == 0 else ()), *views]
             if s.training == "all" or not views:
                 loop.tune(stage, edited, s.iterations)
             elif s.training == "stage":
-                loop.tune(stage, own, s.iterations)
+                loop.tune(stage, views, s.iterations)
             else:  # "modulo"
-                loop.tune(stage, [self.sources[0], *own], s.iterations, released_order(len(own)))
+                loop.tune(stage, [self.source, *views], s.iterations, released_order(len(views)))
 
-    def edit_source(
-        self, number: int, model: Gaussians, step: Callable[[], None]
-    ) -> list[ViewEdit]:
-        """Edit the source of a given index and record its features meanwhile (line 1)."""
-        work, views, view = self.work, self.views, self.sources[number]
-        before = views.recorded(number)
-        sights = [views.sight(number, view, work.frozen)]
+    def edit_source(self, model: Gaussians, step: Callable[[], None]) -> list[ViewEdit]:
+        """Edit the source and record its features meanwhile (line 1)."""
+        work, views, view = self.work, self.views, self.source
         with (
             work.folder.seconds.part("source"),
-            work.guided(views.features.source_guidance(further=number > 0)),
+            work.guided(views.features.source_guidance),
             ExitStack() as stack,
         ):
-            start = views.start([view], work.frozen, by_hand=number == 0)
-            start = views.referenced(start, sights, number)
-            views.attend(stack, [view], sights)
-            self._inject(stack, before, sights)
-            tokens, recording = views.keeping(stack, number), None
+            start = views.start([view], work.frozen, by_hand=True)
+            tokens, recording = views.keeping(stack), None
             if views.features.layers:
-                # Record after the injection: the next source gets the features this source used.
-                plan = views.features.plan(view, views.latent_size(view), further=number > 0)
+                plan = views.features.plan(views.latent_size(view))
                 recording = stack.enter_context(record(work.editor, plan))
-            pictures = views.denoise(start, sights, step)
-        views.keep(number, RecordedSource(pictures[0], recording, sights[0], tokens))
-        return [views.result(view, pictures[0], sights[0], number)]
+            (picture,) = views.denoise(start, [None], step)
+        views.keep(RecordedSource(picture, recording, tokens))
+        return [views.result(view, picture)]
 
     def edit_targets(
         self, stage: int, batch: Sequence[int], model: Gaussians, step: Callable[[], None]
     ) -> list[ViewEdit]:
-        """Warp the sources' features to views of one size and edit the views (lines 4 and 5)."""
-        work, views, count = self.work, self.views, len(self.sources)
-        recorded = views.recorded(count)
+        """Warp the source's features to views of one size and edit the views (lines 4 and 5)."""
+        work, views, s = self.work, self.views, self.settings
+        source = views.recorded
         with work.folder.seconds.part("warp"):
-            sights = [views.sight(count, view, model) for view in batch]
-        with work.guided(self.settings.guidance(stage)), ExitStack() as stack:
-            start = views.start(batch, model, stage=stage)
-            start = views.referenced(start, sights, count)
-            views.attend(stack, batch, sights)
-            self._inject(stack, recorded, sights)
-            pictures = views.denoise(start, sights, step)
+            warps = [views.warp(view, model) for view in batch]
+        with work.guided(s.guidance(stage)), ExitStack() as stack:
+            start = views.referenced(views.start(batch, model, stage=stage), warps)
+            views.attend(stack, batch, warps)
+            if source.recording is not None:
+                layers = [views.of_features(warp) for warp in warps]
+                weight = partial(a_t, s=s)
+                stack.enter_context(
+                    inject(work.editor, source.recording, warps=layers, weight=weight)
+                )
+            pictures = views.denoise(start, warps, step)
         return [
-            views.result(view, picture, sight, count)
-            for view, picture, sight in zip(batch, pictures, sights, strict=True)
+            views.result(view, picture, warp)
+            for view, picture, warp in zip(batch, pictures, warps, strict=True)
         ]
-
-    def _inject(
-        self, stack: ExitStack, recorded: Sequence[RecordedSource], sights: Sequence[Sight | None]
-    ) -> None:
-        """Blend recorded features into the editor's; each pixel takes at most one source."""
-        weight = partial(a_t, s=self.settings)
-        for number, source in enumerate(recorded):
-            if source.recording is None:
-                continue
-            warps = [None if sight is None else sight.warp(number) for sight in sights]
-            stack.enter_context(
-                inject(self.work.editor, source.recording, warps=warps, weight=weight)
-            )
 
     def clear(self) -> None:
         """Remove recordings on disk."""
         self.views.clear()
 
     def counters(self, records: dict[int, dict[str, Any]]) -> dict[str, float]:
-        """Count sources and bytes of features; average the warps' weights, before a_t."""
-        shares = [about["injected"] for view, about in records.items() if view != self.sources[0]]
+        """Count bytes of features; average the warps' weights, before a_t."""
+        shares = [about["injected"] for view, about in records.items() if view != self.source]
         return {
-            "sources": len(self.sources),
             "feature_bytes": sum(about.get("feature_bytes", 0) for about in records.values()),
             "injected": sum(shares) / len(shares) if shares else 0.0,
         }

@@ -216,7 +216,7 @@ def _editor(
         warping = settings
 
         def recorded(empty: Any, size: tuple[int, int]) -> str:
-            return str(Features(empty, warping, store).plan(0, size, further=False))
+            return str(Features(empty, warping, store).plan(size))
 
     dtype = dtype_of(options.dtype, device, name)
     if line := announced(name, dtype, device, settings.size, recorded):

@@ -16,13 +16,13 @@ from torch import Tensor
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor, Latent
 from attnwarp.editing.layers import Call, Layer, Network, all_layers, check_rows, hooked
+from attnwarp.editing.schedule import Size
 from attnwarp.gaussians import Gaussians
 from attnwarp.methods.attention import aligned, self_attention
 from attnwarp.methods.base import Loop, Options, Result, ViewEdit, run
 from attnwarp.methods.by_warps import ByWarps, checked_source
 from attnwarp.methods.geometry import Warps
 from attnwarp.methods.settings import CorrespondingSettings
-from attnwarp.methods.sight import Size
 from attnwarp.methods.work import Work, chunks
 from attnwarp.warp import FeatureWarp
 from attnwarp.warp.sampling import work_type

@@ -10,8 +10,8 @@ import torch
 from attnwarp.editing.editor import Editor, guided
 from attnwarp.editing.layers import Layer, choose_layers
 from attnwarp.editing.recording import RecordingPlan
+from attnwarp.editing.schedule import Size
 from attnwarp.methods.settings import AttentionWarpingSettings
-from attnwarp.methods.sight import Size
 
 
 class Features:
@@ -35,23 +35,23 @@ class Features:
             )
             self._check_branches()
 
-    def source_guidance(self, *, further: bool) -> float | None:
-        """Text guidance of a source; None for the editor's default. Further sources use stage 0."""
-        s = self.settings
-        own = None if further else s.source_text_guidance
-        return s.guidance(0) if own is None else own
+    @property
+    def source_guidance(self) -> float | None:
+        """Text guidance of the source; None for the editor's default."""
+        own = self.settings.source_text_guidance
+        return self.settings.guidance(0) if own is None else own
 
-    def plan(self, view: int, size: Size, *, further: bool) -> RecordingPlan:
-        """Plan the recording of a source."""
+    def plan(self, size: Size) -> RecordingPlan:
+        """Plan the recording of the source."""
         s = self.settings
-        branches = self.branches(self.source_guidance(further=further))
+        branches = self.branches(self.source_guidance)
         return RecordingPlan(
             self.layers,
             size,
             self._kept(branches),
             s.steps,
             dtype=self.stored,
-            store=self.store / str(view) if isinstance(self.store, Path) else self.store,  # type: ignore[arg-type]
+            store=self.store,  # type: ignore[arg-type]
             chosen=s.feature_range(),
         )
 
@@ -73,7 +73,7 @@ class Features:
         return tuple(branch for branch in self.editor.carries if branch in branches)
 
     def _check_branches(self) -> None:
-        guidance = self.source_guidance(further=False)
+        guidance = self.source_guidance
         available = self.branches(guidance)
         if self.settings.branches == ():
             raise ValueError(f"branches: got none, expected some of {', '.join(available)}")
@@ -85,39 +85,29 @@ class Features:
                     f" {_in_words(guidance)}"
                 )
 
-    def check_batches(self, stages: Sequence[int], *, further: bool, attends: bool) -> None:
+    def check_batches(self, stages: Sequence[int], *, attends: bool) -> None:
         """Refuse, before any work, source branches that a later batch lacks, and any difference of
         branches if views attend to the source.
         """
         if not self.layers:
             return
-        s = self.settings
-        guidances = {"a further source": s.guidance(0)} if further else {}
-        recorded = [
-            self._kept(self.branches(guidance))
-            for guidance in (self.source_guidance(further=False), *guidances.values())
-        ]
-        guidances |= {f"stage {number + 1}": s.guidance(number) for number in stages}
-        for name, guidance in guidances.items():
+        own = self.branches(self.source_guidance)
+        kept, at = self._kept(own), _in_words(self.source_guidance)
+        change = "text_guidance, source_text_guidance or guidance_drop"
+        for number in stages:
+            guidance = self.settings.guidance(number)
             branches = self.branches(guidance)
-            source = self.source_guidance(further=False)
-            if attends and branches != self.branches(source):
+            there = f"at {_in_words(guidance)} stage {number + 1} has {', '.join(branches)}"
+            if attends and branches != own:
                 raise ValueError(
-                    f"unseen: attends to the source, which has {', '.join(self.branches(source))}"
-                    f" at {_in_words(source)}, but at {_in_words(guidance)} {name} has"
-                    f" {', '.join(branches)}; set unseen to 'free', or choose another"
-                    " text_guidance, source_text_guidance or guidance_drop"
+                    f"unseen: attends to the source, which has {', '.join(own)} at {at}, but"
+                    f" {there}; set unseen to 'free', or choose another {change}"
                 )
-            # A further source also records the branches named by the settings.
-            needs_all = name == "a further source" and s.branches is not None
-            for keep in recorded:
-                shared = set(keep) & set(branches)
-                if not shared or (needs_all and len(shared) < len(set(keep))):
-                    raise ValueError(
-                        f"branches: {', '.join(keep) or 'none'} would be recorded, but at"
-                        f" {_in_words(guidance)} {name} has {', '.join(branches)}; choose other"
-                        " branches, text_guidance, source_text_guidance or guidance_drop"
-                    )
+            if not set(kept) & set(branches):
+                raise ValueError(
+                    f"branches: {', '.join(kept) or 'none'} would be recorded, but {there}; choose"
+                    f" other branches, {change}"
+                )
 
 
 def _in_words(guidance: float | None) -> str:

@@ -9,8 +9,6 @@ Warped Your Noise", ICLR 2024, subdivide pixels and sum the parts instead.)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -37,50 +35,40 @@ def own_seed(*numbers: int) -> int:
     return int(entropy.generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
-def unmoved(size: tuple[int, int]) -> Tensor:
-    """Return the order of a first source, (h, w) int64: the pixels' numbers in turn."""
-    return torch.arange(size[0] * size[1]).reshape(size)
-
-
-def carried(sources: Sequence[Tensor], positions: Sequence[Tensor], choice: Tensor) -> Tensor:
-    """Compute the order of a target's noise.
+def carried(positions: Tensor, mask: Tensor) -> Tensor:
+    """Compute the order of a target's noise from where its pixels lie in the source.
 
     Of several pixels that claim one value, the pixel nearest to the value's source pixel gets it,
     the first of equally near ones. Each remaining pixel takes the value of its number in order if
     free; the rest take the free values in order.
 
     Args:
-        sources: (h, w) int64 order of each source: its pixel p has value number ``order[p]``.
-        positions: (h, w, 2) positions in px of each source's grid (centres at +0.5).
-        choice: (h, w) number of each pixel's source, -1 for none.
+        positions: (h, w, 2) positions in px of the source's grid (centres at +0.5).
+        mask: (h, w) bool: pixels that show what the source shows.
 
     Returns:
-        (h, w) int64, a permutation of the h w numbers.
+        (h, w) int64, a permutation of the numbers of the source's h w pixels in turn.
 
     Example:
         >>> x = torch.tensor([1.2, 1.6, 2.5, 3.5])  # the first two both fall into pixel 1
         >>> xy = torch.stack([x, torch.full((4,), 0.5)], dim=-1)[None]
-        >>> source, first = unmoved((1, 4)), torch.zeros(1, 4, dtype=torch.int64)
-        >>> carried([source], [xy], first).tolist()
+        >>> seen = torch.ones(1, 4, dtype=torch.bool)
+        >>> carried(xy, seen).tolist()
         [[0, 1, 2, 3]]
-        >>> carried([source], [xy + torch.tensor([1.0, 0])], first).tolist()
+        >>> carried(xy + torch.tensor([1.0, 0]), seen).tolist()
         [[0, 2, 3, 1]]
     """
-    h, w = choice.shape
-    pixels, values, distances = [], [], []
-    for number, (order, xy) in enumerate(zip(sources, positions, strict=True)):
-        check.shape(order, (h, w), "sources")
-        check.shape(xy, (h, w, 2), "positions")
-        inside = (xy >= 0).all(dim=-1) & (xy[..., 0] <= w) & (xy[..., 1] <= h)  # False for NaN
-        wanted = ((choice == number) & inside).flatten()
-        place = xy.reshape(-1, 2)[wanted]
-        column, row = place[:, 0].floor().clamp(max=w - 1), place[:, 1].floor().clamp(max=h - 1)
-        pixels.append(wanted.nonzero()[:, 0].numpy())
-        values.append(order.flatten()[(row * w + column).long()].numpy())
-        center = torch.stack([column, row], dim=-1) + 0.5
-        distances.append((place - center).square().sum(dim=-1).numpy())
-    pixel, value = np.concatenate(pixels), np.concatenate(values)
-    ranked = np.lexsort((pixel, np.concatenate(distances), value))
+    h, w = mask.shape
+    check.shape(positions, (h, w, 2), "positions")
+    # False for NaN
+    inside = (positions >= 0).all(dim=-1) & (positions[..., 0] <= w) & (positions[..., 1] <= h)
+    wanted = (mask & inside).flatten()
+    place = positions.reshape(-1, 2)[wanted]
+    column, row = place[:, 0].floor().clamp(max=w - 1), place[:, 1].floor().clamp(max=h - 1)
+    center = torch.stack([column, row], dim=-1) + 0.5
+    distance = (place - center).square().sum(dim=-1).numpy()
+    pixel, value = wanted.nonzero()[:, 0].numpy(), (row * w + column).long().numpy()
+    ranked = np.lexsort((pixel, distance, value))
     pixel, value = pixel[ranked], value[ranked]
     first = np.ones(len(value), dtype=bool)
     first[1:] = value[1:] != value[:-1]

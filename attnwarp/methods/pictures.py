@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,9 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.camera import Camera
+from attnwarp.editing.injection import LayerWarp
 from attnwarp.editing.layers import Layer
 from attnwarp.editing.recording import Recording
-from attnwarp.methods.sight import Sight
 
 Image = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
@@ -136,20 +135,6 @@ def mask_picture(mask: Tensor) -> Bytes:
     return np.repeat(pixels[..., None], 3, axis=2)
 
 
-SOURCE_COLORS = (
-    (255, 255, 255), (240, 180, 60), (80, 170, 240), (90, 200, 110), (220, 110, 190), (200, 90, 70),
-)  # fmt: skip
-"""Colours of the sources in a picture of masks, the first white; the colours repeat."""
-
-
-def sight_picture(sight: Sight) -> Bytes:
-    """Draw visibility, (H, W, 3) uint8: the colour of each pixel's source, black without one."""
-    choice = sight.choice((sight.mask.shape[0], sight.mask.shape[1]))
-    colors = torch.tensor(SOURCE_COLORS, dtype=torch.float64)
-    pixels = colors[choice.clamp_min(0) % len(colors)] * sight.mask[..., None]
-    return np.asarray(pixels.round().to(torch.uint8).cpu().numpy())
-
-
 class Principal:
     """Three principal components of a source's feature map, as colours.
 
@@ -198,22 +183,18 @@ class FeaturePictures:
 
     def of_target(
         self,
-        recordings: Sequence[Recording],
-        sight: Sight,
+        recording: Recording,
+        warp: LayerWarp,
         latent_size: Size,
         shape: tuple[int, ...],
     ) -> Bytes:
-        """Draw sources' features warped to a target, (H, W, 3) uint8; black without a source."""
-        parts = []
-        for number, recording in enumerate(recordings):
-            layer, features = self._of(recording)
-            size = layer.size(latent_size)
-            source_size = layer.size(recording.plan.latent_size)
-            grid = sight.warp(number).at(size, source_size=source_size)
-            warped = grid.warp_tokens(features[None].cpu())[0]
-            parts.append(self._principal.picture(warped, size, grid.mask))
-        # A pixel takes at most one source and is black in the other sources' pictures.
-        return enlarged(np.maximum.reduce(parts), (shape[0], shape[1]))
+        """Draw the source's features warped to a target, (H, W, 3) uint8; black where none are."""
+        layer, features = self._of(recording)
+        size = layer.size(latent_size)
+        grid = warp.at(size, source_size=layer.size(recording.plan.latent_size))
+        warped = grid.warp_tokens(features[None].cpu())[0]
+        picture = self._principal.picture(warped, size, grid.weight > 0)
+        return enlarged(picture, (shape[0], shape[1]))
 
     def _of(self, recording: Recording) -> tuple[Layer, Tensor]:
         """Select the displayed layer and its (h w, C) features."""

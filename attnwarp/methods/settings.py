@@ -147,11 +147,8 @@ class AttentionWarpingSettings(MethodSettings):
         mask: True injects only inside M; False wherever the target has a depth (ablation "no M").
         outside: features of points that project outside the source: the "border"'s, or "zeros", as
             padding gives them. With a mask such points take no features.
-        sources: number of views whose features are recorded and warped. Those after the first are
-            edited in a chain outward from it, each covered by the ones before; a target's pixel
-            takes the source that sees it best (:mod:`attnwarp.methods.sight`).
         unseen: editing of marked pixels that no warp reaches: "free", as the editor chooses, or
-            "attend", with attention to the first source's edit (:mod:`attnwarp.methods.unseen`).
+            "attend", with attention to the source's edit (:mod:`attnwarp.methods.unseen`).
         reference: the source's edit as a further picture that the editor sees beside the view's
             own, if it takes any: "plain" as it is, or "warped" to the view, whose own picture stays
             where the source sees nothing.
@@ -215,7 +212,6 @@ class AttentionWarpingSettings(MethodSettings):
     warp: WarpSettings = WARPS["corrected"]
     mask: bool = True
     outside: Literal["border", "zeros"] = "border"
-    sources: Count = 1
     unseen: Literal["free", "attend"] = "free"
     reference: Literal["none", "plain", "warped"] = "none"
     depth_from: Literal["frozen", "current"] = "frozen"

@@ -17,7 +17,7 @@ SOURCE_EVERY = 10
 def draw_stages(unedited: Sequence[int], settings: AttentionWarpingSettings) -> list[list[int]]:
     """Draw each stage's views at random from those not edited so far (line 3).
 
-    If all views are sources, one stage without views remains, which tunes on the sources. A last
+    Without views, one stage without views remains, which tunes on the source. A last
     stage short of views takes some of the earlier views again, if the settings say so.
     """
     s = settings

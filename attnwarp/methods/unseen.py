@@ -19,18 +19,20 @@ from torch import Tensor
 from attnwarp.editing.layers import Layer
 from attnwarp.editing.schedule import Size
 from attnwarp.methods.attention import Attend, self_attention
-from attnwarp.methods.sight import Sight, averaged
+from attnwarp.warp import WarpedView
+from attnwarp.warp.masks import axis_weights
 
 Unseen = Callable[[Size], Tensor]
 """Function of a grid's (h, w) that returns the share of each token that attends to the source."""
 
 
-def unseen_of(sight: Sight, segment: npt.NDArray[Any]) -> Unseen:
+def unseen_of(warp: WarpedView, segment: npt.NDArray[Any]) -> Unseen:
     """Mark the tokens of a target that no warp reaches, inside its segment."""
 
     def share(size: Size) -> Tensor:
-        reached = torch.stack([sight.mask_at(k, size) for k in range(len(sight.views))]).any(dim=0)
-        return averaged(torch.as_tensor(segment), size) * ~reached
+        # The mask does not depend on the size of the source's grid.
+        reached = warp.at(size, source_size=size).mask
+        return _averaged(torch.as_tensor(segment), size) * ~reached
 
     return share
 
@@ -113,3 +115,10 @@ def has_self_attention(network: Any) -> bool:
     """Return True if a network has self-attention of diffusers."""
     names = getattr(network, "attn_processors", {})
     return any(name.endswith(".attn1.processor") for name in names)
+
+
+def _averaged(values: Tensor, size: Size) -> Tensor:
+    """Average (H, W) values over the pixels of an (h, w) grid, float64."""
+    rows = axis_weights(size[0], values.shape[0], "area")
+    columns = axis_weights(size[1], values.shape[1], "area")
+    return rows @ values.double() @ columns.T

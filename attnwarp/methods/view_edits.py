@@ -1,4 +1,4 @@
-"""Edits of single views for attention warping: guides, initial latents, recorded sources."""
+"""Edits of single views for attention warping: guides, initial latents, the recorded source."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from attnwarp.digest import digest
 from attnwarp.editing.editor import Editor, edit
 from attnwarp.editing.inversion import NoiseMaps, inversion_rows, invert_view, noise_maps, replay
 from attnwarp.editing.layers import Layer
-from attnwarp.editing.recording import Recording, RecordingPlan, in_words
-from attnwarp.editing.schedule import Time
+from attnwarp.editing.recording import Recording, RecordingPlan
+from attnwarp.editing.schedule import Size, Time
 from attnwarp.gaussians import Gaussians
 from attnwarp.io.names import file_stems
 from attnwarp.methods.base import ViewEdit, edit_file
-from attnwarp.methods.carried import Noise, carry
+from attnwarp.methods.carried import carry, initial_noise
 from attnwarp.methods.features import Features
 from attnwarp.methods.geometry import Geometry, Warps
+from attnwarp.methods.padding import ZeroPadded
 from attnwarp.methods.pictures import (
     FeaturePictures,
     Image,
     check_view_aspect,
+    mask_picture,
     resized,
-    sight_picture,
     to_bytes,
 )
 from attnwarp.methods.scene import checked_image, to_float
 from attnwarp.methods.settings import AttentionWarpingSettings
-from attnwarp.methods.sight import Sight, Size
 from attnwarp.methods.unseen import (
     SourceTokens,
     attending,
@@ -46,7 +46,7 @@ from attnwarp.methods.unseen import (
     unseen_of,
 )
 from attnwarp.methods.work import Guide, Work
-from attnwarp.workdir import MANIFEST
+from attnwarp.warp import WarpedView
 
 RECORDING = ".recording"
 """Folder of the recorded features while an edit with ``store="disk"`` is in progress."""
@@ -54,18 +54,16 @@ RECORDING = ".recording"
 
 @dataclass(frozen=True, eq=False)
 class RecordedSource:
-    """Edit of a source in this process.
+    """Edit of the source in this process.
 
     Attributes:
         picture: (h, w, 3) in [0, 1].
-        recording: features of the source; None if their weight is 0.
-        sight: visibility of this source from the earlier ones; None for the first.
-        tokens: inputs of the first source's self-attention, if unseen tokens attend to them.
+        recording: its features; None if their weight is 0.
+        tokens: inputs of its self-attention, if unseen tokens attend to them.
     """
 
     picture: Image
     recording: Recording | None
-    sight: Sight | None = None
     tokens: SourceTokens | None = None
 
 
@@ -114,7 +112,7 @@ def check_editor(editor: Editor, settings: AttentionWarpingSettings) -> int | No
 
 
 class ViewEdits:
-    """Editor of single views, with its sources."""
+    """Editor of single views, with the source."""
 
     def __init__(
         self,
@@ -138,16 +136,14 @@ class ViewEdits:
         self.folder = work.folder.path / RECORDING
         self.features = Features(work.editor, settings, self.folder if store == "disk" else store)
         self.geometry = Geometry(work, settings, warps)
-        self.noise = Noise(settings)
-        self.sources = (source, *self._further_sources(source))
-        self._recorded: list[RecordedSource] = []
-        names = [self.names[view] for view in self.sources]
-        self.about = {"source": names[0], "sources": names}
+        self.source = source
+        self._recorded: RecordedSource | None = None
+        self.about = {"source": self.names[source]}
         self.inputs = {"source_picture": None if self.by_hand is None else digest(self.by_hand)}
 
     @property
     def attends(self) -> bool:
-        """True if marked tokens that no warp reaches attend to the first source."""
+        """True if marked tokens that no warp reaches attend to the source."""
         able = has_self_attention(self.work.editor.network) and bool(self._attending_layers)
         return self._wants_attention and able
 
@@ -160,30 +156,30 @@ class ViewEdits:
     def _attending_layers(self) -> tuple[Layer, ...]:
         return tuple(layer for layer in self.features.layers if layer.kind == "self")
 
-    def keeping(self, stack: ExitStack, number: int) -> SourceTokens | None:
-        """Keep the first source's tokens for views to attend to, until the stack is left."""
-        if number or not self.attends:
+    def keeping(self, stack: ExitStack) -> SourceTokens | None:
+        """Keep the source's tokens for views to attend to, until the stack is left."""
+        if not self.attends:
             return None
         passes = self.settings.feature_range()
         network, layers = self.work.editor.network, self._attending_layers
         return stack.enter_context(kept_tokens(network, layers, self.features.stored, passes))
 
     def _tokens_plan(self, features: RecordingPlan) -> RecordingPlan:
-        branches = self.features.branches(self.features.source_guidance(further=False))
+        branches = self.features.branches(self.features.source_guidance)
         return replace(features, layers=self._attending_layers, keep=branches, store="cpu")
 
     def attend(
-        self, stack: ExitStack, views: Sequence[int], sights: Sequence[Sight | None]
+        self, stack: ExitStack, views: Sequence[int], warps: Sequence[WarpedView | None]
     ) -> None:
-        """Let unseen tokens of views attend to the first source, until the stack is left."""
-        tokens = self._recorded[0].tokens if self._recorded else None
+        """Let unseen tokens of views attend to the source, until the stack is left."""
+        tokens = self.recorded.tokens
         segments = self.work.scene.segments
         if tokens is None or segments is None:
             return
         unseen = [
-            unseen_of(sight, segments[view])
-            for view, sight in zip(views, sights, strict=True)
-            if sight is not None
+            unseen_of(warp, segments[view])
+            for view, warp in zip(views, warps, strict=True)
+            if warp is not None
         ]
         network, layers = self.work.editor.network, self._attending_layers
         size, passes = self.latent_size(views[0]), self.settings.feature_range()
@@ -202,41 +198,23 @@ class ViewEdits:
             )
         return resized(image, self.work.sizes[source])
 
-    def _further_sources(self, source: int) -> tuple[int, ...]:
-        """Sources after the first; a resumed run keeps the sources of its folder."""
-        if self.settings.sources == 1:
-            return ()
-        if self.work.folder.has(MANIFEST):
-            names = self.work.folder.read_json(MANIFEST).get("sources", [])[1:]
-            if set(names) <= set(self.names):  # else the claim refuses the folder
-                return tuple(self.names.index(name) for name in names)
-        with self.work.folder.seconds.part("warp"):
-            return self.geometry.chain(source)
-
     def check_stages(self, stages: int) -> None:
         """Refuse, before any work, branches that a stage lacks."""
-        self.features.check_batches(
-            range(stages), further=len(self.sources) > 1, attends=self.attends
-        )
+        self.features.check_batches(range(stages), attends=self.attends)
 
     def notes(self, stages: int) -> list[str]:
         """Describe settings that the views or the editor limit, one line each."""
         asked, views = self.settings, len(self.names)
-        longest, lines = max(self.work.sizes[self.sources[0]]), []
+        longest, lines = max(self.work.sizes[self.source]), []
         if asked.size is not None and longest != asked.size:
             lines.append(
                 f"size: {longest} px in place of {asked.size}, as this editor's sides are multiples"
                 f" of {self.work.editor.side_multiple}"
             )
-        if len(self.sources) < asked.sources:
-            lines.append(
-                f"sources: {len(self.sources)} in place of {asked.sources}, as there are {views}"
-                " views"
-            )
         if stages < asked.stages:
-            on_sources = "" if views > len(self.sources) else " that tunes on the sources alone"
+            on_source = "" if views > 1 else " that tunes on the source alone"
             lines.append(
-                f"stages: {stages}{on_sources} in place of {asked.stages}, as {views} views leave"
+                f"stages: {stages}{on_source} in place of {asked.stages}, as {views} views leave"
                 " no more to edit"
             )
         if self._wants_attention and not self.attends:
@@ -245,44 +223,43 @@ class ViewEdits:
                 " of a UNet is recorded that could attend to the source"
             )
         if self.features.layers:
-            plans = [
-                self.features.plan(view, self.latent_size(view), further=number > 0)
-                for number, view in enumerate(self.sources)
-            ]
-            lines.append(in_words(plans))
+            plan = self.features.plan(self.latent_size(self.source))
+            lines.append(str(plan))
             if self.attends:
-                lines.append(f"for what no warp reaches, {in_words([self._tokens_plan(plans[0])])}")
+                lines.append(f"for what no warp reaches, {self._tokens_plan(plan)}")
         return lines
 
-    # --- sources
+    # --- the source
 
-    def recorded(self, count: int) -> list[RecordedSource]:
-        """Return the first ``count`` sources with their features. A process that found their edits
-        finished repeats the edits, with the same bytes.
+    @property
+    def recorded(self) -> RecordedSource:
+        """The source with its features. A process that found its edit finished repeats the edit,
+        with the same bytes.
         """
-        while len(self._recorded) < count:
-            number = len(self._recorded)
-            view = self.sources[number]
-            self.work.report.log(f"recording the features of {self.names[view]} again")
-            (again,) = self.edit_source(number, self.work.frozen, lambda: None)
-            pixels = to_bytes(self.work.composite(view, again.picture))
-            self.work.folder.check_same(edit_file(0, self.names[view]), pixels)
-        return self._recorded[:count]
+        if self._recorded is None:
+            name = self.names[self.source]
+            self.work.report.log(f"recording the features of {name} again")
+            (again,) = self.edit_source(self.work.frozen, lambda: None)
+            pixels = to_bytes(self.work.composite(self.source, again.picture))
+            self.work.folder.check_same(edit_file(0, name), pixels)
+        assert self._recorded is not None
+        return self._recorded
 
-    def keep(self, number: int, source: RecordedSource) -> None:
-        """Keep a source's edit for the views that take its features."""
-        del self._recorded[number:], self.noise.orders[number:]
-        self._recorded.append(source)
-        size = self.latent_size(self.sources[number])
-        self.noise.orders.append(self.noise.order(source.sight, size))
+    def keep(self, source: RecordedSource) -> None:
+        """Keep the source's edit for the views that take its features."""
+        self._recorded = source
 
-    def sight(self, sources: int, view: int, model: Gaussians) -> Sight | None:
-        """Compute the visibility of a view from the first sources; None if nothing is warped."""
+    def warp(self, view: int, model: Gaussians) -> WarpedView | None:
+        """Compute the warp from the source to a view; None if nothing is warped."""
         s = self.settings
-        warps = s.a0 > 0 or s.noise == "surface" or s.reference == "warped"
-        if not sources or not warps:
-            return None
-        return self.geometry.sight(self.sources[:sources], view, model)
+        if s.a0 > 0 or s.noise == "surface" or s.reference == "warped":
+            return self.geometry.warp(self.source, view, model)
+        return None
+
+    def of_features(self, warp: WarpedView | None) -> WarpedView | ZeroPadded | None:
+        """Surround features by zeros, if the settings say so."""
+        zeros = not self.settings.mask and self.settings.outside == "zeros"
+        return ZeroPadded(warp) if warp is not None and zeros else warp
 
     # --- an edit
 
@@ -292,7 +269,7 @@ class ViewEdits:
         """Prepare views' edits, before features are recorded or injected.
 
         Args:
-            stage: number of the stage, from 0; sources are edited in the first.
+            stage: number of the stage, from 0; the source is edited in the first.
             by_hand: True replays the edit made elsewhere, if given.
         """
         work, s = self.work, self.settings
@@ -317,26 +294,24 @@ class ViewEdits:
         )
         return Start(views, guides, latents=latents)
 
-    def referenced(self, start: Start, sights: Sequence[Sight | None], sources: int) -> Start:
-        """Show the edits of the first ``sources`` beside the views' guides, as settings say."""
-        kind, edits = self.settings.reference, [s.picture for s in self._recorded[:sources]]
-        if kind == "none" or not edits:
+    def referenced(self, start: Start, warps: Sequence[WarpedView | None]) -> Start:
+        """Show the source's edit beside the views' guides, as settings say."""
+        kind = self.settings.reference
+        if kind == "none":
             return start
-        guides = []
-        for guide, sight in zip(start.guides, sights, strict=True):
-            size = guide.shape[0], guide.shape[1]
+        edited, guides = self.recorded.picture, []
+        for guide, warp in zip(start.guides, warps, strict=True):
             if kind == "plain":
-                shown = [resized(edit, size) for edit in edits[: self.work.editor.references]]
+                shown = resized(edited, (guide.shape[0], guide.shape[1]))
             else:
-                assert sight is not None
-                own, *maps = (torch.from_numpy(p).permute(2, 0, 1) for p in (guide, *edits))
-                warps = [sight.warp(number, picture=True) for number in range(len(edits))]
-                shown = [carry(own, maps, warps, 1.0).permute(1, 2, 0).numpy().clip(0, 1)]
-            guides.append(np.stack([guide, *shown]))
+                assert warp is not None
+                own, source = (torch.from_numpy(p).permute(2, 0, 1) for p in (guide, edited))
+                shown = carry(own, source, warp).permute(1, 2, 0).numpy().clip(0, 1)
+            guides.append(np.stack([guide, shown]))
         return replace(start, guides=guides)
 
     def denoise(
-        self, start: Start, sights: Sequence[Sight | None], step: Callable[[], None]
+        self, start: Start, warps: Sequence[WarpedView | None], step: Callable[[], None]
     ) -> list[Image]:
         """Edit views from their start, as (h, w, 3) pictures in [0, 1]."""
         work, s = self.work, self.settings
@@ -344,7 +319,10 @@ class ViewEdits:
             picture, task, maps = start.replayed
             replay(work.editor.schedule, task.predict, maps, on_step=lambda *_: step())
             return [picture]
-        shape = work.editor.noise_shape(work.sizes[start.views[0]])
+        noise = None
+        if start.latents is None:
+            shape = work.editor.noise_shape(work.sizes[start.views[0]])
+            noise = initial_noise(s, start.views, shape, self.latent_size(self.source), warps)
         return edit(
             work.editor,
             start.guides,
@@ -353,7 +331,7 @@ class ViewEdits:
             start=self.timestep,
             grid=s.grid,
             pictures=start.pictures or None,
-            noise=self.noise.of(start.views, shape, sights) if start.latents is None else None,
+            noise=noise,
             latents=start.latents,
             on_step=lambda *_: step(),
             regions=work.regions(start.views),
@@ -363,18 +341,17 @@ class ViewEdits:
         """Timesteps of the source's edit."""
         s, schedule = self.settings, self.work.editor.schedule
         if self.timestep is None:
-            return schedule.timesteps(s.steps, self.latent_size(self.sources[0]))
+            return schedule.timesteps(s.steps, self.latent_size(self.source))
         return schedule.published(self.timestep, s.steps, s.grid)
 
     def latent_size(self, view: int) -> Size:
         """(h, w) of a view's latents."""
         return self.work.editor.noise_shape(self.work.sizes[view])[1:]
 
-    def rows_of_source(self, number: int) -> int:
-        """Rows through the UNet for a source's edit; an edit made elsewhere is inverted first."""
-        guidance = self.features.source_guidance(further=number > 0)
-        by_hand = number == 0 and self.by_hand is not None
-        return self.rows(1, guidance, 0) * (2 if by_hand else 1)
+    def rows_of_source(self) -> int:
+        """Rows through the UNet for the source's edit; an edit made elsewhere is inverted first."""
+        rows = self.rows(1, self.features.source_guidance, 0)
+        return rows if self.by_hand is None else 2 * rows
 
     def rows(self, views: int, guidance: float | None, stage: int) -> int:
         """Rows through the UNet for the edits of a stage's views, given the text guidance."""
@@ -386,44 +363,24 @@ class ViewEdits:
 
     # --- results for inspection
 
-    def result(self, view: int, picture: Image, sight: Sight | None, sources: int) -> ViewEdit:
-        """Collect a view's edit with its record and pictures.
-
-        Args:
-            sources: number of sources available to the view; for a source, its index.
-        """
+    def result(self, view: int, picture: Image, warp: WarpedView | None = None) -> ViewEdit:
+        """Collect a view's edit with its record and pictures."""
         about: dict[str, Any] = {"injected": 0.0}
-        pictures = {}
-        own = self._recorded[sources] if self.sources.count(view) else None
-        if own is not None:
-            plan = None if own.recording is None else own.recording.plan
-            about["feature_bytes"] = 0 if plan is None else plan.bytes
-        recordings = [s.recording for s in self._recorded[:sources] if s.recording is not None]
+        pictures, recording = {}, self.recorded.recording
         shape = self.work.scene.images[view].shape[:2]
-        if sight is not None and recordings:
-            about["injected"] = float(sight.mask.float().mean())
-            rules = sight.views[0].rules
-            about["rules"] = {k: float(rule.float().mean()) for k, rule in rules.items()}
-            if sources > 1:
-                choice = sight.choice((sight.mask.shape[0], sight.mask.shape[1]))
-                about["sources"] = {
-                    self.names[source]: float((choice == number).float().mean())
-                    for number, source in enumerate(self.sources[:sources])
-                }
-            pictures["masks"] = sight_picture(sight)
-            pictures["features"] = self._shown.of_target(
-                recordings, sight, self.latent_size(view), shape
-            )
-        elif own is not None and own.recording is not None:
-            pictures["features"] = self._shown.of_source(own.recording, shape)
+        if view == self.source:
+            about["feature_bytes"] = 0 if recording is None else recording.plan.bytes
+            if recording is not None:
+                pictures["features"] = FeaturePictures(recording).of_source(recording, shape)
+        elif warp is not None and recording is not None:
+            about["injected"] = float(warp.mask.float().mean())
+            about["rules"] = {k: float(rule.float().mean()) for k, rule in warp.rules.items()}
+            pictures["masks"] = mask_picture(warp.mask)
+            layers, size = self.of_features(warp), self.latent_size(view)
+            assert layers is not None
+            shown = FeaturePictures(recording)
+            pictures["features"] = shown.of_target(recording, layers, size, shape)
         return ViewEdit(picture, about, pictures)
-
-    @property
-    def _shown(self) -> FeaturePictures:
-        """Colours of features, from the first source's principal components."""
-        first = self._recorded[0].recording
-        assert first is not None
-        return FeaturePictures(first)
 
     def clear(self) -> None:
         """Remove recordings on disk: recordings of a killed process are never read."""

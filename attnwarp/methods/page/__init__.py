@@ -28,7 +28,7 @@ from attnwarp.methods.base import VIEWER_PLY, edit_file
 from attnwarp.methods.change import say_change, say_drift, say_little
 from attnwarp.methods.page.measured import CONTROL, disagreement, edited_alone, spill
 from attnwarp.methods.page.orbit import degrees_apart, focus_of, orbit, renders, up_of, write_film
-from attnwarp.methods.pictures import SOURCE_COLORS, Bytes, resized, to_bytes
+from attnwarp.methods.pictures import Bytes, resized, to_bytes
 from attnwarp.methods.scene import Scene, near_of, to_float
 from attnwarp.reporting import SILENT, Reporter
 from attnwarp.workdir import MANIFEST, Workdir
@@ -112,11 +112,12 @@ class _Page:
         self.photographs = dict(zip(self.names, images, strict=True))
         # A run ended by its budget lacks the last planned views.
         self.edited = [name for name in self.names if folder.has(f"views/{name}.png")]
-        self.sources = [name for name in self.manifest.get("sources", []) if name in self.edited]
-        others = [name for name in self.edited if name not in self.sources]
-        room = min(max(0, MOST_VIEWS - len(self.sources)), len(others))
+        source = self.manifest.get("source")
+        self.source = source if source in self.edited else None
+        others = [name for name in self.edited if name != self.source]
+        room = min(MOST_VIEWS - (self.source is not None), len(others))
         spread = [others[k * len(others) // room] for k in range(room)]
-        self.shown = [*self.sources, *spread][:MOST_VIEWS]
+        self.shown = [*([] if self.source is None else [self.source]), *spread]
         files = [f"segments/{name}.png" for name in self.names]
         self.segments = (
             [folder.read_picture(file)[..., 0] > 127 for file in files]
@@ -224,7 +225,8 @@ class _Page:
             ),
             ("Scene before", "scene before", lambda name: self._read(f"{RENDERS[0]}/{name}.png")),
             ("Edited scene", "edited scene", lambda name: self._read(f"{RENDERS[1]}/{name}.png")),
-            (self._where(), "where features came from",
+            ("Where features came from: white from the source, black from none",
+             "where features came from",
              lambda name: self._read(f"masks/{name}.png")),
             ("Features of the source, warped to the view; their three main components as colours",
              "features", lambda name: self._read(f"features/{name}.png")),
@@ -243,44 +245,29 @@ class _Page:
             if len(self.shown) < len(self.edited)
             else ""
         )
-        if len(self.shown) > 1 and self.sources:
-            count += f" Degrees are from {escape(self.sources[0])}, about the scene's middle."
+        if len(self.shown) > 1 and self.source is not None:
+            count += f" Degrees are from {escape(self.source)}, about the scene's middle."
         style = f"grid-template-columns: repeat({max(1, len(self.shown))}, minmax(0, 1fr))"
         shares = self._shares() if carried else ""
         grid = f'<div class="grid" style="{style}">{"".join(cells)}</div>'
         return f"<h2>Views</h2><p>{count}</p>{shares}{grid}"
 
     def _title(self, name: str) -> str:
-        if not self.sources or name in self.sources:
-            return f"{name} (source)" if self.sources else name
-        source, view = (self.cameras[self.names.index(n)] for n in (self.sources[0], name))
+        if self.source is None or name == self.source:
+            return name if self.source is None else f"{name} (source)"
+        source, view = (self.cameras[self.names.index(n)] for n in (self.source, name))
         return f"{name}, {degrees_apart(source, view, self.focus):.0f}°"
-
-    def _where(self) -> str:
-        if len(self.sources) < 2:
-            return "Where features came from: white from the source, black from none"
-        colors = " ".join(
-            f'<span style="background:rgb{SOURCE_COLORS[k % len(SOURCE_COLORS)]};color:#000;'
-            f'padding:0 .4em;border-radius:3px">{escape(name)}</span>'
-            for k, name in enumerate(self.sources)
-        )
-        return f"Where features came from: {colors}; black from none"
 
     def _shares(self) -> str:
         """Write a sentence on the part of the views that receives features."""
         lines = []
         for name in self.shown:
             about = self._record(name)
-            if about is None or name == self.sources[0]:
-                continue
-            if "sources" in about:
-                each = [f"{v:.0%} from {escape(k)}" for k, v in about["sources"].items() if v > 0]
-                lines.append(f"{escape(name)} {', '.join(each) or 'none'}")
-            else:
+            if about is not None and name != self.source:
                 lines.append(f"{escape(name)} {about['injected']:.0%}")
         if not lines:
             return ""
-        return f"<p>Pixels that take features of a source: {'; '.join(lines)}.</p>"
+        return f"<p>Pixels that take features of the source: {'; '.join(lines)}.</p>"
 
     def _record(self, name: str) -> dict[str, Any] | None:
         numbers = [k for k, part in enumerate(self.manifest["rounds"]) if name in part["views"]]

@@ -66,9 +66,8 @@ def edited_alone(
         settings = AttentionWarpingSettings.from_dict({**given, **nothing})
         work, source = work_with(settings), names.index(manifest["source"])
         method = AttentionWarping(work, settings, source, None, None, "cpu")
-        # Noise on the surface hangs on the sources', so they are edited first.
-        edits += [((v,), partial(method.edit_source, n)) for n, v in enumerate(method.sources)]
-        targets = [view for view in left if view not in method.sources]
+        edits.append(((source,), method.edit_source))
+        targets = [view for view in left if view != source]
         for _, same in groupby(targets, key=lambda view: work.sizes[view]):
             for some in chunks([*same], settings.batch):
                 edits.append((some, partial(method.edit_targets, 0, some)))

@@ -39,25 +39,16 @@ from attnwarp.trial import disc
 from attnwarp.warp import Surface, warp_surfaces
 
 QUICK = preset("attention_warping", stages=2, views_per_stage=2, steps=2, iterations=3)
-IDEAS = {
-    "sources": {"sources": 3},
-    "surface noise": {"noise": "surface"},
-}
+IDEAS = {"noise": "surface", "decay": "late"}
 FLAT = Surface(np.full((32, 32), 2.0), np.broadcast_to([0.0, 0, -1], (32, 32, 3)))
-ALL_IDEAS = {name: value for idea in IDEAS.values() for name, value in idea.items()}
 
 
 def plan(result):
-    """Plan of who was edited when, by the result's rounds: the sources are the first of the
-    first.
-    """
-    sources = result.counters["sources"]
+    """Plan of who was edited when, by the result's rounds: the source is the first of the first."""
     first, *others = [part.views for part in result.rounds]
-    stages = [first[sources:], *others]
     return SimpleNamespace(
         source=first[0],
-        chain=first[1:sources],
-        stages=stages,
+        stages=[first[1:], *others],
         targets=[*first[1:], *(view for part in others for view in part)],
         edited=[*first, *(view for part in others for view in part)],
     )
@@ -344,7 +335,7 @@ def test_counters_are_what_was_done(scene, editor):
         None,  # a source made by hand: inverted and replayed
         {"source_text_guidance": 1.5},  # s_T = s_I leaves no image branch
         {"source_text_guidance": 7.0, "text_guidance": 2.5, "guidance_drop": 1.0},
-        ALL_IDEAS,
+        IDEAS,
     ],
 )
 def test_network_rows_are_those_that_hooks_count(changes, scene, editor):
@@ -662,26 +653,24 @@ def test_a_picture_by_hand_may_have_any_type_that_images_have(scene, editor):
         run(scene, editor, settings=settings, source_picture=picture.astype(np.int64))
 
 
-@pytest.mark.parametrize("views", further(3, 1))
-def test_where_all_views_are_sources_the_splats_are_tuned_on_them(views, scene, editor, tmp_path):
+def test_where_the_source_is_the_only_view_the_splats_are_tuned_on_it(scene, editor, tmp_path):
     model, cameras, images = scene
-    part = model, cameras[:views], images[:views]
-    settings = replace(QUICK, steps=1, sources=views)
+    part = model, cameras[:1], images[:1]
     lines = []
-    result = run(part, editor, tmp_path, settings, report=Watched(log=lines.append))
-    assert sorted(result.edited) == list(range(views))
+    result = run(part, editor, tmp_path, replace(QUICK, steps=1), report=Watched(log=lines.append))
+    assert list(result.edited) == [0]
     tuned = json.loads((tmp_path / "result.json").read_text())["tuned"]
-    assert tuned == {f"v{view}": 3 // views for view in range(views)}
+    assert tuned == {"v0": 3}
     assert result.counters["iterations"] == 3
     assert not torch.equal(result.gaussians.sh, model.sh)
     (line,) = [line for line in lines if line.startswith("stages")]
-    assert line.startswith("stages: 1 that tunes on the sources alone in place of 2, as ")
+    assert line.startswith("stages: 1 that tunes on the source alone in place of 2, as ")
 
 
 def noise(settings, views):
-    from attnwarp.methods.carried import Noise
+    from attnwarp.methods.carried import initial_noise
 
-    return Noise(settings).of(views, (4, 16, 16), [None] * len(views))
+    return initial_noise(settings, views, (4, 16, 16), (16, 16), [None] * len(views))
 
 
 def test_fresh_noise_is_each_views_own_and_shared_noise_is_one():
@@ -793,15 +782,6 @@ def test_arguments_that_do_not_fit_are_named(scene, editor):
         (
             {"branches": ("image",), "text_guidance": 3.0, "guidance_drop": 1.5},
             "branches: image would be .* text guidance 1.5 stage 2 has text, uncond; choose",
-        ),
-        (
-            {
-                "branches": ("image", "text"),
-                "source_text_guidance": 7.0,
-                "text_guidance": 1.5,
-                "sources": 2,
-            },
-            "text guidance 1.5 a further source has text, uncond; choose",
         ),
         (
             {"unseen": "attend", "source_text_guidance": 1.5},  # s_T = s_I
@@ -1053,7 +1033,7 @@ def recorded(scene, editor, tmp_path, settings):
     from attnwarp.editing.recording import record as keep
     from attnwarp.methods.features import Features
 
-    plan = Features(editor, settings, "cpu").plan(0, (16, 16), further=False)
+    plan = Features(editor, settings, "cpu").plan((16, 16))
     with keep(editor, plan) as recording:
         edit(editor, [scene[2][0]], "a bear", steps=settings.steps)
     return recording
@@ -1114,31 +1094,27 @@ def pictures_in(folder):
     return {name: data for name, data in files(folder).items() if name.startswith("views/")}
 
 
-@pytest.mark.parametrize("idea", IDEAS)
-def test_each_idea_alone_changes_the_views(idea, finished, scene, editor, tmp_path):
-    run(scene, editor, tmp_path, replace(QUICK, iterations=0, **IDEAS[idea]))
+def test_noise_of_the_surface_changes_the_views(finished, scene, editor, tmp_path):
+    run(scene, editor, tmp_path, replace(QUICK, iterations=0, noise="surface"))
     before, after = pictures_in(finished[1]), pictures_in(tmp_path)
-    assert set(before) == set(after) or idea == "sources"
+    assert set(before) == set(after)
     # The first stage's views are edited before any tuning, so tuning is no part of the difference.
     first = [f"views/{Path(scene[1][view].name).stem}.png" for view in plan(finished[0]).stages[0]]
-    assert any(after.get(name) != before[name] for name in first)
+    assert any(after[name] != before[name] for name in first)
 
 
 @pytest.fixture(scope="module")
 def extended(scene, editor, tmp_path_factory):
     folder = tmp_path_factory.mktemp("extended")
-    return run(scene, editor, folder, replace(QUICK, **ALL_IDEAS)), folder
+    return run(scene, editor, folder, replace(QUICK, **IDEAS)), folder
 
 
 @pytest.mark.parametrize("store", further("cpu", "disk"))
-def test_the_memory_of_all_recordings_is_told_once_before_the_first(store, scene, editor, tmp_path):
-    """Oracle: features counted by hand, of two views of 32 px and one of twice as many pixels."""
-    model, views, images = scene
-    wide = views[1].resize(64, 32)
-    part = model, [views[0], wide, views[2]], [images[0], pictures(model, [wide])[0], images[2]]
+def test_the_memory_of_the_recording_is_told_once_before_it(store, scene, editor, tmp_path):
+    """Oracle: features counted by hand."""
     told = []
-    settings = replace(QUICK, sources=3, steps=2, iterations=0, size=None)
-    run(part, editor, tmp_path, settings, store=store,
+    settings = replace(QUICK, iterations=0, size=None)
+    result = run(scene, editor, tmp_path, settings, store=store,
         report=Watched(lambda *_: told.append("work"), told.append))  # fmt: skip
     (line,) = [text for text in told if text.startswith("recording")]
     assert "work" not in told[: told.index(line)]
@@ -1146,29 +1122,10 @@ def test_the_memory_of_all_recordings_is_told_once_before_the_first(store, scene
     one = (4 * 256 * 16 + 4 * 64 * 32) * 2 * 2 * 4
     place = tmp_path / ".recording" if store == "disk" else "main memory"
     assert line == (
-        f"recording 3 sources, 8 layers, 2 branches (text, image), 2 steps in float32:"
-        f" {4 * one / 2**20:.1f} MiB in {place}"
+        f"recording 8 layers, 2 branches (text, image), 2 steps in float32:"
+        f" {one / 2**20:.1f} MiB in {place}"
     )
-
-
-def test_further_sources_are_edited_first_and_counted(extended, scene):
-    result, folder = extended
-    assert len(plan(result).chain) == 2
-    manifest = json.loads((folder / "manifest.json").read_text())
-    names = [Path(camera.name).stem for camera in scene[1]]
-    chain = [names[view] for view in plan(result).chain]
-    assert manifest["sources"][1:] == chain
-    assert set(chain).isdisjoint(name for part in manifest["rounds"][1:] for name in part["views"])
-    for number, name in enumerate(chain):
-        about = record(folder, name)
-        assert about["round"] == 1
-        if number:
-            assert list(about["sources"]) == [names[0], *chain[:number]]
-    assert result.counters["sources"] == 3
-    assert result.counters["views"] == 5
-    assert result.counters["network_rows"] == 5 * 2 * 3
-    # 4 layers of 16 channels at 16 x 16 and 4 of 32 at 8 x 8, two branches, two steps, float32.
-    assert result.counters["feature_bytes"] == 3 * (4 * 256 * 16 + 4 * 64 * 32) * 2 * 2 * 4
+    assert result.counters["feature_bytes"] == one
 
 
 @pytest.mark.door
@@ -1183,7 +1140,7 @@ def test_a_source_prompt_that_is_too_long_is_refused_before_any_work(
 
 
 def test_with_every_idea_a_killed_run_gives_the_same_bytes(extended, scene, editor, tmp_path):
-    settings = replace(QUICK, **ALL_IDEAS)
+    settings = replace(QUICK, **IDEAS)
     moment = int(np.random.default_rng(0).integers(5, 60))
     with pytest.MonkeyPatch.context() as patch:
         watch, _ = events(patch, moment)
@@ -1191,20 +1148,3 @@ def test_with_every_idea_a_killed_run_gives_the_same_bytes(extended, scene, edit
             run(scene, editor, tmp_path, settings, report=Watched(watch), checkpoint_seconds=0)
     run(scene, editor, tmp_path, settings)
     assert files(tmp_path) == files(extended[1])
-
-
-def test_a_view_at_a_further_sources_place_gets_that_sources_edit(scene, editor):
-    """With one more camera at the place of a further source and all features taken over, its edit
-    is that source's, not the first one's."""
-    model, views, images = scene
-    first = plan(run(scene, editor, settings=replace(QUICK, sources=2, iterations=0))).chain[0]
-    twin = Camera(views[first].K, views[first].world_to_camera, 32, 32, "twin")
-    settings = replace(
-        QUICK, stages=1, views_per_stage=9, iterations=0, a0=1.0, decay="constant", sources=2, batch=1
-    )  # fmt: skip
-    result = attention_warping(
-        model, [*views, twin], [*images, images[first]], editor, "a bear", settings
-    )
-    assert plan(result).chain == (first,)
-    assert np.array_equal(result.edited[first], result.edited[5])
-    assert not np.array_equal(result.edited[0], result.edited[5])

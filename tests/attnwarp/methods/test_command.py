@@ -583,7 +583,7 @@ def test_the_kind_that_a_person_names_is_that_of_the_splats_that_are_given(place
         assert result.exit_code == 2 and message in result.output
 
 
-def test_stages_sources_and_a_size_that_cannot_be_had_are_said_in_one_line_each(place, tmp_path):
+def test_stages_and_a_size_that_cannot_be_had_are_said_in_one_line_each(place, tmp_path):
     """Oracle: the manifest and the pictures that the edit leaves."""
     more = ("--ply", place / "splats.ply", "--stages", 9, "--views-per-stage", 2, "--size", 31)
     result = run(place, tmp_path, *more)
@@ -593,10 +593,6 @@ def test_stages_sources_and_a_size_that_cannot_be_had_are_said_in_one_line_each(
     assert (len(stages), longest) == (2, 32)
     assert "stages: 2 in place of 9, as 5 views leave no more to edit\n" in result.stderr
     assert "size: 32 px in place of 31, as this editor's sides are multiples of" in result.stderr
-    more = ("--ply", place / "splats.ply", "--set", "sources=9", "--stages", 1)
-    result = run(place, tmp_path / "sources", *more)
-    assert result.exit_code == 0, result.output
-    assert "sources: 5 in place of 9, as there are 5 views\n" in result.stderr
 
 
 def test_an_edit_whose_targets_got_no_features_says_so(place, tmp_path):

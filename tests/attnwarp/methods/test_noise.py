@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from attnwarp.methods.noise import carried, unmoved
+from attnwarp.methods.noise import carried
 
 SIZE = 8
 
@@ -19,28 +19,24 @@ def positions(seed):
 
 
 def setting():
-    """Two sources, the second with noise of the first, and a target's places and choice."""
-    first = unmoved((SIZE, SIZE))
-    second = carried([first], [positions(7)], torch.zeros_like(first))
-    choice = torch.from_numpy(np.random.default_rng(3).integers(-1, 2, (SIZE, SIZE)))
-    return [first, second], [positions(8), positions(9)], choice
+    """Places of a target's pixels in the source, and which of them the source shows."""
+    return positions(8), torch.from_numpy(np.random.default_rng(3).random((SIZE, SIZE)) < 2 / 3)
 
 
 def test_each_pixel_takes_its_sources_value_unless_a_nearer_one_does_by_a_loop():
-    sources, places, choice = setting()
-    result = carried(sources, places, choice).tolist()
+    places, seen = setting()
+    result = carried(places, seen).tolist()
     wanted = {}
     for row in range(SIZE):
         for column in range(SIZE):
-            k = int(choice[row, column])
-            if k < 0:
+            if not seen[row, column]:
                 continue
-            x, y = (float(v) for v in places[k][row, column])
+            x, y = (float(v) for v in places[row, column])
             if not (0 <= x <= SIZE and 0 <= y <= SIZE):
                 continue
             i, j = min(math.floor(y), SIZE - 1), min(math.floor(x), SIZE - 1)
             distance = (x - j - 0.5) ** 2 + (y - i - 0.5) ** 2
-            value = int(sources[k][i, j])
+            value = SIZE * i + j
             if value not in wanted or distance < wanted[value][0]:
                 wanted[value] = distance, (row, column)
     taken = {place: value for value, (_, place) in wanted.items()}
@@ -68,10 +64,10 @@ def test_every_value_stands_once_in_a_view():
 
 
 def test_a_view_at_the_sources_place_has_the_sources_noise():
-    order = carried([unmoved((SIZE, SIZE))], [positions(7)], torch.zeros(SIZE, SIZE).long())
     y, x = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
     here = torch.stack([x, y], dim=-1).double()
-    assert torch.equal(carried([order], [here], torch.zeros(SIZE, SIZE).long()), order)
+    order = carried(here, torch.ones(SIZE, SIZE, dtype=torch.bool))
+    assert order.flatten().tolist() == list(range(SIZE**2))
 
 
 def draws(count):

@@ -1,6 +1,5 @@
 """The page of an edit. Oracles: files of the run's folder, closed forms, and methods of the library."""
 
-import json
 import re
 import shutil
 from base64 import b64decode
@@ -126,16 +125,6 @@ def test_of_too_many_splats_those_that_cover_most_are_on_the_page(warped, scene,
     assert "7 of 60 splats" in text
     data = b64decode(re.search(r'id="splat-bytes">(.*?)<', text)[1])
     assert len(data) == 7 * 32
-
-
-def test_further_sources_are_shown_in_their_order_with_their_colours(edits):
-    folder, text = edits("attention_warping", stages=1, sources=3)
-    sources = json.loads((folder / "manifest.json").read_text())["sources"]
-    assert re.findall(r'small">(v\d) \(source\)', text) == sources
-    colors = re.findall(r"background:rgb\((\d+), (\d+), (\d+)\)", text)
-    allowed = {(0, 0, 0), *(tuple(map(int, color)) for color in colors)}
-    mask = read_image(folder / "masks" / f"{sources[2]}.png").reshape(-1, 3)
-    assert len(colors) == 3 and {tuple(pixel) for pixel in mask.tolist()} <= allowed
 
 
 def test_a_view_edited_alone_is_the_one_of_the_method_that_edits_every_view_alone(

@@ -136,7 +136,7 @@ def test_shares_of_the_steps_are_those_that_begin_within(steps, shares, numbers)
         ({"warp": {"opaqe": 1}}, "did you mean 'opaque'"),
         ({"a0.opaque": 1}, "a0: got 0.9, expected its fields by name"),
         ({"mask": 1}, "mask: got 1, expected true or false"),
-        ({"sources": 0}, "sources: got 0, expected a whole number >= 1"),
+        ({"stages": 0}, "stages: got 0, expected a whole number >= 1"),
         (
             {"text_guidance": 1.5, "guidance_drop": 1.0, "stages": 3},
             "text_guidance, guidance_drop: got 1.5 and 1, so stage 3 has -0.5, expected at least 0",

@@ -12,7 +12,6 @@ from attnwarp.editing.layers import choose_layers
 from attnwarp.editing.small import load_editor
 from attnwarp.methods import attention_warping, preset
 from attnwarp.methods.attention import aligned, self_attention
-from attnwarp.methods.sight import Sight
 from attnwarp.methods.unseen import attending, kept_tokens, unseen_of
 from attnwarp.warp import Surface, warp_surfaces
 
@@ -75,18 +74,15 @@ def test_a_view_that_sees_all_stays_beside_one_that_does_not(editor, of_source):
     assert (both[1] - all_unseen[1]).abs().max() < 1e-5
 
 
-def test_tokens_are_unseen_where_no_source_reaches_the_marked_part(scene):
+def test_tokens_are_unseen_where_no_warp_reaches_the_marked_part(scene):
     _, cameras, _ = scene
     shape = cameras[0].height, cameras[0].width
     flat = Surface(np.full(shape, 3.0), np.broadcast_to([0.0, 0, 1], (*shape, 3)))
-    warps = [warp_surfaces(cameras[k], cameras[2], flat, flat) for k in (0, 1)]
-    draw = np.random.default_rng(0)
-    masks = [torch.from_numpy(draw.random(shape) < 0.3) for _ in warps]
-    sight = Sight([warp.with_mask(mask) for warp, mask in zip(warps, masks, strict=True)])
-    marked = draw.random(shape) < 0.5
-    got = unseen_of(sight, marked)(shape)
-    expected = marked & ~(masks[0] | masks[1]).numpy()
-    assert np.array_equal(got.numpy(), expected)
+    warp, draw = warp_surfaces(cameras[0], cameras[2], flat, flat), np.random.default_rng(0)
+    reached, marked = draw.random(shape) < 0.3, draw.random(shape) < 0.5
+    got = unseen_of(warp.with_mask(torch.from_numpy(reached)), marked)(shape)
+    defined = warp.correspondence.defined.numpy()
+    assert np.array_equal(got.numpy(), marked & ~(reached & defined))
 
 
 def test_an_edit_attends_only_if_something_is_marked(scene, editor):

@@ -183,12 +183,12 @@ def _with_features_of(job: Job, donor: Donor) -> EditedScene:
     class Swapping(AttentionWarping):
         """Record in a first run, and take that recording in a second one."""
 
-        def edit_source(self, number: int, *rest: Any) -> list[ViewEdit]:
-            edits = super().edit_source(number, *rest)
-            own = self.views.recorded(number + 1)[number]
+        def edit_source(self, *rest: Any) -> list[ViewEdit]:
+            edits = super().edit_source(*rest)
+            own = self.views.recorded
             if own.recording is not None:
                 recordings.append(own.recording)
-                self.views.keep(number, replace(own, recording=recordings[0]))
+                self.views.keep(replace(own, recording=recordings[0]))
             return edits
 
     settings = AttentionWarpingSettings.from_dict(job.settings)
@@ -234,8 +234,8 @@ def _true_pictures(job: Job) -> EditedScene:
     class TruePictures(AttentionWarping):
         """Views become their true pictures."""
 
-        def edit_source(self, number: int, *_: Any) -> list[ViewEdit]:
-            return self.edit_targets(0, [self.sources[number]])
+        def edit_source(self, *_: Any) -> list[ViewEdit]:
+            return self.edit_targets(0, [self.source])
 
         def edit_targets(self, stage: int, batch: Sequence[int], *_: Any) -> list[ViewEdit]:
             return [ViewEdit(pictures[view], {"injected": 0.0}) for view in batch]
@@ -254,12 +254,11 @@ def _true_pictures(job: Job) -> EditedScene:
 
 
 def _warped_views(settings: Mapping[str, Any], views: int) -> int:
-    """The sources, and the views that the stages draw."""
+    """The source, and the views that the stages draw."""
     from attnwarp.methods.stages import draw_stages
 
     s = AttentionWarpingSettings.from_dict(dict(settings))
-    sources = min(s.sources, views)
-    return sources + len(set().union(*draw_stages(range(sources, views), s)))
+    return 1 + len(set().union(*draw_stages(range(1, views), s)))
 
 
 def _drawn_views(settings: Mapping[str, Any], views: int) -> int:

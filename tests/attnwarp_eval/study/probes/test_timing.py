@@ -30,7 +30,7 @@ STUDY = {
     "editing": {"options": {"views_per_stage": 1, "stages": 2, "steps": 1, "iterations": 1}},
     "variants": {
         "full": {},
-        "other": {"options": {"stages": 1, "steps": 3, "sources": 2}},
+        "other": {"options": {"stages": 1, "steps": 3}},
         "oracle": {"geometry": "truth"},
     },
     "probes": {"editing": ["full", "other"], "timing": ["full", "other"]},
@@ -38,10 +38,10 @@ STUDY = {
 BRANCHES = 2
 """Rows through the network for a view and a step; image guidance of 1 drops a branch."""
 
-# (sources, targets, steps, stages) by the settings above.
+# (targets, steps, stages) by the settings above.
 PLANNED = {
-    "full": (1, 2, 1, 2),
-    "other": (2, 1, 3, 1),
+    "full": (2, 1, 2),
+    "other": (1, 3, 1),
 }
 
 
@@ -84,10 +84,10 @@ def test_every_setting_runs_once_a_round_with_the_network_passes_of_its_plan(
 
     expected = {
         name: {
-            "network_rows": (sources + targets) * steps * BRANCHES,
+            "network_rows": (1 + targets) * steps * BRANCHES,
             "iterations": stages,
         }
-        for name, (sources, targets, steps, stages) in PLANNED.items()
+        for name, (targets, steps, stages) in PLANNED.items()
     }
     assert dict(zip(cell.labels, record.extra.work, strict=True)) == expected
     # One round to compile; the first setting runs twice a round.

@@ -116,16 +116,11 @@ class EditingProbe(MethodProbe[EditResult]):
     def _check_other_scene(self, study: Study, variant: Variant) -> None:
         from attnwarp.editing.small import guide_of
 
-        editor, settings = editor_of(study, variant), settings_of(study, variant, 0)
+        editor = editor_of(study, variant)
         if editor.ideal is None and guide_of(editor.name) == "depth":
             raise ValueError(
                 f"control: {OTHER_SCENE!r} needs an editor that takes pictures, and"
                 f" {editor.name!r} takes depth; choose another editor or control"
-            )
-        if settings.get("sources", 1) > 1:
-            raise ValueError(
-                f"control: {OTHER_SCENE!r} replaces the features of one source and nothing else;"
-                " set options.sources to 1, or choose another control"
             )
 
     def measured(self, study: Study) -> Set[str]:
